@@ -1,0 +1,54 @@
+"""barpc: bundle adjustment of satellite images with RPC cameras.
+
+Images become tie points, tie points become corrections, corrections compose into P_BA, and P_BA is
+fitted into an RPC. The names below are the public ones; they are imported when first used, so that
+``import barpc`` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "RPC": "barpc.sensor.rpc",
+    "Pushbroom": "barpc.sensor.pushbroom",
+    "SensorModel": "barpc.sensor",
+    "Correction": "barpc.sensor.corrected",
+    "Corrected": "barpc.sensor.corrected",
+    "View": "barpc.scene",
+    "Tracks": "barpc.scene",
+    "GroundPoints": "barpc.scene",
+    "read_rpc": "barpc.rpcio",
+    "write_rpc": "barpc.rpcio",
+    "fit_rpc": "barpc.fit",
+    "fit_rpc_points": "barpc.fit",
+    "adjust": "barpc.adjust",
+    "BarpcError": "barpc.errors",
+    "BarpcWarning": "barpc.errors",
+}
+
+if TYPE_CHECKING:
+    from barpc.errors import BarpcError as BarpcError
+    from barpc.errors import BarpcWarning as BarpcWarning
+    from barpc.scene import GroundPoints as GroundPoints
+    from barpc.scene import Tracks as Tracks
+    from barpc.scene import View as View
+    from barpc.sensor import SensorModel as SensorModel
+    from barpc.sensor.corrected import Corrected as Corrected
+    from barpc.sensor.corrected import Correction as Correction
+    from barpc.sensor.rpc import RPC as RPC
+
+__all__ = ["__version__", *sorted(_PUBLIC)]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'barpc' has no attribute {name!r}")
+    return getattr(import_module(_PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,1 @@
+"""Tracks to corrections: the bundle adjustment."""

@@ -1,0 +1,1 @@
+"""Sensor model to RPC: the fit and its certificate."""

@@ -1,0 +1,185 @@
+"""The data that travels between the halves of barpc: views, tracks, ground points.
+
+Frozen records of plain float64 arrays. `tie` makes tracks, `ba` reads them; neither knows the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from barpc.errors import InputError
+from barpc.geodesy import Array
+from barpc.sensor import SensorModel
+
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+def _frozen(owner: object, name: str, shape: tuple[int | None, ...], dtype: npt.DTypeLike) -> Any:
+    """Store the field `name` of `owner` as a read-only array of the given shape (None: any length)."""
+    value: npt.NDArray[Any] = np.array(getattr(owner, name), dtype=dtype)
+    if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
+        raise InputError(f"{type(owner).__name__}.{name}: shape {value.shape}, expected {shape}")
+    value.setflags(write=False)
+    object.__setattr__(owner, name, value)
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One image and its camera.
+
+    Parameters
+    ----------
+    name : str
+        Unique in a run: the file's stem, with its folder where stems repeat.
+    path : str
+        Absolute path of the raster; empty for a view without pixels.
+    size : tuple of int
+        Width, height [px].
+    sensor : SensorModel
+        The camera as delivered.
+    alt_range : tuple of float
+        Lowest and highest altitude [m above the ellipsoid] that the camera is used for.
+    """
+
+    name: str
+    path: str
+    size: tuple[int, int]
+    sensor: SensorModel
+    alt_range: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if min(self.size) < 1:
+            raise InputError(f"{self.name}: size {self.size} is empty")
+        if not (np.isfinite(self.alt_range).all() and self.alt_range[0] <= self.alt_range[1]):
+            raise InputError(f"{self.name}: altitude range {self.alt_range} is not an interval")
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Tie points over the views, one row an observation.
+
+    Parameters
+    ----------
+    view : (K,)
+        Index of the view.
+    point : (K,)
+        Index of the track, 0 .. P-1; rows of one track stand together, views ascending.
+    xy : (K, 2)
+        col, row [px].
+    sigma : (K,)
+        Standard deviation of each coordinate [px].
+    """
+
+    view: IntArray
+    point: IntArray
+    xy: Array
+    sigma: Array
+
+    def __post_init__(self) -> None:
+        view = _frozen(self, "view", (None,), np.int64)
+        k = len(view)
+        _frozen(self, "point", (k,), np.int64)
+        xy = _frozen(self, "xy", (k, 2), np.float64)
+        sigma = _frozen(self, "sigma", (k,), np.float64)
+        if not (np.isfinite(xy).all() and np.isfinite(sigma).all() and (sigma > 0).all()):
+            raise InputError("tracks: coordinates must be finite and sigmas positive")
+        if k and (view.min() < 0 or self.point.min() < 0):
+            raise InputError("tracks: negative view or track index")
+
+    def __len__(self) -> int:
+        """Number of observations K."""
+        return len(self.view)
+
+    @property
+    def num_points(self) -> int:
+        """Number of tracks P."""
+        return int(self.point.max()) + 1 if len(self.point) else 0
+
+    def select(self, keep: BoolArray) -> Tracks:
+        """The observations of a mask (K,); tracks left with fewer than two views go, indices close up."""
+        count = np.bincount(self.point[keep], minlength=self.num_points)
+        keep = keep & (count[self.point] >= 2)
+        _, point = np.unique(self.point[keep], return_inverse=True)
+        return Tracks(self.view[keep], point, self.xy[keep], self.sigma[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPoints:
+    """Points of known position (GCPs or check points), and where they are seen.
+
+    Parameters
+    ----------
+    names : tuple of str
+        One a point.
+    lonlatalt : (G, 3)
+        lon, lat [deg], alt [m above the ellipsoid].
+    sigma : (G, 3)
+        East, north, up standard deviation [m].
+    point, view : (M,)
+        Observations: index of the ground point, index of the view.
+    xy : (M, 2)
+        col, row [px].
+    xy_sigma : (M,)
+        Standard deviation of each coordinate [px].
+    """
+
+    names: tuple[str, ...]
+    lonlatalt: Array
+    sigma: Array
+    point: IntArray
+    view: IntArray
+    xy: Array
+    xy_sigma: Array
+
+    def __post_init__(self) -> None:
+        g = len(self.names)
+        _frozen(self, "lonlatalt", (g, 3), np.float64)
+        sigma = _frozen(self, "sigma", (g, 3), np.float64)
+        point = _frozen(self, "point", (None,), np.int64)
+        m = len(point)
+        _frozen(self, "view", (m,), np.int64)
+        _frozen(self, "xy", (m, 2), np.float64)
+        xy_sigma = _frozen(self, "xy_sigma", (m,), np.float64)
+        if not ((sigma > 0).all() and (xy_sigma > 0).all() and np.isfinite(self.lonlatalt).all()):
+            raise InputError("ground points: coordinates must be finite and sigmas positive")
+        if m and (point.min() < 0 or point.max() >= g):
+            raise InputError("ground points: an observation names a point that does not exist")
+
+
+def connected_groups(num_views: int, pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
+    """Connected components of the views, the largest first (then by first view).
+
+    Parameters
+    ----------
+    num_views : int
+        Number of views.
+    pairs : sequence of (int, int)
+        Views that are tied to each other.
+
+    Returns
+    -------
+    groups : list of list of int
+        Every view in exactly one group, ascending.
+    """
+    parent = list(range(num_views))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    for a, b in pairs:
+        ra, rb = root(a), root(b)
+        parent[max(ra, rb)] = min(ra, rb)
+    groups: dict[int, list[int]] = {}
+    for i in range(num_views):
+        groups.setdefault(root(i), []).append(i)
+    return sorted(groups.values(), key=lambda g: (-len(g), g[0]))

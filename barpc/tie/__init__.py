@@ -1,0 +1,1 @@
+"""Images to tracks: windowed reading, detection, matching, linking."""
