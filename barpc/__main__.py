@@ -1,0 +1,5 @@
+"""`python -m barpc`."""
+
+from barpc.cli import main
+
+main()

@@ -1,0 +1,94 @@
+"""The `barpc` command: a table of verbs, exit codes, and the options that all verbs share."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import sys
+import traceback
+from importlib import import_module
+
+import click
+
+from barpc import __version__
+from barpc.errors import BarpcError
+
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+EXIT_GATE = 3
+EXIT_INTERRUPTED = 130
+
+COMMANDS = {
+    "adjust": "Correct the cameras of overlapping images and write fresh RPCs.",
+    "simulate": "Make synthetic images with known cameras and truth.",
+}
+"""Verb -> its line in `barpc --help`; the code is `barpc.cli.<verb>.command`."""
+
+
+class Verbs(click.Group):
+    """A group that imports a verb's module when the verb is used."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = import_module(f"barpc.cli.{cmd_name}").command
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and not args[0].startswith("-") and args[0] not in COMMANDS:
+            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
+            hint = f" Did you mean '{near[0]}'?" if near else f" One of: {', '.join(COMMANDS)}."
+            raise click.UsageError(f"No such verb '{args[0]}'.{hint}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Verbs"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.group(cls=Verbs, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, message="barpc %(version)s")
+@click.option("-v", "--verbose", count=True, help="Log stages with their seconds (-vv: everything).")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no log: results and errors only.")
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+@click.pass_context
+def cli(ctx: click.Context, verbose: int, quiet: bool, debug: bool) -> None:
+    """Correct the camera models (RPCs) of satellite images.
+
+    \b
+    Example:
+      barpc adjust scene/*.tif -o adjusted
+
+    Exit codes: 0 done, 1 an error (one line says which file and what to do), 2 wrong usage, 3 finished but a
+    quality gate was missed, 130 interrupted.
+    """
+    ctx.obj = {"quiet": quiet, "verbose": verbose}
+    level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    logging.basicConfig(level=level, format="%(levelname).1s %(name)s: %(message)s", stream=sys.stderr)
+    logging.captureWarnings(True)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the console script: runs a verb and turns errors into exit codes."""
+    argv = sys.argv[1:] if args is None else args
+    try:
+        code = cli.main(args=argv, prog_name="barpc", standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        code = stop.exit_code
+    except click.Abort:
+        click.echo("barpc: interrupted; run the same command again to go on", err=True)
+        code = EXIT_INTERRUPTED
+    except click.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except BarpcError as error:
+        if "--debug" in argv:
+            traceback.print_exc()
+        click.echo(f"barpc: {' '.join(str(error).split())}", err=True)
+        code = EXIT_FAILED
+    sys.exit(code if isinstance(code, int) else 0)
