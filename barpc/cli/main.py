@@ -29,9 +29,11 @@ class Verbs(click.Group):
     """A group that imports a verb's module when the verb is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """The verbs, in the table's order."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the verb's module and hand out its command."""
         if cmd_name not in COMMANDS:
             return None
         command: click.Command = import_module(f"barpc.cli.{cmd_name}").command
@@ -40,6 +42,7 @@ class Verbs(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Refuse an unknown verb with the nearest known one."""
         if args and not args[0].startswith("-") and args[0] not in COMMANDS:
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f" Did you mean '{near[0]}'?" if near else f" One of: {', '.join(COMMANDS)}."
@@ -47,6 +50,7 @@ class Verbs(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the verbs from the table, without importing them."""
         with formatter.section("Verbs"):
             formatter.write_dl(list(COMMANDS.items()))
 
@@ -58,7 +62,7 @@ class Verbs(click.Group):
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 @click.pass_context
 def cli(ctx: click.Context, verbose: int, quiet: bool, debug: bool) -> None:
-    """Correct the camera models (RPCs) of satellite images.
+    r"""Correct the camera models (RPCs) of satellite images.
 
     \b
     Example:

@@ -1,0 +1,393 @@
+"""What every sensor model implies: footprint, lines of sight, view angles, triangulation, camera centre."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from barpc.errors import RpcError
+from barpc.geodesy import (
+    Array,
+    ecef_from_ground,
+    enu_basis,
+    ground_from_ecef,
+    metres_per_unit,
+    wrap_longitude,
+)
+from barpc.sensor import SensorModel
+from barpc.sensor.rpc import RPC
+
+CenterMethod = Literal["line", "projective", "nominal"]
+
+NOMINAL_ALTITUDE = 650e3
+"""Orbit altitude [m] assumed where a model does not tell its own."""
+PLAUSIBLE_ALTITUDE = (250e3, 1000e3)
+"""A camera centre regressed outside this range [m] is not believed."""
+
+
+def altitude_range(rpc: RPC) -> tuple[float, float]:
+    """The altitudes [m] that an RPC states: its offset -/+ its scale."""
+    offset, scale = float(rpc.ground_offset[2]), abs(float(rpc.ground_scale[2]))
+    return offset - scale, offset + scale
+
+
+def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
+    """Points (4 per_side, 2) [px] along the outline of an image, from the top-left corner, clockwise."""
+    width, height = size
+    t = np.arange(per_side) / per_side
+    col, row = t * width - 0.5, t * height - 0.5
+    right, bottom = np.full(per_side, width - 0.5), np.full(per_side, height - 0.5)
+    left, top = np.full(per_side, -0.5), np.full(per_side, -0.5)
+    return np.concatenate(
+        [
+            np.column_stack([col, top]),
+            np.column_stack([right, row]),
+            np.column_stack([width - 1 - col, bottom]),
+            np.column_stack([left, height - 1 - row]),
+        ]
+    )
+
+
+def footprint(
+    sensor: SensorModel, size: tuple[int, int], alt: float | npt.ArrayLike, per_side: int = 8
+) -> Array:
+    """Outline of an image on the ground.
+
+    Parameters
+    ----------
+    sensor : SensorModel
+        The camera.
+    size : (width, height)
+        [px].
+    alt : float or (4 per_side,)
+        Altitude of the ground [m above the ellipsoid].
+    per_side : int
+        Points on each side; an edge is a curve on the ground.
+
+    Returns
+    -------
+    ring : (4 per_side, 2)
+        lon, lat [deg], not closed, in the order of the image's outline; longitudes run on continuously
+        across the antimeridian.
+    """
+    border = image_border(size, per_side)
+    ring = sensor.localize(border, np.broadcast_to(np.asarray(alt, dtype=np.float64), len(border)))[:, :2]
+    ring[:, 0] = wrap_longitude(ring[:, 0], ring[0, 0])
+    return ring
+
+
+def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, float]) -> tuple[Array, Array]:
+    """Straight lines through the ground points of image points at two altitudes.
+
+    Parameters
+    ----------
+    sensor : SensorModel
+        The camera.
+    image : (..., 2)
+        col, row [px].
+    alt_range : (low, high)
+        The two altitudes [m]; at least 100 m apart are taken.
+
+    Returns
+    -------
+    origin : (..., 3)
+        ECEF [m], at the lower altitude.
+    direction : (..., 3)
+        Unit vector in ECEF, pointing up, towards the sensor.
+    """
+    image = np.asarray(image, dtype=np.float64)
+    low, high = alt_range[0], max(alt_range[1], alt_range[0] + 100.0)
+    origin = ecef_from_ground(sensor.localize(image, np.full(image.shape[:-1], low)))
+    direction = ecef_from_ground(sensor.localize(image, np.full(image.shape[:-1], high))) - origin
+    return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def sight_enu(sensor: SensorModel, ground: Array) -> Array:
+    """Unit vectors (..., 3) east, north, up from ground points (..., 3) towards the sensor.
+
+    The direction in which a point can move without moving in the image: the null vector of the
+    projection's derivative.
+    """
+    ground = np.asarray(ground, dtype=np.float64)
+    _, jacobian = sensor.project_jacobian(ground)
+    metric = jacobian / metres_per_unit(ground)[..., None, :]
+    sight = np.cross(metric[..., 0, :], metric[..., 1, :])
+    sight *= np.where(sight[..., 2:] < 0, -1.0, 1.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(sight / np.linalg.norm(sight, axis=-1, keepdims=True))
+
+
+def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
+    """Incidence and azimuth of the line of sight at ground points.
+
+    Parameters
+    ----------
+    sensor : SensorModel
+        The camera.
+    ground : (..., 3)
+        lon, lat [deg], alt [m].
+
+    Returns
+    -------
+    incidence : (...)
+        Angle between the local vertical and the direction to the sensor [deg].
+    azimuth : (...)
+        Direction to the sensor, clockwise from north [deg, 0 to 360].
+    """
+    sight = sight_enu(sensor, ground)
+    incidence = np.degrees(np.arctan2(np.hypot(sight[..., 0], sight[..., 1]), sight[..., 2]))
+    azimuth = np.degrees(np.arctan2(sight[..., 0], sight[..., 1])) % 360.0
+    return incidence, azimuth
+
+
+def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
+    """Angle (...) [deg] between the lines of sight of two cameras at ground points (..., 3)."""
+    a, b = sight_enu(sensor_a, ground), sight_enu(sensor_b, ground)
+    cross = np.linalg.norm(np.cross(a, b), axis=-1)
+    return np.asarray(np.degrees(np.arctan2(cross, (a * b).sum(axis=-1))))
+
+
+@dataclass(frozen=True, eq=False)
+class Triangulation:
+    """Ground points intersected from tracks.
+
+    Parameters
+    ----------
+    points : (P, 3)
+        ECEF [m]; NaN where the rays do not meet (fewer than two, parallel, or outside a model's domain).
+    residuals : (K, 2)
+        Projected - observed [px]; NaN for the rows of such points.
+    ok : (P,)
+        Whether the point is usable.
+    """
+
+    points: Array
+    residuals: Array
+    ok: npt.NDArray[np.bool_]
+
+
+def triangulate(
+    sensors: Sequence[SensorModel],
+    view: npt.ArrayLike,
+    point: npt.ArrayLike,
+    xy: Array,
+    sigma: Array | None = None,
+    *,
+    alt: float | npt.ArrayLike = 0.0,
+    steps: int = 10,
+) -> Triangulation:
+    """Intersect the rays of tracks: batched Gauss-Newton on the reprojection error.
+
+    The unknowns of a step are metres east, north and up at the point, so that it is the step in ECEF
+    without the conversions.
+
+    Parameters
+    ----------
+    sensors : sequence of SensorModel
+        One a view.
+    view, point : (K,)
+        View and track of each observation.
+    xy : (K, 2)
+        col, row [px].
+    sigma : (K,), optional
+        Standard deviations [px]; equal if not given.
+    alt : float or (P,)
+        Altitude [m] that the first guess is localised at.
+    steps : int
+        At most so many steps.
+
+    Returns
+    -------
+    Triangulation
+        Points (P, 3) in ECEF [m], residuals (K, 2) [px], and which points are usable.
+    """
+    view, point = np.asarray(view, dtype=np.int64), np.asarray(point, dtype=np.int64)
+    xy = np.asarray(xy, dtype=np.float64)
+    num = int(point.max()) + 1 if len(point) else 0
+    if not num:
+        return Triangulation(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, dtype=bool))
+    rows = [(sensors[v], np.flatnonzero(view == v)) for v in np.unique(view)]
+    weight = np.ones(len(xy)) if sigma is None else 1.0 / np.asarray(sigma, dtype=np.float64)
+    ground = _first_guess(rows, point, xy, np.broadcast_to(np.asarray(alt, dtype=np.float64), num))
+    residual = np.empty((len(xy), 2))
+    jacobian = np.empty((len(xy), 2, 3))
+    ok = np.ones(num, dtype=bool)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        for _ in range(steps):
+            scale = metres_per_unit(ground)
+            for sensor, index in rows:
+                at = point[index]
+                image, by_ground = sensor.project_jacobian(ground[at])
+                residual[index] = image - xy[index]
+                jacobian[index] = by_ground / scale[at][:, None, :]
+            step, ok = _normal_step(jacobian, residual, weight, point, num)
+            ground -= np.where(ok[:, None], step, 0.0) / scale
+            if not np.abs(step[ok]).max(initial=0.0) > 1e-4:  # metres; quadratic: the next is below 1e-9
+                break
+        for sensor, index in rows:
+            residual[index] = sensor.project(ground[point[index]]) - xy[index]
+    bad = np.ones(num, dtype=bool)
+    bad[point] = False
+    bad[point[~np.isfinite(residual).all(axis=1)]] = True
+    ok &= ~bad
+    ground[~ok] = np.nan
+    residual[~ok[point]] = np.nan
+    return Triangulation(ecef_from_ground(ground), residual, ok)
+
+
+def _first_guess(
+    rows: list[tuple[SensorModel, npt.NDArray[np.int64]]],
+    point: npt.NDArray[np.int64],
+    xy: Array,
+    alt: Array,
+) -> Array:
+    """Each track localised at `alt` in one of its views."""
+    ground = np.full((len(alt), 3), np.nan)
+    for sensor, index in rows:
+        new = index[np.isnan(ground[point[index], 0])]
+        if len(new):
+            ground[point[new]] = sensor.localize(xy[new], alt[point[new]])
+    return ground
+
+
+def _normal_step(
+    jacobian: Array, residual: Array, weight: Array, point: npt.NDArray[np.int64], num: int
+) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Gauss-Newton steps (num, 3) [m], and for which points the rays determine one."""
+    a = jacobian * weight[:, None, None]
+    r = residual * weight[:, None]
+    upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    normal = np.empty((num, 3, 3))
+    for i, j in upper:
+        value = np.bincount(point, (a[:, :, i] * a[:, :, j]).sum(axis=1), minlength=num)
+        normal[:, i, j] = normal[:, j, i] = value
+    rhs = np.stack(
+        [np.bincount(point, (a[:, :, i] * r).sum(axis=1), minlength=num) for i in range(3)], axis=1
+    )
+    # parallel rays: the smallest pivot of a Cholesky factor, against the trace; 1e-10 is 0.0006 degrees
+    trace = normal[:, 0, 0] + normal[:, 1, 1] + normal[:, 2, 2]
+    det = np.linalg.det(normal)
+    ok = np.isfinite(det) & (det > 1e-10 * trace**3 / 27)
+    step = np.zeros((num, 3))
+    if ok.any():
+        step[ok] = np.linalg.solve(normal[ok], rhs[ok][..., None])[..., 0]
+    return step, ok
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCenter:
+    """Where a camera stands.
+
+    Parameters
+    ----------
+    ecef : (3,)
+        [m].
+    altitude : float
+        [m above the ellipsoid].
+    method : str
+        How it was found: "line", "projective", or "nominal" where the first was not plausible.
+    """
+
+    ecef: Array
+    altitude: float
+    method: CenterMethod
+
+
+def camera_center(
+    sensor: SensorModel,
+    size: tuple[int, int],
+    alt_range: tuple[float, float],
+    method: Literal["line", "projective"] = "line",
+) -> CameraCenter:
+    """Camera centre regressed from a sensor model.
+
+    ``line``: one image line of a pushbroom camera IS a perspective camera, so its rays meet in one
+    point, found by least squares. ``projective``: a 3x4 projective camera by direct linear
+    transformation over the whole image, as in the paper; of a pushbroom image it finds a point at about
+    twice the distance, for the image is perspective across the track and affine along it.
+
+    Parameters
+    ----------
+    sensor : SensorModel
+        The camera.
+    size : (width, height)
+        [px].
+    alt_range : (low, high)
+        Altitudes [m] between which rays are drawn.
+    method : {"line", "projective"}
+        See above.
+
+    Returns
+    -------
+    CameraCenter
+        With ``line``, a point outside `PLAUSIBLE_ALTITUDE` is replaced by one at `NOMINAL_ALTITUDE` on
+        the central ray, and says so in its ``method``.
+
+    Raises
+    ------
+    RpcError
+        The model cannot be localised over its own image.
+    """
+    found: CenterMethod = method
+    ecef = (_center_of_line if method == "line" else _center_projective)(sensor, size, alt_range)
+    altitude = float(ground_from_ecef(ecef)[2])
+    if not np.isfinite(altitude):
+        if not np.isfinite(sensor.localize(np.array(size) / 2.0, np.array(alt_range[0]))).all():
+            raise RpcError("camera centre: the model has no ground point at its image's centre")
+        altitude = np.inf
+    if method == "line" and not PLAUSIBLE_ALTITUDE[0] <= altitude <= PLAUSIBLE_ALTITUDE[1]:
+        ecef, found = _center_nominal(sensor, size, alt_range), "nominal"
+        altitude = float(ground_from_ecef(ecef)[2])
+    return CameraCenter(ecef, altitude, found)
+
+
+def _center_of_line(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
+    width, height = size
+    image = np.column_stack([np.linspace(0, width - 1, 41), np.full(41, (height - 1) / 2)])
+    origin, direction = lines_of_sight(sensor, image, alt_range)
+    shift = origin.mean(axis=0)
+    projector = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    normal = projector.sum(axis=0)
+    rhs = (projector @ (origin - shift)[..., None]).sum(axis=0)[:, 0]
+    if not np.isfinite(normal).all():
+        return np.full(3, np.nan)
+    return np.asarray(np.linalg.lstsq(normal, rhs, rcond=1e-15)[0] + shift)
+
+
+def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
+    width, height = size
+    low, high = alt_range[0], max(alt_range[1], alt_range[0] + 100.0)
+    grid = np.meshgrid(
+        np.linspace(0, width - 1, 10),
+        np.linspace(0, height - 1, 10),
+        np.linspace(low, high, 6),
+        indexing="ij",
+    )
+    col, row, alt = (g.ravel() for g in grid)
+    image = np.column_stack([col, row])
+    ecef = ecef_from_ground(sensor.localize(image, alt))
+    if not np.isfinite(ecef).all():
+        return np.full(3, np.nan)
+    shift, scale = ecef.mean(axis=0), ecef.std(axis=0).max()
+    x = np.column_stack([(ecef - shift) / scale, np.ones(len(ecef))])
+    u = (image - image.mean(axis=0)) / image.std(axis=0).max()
+    zero = np.zeros_like(x)
+    system = np.concatenate([np.hstack([x, zero, -u[:, :1] * x]), np.hstack([zero, x, -u[:, 1:] * x])])
+    camera = np.linalg.svd(system, full_matrices=False)[2][-1].reshape(3, 4)
+    center = np.linalg.svd(camera)[2][-1]
+    return np.asarray(center[:3] / center[3] * scale + shift)
+
+
+def _center_nominal(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
+    image = np.array([(size[0] - 1) / 2, (size[1] - 1) / 2])
+    origin, direction = lines_of_sight(sensor, image, alt_range)
+    up = enu_basis(ground_from_ecef(origin))[2]
+    distance = NOMINAL_ALTITUDE / max(float(direction @ up), 0.3)
+    for _ in range(5):  # the Earth curves away: a few steps along the ray reach the altitude
+        altitude = float(ground_from_ecef(origin + distance * direction)[2])
+        distance += (NOMINAL_ALTITUDE - altitude) / max(float(direction @ up), 0.3)
+    return np.asarray(origin + distance * direction)
