@@ -116,7 +116,9 @@ class Corrected:
     _matrix: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_matrix", rotation_matrix(self.correction.rotation))
+        matrix = rotation_matrix(self.correction.rotation)
+        matrix.setflags(write=False)
+        object.__setattr__(self, "_matrix", matrix)
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""

@@ -135,6 +135,7 @@ class RPC:
             raise RpcError("RPC coeffs: a denominator is zero everywhere")
         # (12, 10): d/dL, d/dP, d/dH of the four polynomials on the first ten monomials
         gradient = np.einsum("pi,aij->paj", self.coeffs, _DERIVATIVE).reshape(12, 10)
+        gradient.setflags(write=False)
         object.__setattr__(self, "_gradient", gradient)
 
     def __eq__(self, other: object) -> bool:

@@ -1,0 +1,55 @@
+"""The sensor models that the contract tests run over: one line a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from barpc.geodesy import ecef_from_ground
+from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.rpc import RPC
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model and where it is tried."""
+
+    model: SensorModel
+    size: tuple[int, int]
+    alt_range: tuple[float, float]
+
+
+def make_rpc(lon: float = 5.4, lat: float = 43.2, seed: int = 3) -> RPC:
+    """An RPC with all of its coefficients at work: a camera 25 deg off nadir, GSD near 0.5 m."""
+    rng = np.random.default_rng(seed)
+    coeffs = rng.normal(0, 2e-6, (4, 20))
+    coeffs[0, :4] += [1e-3, 1.0, 0.02, -0.04]
+    coeffs[2, :4] += [-2e-3, 0.03, -1.0, 0.025]
+    coeffs[1::2, 1:4] += rng.normal(0, 1e-4, (2, 3))
+    coeffs[1::2, 0] = 1.0
+    return RPC(coeffs, [lon, lat, 500.0], [0.12, 0.09, 500.0], [10000.0, 9500.0], [10100.0, 9800.0], 3.0, 0.5)
+
+
+def _correction(lon: float = 5.4, lat: float = 43.2) -> Correction:
+    return Correction([2e-5, -3e-5, 1e-5], [4.0, -3.0, 2.0], ecef_from_ground([lon + 2.0, lat - 1.0, 7e5]))
+
+
+MODELS: dict[str, Callable[[], Case]] = {
+    "rpc": lambda: Case(make_rpc(), (20000, 19000), (0.0, 1000.0)),
+    "rpc across the antimeridian": lambda: Case(make_rpc(lon=179.98), (20000, 19000), (0.0, 1000.0)),
+    "rpc near the pole": lambda: Case(make_rpc(lat=84.9), (20000, 19000), (0.0, 1000.0)),
+    "corrected rpc": lambda: Case(Corrected(make_rpc(), _correction()), (20000, 19000), (0.0, 1000.0)),
+    "corrected rpc across the antimeridian": lambda: Case(
+        Corrected(make_rpc(lon=-179.98), _correction(lon=-179.98)), (20000, 19000), (0.0, 1000.0)
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=list(MODELS))
+def case(request: pytest.FixtureRequest) -> Case:
+    """Every model in turn."""
+    return MODELS[request.param]()

@@ -1,0 +1,146 @@
+"""Footprints, angles, triangulation and camera centres."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.sensor.geometry import (
+    camera_center,
+    convergence_angle,
+    footprint,
+    image_border,
+    lines_of_sight,
+    triangulate,
+    view_angles,
+)
+from barpc.sensor.rpc import RPC
+
+from .conftest import make_rpc
+
+
+def tilted_rpc(toward: tuple[float, float]) -> RPC:
+    """An RPC that sees a point displaced in the image with altitude: px per metre in col and row."""
+    rpc = make_rpc()
+    coeffs = rpc.coeffs.copy()
+    coeffs[0, 3] = toward[0] * 500 / rpc.image_scale[0]
+    coeffs[2, 3] = toward[1] * 500 / rpc.image_scale[1]
+    return RPC(coeffs, rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+
+
+def test_the_border_runs_clockwise_on_the_edges_of_the_outer_pixels():
+    border = image_border((10, 20), per_side=4)
+    assert len(border) == 16
+    np.testing.assert_array_equal(
+        border[[0, 4, 8, 12]], [[-0.5, -0.5], [9.5, -0.5], [9.5, 19.5], [-0.5, 19.5]]
+    )
+
+
+def test_a_footprint_projects_onto_the_images_border():
+    rpc = make_rpc()
+    ring = footprint(rpc, (800, 600), 300.0)
+    image = rpc.project(np.column_stack([ring, np.full(len(ring), 300.0)]))
+    np.testing.assert_allclose(image, image_border((800, 600)), rtol=0, atol=1e-6)
+
+
+def test_a_footprint_across_the_antimeridian_is_in_one_piece():
+    rpc = make_rpc(lon=180.0)
+    ring = footprint(rpc, (20000, 19000), 0.0)
+    assert np.ptp(ring[:, 0]) < 0.5
+    assert ring[:, 0].min() < 180.0 < ring[:, 0].max()
+
+
+def test_the_view_angles_are_those_of_the_line_of_sight():
+    rpc = tilted_rpc((0.6, -0.4))
+    image = np.array([[5000.0, 4000.0], [15000.0, 12000.0]])
+    ground = rpc.localize(image, np.full(2, 500.0))
+    incidence, azimuth = view_angles(rpc, ground)
+    _, direction = lines_of_sight(rpc, image, (490.0, 510.0))
+    enu = (enu_basis(ground) @ direction[..., None])[..., 0]
+    np.testing.assert_allclose(np.cos(np.radians(incidence)), enu[:, 2], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(azimuth, np.degrees(np.arctan2(enu[:, 0], enu[:, 1])) % 360, atol=0.02)
+    assert (incidence > 10).all()
+
+
+def test_the_convergence_angle_is_the_angle_between_the_rays():
+    a, b = tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2))
+    ground = a.localize(np.array([9000.0, 9000.0]), np.array(500.0))
+    rays = [lines_of_sight(m, m.project(ground), (490.0, 510.0))[1] for m in (a, b)]
+    expected = np.degrees(np.arccos(rays[0] @ rays[1]))
+    assert convergence_angle(a, b, ground) == pytest.approx(expected, abs=0.01)
+    assert convergence_angle(a, a, ground) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_triangulation_meets_the_points_that_were_projected():
+    models = [tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2)), tilted_rpc((0.1, 0.5))]
+    rng = np.random.default_rng(2)
+    truth = models[0].localize(rng.uniform(2000, 17000, (500, 2)), rng.uniform(0, 1000, 500))
+    view, point = np.tile([0, 1, 2], 500), np.repeat(np.arange(500), 3)
+    xy = np.stack([m.project(truth) for m in models], axis=1).reshape(-1, 2)
+    result = triangulate(models, view, point, xy)
+    assert result.ok.all()
+    assert np.abs(result.points - ecef_from_ground(truth)).max() < 1e-5
+    assert np.abs(result.residuals).max() < 1e-6
+
+
+def test_triangulation_is_the_least_squares_point_under_noise():
+    models = [tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2)), tilted_rpc((0.1, 0.5))]
+    truth = models[0].localize(np.array([[8000.0, 9000.0]]), np.array([400.0]))
+    rng = np.random.default_rng(5)
+    sigma = np.array([0.1, 0.4, 0.2])
+    xy = np.stack([m.project(truth)[0] for m in models]) + rng.normal(0, 0.3, (3, 2))
+    result = triangulate(models, [0, 1, 2], [0, 0, 0], xy, sigma)
+
+    def cost(ecef):
+        ground = ground_from_ecef(ecef)
+        return sum(
+            (((m.project(ground) - x) / s) ** 2).sum() for m, x, s in zip(models, xy, sigma, strict=True)
+        )
+
+    best = cost(result.points[0])
+    for step in 0.01 * np.vstack([np.eye(3), -np.eye(3)]):
+        assert cost(result.points[0] + step) > best
+
+
+def test_points_without_an_intersection_are_nan_and_flagged():
+    a, b = tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2))
+    ground = a.localize(np.array([9000.0, 9000.0]), np.array(500.0))
+    pa, pb = a.project(ground), b.project(ground)
+    # track 0: fine; 1: one view only; 2: the same view twice, so parallel rays; 3: not finite
+    xy = np.array([pa, pb, pa, pa, pa, pa, [np.nan, 1.0]])
+    result = triangulate([a, b], [0, 1, 0, 0, 0, 0, 1], [0, 0, 1, 2, 2, 3, 3], xy)
+    assert result.ok.tolist() == [True, False, False, False]
+    assert np.isnan(result.points[1:]).all()
+    assert np.isnan(result.residuals[2:]).all()
+
+
+def test_no_tracks_give_no_points():
+    result = triangulate([], [], [], np.empty((0, 2)))
+    assert result.points.shape == (0, 3)
+
+
+def test_the_line_method_finds_the_orbit_of_the_pleiades_crops(shared_data):
+    rasterio = pytest.importorskip("rasterio")
+    from barpc.rpcio import read_rpc
+    from barpc.sensor.geometry import altitude_range
+
+    for path in sorted((shared_data / "optical/phr_triplet_north").glob("*.tif")):
+        rpc = read_rpc(path)
+        with rasterio.open(path) as image:
+            size = (image.width, image.height)
+        line = camera_center(rpc, size, altitude_range(rpc))
+        assert line.method == "line"
+        assert line.altitude == pytest.approx(694e3, rel=0.05)
+        # the paper's regression puts the centre of a pushbroom image much too far
+        assert camera_center(rpc, size, altitude_range(rpc), "projective").altitude > 1.2 * line.altitude
+
+
+def test_a_centre_that_cannot_be_is_replaced_by_a_nominal_one_on_the_central_ray():
+    rpc = make_rpc()  # its rays are parallel: they meet nowhere
+    center = camera_center(rpc, (20000, 19000), (0.0, 1000.0))
+    assert center.method == "nominal"
+    assert center.altitude == pytest.approx(650e3, rel=0.01)
+    origin, direction = lines_of_sight(rpc, np.array([9999.5, 9499.5]), (0.0, 1000.0))
+    off = np.cross(center.ecef - origin, direction)
+    assert np.linalg.norm(off) < 1e-3

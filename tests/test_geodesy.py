@@ -1,0 +1,67 @@
+"""Ground to ECEF and back, against PROJ and against central differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc import geodesy
+
+
+@pytest.fixture
+def ground():
+    rng = np.random.default_rng(0)
+    n = 20000
+    return np.column_stack(
+        [rng.uniform(-180, 180, n), rng.uniform(-89.9, 89.9, n), rng.uniform(-1e4, 9e5, n)]
+    )
+
+
+def test_ecef_equals_proj(ground):
+    pyproj = pytest.importorskip("pyproj")
+    proj = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
+    expected = np.column_stack(proj.transform(*ground.T))
+    np.testing.assert_allclose(geodesy.ecef_from_ground(ground), expected, rtol=0, atol=2e-9)
+
+
+def test_there_and_back_is_a_few_nanometres(ground):
+    ecef = geodesy.ecef_from_ground(ground)
+    back = geodesy.ground_from_ecef(ecef)
+    assert np.abs(geodesy.ecef_from_ground(back) - ecef).max() <= 8e-9
+    assert np.abs(back[:, 2] - ground[:, 2]).max() <= 8e-9
+
+
+def test_the_poles_and_the_equator_have_an_answer():
+    ecef = [[0, 0, 6.4e6], [0, 0, -6.4e6], [geodesy.WGS84_A, 0, 0], [0, -geodesy.WGS84_A - 100, 0]]
+    ground = geodesy.ground_from_ecef(ecef)
+    altitude = 6.4e6 - geodesy.WGS84_B
+    expected = [[0, 90, altitude], [0, -90, altitude], [0, 0, 0], [-90, 0, 100]]
+    np.testing.assert_allclose(ground, expected, rtol=0, atol=1e-8)
+
+
+def test_jacobians_are_central_differences_and_each_others_inverse(ground):
+    ground = ground[np.abs(ground[:, 1]) < 85][:500]
+    forward = geodesy.ecef_from_ground_jacobian(ground)
+    for axis, step in enumerate((1e-4, 1e-4, 10.0)):
+        d = np.zeros(3)
+        d[axis] = step
+        difference = (geodesy.ecef_from_ground(ground + d) - geodesy.ecef_from_ground(ground - d)) / (
+            2 * step
+        )
+        np.testing.assert_allclose(
+            forward[..., axis], difference, rtol=0, atol=2e-6 * np.abs(difference).max()
+        )
+    product = forward @ geodesy.ground_from_ecef_jacobian(ground)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), rtol=0, atol=1e-12)
+
+
+def test_wrapping_a_longitude_leaves_near_ones_alone_to_the_bit():
+    lon = np.array([5.123456789, -179.9, 179.9, 359.5, -200.0])
+    np.testing.assert_array_equal(geodesy.wrap_longitude(lon[:3]), lon[:3])
+    np.testing.assert_allclose(geodesy.wrap_longitude(lon), [5.123456789, -179.9, 179.9, -0.5, 160.0])
+    np.testing.assert_allclose(geodesy.wrap_longitude([-179.9], 179.9), [180.1])
+
+
+def test_what_is_not_finite_stays_so_without_an_exception():
+    assert np.isnan(geodesy.ecef_from_ground([np.nan, 0, 0])).any()
+    assert np.isnan(geodesy.ground_from_ecef([np.nan, 0, 0])).any()
