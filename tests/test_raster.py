@@ -1,0 +1,115 @@
+"""Opening rasters: what is read, and what is refused in one line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.errors import ImageError
+from barpc.raster import open_raster
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    path = tmp_path / "image.tif"
+    data = np.arange(48, dtype=np.uint16).reshape(1, 6, 8)
+    with (
+        pytest.warns(rasterio.errors.NotGeoreferencedWarning),
+        rasterio.open(path, "w", driver="GTiff", width=8, height=6, count=1, dtype="uint16") as out,
+    ):
+        out.write(data)
+    return path
+
+
+def vrt(path: Path, body: str, attributes: str = "") -> Path:
+    path.write_text(f'<VRTDataset rasterXSize="8" rasterYSize="6"{attributes}>{body}</VRTDataset>')
+    return path
+
+
+def band(source: str, relative: int = 1) -> str:
+    return (
+        '<VRTRasterBand dataType="UInt16" band="1"><SimpleSource>'
+        f'<SourceFilename relativeToVRT="{relative}">{source}</SourceFilename><SourceBand>1</SourceBand>'
+        "</SimpleSource></VRTRasterBand>"
+    )
+
+
+def test_a_raster_without_georeference_opens_without_a_warning(image: Path) -> None:
+    with open_raster(image) as dataset:
+        assert dataset.shape == (6, 8)
+        assert dataset.read(1)[5, 7] == 47
+
+
+def test_a_vrt_of_a_plain_local_raster_opens(image: Path, tmp_path: Path) -> None:
+    with open_raster(vrt(tmp_path / "a.vrt", band("image.tif"))) as dataset:
+        assert dataset.read(1)[5, 7] == 47
+    with open_raster(vrt(tmp_path / "b.vrt", band(str(image), 0))) as dataset:
+        assert dataset.read(1)[0, 1] == 1
+
+
+@pytest.mark.parametrize(
+    ("body", "attributes", "message"),
+    [
+        (band("/vsicurl/http://127.0.0.1:9/x.tif", 0), "", "no plain local file"),
+        (band("http://127.0.0.1:9/x.tif", 0), "", "no plain local file"),
+        (band("image.tif", 0), "", "no plain local file"),
+        (band("nowhere.tif"), "", "no such file"),
+        (band("loop.vrt"), "", "VRT"),
+        ("<OpenOptions/>", "", "OpenOptions"),
+        ("", ' subClass="VRTWarpedDataset"', "VRTDataset"),
+        ("<SRS>", "", "does not parse"),
+    ],
+)
+def test_a_vrt_that_points_elsewhere_is_refused(
+    tmp_path: Path, image: Path, body: str, attributes: str, message: str
+) -> None:
+    if "loop" in body:
+        vrt(tmp_path / "loop.vrt", band("image.tif"))
+    with pytest.raises(ImageError, match=message), open_raster(vrt(tmp_path / "x.vrt", body, attributes)):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "empty"),
+        (b"hello world", "not a raster"),
+        (b"<GDAL_WMS><Service/></GDAL_WMS>", "not a raster"),
+        (b'<VRTDataset><!DOCTYPE x [<!ENTITY a "b">]></VRTDataset>', "document type"),
+        (b"II*\x00\x08\x00\x00\x00", "cannot be read as GTiff"),
+        (b"\x89PNG damaged", "cannot be read as PNG"),
+    ],
+)
+def test_a_file_that_is_no_image_is_refused_in_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "x.tif"
+    path.write_bytes(content)
+    with pytest.raises(ImageError, match=message) as caught, open_raster(path):
+        pass
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "path", ["/vsicurl/http://127.0.0.1:9/x.tif", "s3://bucket/x.tif", "GTIFF_DIR:1:x.tif"]
+)
+def test_a_remote_or_indirect_path_is_refused(path: str) -> None:
+    with pytest.raises(ImageError, match="remote and virtual"), open_raster(path):
+        pass
+
+
+def test_a_missing_file_a_folder_and_a_pipe_are_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for name, message in (("missing.tif", "no such file"), ("", "folder"), ("pipe", "pipe")):
+        with pytest.raises(ImageError, match=message), open_raster(tmp_path / name):
+            pass
+
+
+def test_an_error_while_reading_names_the_file(image: Path) -> None:
+    cut = image.with_name("cut.tif")
+    cut.write_bytes(image.read_bytes()[:-40])
+    with pytest.raises(ImageError, match=r"cut\.tif"), open_raster(cut) as dataset:
+        dataset.read(1)
