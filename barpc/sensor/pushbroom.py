@@ -1,0 +1,368 @@
+"""The rigorous pushbroom camera: orbit, attitude, detector line of sight and line time.
+
+A line of the image is taken at one instant. At time t the camera stands at O(t) and its axes in ECEF are
+A(t) = mount exp([w(t)]x), x along the scan, y along the detector line, z towards the ground. Column c looks
+along A(t) (l_x(c), l_y(c), 1), l being two polynomials of the column. A ground point X is seen at (t, c) with
+
+    p = A(t)^T (X - O(t)),    p_x / p_z = l_x(c),    p_y / p_z = l_y(c),
+
+two equations that Newton's method solves with analytic derivatives; the derivative of (c, t) by X follows
+from the same 2x2 system.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from barpc.errors import RpcError
+from barpc.geodesy import (
+    WGS84_A,
+    WGS84_B,
+    Array,
+    ecef_from_ground,
+    ecef_from_ground_jacobian,
+    ground_from_ecef,
+    wrap_longitude,
+)
+from barpc.sensor.curve import Curve
+
+CHUNK = 4096
+"""Points worked on at a time, so that what Newton's method needs stays in cache."""
+
+EXTRAPOLATION = 1.0
+"""Seconds beyond the orbit's and the attitude's knots that are still believed; NaN farther out."""
+
+_STEPS = 12
+_SETTLED = 1e-4  # px: Newton is quadratic, what is left after a step of this size is below rounding
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products of (3, N) vectors."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Pushbroom:
+    """A rigorous pushbroom camera: itself a `SensorModel`.
+
+    Parameters
+    ----------
+    orbit : Curve
+        Position of the camera over time [m], ECEF.
+    attitude : Curve
+        Rotation vector w over time [rad], in the axes of `mount`.
+    mount : (3, 3)
+        ecef_from_camera where w = 0: columns are the camera's x (along the scan), y (along the detector
+        line) and z (towards the ground).
+    look : (2, K)
+        Tangents l_x and l_y of the detector's line of sight as polynomials of (col - look_origin), ascending
+        powers [1/px^k].
+    look_origin : float
+        Column [px] from which `look` counts.
+    line_period : float
+        Time from one row to the next [s].
+    first_line : float
+        Time of row 0 [s].
+
+    Raises
+    ------
+    RpcError
+        A wrong shape, a value that is not finite, a `mount` that is no rotation, a line period that is not
+        positive.
+    """
+
+    orbit: Curve
+    attitude: Curve
+    mount: Array
+    look: Array
+    look_origin: float
+    line_period: float
+    first_line: float = 0.0
+    _lon: float = field(init=False, repr=False, default=0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("mount", "look"):
+            value = np.array(getattr(self, name), dtype=np.float64)
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        self._check()
+        row = (self._middle - self.first_line) / self.line_period
+        with np.errstate(all="ignore"):
+            center = self._meet(np.array([[self.look_origin, row]]), np.zeros(1))
+        object.__setattr__(self, "_lon", float(np.nan_to_num(center[0, 0])))
+
+    def _check(self) -> None:
+        if self.mount.shape != (3, 3) or self.look.shape != (2, max(2, self.look.shape[-1])):
+            shapes = f"{self.mount.shape} and {self.look.shape}"
+            raise RpcError(f"pushbroom: mount and look have shapes {shapes}, expected (3, 3) and (2, K)")
+        numbers = (self.look_origin, self.line_period, self.first_line)
+        if not all(np.isfinite(value).all() for value in (self.mount, self.look, numbers)):
+            raise RpcError("pushbroom: all numbers must be finite")
+        if not self.line_period > 0:
+            raise RpcError(f"pushbroom: line period {self.line_period} s is not positive")
+        if np.abs(self.mount @ self.mount.T - np.eye(3)).max() > 1e-9 or np.linalg.det(self.mount) < 0:
+            raise RpcError("pushbroom: mount is not a rotation matrix")
+        if not self._span[0] < self._span[1]:
+            raise RpcError("pushbroom: orbit and attitude share no time")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Pushbroom) and self._content() == other._content()
+
+    def __hash__(self) -> int:
+        return hash(self._content())
+
+    def _content(self) -> tuple[object, ...]:
+        numbers = (*self.mount.ravel().tolist(), self.look.shape, *self.look.ravel().tolist())
+        scalars = (self.look_origin, self.line_period, self.first_line)
+        return (self.orbit.content(), self.attitude.content(), *numbers, *scalars)
+
+    @property
+    def _middle(self) -> float:
+        """Middle of the time that both curves cover [s]."""
+        start, stop = self._span
+        return 0.5 * (start + stop)
+
+    @property
+    def _span(self) -> tuple[float, float]:
+        """First and last time that both curves cover [s]."""
+        return (
+            max(self.orbit.knots[0], self.attitude.knots[0]),
+            min(self.orbit.knots[-1], self.attitude.knots[-1]),
+        )
+
+    def time(self, row: npt.ArrayLike) -> Array:
+        """Time [s] of rows (...) [px]."""
+        return self.first_line + self.line_period * np.asarray(row, dtype=np.float64)
+
+    def position(self, row: npt.ArrayLike) -> Array:
+        """Camera centres (..., 3) [m, ECEF] of rows (...) [px]."""
+        time = self.time(row)
+        return np.moveaxis(self.orbit(time.reshape(-1))[0], 0, -1).reshape(*time.shape, 3)
+
+    def project(self, ground: Array) -> Array:
+        """Image points of ground points.
+
+        Parameters
+        ----------
+        ground : (..., 3)
+            lon, lat [deg], alt [m above the WGS84 ellipsoid].
+
+        Returns
+        -------
+        image : (..., 2)
+            col, row [px]; NaN behind the camera and more than `EXTRAPOLATION` beyond the orbit or attitude.
+        """
+        ground = np.asarray(ground, dtype=np.float64)
+        flat = ground.reshape(-1, 3)
+        out = np.empty((len(flat), 2))
+        with np.errstate(all="ignore"):
+            for start in range(0, len(flat), CHUNK):
+                part = slice(start, start + CHUNK)
+                out[part] = self._solve(ecef_from_ground(flat[part]).T).T
+        return out.reshape(*ground.shape[:-1], 2)
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Image points of ground points, with the derivative.
+
+        Parameters
+        ----------
+        ground : (..., 3)
+            lon, lat [deg], alt [m].
+
+        Returns
+        -------
+        image : (..., 2)
+            col, row [px].
+        jacobian : (..., 2, 3)
+            d(col, row) / d(lon, lat, alt) [px/deg, px/deg, px/m].
+        """
+        ground = np.asarray(ground, dtype=np.float64)
+        flat = ground.reshape(-1, 3)
+        image, jacobian = np.empty((len(flat), 2)), np.empty((len(flat), 2, 3))
+        with np.errstate(all="ignore"):
+            for start in range(0, len(flat), CHUNK):
+                part = slice(start, start + CHUNK)
+                ecef = ecef_from_ground(flat[part]).T
+                found = self._solve(ecef)
+                image[part] = found.T
+                jacobian[part] = self._by_ecef(ecef, found) @ ecef_from_ground_jacobian(flat[part])
+        return image.reshape(*ground.shape[:-1], 2), jacobian.reshape(*ground.shape[:-1], 2, 3)
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Ground points seen at image points, at known altitudes (the inverse of `project`).
+
+        The line of sight meets the ellipsoid whose axes are longer by the altitude in closed form; Newton's
+        method on the distance brings it to the altitude itself.
+
+        Parameters
+        ----------
+        image : (..., 2)
+            col, row [px].
+        alt : (...)
+            Altitude above the WGS84 ellipsoid [m]; broadcast with `image`.
+
+        Returns
+        -------
+        ground : (..., 3)
+            lon (continuous across the antimeridian), lat [deg], alt [m]. NaN where the line of sight misses
+            the Earth or the row lies more than `EXTRAPOLATION` beyond the orbit or attitude.
+        """
+        image = np.asarray(image, dtype=np.float64)
+        alt = np.asarray(alt, dtype=np.float64)
+        shape = np.broadcast_shapes(image.shape[:-1], alt.shape)
+        flat = np.broadcast_to(image, (*shape, 2)).reshape(-1, 2)
+        height = np.broadcast_to(alt, shape).reshape(-1)
+        out = np.empty((len(flat), 3))
+        with np.errstate(all="ignore"):
+            for start in range(0, len(flat), CHUNK):
+                part = slice(start, start + CHUNK)
+                out[part] = self._meet(flat[part], height[part])
+        return out.reshape(*shape, 3)
+
+    def line_of_sight(self, image: Array) -> tuple[Array, Array]:
+        """Lines of sight of image points.
+
+        Parameters
+        ----------
+        image : (..., 2)
+            col, row [px].
+
+        Returns
+        -------
+        origin : (..., 3)
+            Camera centre [m], ECEF.
+        direction : (..., 3)
+            Unit vector from the camera to the ground, ECEF.
+        """
+        image = np.asarray(image, dtype=np.float64)
+        origin, direction = self._rays(image.reshape(-1, 2))
+        return origin.T.reshape(*image.shape[:-1], 3), direction.T.reshape(*image.shape[:-1], 3)
+
+    def _rays(self, image: Array) -> tuple[Array, Array]:
+        """Camera centres and unit directions to the ground, (3, N), of image points (N, 2)."""
+        time = self.time(image[:, 1])
+        tangents = self._look(image[:, 0])[0]
+        w, _ = self.attitude(time)
+        inside = np.stack([tangents[0], tangents[1], np.ones(len(time))])
+        direction = self.mount @ _turn(w, inside)
+        direction /= np.sqrt((direction * direction).sum(axis=0))
+        return self.orbit(time)[0], direction
+
+    def _meet(self, image: Array, alt: Array) -> Array:
+        """Ground points (N, 3) where lines of sight (N, 2) reach altitudes (N,)."""
+        origin, direction = self._rays(image)
+        axes = np.array([[WGS84_A], [WGS84_A], [WGS84_B]]) + alt
+        o, d = origin / axes, direction / axes
+        a, b, c = (d * d).sum(axis=0), (o * d).sum(axis=0), (o * o).sum(axis=0) - 1.0
+        distance = c / (np.sqrt(b * b - a * c) - b)  # the nearer root, without cancellation
+        for _ in range(2):
+            ground = ground_from_ecef((origin + distance * direction).T)
+            up = _up(ground)
+            distance += (alt - ground[:, 2]) / (up * direction).sum(axis=0)
+        ground = ground_from_ecef((origin + distance * direction).T)
+        ground[:, 0] = wrap_longitude(ground[:, 0], self._lon)
+        ground[:, 2] = alt
+        ground[~(distance > 0) | self._beyond(self.time(image[:, 1]))] = np.nan
+        return ground
+
+    def _beyond(self, time: Array) -> npt.NDArray[np.bool_]:
+        """Which times (N,) lie outside what the curves are believed for."""
+        start, stop = self._span
+        return np.asarray(~((time >= start - EXTRAPOLATION) & (time <= stop + EXTRAPOLATION)))
+
+    def _look(self, col: Array) -> tuple[Array, Array]:
+        """Tangents (2, N) of the line of sight and their derivatives by the column."""
+        x = col - self.look_origin
+        value = np.broadcast_to(self.look[:, -1:], (2, len(x)))
+        rate = np.zeros((2, 1))
+        for k in range(self.look.shape[1] - 2, -1, -1):
+            rate = rate * x + value
+            value = value * x + self.look[:, k : k + 1]
+        return value, np.broadcast_to(rate, value.shape)
+
+    def _seen(self, ecef: Array, time: Array) -> tuple[Array, Array, Array]:
+        """Tangents (2, N) under which points (3, N) are seen at times (N,), their rates, and p_z (N,)."""
+        origin, velocity = self.orbit(time)
+        w, w_rate = self.attitude(time)
+        sine, cosine, third = _series(w)
+        p = _turn_back(w, self.mount.T @ (ecef - origin), sine, cosine)
+        bent = _cross(w, w_rate)
+        omega = w_rate - cosine * bent + third * _cross(w, bent)  # angular rate in the camera's axes
+        p_rate = _cross(p, omega) - _turn_back(w, self.mount.T @ velocity, sine, cosine)
+        tangents = p[:2] / p[2]
+        return tangents, (p_rate[:2] - tangents * p_rate[2]) / p[2], p[2]
+
+    def _solve(self, ecef: Array) -> Array:
+        """Image points (2, N) of ECEF points (3, N): Newton on (col, row)."""
+        start, stop = self._span
+        time = np.full(ecef.shape[1], self._middle)
+        col = np.full(ecef.shape[1], self.look_origin)
+        settled = np.zeros(ecef.shape[1], dtype=bool)
+        for _ in range(_STEPS):
+            tangents, rate, depth = self._seen(ecef, time)
+            look, slope = self._look(col)
+            miss = look - tangents
+            det = rate[1] * slope[0] - rate[0] * slope[1]
+            d_time = (slope[0] * miss[1] - slope[1] * miss[0]) / det
+            d_col = (rate[0] * miss[1] - rate[1] * miss[0]) / det
+            time = np.clip(time + d_time, start - EXTRAPOLATION, stop + EXTRAPOLATION)
+            col = col + d_col
+            settled = (
+                (np.abs(d_time) < _SETTLED * self.line_period) & (np.abs(d_col) < _SETTLED) & (depth > 0)
+            )
+            if not (~settled & np.isfinite(col) & np.isfinite(time)).any():
+                break
+        out = np.stack([col, (time - self.first_line) / self.line_period])
+        out[:, ~settled] = np.nan
+        return out
+
+    def _by_ecef(self, ecef: Array, image: Array) -> Array:
+        """d(col, row)/dX (N, 2, 3) [px/m] at ECEF points (3, N) seen at image points (2, N)."""
+        time = self.time(image[1])
+        w, _ = self.attitude(time)
+        tangents, rate, depth = self._seen(ecef, time)
+        slope = self._look(image[0])[1]
+        zero, one = np.zeros(len(time)), np.ones(len(time))
+        by_x = self.mount @ _turn(w, np.stack([one, zero, -tangents[0]])) / depth  # d(tangent x)/dX
+        by_y = self.mount @ _turn(w, np.stack([zero, one, -tangents[1]])) / depth
+        det = rate[1] * slope[0] - rate[0] * slope[1]
+        row = (slope[1] * by_x - slope[0] * by_y) / det / self.line_period
+        col = (rate[1] * by_x - rate[0] * by_y) / det
+        return np.moveaxis(np.stack([col, row]), 2, 0)
+
+
+def _up(ground: Array) -> Array:
+    """Unit vectors (3, N) up at ground points (N, 3), ECEF."""
+    lon, lat = np.radians(ground[:, 0]), np.radians(ground[:, 1])
+    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+
+
+def _series(w: Array) -> tuple[Array, Array, Array]:
+    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of the angles a = |w| of rotation vectors (3, N)."""
+    angle2 = (w * w).sum(axis=0)
+    angle = np.sqrt(angle2)
+    sine = np.sinc(angle / np.pi)
+    cosine = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    with np.errstate(all="ignore"):
+        third = np.where(angle2 > 1e-4, (1.0 - sine) / angle2, 1.0 / 6 - angle2 / 120)
+    return sine, cosine, third
+
+
+def _turn(w: Array, v: Array) -> Array:
+    """exp([w]x) v for (3, N) vectors."""
+    sine, cosine, _ = _series(w)
+    bent = _cross(w, v)
+    return v + sine * bent + cosine * _cross(w, bent)
+
+
+def _turn_back(w: Array, v: Array, sine: Array, cosine: Array) -> Array:
+    """exp(-[w]x) v for (3, N) vectors, with the first two of `_series(w)`."""
+    bent = _cross(w, v)
+    return v - sine * bent + cosine * _cross(w, bent)

@@ -1,0 +1,152 @@
+"""The rigorous pushbroom camera: exact inverse, exact derivative, honest failure."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.errors import RpcError
+from barpc.geodesy import ecef_from_ground, ground_from_ecef, metres_per_unit
+from barpc.sensor import SensorModel
+from barpc.sensor.curve import Curve
+from barpc.sensor.pushbroom import Pushbroom
+from barpc.simulate.orbit import Look, fly
+
+TARGET = np.array([5.4, 43.3, 200.0])
+SIZE = (20000, 20000)
+LOOKS = [
+    Look(0.0, 0.0, 500e3),
+    Look(25.0, 100.0, 694e3),
+    Look(20.0, 300.0, 800e3, heading=350.0),
+    Look(12.0, 200.0, 620e3, scan=90.0),
+]
+
+
+@pytest.fixture(params=LOOKS, ids=lambda look: f"{look.incidence:g}deg")
+def sensor(request) -> Pushbroom:
+    return fly(TARGET, request.param, SIZE, 0.5)
+
+
+@pytest.fixture
+def points() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    return rng.uniform(0, SIZE[0], (2000, 2)), rng.uniform(-500, 9000, 2000)
+
+
+def test_it_is_a_sensor_model(sensor):
+    assert isinstance(sensor, SensorModel)
+
+
+def test_projection_inverts_localisation_to_rounding(sensor, points):
+    image, alt = points
+    ground = sensor.localize(image, alt)
+    assert np.abs(sensor.project(ground) - image).max() < 2e-8
+    assert np.array_equal(ground[:, 2], alt)
+
+
+def test_a_projected_point_lies_on_its_line_of_sight(sensor, points):
+    image, alt = points
+    ecef = ecef_from_ground(sensor.localize(image, alt))
+    origin, direction = sensor.line_of_sight(image)
+    assert np.allclose(origin, sensor.position(image[:, 1]))
+    assert np.linalg.norm(np.cross(ecef - origin, direction), axis=1).max() < 1e-8
+
+
+def test_the_derivative_is_the_central_difference(sensor, points):
+    ground = sensor.localize(*points)[:200]
+    _, jacobian = sensor.project_jacobian(ground)
+    for axis, step in enumerate((1e-4, 1e-4, 10.0)):
+        delta = step * np.eye(3)[axis]
+        difference = (sensor.project(ground + delta) - sensor.project(ground - delta)) / (2 * step)
+        assert np.abs(difference - jacobian[..., axis]).max() < 1e-7 * np.abs(jacobian[..., axis]).max()
+
+
+def test_the_image_centre_is_the_target_and_pixels_measure_the_ground_sampling(sensor):
+    middle = np.array([0.5 * (SIZE[0] - 1), 0.5 * (SIZE[1] - 1)])
+    ground = sensor.localize(middle + np.array([[0, 0], [1, 0], [0, 1]]), TARGET[2])
+    assert np.abs(ground[0] - TARGET).max() < 1e-9
+    steps = np.linalg.norm((ground[1:] - ground[0]) * metres_per_unit(TARGET), axis=1)
+    assert (steps > 0.45).all()
+    assert (steps < 0.75).all()
+
+
+def test_a_descending_pass_shows_north_up_and_east_right():
+    sensor = fly(TARGET, Look(5.0, 100.0, heading=190.0), SIZE, 0.5)
+    ground = sensor.localize(np.array([[9000, 9000], [11000, 9000], [9000, 11000]]), TARGET[2])
+    assert ground[1, 0] > ground[0, 0]
+    assert ground[2, 1] < ground[0, 1]
+
+
+def test_leading_axes_broadcast(sensor):
+    image = np.array([[100.0, 200.0], [5000.0, 7000.0]])
+    alt = np.array([[0.0], [100.0], [500.0]])
+    ground = sensor.localize(image, alt)
+    assert ground.shape == (3, 2, 3)
+    assert sensor.project(ground).shape == (3, 2, 2)
+    assert sensor.project_jacobian(ground)[1].shape == (3, 2, 2, 3)
+    assert np.allclose(ground[1, 1], sensor.localize(image[1], np.array(100.0)), rtol=0, atol=1e-12)
+
+
+def test_a_scene_across_the_antimeridian_is_continuous():
+    sensor = fly(np.array([180.0, -16.0, 0.0]), LOOKS[1], SIZE, 0.5)
+    image = np.stack([np.linspace(0, SIZE[0], 50), np.full(50, 100.0)], axis=1)
+    ground = sensor.localize(image, np.array(10.0))
+    assert np.abs(np.diff(ground[:, 0])).max() < 0.1
+    assert np.abs(sensor.project(ground + np.array([360.0, 0, 0])) - image).max() < 1e-6
+
+
+def test_what_cannot_be_seen_is_nan(sensor):
+    antipode = np.array([TARGET[0] - 180.0, -TARGET[1], 0.0])
+    ground = np.array([TARGET, antipode, [np.nan, 43.0, 0.0], [5.4, 10.0, 0.0]])
+    image, jacobian = sensor.project_jacobian(ground)
+    bad = np.array([False, True, True, True])
+    assert np.array_equal(np.isnan(image).all(axis=1), bad)
+    assert np.array_equal(np.isnan(jacobian).all(axis=(1, 2)), bad)
+    far = np.array([[0.0, 1e9], [1e9, 0.0], [np.nan, 0.0], [0.0, 0.0]])
+    assert np.array_equal(
+        np.isnan(sensor.localize(far, np.array(0.0))).any(axis=1), [True, True, True, False]
+    )
+
+
+def test_it_is_frozen_compares_by_content_and_survives_a_pickle(sensor):
+    again = pickle.loads(pickle.dumps(sensor))
+    assert again == sensor
+    assert hash(again) == hash(sensor)
+    assert replace(sensor, first_line=sensor.first_line + 1e-9) != sensor
+    with pytest.raises(ValueError, match="read-only"):
+        sensor.mount[0, 0] = 2.0
+    with pytest.raises(ValueError, match="read-only"):
+        sensor.orbit.coeffs[0, 0, 0] = 2.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"line_period": 0.0}, "line period"),
+        ({"mount": 2 * np.eye(3)}, "rotation"),
+        ({"mount": np.eye(2)}, "shapes"),
+        ({"look": np.array([[0.0, np.nan], [0.0, 1.0]])}, "finite"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(sensor, change, message):
+    with pytest.raises(RpcError, match=message):
+        replace(sensor, **change)
+
+
+def test_a_curve_of_pieces_is_continued_by_its_first_and_last_piece():
+    knots = np.array([0.0, 1.0, 2.0])
+    coeffs = np.zeros((2, 3, 3))
+    coeffs[0, 2], coeffs[1, :3] = 1.0, np.array([1.0, 2.0, 1.0])[:, None]  # t^2, cut into two
+    value, rate = Curve(knots, coeffs)(np.array([-0.5, 0.5, 1.0, 1.5, 2.5]))
+    assert np.allclose(value, np.array([0.25, 0.25, 1.0, 2.25, 6.25]))
+    assert np.allclose(rate, 2 * np.array([-0.5, 0.5, 1.0, 1.5, 2.5]))
+
+
+def test_ecef_comes_back_from_a_localised_point(sensor):
+    origin, direction = sensor.line_of_sight(np.array([10.0, 20.0]))
+    ground = sensor.localize(np.array([10.0, 20.0]), np.array(1234.0))
+    distance = (ecef_from_ground(ground) - origin) @ direction
+    assert abs(ground_from_ecef(origin + distance * direction)[2] - 1234.0) < 1e-7
