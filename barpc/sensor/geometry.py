@@ -391,3 +391,51 @@ def _center_nominal(sensor: SensorModel, size: tuple[int, int], alt_range: tuple
         altitude = float(ground_from_ecef(origin + distance * direction)[2])
         distance += (NOMINAL_ALTITUDE - altitude) / max(float(direction @ up), 0.3)
     return np.asarray(origin + distance * direction)
+
+
+def epipolar_offset(
+    sensor_a: SensorModel,
+    sensor_b: SensorModel,
+    image_a: Array,
+    image_b: Array,
+    alt: float | npt.ArrayLike = 0.0,
+    steps: int = 6,
+) -> tuple[Array, Array]:
+    """How far matches lie off the epipolar line: what no altitude explains.
+
+    The altitude that brings the ray of a nearest to the point in b is found by Gauss-Newton along the
+    ray; the signed distance that is left, across the epipolar line, is the offset.
+
+    Parameters
+    ----------
+    sensor_a, sensor_b : SensorModel
+        The two cameras.
+    image_a, image_b : (N, 2)
+        col, row [px] of the matches.
+    alt : float or (N,)
+        First guess of the altitude [m].
+    steps : int
+        Gauss-Newton steps.
+
+    Returns
+    -------
+    offset : (N,)
+        Signed distance in image b [px], positive to the right of the direction of rising altitude
+        (columns to the right, rows down: clockwise); NaN where the rays are parallel.
+    alt : (N,)
+        The altitudes [m].
+    """
+    alt = np.array(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(image_a)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for step in range(steps + 1):
+            ground = sensor_a.localize(image_a, alt)
+            sight = sight_enu(sensor_a, ground)
+            rise = sight / sight[:, 2:] / metres_per_unit(ground)  # ground units per metre of altitude
+            image, jacobian = sensor_b.project_jacobian(ground)
+            along = (jacobian @ rise[..., None])[..., 0]
+            miss = image_b - image
+            length2 = (along * along).sum(axis=1)
+            if step < steps:
+                alt += (miss * along).sum(axis=1) / length2
+        offset = (along[:, 0] * miss[:, 1] - along[:, 1] * miss[:, 0]) / np.sqrt(length2)
+    return offset, alt

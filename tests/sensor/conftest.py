@@ -11,7 +11,9 @@ import pytest
 from barpc.geodesy import ecef_from_ground
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
+from barpc.simulate.orbit import Look, fly
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,10 @@ def _correction(lon: float = 5.4, lat: float = 43.2) -> Correction:
     return Correction([2e-5, -3e-5, 1e-5], [4.0, -3.0, 2.0], ecef_from_ground([lon + 2.0, lat - 1.0, 7e5]))
 
 
+def _pushbroom(lon: float) -> Pushbroom:
+    return fly(np.array([lon, 43.2, 500.0]), Look(25.0, 100.0), (20000, 19000), 0.5)
+
+
 MODELS: dict[str, Callable[[], Case]] = {
     "rpc": lambda: Case(make_rpc(), (20000, 19000), (0.0, 1000.0)),
     "rpc across the antimeridian": lambda: Case(make_rpc(lon=179.98), (20000, 19000), (0.0, 1000.0)),
@@ -45,6 +51,11 @@ MODELS: dict[str, Callable[[], Case]] = {
     "corrected rpc": lambda: Case(Corrected(make_rpc(), _correction()), (20000, 19000), (0.0, 1000.0)),
     "corrected rpc across the antimeridian": lambda: Case(
         Corrected(make_rpc(lon=-179.98), _correction(lon=-179.98)), (20000, 19000), (0.0, 1000.0)
+    ),
+    "pushbroom": lambda: Case(_pushbroom(5.4), (20000, 19000), (0.0, 1000.0)),
+    "pushbroom across the antimeridian": lambda: Case(_pushbroom(180.0), (20000, 19000), (0.0, 1000.0)),
+    "corrected pushbroom": lambda: Case(
+        Corrected(_pushbroom(5.4), _correction()), (20000, 19000), (0.0, 1000.0)
     ),
 }
 

@@ -9,6 +9,7 @@ from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.sensor.geometry import (
     camera_center,
     convergence_angle,
+    epipolar_offset,
     footprint,
     image_border,
     lines_of_sight,
@@ -144,3 +145,19 @@ def test_a_centre_that_cannot_be_is_replaced_by_a_nominal_one_on_the_central_ray
     origin, direction = lines_of_sight(rpc, np.array([9999.5, 9499.5]), (0.0, 1000.0))
     off = np.cross(center.ecef - origin, direction)
     assert np.linalg.norm(off) < 1e-3
+
+
+def test_the_epipolar_offset_is_the_shift_across_the_epipolar_line():
+    a, b = tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2))
+    rng = np.random.default_rng(4)
+    truth = a.localize(rng.uniform(4000, 15000, (50, 2)), rng.uniform(0, 1000, 50))
+    xa, xb = a.project(truth), b.project(truth)
+    offset, alt = epipolar_offset(a, b, xa, xb)
+    np.testing.assert_allclose(offset, 0, atol=1e-6)
+    np.testing.assert_allclose(alt, truth[:, 2], atol=1e-5)
+    # b moves by (-0.9, 0.6) px per metre against a: along it nothing shows, across it all does
+    along = b.project(a.localize(xa, truth[:, 2] + 1)) - xb
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    offset, _ = epipolar_offset(a, b, xa, xb + 3 * along + 2 * across)
+    np.testing.assert_allclose(offset, 2, atol=1e-3)
