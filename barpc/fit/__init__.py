@@ -1,1 +1,9 @@
 """Sensor model to RPC: the fit and its certificate."""
+
+from __future__ import annotations
+
+from barpc.fit.certificate import RpcFit
+from barpc.fit.options import FitOptions, Normalization
+from barpc.fit.rpc import fit_rpc
+
+__all__ = ["FitOptions", "Normalization", "RpcFit", "fit_rpc"]
