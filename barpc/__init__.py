@@ -25,7 +25,7 @@ _PUBLIC = {
     "write_rpc": "barpc.rpcio",
     "fit_rpc": "barpc.fit",
     "fit_rpc_points": "barpc.fit",
-    "adjust": "barpc.adjust",
+    "adjust": "barpc.pipeline",
     "BarpcError": "barpc.errors",
     "BarpcWarning": "barpc.errors",
 }

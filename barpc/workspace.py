@@ -35,7 +35,7 @@ import numpy.typing as npt
 
 from barpc import __version__
 from barpc.atomic import remove_leftovers, replacing, write_text
-from barpc.errors import OutputError
+from barpc.errors import BarpcError, OutputError
 
 logger = logging.getLogger(__name__)
 
@@ -43,6 +43,9 @@ Record = dict[str, npt.NDArray[Any]]
 """What a stage leaves behind: named plain arrays."""
 
 STATE = ".barpc"
+KEEP_AFTER = 30.0
+"""A run that is refused within so many seconds leaves nothing; after that its stages are kept."""
+
 _WHOLE_FILE = 64 << 20  # bytes: larger inputs are sampled for their fingerprint
 _SAMPLE = 1 << 20
 
@@ -140,6 +143,7 @@ class Workspace:
         self.folder = Path(folder).absolute()
         self._keep = frozenset(path.resolve() for path in keep)
         self._check_free(overwrite)
+        self._start = time.perf_counter()
         self._made = [p for p in (self.folder, *self.folder.parents) if not p.exists()]
         try:
             (self.folder / STATE / "cache").mkdir(parents=True, exist_ok=True)
@@ -170,15 +174,17 @@ class Workspace:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        refused = kind is not None and issubclass(kind, BarpcError)
         try:
             self._save_state("done" if kind is None else "failed")
         finally:
             self._lock.release()
+            if refused and time.perf_counter() - self._start < KEEP_AFTER:
+                self._discard()
 
-    def discard_if_empty(self) -> None:
-        """Take the folder away again when a run failed before it made anything worth keeping."""
-        cached = any(path.is_file() for path in (self.folder / STATE / "cache").rglob("*"))
-        if self.outputs or self._earlier or cached:
+    def _discard(self) -> None:
+        """Take the folder away again, for a run that was refused before it made anything worth keeping."""
+        if self.outputs or self._earlier:
             return
         shutil.rmtree(self.folder / STATE, ignore_errors=True)
         for made in self._made:  # innermost first; only what this run made, and only when empty

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from barpc.errors import OutputError
+from barpc.errors import OutputError, TiePointError
 from barpc.workspace import Workspace, code_version, fingerprint, key_of, peak_memory
 
 
@@ -162,11 +162,20 @@ def test_a_read_only_place_is_named(tmp_path):
         Workspace(tmp_path / "run")
 
 
-def test_a_failed_run_that_made_nothing_leaves_nothing(tmp_path):
-    with pytest.raises(RuntimeError), Workspace(tmp_path / "new/run") as run:
-        raise RuntimeError
-    run.discard_if_empty()
+def test_a_run_that_is_refused_at_once_leaves_nothing(tmp_path):
+    with pytest.raises(TiePointError), Workspace(tmp_path / "new/run") as run:
+        run.store("detect", "k", {"x": np.ones(3)})
+        raise TiePointError
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_is_refused_late_keeps_its_stages(tmp_path, monkeypatch):
+    monkeypatch.setattr("barpc.workspace.KEEP_AFTER", 0.0)
+    with pytest.raises(TiePointError), Workspace(tmp_path / "run") as run:
+        run.store("detect", "k", {"x": np.ones(3)})
+        raise TiePointError
+    with Workspace(tmp_path / "run") as run:
+        assert run.load("detect", "k") is not None
 
 
 def test_stages_are_timed(tmp_path):

@@ -1,0 +1,139 @@
+"""Image files to views: what each file must have before any work starts."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from barpc.errors import BarpcError, ImageError, InputError, RpcError
+from barpc.raster import open_raster
+from barpc.rpcio import RpcSource, read_rpc_source
+from barpc.scene import View
+from barpc.sensor.geometry import altitude_range, footprint
+
+logger = logging.getLogger(__name__)
+
+MIN_ALTITUDE_SPAN = 100.0
+"""Altitude ranges narrower than this [m] are widened to it: an RPC with a zero height scale is usable."""
+ALTITUDE_LIMITS = (-1000.0, 9500.0)
+"""The Earth's ground stays inside this [m], with a margin; RPCs that state more are cut to it."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedViews:
+    """Views, where their RPCs came from, and what was left out.
+
+    Parameters
+    ----------
+    views : tuple of View
+        In the order given.
+    sources : tuple of RpcSource
+        One a view.
+    left_out : tuple of (str, str)
+        Path and reason of each file that was left out.
+    """
+
+    views: tuple[View, ...]
+    sources: tuple[RpcSource, ...]
+    left_out: tuple[tuple[str, str], ...] = ()
+
+
+def load_views(
+    paths: Sequence[str | Path], *, min_views: int = 2, keep_going: bool = False, band: int = 1
+) -> LoadedViews:
+    """Open every image once and read its camera.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        The image files.
+    min_views : int
+        So many are needed.
+    keep_going : bool
+        Leave a bad file out instead of stopping.
+    band : int
+        The band that will be read, from 1.
+
+    Returns
+    -------
+    LoadedViews
+
+    Raises
+    ------
+    ImageError, RpcError
+        A file cannot be used; the message names it.
+    InputError
+        Too few images, or the same image twice.
+    """
+    files = [Path(path).absolute() for path in paths]
+    if len(files) < min_views:
+        found = files[0] if files else "none"
+        raise InputError(f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed")
+    views: list[View] = []
+    sources: list[RpcSource] = []
+    left_out: list[tuple[str, str]] = []
+    for name, file in zip(unique_names(files), files, strict=True):
+        try:
+            view, source = _load(name, file, band)
+            _refuse_twin(view, views)
+        except BarpcError as error:
+            if not keep_going:
+                raise
+            logger.warning("%s is left out: %s", file, error)
+            left_out.append((str(file), str(error)))
+            continue
+        views.append(view)
+        sources.append(source)
+    if len(views) < min_views:
+        raise InputError(f"{len(views)} of {len(files)} images can be used: at least {min_views} are needed")
+    return LoadedViews(tuple(views), tuple(sources), tuple(left_out))
+
+
+def unique_names(files: Sequence[Path]) -> list[str]:
+    """A name for each file: its stem, with as many folders before it as it takes to tell them apart.
+
+    Examples
+    --------
+    >>> unique_names([Path("a/img.tif"), Path("b/img.tif"), Path("b/other.tif")])
+    ['a_img', 'b_img', 'other']
+    """
+    depth = dict.fromkeys(range(len(files)), 1)
+    while True:
+        names = ["_".join([*file.parts[-depth[i] : -1], file.stem]) for i, file in enumerate(files)]
+        count = Counter(names)
+        again = [i for i, name in enumerate(names) if count[name] > 1 and depth[i] < len(files[i].parts) - 1]
+        if not again:
+            break
+        for i in again:
+            depth[i] += 1
+    return names
+
+
+def _load(name: str, file: Path, band: int) -> tuple[View, RpcSource]:
+    with open_raster(file) as image:
+        size = (int(image.width), int(image.height))
+        if not 1 <= band <= image.count:
+            raise ImageError(f"{file}: has {image.count} band(s), no band {band}")
+    source = read_rpc_source(file)
+    low, high = altitude_range(source.rpc)
+    low, high = max(low, ALTITUDE_LIMITS[0]), min(high, ALTITUDE_LIMITS[1])
+    if high - low < MIN_ALTITUDE_SPAN:
+        middle = min(max((low + high) / 2, ALTITUDE_LIMITS[0]), ALTITUDE_LIMITS[1])
+        low, high = middle - MIN_ALTITUDE_SPAN / 2, middle + MIN_ALTITUDE_SPAN / 2
+    view = View(name, str(file), size, source.rpc, (low, high))
+    ring = footprint(view.sensor, size, (low + high) / 2)
+    if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
+        raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
+    return view, source
+
+
+def _refuse_twin(view: View, others: Sequence[View]) -> None:
+    """The same image under two names ties itself to itself, perfectly and uselessly."""
+    for other in others:
+        same_file = Path(view.path).samefile(other.path)
+        if same_file or (view.size == other.size and view.sensor == other.sensor):
+            what = "the same file" if same_file else "the same size and the same RPC"
+            raise InputError(f"{view.path}: is {what} as {other.path}; give each image once")
