@@ -1,0 +1,202 @@
+"""Keypoints: found tile by tile, the strongest of every cell kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray, View
+from barpc.tie.options import TieOptions
+from barpc.tie.raster import Box, ByteImage, Stretch, grow, read_pixels
+
+_MARGIN = 48  # px read around a tile, so that keypoints at its border are those of the whole image
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Points of an image that can be found again in another one.
+
+    Parameters
+    ----------
+    xy : (N, 2)
+        col, row [full-resolution px].
+    scale : (N,)
+        Diameter of the neighbourhood described [px].
+    angle : (N,)
+        Orientation, from the column axis towards the row axis [rad].
+    response : (N,)
+        Strength, comparable within an image.
+    descriptors : (N, D) uint8
+        Unit vectors times 255 (RootSIFT: square roots of SIFT's).
+    """
+
+    xy: Array
+    scale: Array
+    angle: Array
+    response: Array
+    descriptors: npt.NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        """Number of keypoints N."""
+        return len(self.xy)
+
+    def select(self, which: IntArray | BoolArray) -> Keypoints:
+        """The keypoints of a mask or of indices."""
+        return Keypoints(
+            self.xy[which],
+            self.scale[which],
+            self.angle[which],
+            self.response[which],
+            self.descriptors[which],
+        )
+
+
+def join(parts: Sequence[Keypoints]) -> Keypoints:
+    """Keypoints of several tiles as one set; an empty set of none."""
+    if not parts:
+        none = np.empty(0)
+        return Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))
+    return Keypoints(
+        np.concatenate([p.xy for p in parts]),
+        np.concatenate([p.scale for p in parts]),
+        np.concatenate([p.angle for p in parts]),
+        np.concatenate([p.response for p in parts]),
+        np.concatenate([p.descriptors for p in parts]),
+    )
+
+
+class Detector(Protocol):
+    """Finds and describes the keypoints of an 8-bit picture."""
+
+    def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
+        """Keypoints for which `keep(xy, scale, response)` is true."""
+        ...
+
+
+class Sift:
+    """SIFT (Lowe 2004) with RootSIFT descriptors (Arandjelovic and Zisserman 2012)."""
+
+    def __init__(self, options: TieOptions) -> None:
+        self._sift: Any = cv2.SIFT.create(contrastThreshold=options.contrast)
+
+    def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
+        """Keypoints for which `keep(xy, scale, response)` is true; only those are described."""
+        found = self._sift.detect(picture, None)
+        if not found:
+            return join([])
+        kept = np.flatnonzero(keep(*_table(found)))
+        described, raw = self._sift.compute(picture, [found[i] for i in kept])
+        if raw is None:
+            return join([])
+        xy, scale, response = _table(described)
+        root = np.sqrt(raw / np.maximum(np.abs(raw).sum(axis=1, keepdims=True), 1e-9))
+        angle = np.radians([k.angle for k in described])
+        return Keypoints(xy, scale, angle, response, np.rint(255 * root).astype(np.uint8))
+
+
+DETECTORS: dict[str, Callable[[TieOptions], Detector]] = {"sift": Sift}
+"""Name -> detector."""
+
+
+def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
+    table = np.array([(*k.pt, k.size, k.response) for k in found], dtype=np.float64).reshape(-1, 4)
+    return table[:, :2], table[:, 2], table[:, 3]
+
+
+def tiles(size: tuple[int, int], options: TieOptions) -> list[Box]:
+    """Boxes that cover an image of `size` (width, height) without overlap, cut at whole cells."""
+    edges = []
+    for length in size:
+        step = -(-length // -(-length // options.tile))  # equal tiles, none larger than asked
+        step = -(-step // options.cell) * options.cell
+        edges.append([(start, min(step, length - start)) for start in range(0, length, step)])
+    return [(col, row, width, height) for row, height in edges[1] for col, width in edges[0]]
+
+
+def detect_tile(view: View, box: Box, stretch: Stretch, options: TieOptions) -> Keypoints:
+    """Keypoints of one tile of a view, at most a quota a cell.
+
+    Parameters
+    ----------
+    view : View
+        The image.
+    box : Box
+        The tile.
+    stretch : Stretch
+        8-bit stretch of the whole image.
+    options : TieOptions
+        Detector, cells, quota.
+
+    Returns
+    -------
+    keypoints : Keypoints
+        In the coordinates of the whole image, sorted by row and column.
+    """
+    cv2.setNumThreads(1)
+    window = grow(box, _MARGIN, view.size)
+    pixels, valid = read_pixels(view.path, window, options.band)
+    if not valid.any():
+        return join([])
+    distance = cv2.distanceTransform(np.pad(valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    origin = np.array(window[:2], dtype=np.float64)
+
+    def keep(xy: Array, scale: Array, response: Array) -> BoolArray:
+        col, row = np.rint(xy).astype(int).T
+        inside = (
+            (xy + origin >= box[:2] - 0.5 * np.ones(2)) & (xy + origin < np.add(box[:2], box[2:]) - 0.5)
+        ).all(1)
+        inside &= distance[row.clip(0, window[3] - 1), col.clip(0, window[2] - 1)] > np.maximum(3.0, scale)
+        chosen = np.zeros(len(xy), dtype=bool)
+        index = np.flatnonzero(inside)
+        chosen[
+            index[quota(xy[index] + origin, response[index], options.cell, options.keypoints_per_cell)]
+        ] = True
+        return chosen
+
+    found = DETECTORS[options.detector](options).detect(Stretch.apply(stretch, pixels, valid), keep)
+    found = found.select(np.lexsort((found.angle, found.xy[:, 0], found.xy[:, 1])))
+    return Keypoints(found.xy + origin, found.scale, found.angle, found.response, found.descriptors)
+
+
+def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
+    """Indices of the strongest points of every cell, at most `most` each, ascending.
+
+    Parameters
+    ----------
+    xy : (N, 2)
+        col, row [px].
+    response : (N,)
+        Strength.
+    cell : float
+        Side of a cell [px].
+    most : int
+        Points kept in a cell.
+    """
+    if not len(xy):
+        return np.empty(0, dtype=np.int64)
+    cells = np.floor((xy + 0.5) / cell).astype(np.int64)
+    cells -= cells.min(axis=0)
+    key = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
+    order = np.lexsort((xy[:, 0], xy[:, 1], -response, key))
+    starts = np.r_[True, key[order][1:] != key[order][:-1]]
+    rank = np.arange(len(order)) - np.maximum.accumulate(np.where(starts, np.arange(len(order)), 0))
+    kept: IntArray = np.sort(order[rank < most])
+    return kept
+
+
+def bounded(keypoints: Keypoints, options: TieOptions) -> Keypoints:
+    """At most `keypoints_per_image` keypoints, the strongest of every cell, evenly."""
+    most = options.keypoints_per_cell
+    while len(keypoints) > options.keypoints_per_image and most > 1:
+        most = max(1, int(most * options.keypoints_per_image / len(keypoints)))
+        keypoints = keypoints.select(quota(keypoints.xy, keypoints.response, options.cell, most))
+    if len(keypoints) > options.keypoints_per_image:
+        strongest = np.argsort(-keypoints.response, kind="stable")[: options.keypoints_per_image]
+        keypoints = keypoints.select(np.sort(strongest))
+    return keypoints

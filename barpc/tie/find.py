@@ -1,0 +1,196 @@
+"""The stages in a row: images to tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Any
+
+from barpc.errors import TiePointError
+from barpc.scene import Tracks, View
+from barpc.sensor import SensorModel
+from barpc.tie.features import Keypoints, bounded, detect_tile, join, tiles
+from barpc.tie.link import link, thin
+from barpc.tie.matching import Matches, PairReport, match_pair
+from barpc.tie.options import TieOptions
+from barpc.tie.pairs import Pair, require_connected, select_pairs
+from barpc.tie.raster import sample_stretch
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage, how much is done, of how much."""
+
+_DEFAULTS = TieOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class TieResult:
+    """Tie points, and how they came about.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        The tie points.
+    pairs : tuple of PairReport
+        One a pair that was tried.
+    keypoints : tuple of int
+        Keypoints of each view.
+    """
+
+    tracks: Tracks
+    pairs: tuple[PairReport, ...]
+    keypoints: tuple[int, ...]
+
+
+def ordered(
+    executor: Executor | None,
+    function: Callable[..., Any],
+    tasks: Sequence[tuple[Any, ...]],
+    stage: str,
+    progress: Progress | None,
+) -> list[Any]:
+    """Results of `function(*task)` in the order of the tasks, whoever works on them."""
+    results = []
+    futures = [executor.submit(function, *task) for task in tasks] if executor is not None else []
+    try:
+        for done, task in enumerate(tasks, start=1):
+            results.append(futures[done - 1].result() if futures else function(*task))
+            if progress is not None:
+                progress(stage, done, len(tasks))
+    finally:
+        for future in futures:
+            future.cancel()
+    return results
+
+
+def detect(
+    views: Sequence[View],
+    options: TieOptions = _DEFAULTS,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> list[Keypoints]:
+    """Keypoints of every view.
+
+    Parameters
+    ----------
+    views : sequence of View
+        The images.
+    options : TieOptions
+        Band, detector, tiles, quotas.
+    executor : Executor, optional
+        Works on the tiles; without one they are worked on here, one after the other.
+    progress : callable, optional
+        `progress("detect", done, total)`.
+
+    Returns
+    -------
+    keypoints : list of Keypoints
+        One a view; none in an image in which nothing varies.
+    """
+    stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
+    tasks = [
+        (view, box, stretch, options)
+        for view, stretch in zip(views, stretches, strict=True)
+        if stretch is not None
+        for box in tiles(view.size, options)
+    ]
+    found = ordered(executor, detect_tile, tasks, "detect", progress)
+    parts: dict[str, list[Keypoints]] = {view.name: [] for view in views}
+    for (view, *_), part in zip(tasks, found, strict=True):
+        parts[view.name].append(part)
+    return [bounded(join(parts[view.name]), options) for view in views]
+
+
+def match(
+    views: Sequence[View],
+    keypoints: Sequence[Keypoints],
+    pairs: Sequence[Pair],
+    options: TieOptions = _DEFAULTS,
+    *,
+    sensors: Sequence[SensorModel] | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> list[tuple[Matches, PairReport]]:
+    """Matches of every pair, each with its report: `match_pair` over all pairs."""
+    cameras = [view.sensor for view in views] if sensors is None else sensors
+    tasks = []
+    for pair in pairs:
+        i, j = pair.views
+        tasks.append(
+            ((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options, (cameras[i], cameras[j]))
+        )
+    return ordered(executor, match_pair, tasks, "match", progress)
+
+
+def find_tracks(
+    views: Sequence[View],
+    options: TieOptions = _DEFAULTS,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    sensors: Sequence[SensorModel] | None = None,
+) -> TieResult:
+    """Find the tie points of overlapping images.
+
+    Parameters
+    ----------
+    views : sequence of View
+        At least two.
+    options : TieOptions
+        How.
+    executor : Executor, optional
+        Works on tiles and pairs; the result does not depend on it.
+    progress : callable, optional
+        `progress(stage, done, total)`.
+    sensors : sequence of SensorModel, optional
+        Corrected cameras to use instead of the views' own (a second pass).
+
+    Returns
+    -------
+    result : TieResult
+        Tracks and reports.
+
+    Raises
+    ------
+    TiePointError
+        Fewer than two images, or two that do not match.
+    DisconnectedError
+        The images fall into groups that share no tie points.
+    ImageError
+        An image cannot be read.
+    """
+    pairs = select_pairs(views, options, sensors=sensors)
+    keypoints = detect(views, options, executor=executor, progress=progress)
+    matched = match(views, keypoints, pairs, options, sensors=sensors, executor=executor, progress=progress)
+    reports = tuple(report for _, report in matched)
+    require_matches(views, pairs, reports)
+    tracks = thin(
+        link([len(k) for k in keypoints], [found for found, _ in matched]),
+        [view.size for view in views],
+        options.points_per_image,
+    )
+    return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
+
+
+def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
+    """Raise unless the pairs that matched connect all views.
+
+    Raises
+    ------
+    TiePointError
+        There are two views and they do not match.
+    DisconnectedError
+        There are more, and they fall into groups.
+    """
+    failed = [report for report in reports if report.status != "ok"]
+    told = "; ".join(
+        f"{r.names[0]} - {r.names[1]}: {r.status} ({r.keypoints[0]} and {r.keypoints[1]} keypoints, "
+        f"{r.verified} of {r.matches} matches verified)"
+        for r in failed[:4]
+    )
+    advice = "look at the images (clouds? dates? band?), or loosen ratio, search or min_matches"
+    if len(views) == 2 and failed:
+        raise TiePointError(f"too few tie points: {told}: {advice}")
+    links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]
+    require_connected(views, links, f"no tie points between them: {told}: {advice}")

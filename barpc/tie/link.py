@@ -1,0 +1,115 @@
+"""Matches of pairs become tracks: one ground point, seen once in each of its views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray, Tracks
+from barpc.tie.matching import Matches
+
+
+def link(num_keypoints: Sequence[int], matches: Sequence[Matches]) -> Tracks:
+    """Join matches that share keypoints; a track that meets a view twice is thrown away.
+
+    Parameters
+    ----------
+    num_keypoints : sequence of int
+        Keypoints of each view.
+    matches : sequence of Matches
+        Of the pairs, in any order: the result does not depend on it.
+
+    Returns
+    -------
+    tracks : Tracks
+        Ordered by their first keypoint; sigma is that of the best match an observation took part in.
+    """
+    offset = np.concatenate([[0], np.cumsum(num_keypoints)])
+    total = int(offset[-1])
+    used = [m for m in matches if len(m)]
+    if not used:
+        return Tracks(*(np.empty(0, np.int64),) * 2, np.empty((0, 2)), np.empty(0))
+    ends = [m.index + offset[list(m.pair)] for m in used]
+    node = np.concatenate(ends).ravel()
+    xy = np.concatenate([m.xy for m in used]).reshape(-1, 2)
+    sigma = np.concatenate([m.sigma for m in used]).repeat(2)
+    first, second = node.reshape(-1, 2).T
+    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(total, total))
+    label = connected_components(graph, directed=False)[1]
+    order = np.lexsort((sigma, node))
+    once = order[np.r_[True, np.diff(node[order]) > 0]]
+    node, xy, sigma = node[once], xy[once], sigma[once]
+    view = np.searchsorted(offset, node, side="right") - 1
+    return _clean(view, label[node], xy, sigma)
+
+
+def _clean(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
+    """Rows grouped by track and sorted by view; tracks with two keypoints of one view dropped."""
+    order = np.lexsort((view, label))
+    view, label, xy, sigma = view[order], label[order], xy[order], sigma[order]
+    twice = (np.diff(view) == 0) & (np.diff(label) == 0)
+    keep = ~np.isin(label, label[1:][twice])
+    _, head, point = np.unique(label[keep], return_index=True, return_inverse=True)
+    rank = np.empty(len(head), dtype=np.int64)
+    firsts = np.stack([view[keep][head], xy[keep][head][:, 1], xy[keep][head][:, 0]])
+    rank[np.lexsort(firsts[::-1])] = np.arange(len(head))
+    point = rank[point]
+    again = np.lexsort((view[keep], point))
+    return Tracks(view[keep][again], point[again], xy[keep][again], sigma[keep][again])
+
+
+def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
+    """Fewer tracks, evenly spread: long and accurate ones first, until the cells of every image are full.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Rows grouped by track.
+    sizes : sequence of (width, height)
+        Of the views [px].
+    most : int
+        Observations kept in a view, about.
+
+    Returns
+    -------
+    tracks : Tracks
+        Each is wanted by a cell that has room for it in at least one of its views.
+    """
+    count = np.bincount(tracks.view, minlength=len(sizes))
+    if not len(tracks) or (count <= most).all():
+        return tracks
+    quota = 4
+    side = np.sqrt([quota * width * height / most for width, height in sizes])
+    columns = np.array([int(width / s) + 2 for (width, _), s in zip(sizes, side, strict=True)])
+    rows = np.array([int(height / s) + 2 for (_, height), s in zip(sizes, side, strict=True)])
+    first_cell = np.concatenate([[0], np.cumsum(columns * rows)])
+    col, row = np.floor((tracks.xy + 0.5) / side[tracks.view][:, None]).astype(np.int64).clip(0).T
+    cell = first_cell[tracks.view] + row * columns[tracks.view] + col
+    keep = _fill(tracks, cell.tolist(), int(first_cell[-1]), quota, most, len(sizes))
+    return tracks.select(keep[tracks.point])
+
+
+def _fill(
+    tracks: Tracks, cell: list[int], num_cells: int, quota: int, most: int, num_views: int
+) -> BoolArray:
+    """Mask of the tracks that are taken, greedily."""
+    starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
+    worst = np.maximum.reduceat(tracks.sigma, starts[:-1])
+    # Knuth's multiplicative hash: an order without direction among equals
+    shuffle = (np.arange(tracks.num_points) * 2654435761) % (1 << 32)
+    order = np.lexsort((shuffle, np.round(worst, 2), -np.diff(starts)))
+    bounds, views = starts.tolist(), tracks.view.tolist()
+    filled, total = [0] * num_cells, [0] * num_views
+    keep = np.zeros(tracks.num_points, dtype=bool)
+    for track in order.tolist():
+        rows = range(bounds[track], bounds[track + 1])
+        if any(filled[cell[r]] < quota for r in rows) and all(total[views[r]] < most for r in rows):
+            keep[track] = True
+            for r in rows:
+                filled[cell[r]] += 1
+                total[views[r]] += 1
+    return keep

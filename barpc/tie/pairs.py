@@ -1,0 +1,244 @@
+"""Which views to match: footprints that overlap under a useful angle, and a connected graph of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+
+from barpc.errors import DisconnectedError, TiePointError
+from barpc.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.scene import View, connected_groups
+from barpc.sensor import SensorModel
+from barpc.sensor.geometry import convergence_angle, footprint
+from barpc.tie.options import TieOptions
+
+_BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined
+_ANGLE_DECAY = 15.0  # deg
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two views to be matched.
+
+    Parameters
+    ----------
+    views : tuple of int
+        Their indices, ascending.
+    overlap : float
+        Common area over that of the smaller footprint.
+    angle : float
+        Convergence angle in the middle of the common area [deg].
+    """
+
+    views: tuple[int, int]
+    overlap: float
+    angle: float
+
+    @property
+    def score(self) -> float:
+        """Worth of the pair: large overlap, moderate angle."""
+        return self.overlap * float(np.exp(-max(0.0, self.angle - _BEST_ANGLE) / _ANGLE_DECAY))
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Outlines of the views in a common plane.
+
+    Parameters
+    ----------
+    origin : (2,)
+        lon, lat of the plane's origin [deg].
+    alt : float
+        Altitude of the outlines [m].
+    outlines : tuple of shapely geometries
+        [m east, m north of the origin]; empty where the camera sees no ground at that altitude.
+    """
+
+    origin: Array
+    alt: float
+    outlines: tuple[shapely.Geometry, ...]
+    _scale: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_scale", metres_per_unit(np.array([*self.origin, self.alt]))[:2])
+
+    def plane(self, lonlat: Array) -> Array:
+        """East and north (..., 2) [m] of longitudes and latitudes (..., 2) [deg]."""
+        lon = wrap_longitude(lonlat[..., 0], self.origin[0])
+        return (np.stack([lon, lonlat[..., 1]], axis=-1) - self.origin) * self._scale
+
+    def lonlat(self, plane: Array) -> Array:
+        """Longitudes and latitudes (..., 2) [deg] of points of the plane (..., 2) [m]."""
+        return np.asarray(plane, dtype=np.float64) / self._scale + self.origin
+
+
+def footprints(
+    views: Sequence[View], sensors: Sequence[SensorModel], alt: float, reach: float = 0.0
+) -> Footprints:
+    """Outlines of views at one altitude.
+
+    Parameters
+    ----------
+    views, sensors : sequences
+        The views and the cameras to use for them.
+    alt : float
+        Altitude [m].
+    reach : float
+        How far the cameras may be wrong [px]: the outlines grow by as much.
+    """
+    rings = [footprint(sensor, view.size, alt)[:, :2] for view, sensor in zip(views, sensors, strict=True)]
+    usable = [ring[np.isfinite(ring).all(axis=1)] for ring in rings]
+    first = next((ring[0] for ring in usable if len(ring)), np.zeros(2))
+    plane = Footprints(first, alt, ())
+    outlines = []
+    for view, ring in zip(views, usable, strict=True):
+        outline = (
+            shapely.make_valid(shapely.Polygon(plane.plane(ring))) if len(ring) > 3 else shapely.Polygon()
+        )
+        pixel = float(np.sqrt(outline.area / (view.size[0] * view.size[1])))
+        outlines.append(outline.buffer(reach * pixel) if reach else outline)
+    return Footprints(first, alt, tuple(outlines))
+
+
+def overlapping_pairs(
+    views: Sequence[View], sensors: Sequence[SensorModel], options: TieOptions, reach: float = 0.0
+) -> list[Pair]:
+    """All pairs that overlap enough at some altitude, under an angle that is asked for, ascending.
+
+    Parameters
+    ----------
+    views, sensors : sequences
+        The views and the cameras to use for them.
+    options : TieOptions
+        `min_overlap`, `min_angle`, `max_angle`.
+    reach : float
+        How far the cameras may be wrong [px].
+    """
+    ranges = np.array([view.alt_range for view in views])
+    low, high = np.sort([ranges[:, 0].max(), ranges[:, 1].min()])
+    best: dict[tuple[int, int], Pair] = {}
+    for alt in (0.5 * (low + high), low, high):
+        for pair in _overlapping_at(footprints(views, sensors, float(alt), reach), sensors, options):
+            if pair.views not in best or pair.overlap > best[pair.views].overlap:
+                best[pair.views] = pair
+    return [best[views] for views in sorted(best)]
+
+
+def _overlapping_at(prints: Footprints, sensors: Sequence[SensorModel], options: TieOptions) -> list[Pair]:
+    outlines = np.array(prints.outlines, dtype=object)
+    first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
+    pairs = []
+    for i, j in zip(first.tolist(), second.tolist(), strict=True):
+        if i >= j:
+            continue
+        common = shapely.intersection(outlines[i], outlines[j])
+        overlap = common.area / max(min(outlines[i].area, outlines[j].area), 1e-9)
+        if not overlap >= max(options.min_overlap, 1e-9):
+            continue
+        middle = common.point_on_surface()
+        ground = np.array([*prints.lonlat(np.array([middle.x, middle.y])), prints.alt])
+        angle = float(convergence_angle(sensors[i], sensors[j], ground))
+        if options.min_angle <= angle <= options.max_angle:
+            pairs.append(Pair((i, j), float(overlap), angle))
+    return pairs
+
+
+def select_pairs(
+    views: Sequence[View],
+    options: TieOptions,
+    *,
+    sensors: Sequence[SensorModel] | None = None,
+    only: Sequence[tuple[int, int]] = (),
+) -> list[Pair]:
+    """The pairs of views to match.
+
+    For every view its best partners by `Pair.score`, and whatever else is needed to connect all views.
+
+    Parameters
+    ----------
+    views : sequence of View
+        At least two.
+    options : TieOptions
+        `min_overlap`, `min_angle`, `max_angle`, `neighbours`.
+    sensors : sequence of SensorModel, optional
+        Corrected cameras to use instead of the views' own.
+    only : sequence of (int, int)
+        Consider only these pairs.
+
+    Returns
+    -------
+    pairs : list of Pair
+        Ascending.
+
+    Raises
+    ------
+    TiePointError
+        Fewer than two views.
+    DisconnectedError
+        The pairs leave the views in more than one group.
+    """
+    if len(views) < 2:
+        raise TiePointError(f"{len(views)} image given: tie points need at least two that overlap")
+    cameras = [view.sensor for view in views] if sensors is None else sensors
+    wanted = {(min(pair), max(pair)) for pair in only}
+    pairs: list[Pair] = []
+    for reach in (
+        0.0,
+        options.search,
+    ):  # outlines grown by the search only where the plain ones do not connect
+        found = overlapping_pairs(views, cameras, options, reach)
+        known = {pair.views for pair in pairs}
+        pairs += [p for p in found if p.views not in known and (not wanted or p.views in wanted)]
+        if len(connected_groups(len(views), [pair.views for pair in pairs])) == 1:
+            break
+    require_connected(
+        views,
+        [pair.views for pair in pairs],
+        f"no overlap of at least {options.min_overlap:.0%} under {options.min_angle:g} to "
+        f"{options.max_angle:g} deg between them; remove the stray images or lower the minimum overlap",
+    )
+    ranked = sorted(pairs, key=lambda pair: (-pair.score, pair.views))
+    partners = [0] * len(views)
+    parent = list(range(len(views)))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            i = parent[i]
+        return i
+
+    chosen = []
+    for pair in ranked:
+        i, j = pair.views
+        joins = root(i) != root(j)
+        if joins or min(partners[i], partners[j]) < options.neighbours:
+            chosen.append(pair)
+            partners[i] += 1
+            partners[j] += 1
+            parent[max(root(i), root(j))] = min(root(i), root(j))
+    return sorted(chosen, key=lambda pair: pair.views)
+
+
+def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], why: str) -> None:
+    """Raise DisconnectedError unless the links connect all views.
+
+    Parameters
+    ----------
+    views : sequence of View
+        All views.
+    links : sequence of (int, int)
+        Pairs that are tied.
+    why : str
+        What is missing between the groups and what to do.
+    """
+    groups = connected_groups(len(views), links)
+    if len(groups) < 2:
+        return
+    names = [[views[i].name for i in group] for group in groups]
+    listed = "; ".join(
+        ", ".join(group[:5]) + (f" and {len(group) - 5} more" if len(group) > 5 else "")
+        for group in names[:6]
+    )
+    raise DisconnectedError(f"the images fall into {len(groups)} groups ({listed}): {why}", names)
