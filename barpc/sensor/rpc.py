@@ -325,6 +325,27 @@ class RPC:
         """The RPC of a crop whose top-left pixel is (col, row) [px] of this image: exact, no refit."""
         return replace(self, image_offset=self.image_offset - np.array([col, row], dtype=np.float64))
 
+    def window(self, col: float, row: float, step_col: float = 1.0, step_row: float = 1.0) -> RPC:
+        """The RPC of an image cut out of this one and resampled: exact, no refit.
+
+        Parameters
+        ----------
+        col, row : float
+            The new image's top-left CORNER, counted from this image's top-left corner [px of this image].
+        step_col, step_row : float
+            Size of a new pixel [px of this image]; 2 halves the resolution.
+
+        Returns
+        -------
+        rpc : RPC
+        """
+        step = np.array([step_col, step_row], dtype=np.float64)
+        corner = np.array([col, row], dtype=np.float64)
+        if (step == 1).all():
+            return self.crop(col, row)  # the same, without a rounding
+        offset = (self.image_offset + 0.5 - corner) / step - 0.5
+        return replace(self, image_offset=offset, image_scale=self.image_scale / step)
+
 
 def _solve_2x2(matrix: Array, rhs: Array) -> Array:
     """Solve (2, 2, N) systems with right-hand sides (2, N) by Cramer's rule."""

@@ -1,0 +1,26 @@
+"""RPC files: read any vendor's, write those that other tools read, and say where an RPC came from.
+
+`FORMATS` is the table of syntaxes; `read_rpc` goes by content and, for images, by GDAL's order of
+precedence. See ``docs/formats.md``.
+"""
+
+from __future__ import annotations
+
+from barpc.rpcio.fields import ReadOptions
+from barpc.rpcio.formats import FORMATS, Format, write_rpc
+from barpc.rpcio.images import write_rpc_copy, write_rpc_vrt
+from barpc.rpcio.sources import RpcSource, Sidecar, read_rpc, read_rpc_source, sidecars
+
+__all__ = [
+    "FORMATS",
+    "Format",
+    "ReadOptions",
+    "RpcSource",
+    "Sidecar",
+    "read_rpc",
+    "read_rpc_source",
+    "sidecars",
+    "write_rpc",
+    "write_rpc_copy",
+    "write_rpc_vrt",
+]

@@ -1,0 +1,163 @@
+"""An RPC in a raster: a VRT that points at the untouched image, or a copy with the tag."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import rasterio
+from rasterio.shutil import copy as raster_copy
+
+from barpc.atomic import replacing, write_text
+from barpc.errors import ImageError, OutputError
+from barpc.raster import identify, open_raster
+from barpc.rpcio.tiff import GEOREFERENCE_TAGS, put_tag
+from barpc.rpcio.xml import rpc_domain
+from barpc.sensor.rpc import RPC
+
+
+def write_rpc_vrt(
+    rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative: bool = True, overwrite: bool = False
+) -> None:
+    """Write a VRT that carries an RPC and takes its pixels from an image that stays as it is.
+
+    A geotransform without CRS (the origin of a crop in its full image) is left out: the RPC written here is
+    the image's own. One with a CRS is kept.
+
+    Parameters
+    ----------
+    rpc : RPC
+        The camera of `image_path`, every number written with the digits that read back to the bit.
+    image_path, vrt_path : Path or str
+        The image, and the file to write.
+    relative : bool
+        Point at the image relative to the VRT, so that both may move together; else by absolute path.
+    overwrite : bool
+        Replace an existing VRT.
+
+    Raises
+    ------
+    ImageError
+        The image cannot be read.
+    OutputError
+        The VRT exists or cannot be written.
+    """
+    source, driver = identify(image_path)
+    if driver == "VRT":
+        raise ImageError(f"{image_path}: a VRT of a VRT is not written; give the image that it is made of")
+    target = Path(vrt_path).absolute()
+    _refuse_same(source, target)
+    name = os.path.relpath(source.resolve(), target.parent.resolve()) if relative else str(source)
+    with open_raster(source) as dataset:
+        text = _vrt(dataset, rpc, name, relative)
+    write_text(target, text, overwrite=overwrite)
+
+
+def _vrt(dataset: Any, rpc: RPC, source: str, relative: bool) -> str:
+    width, height = dataset.width, dataset.height
+    lines = [f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">']
+    if dataset.crs is not None:
+        numbers = ", ".join(repr(v) for v in dataset.transform.to_gdal())
+        lines += [f"  <SRS>{escape(dataset.crs.to_wkt())}</SRS>", f"  <GeoTransform>{numbers}</GeoTransform>"]
+    lines.append(rpc_domain(rpc))
+    frame = f'xOff="0" yOff="0" xSize="{width}" ySize="{height}"'
+    for index in dataset.indexes:
+        kind = _GDAL_TYPES.get(dataset.dtypes[index - 1], dataset.dtypes[index - 1].capitalize())
+        lines.append(f'  <VRTRasterBand dataType="{kind}" band="{index}">')
+        if (nodata := dataset.nodatavals[index - 1]) is not None:
+            lines.append(f"    <NoDataValue>{nodata!r}</NoDataValue>")
+        lines += [
+            f"    <ColorInterp>{dataset.colorinterp[index - 1].name.capitalize()}</ColorInterp>",
+            "    <SimpleSource>",
+            f'      <SourceFilename relativeToVRT="{int(relative)}">{escape(source)}</SourceFilename>',
+            f"      <SourceBand>{index}</SourceBand>",
+            f"      <SrcRect {frame} />",
+            f"      <DstRect {frame} />",
+            "    </SimpleSource>",
+            "  </VRTRasterBand>",
+        ]
+    if rasterio.enums.MaskFlags.per_dataset in dataset.mask_flag_enums[0] and not _has_alpha(dataset):
+        lines += [
+            "  <MaskBand>",
+            '    <VRTRasterBand dataType="Byte">',
+            "      <SimpleSource>",
+            f'        <SourceFilename relativeToVRT="{int(relative)}">{escape(source)}</SourceFilename>',
+            "        <SourceBand>mask,1</SourceBand>",
+            f"        <SrcRect {frame} />",
+            f"        <DstRect {frame} />",
+            "      </SimpleSource>",
+            "    </VRTRasterBand>",
+            "  </MaskBand>",
+        ]
+    return "\n".join([*lines, "</VRTDataset>"]) + "\n"
+
+
+_GDAL_TYPES = {
+    "uint8": "Byte",
+    "int8": "Int8",
+    "uint16": "UInt16",
+    "int16": "Int16",
+    "uint32": "UInt32",
+    "int32": "Int32",
+    "uint64": "UInt64",
+    "int64": "Int64",
+    "float32": "Float32",
+    "float64": "Float64",
+    "complex_int16": "CInt16",
+    "complex64": "CFloat32",
+    "complex128": "CFloat64",
+}
+
+
+def _has_alpha(dataset: Any) -> bool:
+    return rasterio.enums.ColorInterp.alpha in dataset.colorinterp
+
+
+def write_rpc_copy(
+    rpc: RPC, image_path: Path | str, copy_path: Path | str, *, overwrite: bool = False
+) -> None:
+    """Write a GeoTIFF copy of an image that carries an RPC in its tag.
+
+    A TIFF is copied byte by byte (pixels, compression, overviews and masks untouched, BigTIFF as well); any
+    other raster is converted. A geotransform without CRS is left out, as in `write_rpc_vrt`.
+
+    Parameters
+    ----------
+    rpc : RPC
+        The camera of `image_path`.
+    image_path, copy_path : Path or str
+        The image, and the file to write.
+    overwrite : bool
+        Replace an existing file, never the image itself.
+
+    Raises
+    ------
+    ImageError
+        The image cannot be read.
+    OutputError
+        The copy exists, is the image itself, or cannot be written.
+    """
+    source, driver = identify(image_path)
+    target = Path(copy_path).absolute()
+    _refuse_same(source, target)
+    with open_raster(source) as dataset:
+        drop = () if dataset.crs is not None else GEOREFERENCE_TAGS
+        with replacing(target, overwrite=overwrite) as partial:
+            if driver == "GTiff":
+                shutil.copyfile(source, partial)
+            else:
+                _convert(dataset, partial)
+            put_tag(partial, rpc, drop)
+
+
+def _convert(dataset: Any, target: Path) -> None:
+    options = {"BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
+    raster_copy(dataset, str(target), driver="GTiff", **options)
+
+
+def _refuse_same(source: Path, target: Path) -> None:
+    if target.exists() and target.resolve() == source.resolve():
+        raise OutputError(f"{target}: is the input image, which is never written to; choose another name")

@@ -1,0 +1,254 @@
+"""Where an image's RPC comes from: the file itself, or one of the files beside it.
+
+The order is GDAL's: a vendor's file beside an image goes before what the image itself carries, so that
+barpc sees the camera that every other tool sees. What it found, and what it passed over, is always said.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from barpc.errors import ImageError, RpcError, RpcFormatError
+from barpc.raster import open_raster
+from barpc.rpcio.fields import ReadOptions
+from barpc.rpcio.fixed import is_nitf, read_nitf
+from barpc.rpcio.formats import FORMATS, MAX_BYTES, parse
+from barpc.rpcio.text import decode
+from barpc.rpcio.tiff import is_tiff, read_tag
+from barpc.sensor.rpc import RPC
+
+
+@dataclass(frozen=True)
+class RpcSource:
+    """An RPC and where it came from.
+
+    Parameters
+    ----------
+    rpc : RPC
+        The camera.
+    format : str
+        ``tag``, ``nitf``, or a row of `FORMATS`.
+    path : Path
+        The file that holds it: the image, or one beside it.
+    notes : tuple of str
+        What the user should know: a crop origin that was applied, files beside it that were passed over.
+    """
+
+    rpc: RPC
+    format: str
+    path: Path
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Sidecar:
+    """A file beside an image that may hold an RPC.
+
+    Parameters
+    ----------
+    kind : str
+        ``rpb``, ``txt``, ``xml``, ``dimap``, ``alos``, ``pam`` or ``geom``.
+    path : Path
+        The file.
+    before_tag : bool
+        Whether GDAL and its users read it instead of the image's own RPC.
+    """
+
+    kind: str
+    path: Path
+    before_tag: bool
+
+
+def sidecars(image: Path | str) -> list[Sidecar]:
+    """The files beside an image that hold an RPC for some tool, in the order in which GDAL looks.
+
+    Names are compared without regard to case, as GDAL does. XML files count only where their content is
+    an RPC.
+    """
+    image = Path(image)
+    try:
+        present = {entry.name.lower(): entry for entry in image.parent.iterdir()}
+    except OSError:
+        return []
+    found: list[Sidecar] = []
+    for kind, name, before_tag in _names(image.name):
+        path = present.get(name.lower())
+        if path is None or not path.is_file() or path.name == image.name:
+            continue
+        if kind in ("xml", "dimap", "pam") and not _holds_rpc(path, kind):
+            continue
+        if path not in [sidecar.path for sidecar in found]:
+            found.append(Sidecar(kind, path, before_tag))
+    return found
+
+
+def _names(name: str) -> Iterator[tuple[str, str, bool]]:
+    """(kind, file name, read before the tag) of all sidecars that an image of this name may have."""
+    stem = name.rpartition(".")[0] or name
+    yield "rpb", f"{stem}.RPB", True
+    yield "xml", f"{stem}.XML", True
+    yield "txt", f"{stem}_RPC.TXT", True
+    if len(stem) > 4:  # DIMAP: IMG_<product>_R1C1.TIF beside RPC_<product>.XML
+        yield "dimap", f"RPC_{stem[4:]}.XML", True
+        yield "dimap", f"RPC_{stem[4:].rpartition('_')[0]}.XML", True
+    yield "txt", f"{stem}.rpc", True
+    for cut in (6, 3):  # ALOS: IMG-01-<scene>.tif or IMG-<scene>.tif beside RPC-<scene>.txt
+        if len(stem) > cut:
+            yield "alos", f"RPC{stem[cut:]}.txt", True
+    yield "pam", f"{name}.aux.xml", False
+    yield "geom", f"{stem}.geom", False
+
+
+def _holds_rpc(path: Path, kind: str) -> bool:
+    row = FORMATS["gdal" if kind == "pam" else kind]
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            return False
+        return row.sniff(decode(path.read_bytes()))
+    except OSError:
+        return False
+
+
+def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:
+    """The RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too."""
+    return read_rpc_source(path, first_pixel=first_pixel, band=band).rpc
+
+
+def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RpcSource:
+    """The RPC of an image or of an RPC file, and where it came from.
+
+    For an image: the vendor's file beside it, the RPC in the image, GDAL's ``.aux.xml``, OSSIM's ``.geom``,
+    in this order. Any other file is read by what its content says it is.
+
+    Parameters
+    ----------
+    path : Path or str
+        An image or an RPC file.
+    first_pixel : float, optional
+        The coordinate that an RPC file gives to the centre of the first pixel (0, 0.5 or 1), where it is
+        not the one that its format prescribes.
+    band : int
+        Which band's RPC, from 1, where a file holds one for each.
+
+    Returns
+    -------
+    source : RpcSource
+
+    Raises
+    ------
+    RpcFormatError
+        A file that should hold an RPC and does not parse; never a silent fallback to another one.
+    ImageError
+        No such file, or an image without an RPC.
+    """
+    path = Path(path)
+    options = ReadOptions(first_pixel, band)
+    head = _head(path)
+    if is_tiff(head) or is_nitf(head) or _is_binary(head):
+        return _image_source(path, head, options)
+    data = _content(path)
+    if re.match(rb"\s*<VRTDataset\b", data) and b'domain="RPC"' not in data:
+        return _image_source(path, head, options)
+    rpc, name = parse(data, str(path), options)
+    return RpcSource(rpc, name, path)
+
+
+def _head(path: Path) -> bytes:
+    if not path.is_file():
+        raise ImageError(f"{path}: {'a folder, not a file' if path.is_dir() else 'no such file'}")
+    try:
+        with path.open("rb") as file:
+            return file.read(64)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _is_binary(head: bytes) -> bool:
+    """No RPC text holds a zero byte near its start, unless it is UTF-16, which none is."""
+    return b"\0" in head or head[:3] == b"\xff\xd8\xff" or head[:4] == b"\x89PNG"
+
+
+def _content(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:
+    beside = sidecars(path)
+    own: RPC | None = None
+    own_error: RpcError | None = None
+    try:
+        own = read_tag(path) if is_tiff(head) else read_nitf(path) if is_nitf(head) else None
+    except RpcError as error:  # reported unless a file beside the image goes before
+        own_error = error
+    first = next((sidecar for sidecar in beside if sidecar.before_tag), None)
+    if first is None and own_error is not None:
+        raise own_error
+    if first is None and own is None and beside:
+        first = beside[0]
+    ignored = [s.path.name for s in beside if s is not first]
+    if first is None:
+        if own is None:
+            raise ImageError(
+                f"{path}: no RPC in the image and none beside it (.RPB, _RPC.TXT, .XML, .geom and others)"
+            )
+        return RpcSource(own, "tag" if is_tiff(head) else "nitf", path, _passed_over(ignored))
+    if own is not None:
+        ignored.insert(0, "the image's own RPC")
+    source = _sidecar_source(path, first, options)
+    return RpcSource(source.rpc, source.format, source.path, source.notes + _passed_over(ignored))
+
+
+def _passed_over(names: list[str]) -> tuple[str, ...]:
+    return (f"not used: {', '.join(names)}",) if names else ()
+
+
+def _sidecar_source(image: Path, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
+    rpc, name = parse(_content(sidecar.path), str(sidecar.path), options)
+    if sidecar.kind == "geom":
+        return _geom_source(image, sidecar.path, rpc)
+    if sidecar.kind == "dimap":
+        return _tile_source(image, sidecar.path, rpc)
+    return RpcSource(rpc, name, sidecar.path)
+
+
+def _geom_source(image: Path, path: Path, rpc: RPC) -> RpcSource:
+    """A ``.geom`` speaks of the full image; a geotransform without CRS says where the crop is."""
+    with open_raster(image) as dataset:
+        step_x, _, x, _, step_y, y = dataset.transform[:6]
+        has_crs = dataset.crs is not None
+    if has_crs or (abs(step_x), abs(step_y), x, y) == (1.0, 1.0, 0.0, 0.0):
+        return RpcSource(rpc, "geom", path)
+    if step_x <= 0 or step_y == 0:
+        raise RpcFormatError(f"{image}: a geotransform that is no crop origin (steps {step_x}, {step_y})")
+    row = y if step_y > 0 else -y  # a negative row step: y = -row
+    cropped = rpc.window(x, row, step_x, abs(step_y))
+    return RpcSource(cropped, "geom", path, (f"crop origin ({x:g}, {row:g}) of the geotransform applied",))
+
+
+_TILE = re.compile(r"_R(\d+)C(\d+)$")
+
+
+def _tile_source(image: Path, path: Path, rpc: RPC) -> RpcSource:
+    """A DIMAP product in tiles: the RPC is the whole image's, ``DIM_*.XML`` gives the size of a tile."""
+    tile = _TILE.search(image.stem.upper())
+    if tile is None or tile.groups() == ("1", "1"):
+        return RpcSource(rpc, "dimap", path)
+    product = path.name[4:]
+    names = {entry.name.lower(): entry for entry in image.parent.iterdir()}
+    dim = names.get(f"dim_{product}".lower())
+    text = decode(_content(dim)) if dim else ""
+    width, height = (re.search(rf"<NTILES_SIZE[^>]*\b{key}=\"(\d+)\"", text) for key in ("ncols", "nrows"))
+    if width is None or height is None:
+        raise RpcFormatError(
+            f"{path}: the tile size of {image.name} is unknown (no DIM_{product} with NTILES_SIZE)"
+        )
+    row, col = (int(index) - 1 for index in tile.groups())
+    x, y = col * int(width.group(1)), row * int(height.group(1))
+    return RpcSource(rpc.crop(x, y), "dimap", path, (f"tile origin ({x}, {y}) applied",))

@@ -1,0 +1,222 @@
+"""RPC files in XML: Maxar (ISD), Airbus DIMAP v1 to v3, EnMAP, and the RPC domain of GDAL's VRT and PAM."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from xml.etree.ElementTree import Element
+
+from barpc.errors import RpcFormatError
+from barpc.rpcio.fields import (
+    COEFFICIENTS,
+    ERRORS,
+    OFFSETS,
+    SCALES,
+    Fields,
+    ReadOptions,
+    fields_from_rpc,
+    format_number,
+    number,
+    numbers,
+    rpc_from_fields,
+)
+from barpc.safexml import parse_xml
+from barpc.sensor.rpc import RPC
+
+
+def _root(text: str, name: str) -> Element:
+    return parse_xml(
+        re.sub(r"^\s*<\?xml[^>]*\?>", "", text, count=1).encode(), name=name, strip_namespaces=True
+    )
+
+
+def _text(parent: Element, path: str, name: str) -> str:
+    found = parent.find(path)
+    if found is None or not (found.text or "").strip():
+        raise RpcFormatError(f"{name}: <{path}> is missing or empty")
+    return str(found.text)
+
+
+def _element(parent: Element, paths: Iterable[str], name: str) -> Element:
+    """The first of several elements that is there, at any depth."""
+    for path in paths:
+        found = parent.find(f".//{path}")
+        if found is not None:
+            return found
+    raise RpcFormatError(f"{name}: none of the elements {', '.join(paths)} is there")
+
+
+# --- Maxar ------------------------------------------------------------------------------------------------
+
+_MAXAR_NAMES = {
+    "ERRBIAS": "ERR_BIAS",
+    "ERRRAND": "ERR_RAND",
+    "LINEOFFSET": "LINE_OFF",
+    "SAMPOFFSET": "SAMP_OFF",
+    "LATOFFSET": "LAT_OFF",
+    "LONGOFFSET": "LONG_OFF",
+    "HEIGHTOFFSET": "HEIGHT_OFF",
+    "LINESCALE": "LINE_SCALE",
+    "SAMPSCALE": "SAMP_SCALE",
+    "LATSCALE": "LAT_SCALE",
+    "LONGSCALE": "LONG_SCALE",
+    "HEIGHTSCALE": "HEIGHT_SCALE",
+    "LINENUMCOEF": "LINE_NUM_COEFF",
+    "LINEDENCOEF": "LINE_DEN_COEFF",
+    "SAMPNUMCOEF": "SAMP_NUM_COEFF",
+    "SAMPDENCOEF": "SAMP_DEN_COEFF",
+}
+
+
+def sniff_maxar(text: str) -> bool:
+    """An ``<isd>`` with ``<RPB>`` in it, plain or in a namespace (``lv1b:``)."""
+    return re.search(r"<(\w+:)?LINENUMCOEF", text) is not None
+
+
+def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
+    """Maxar's image support data: `<RPB><IMAGE>`, twenty numbers in one element a list."""
+    root = _root(text, name)
+    rpb = root if root.tag == "RPB" else _element(root, ("RPB",), name)
+    spec = rpb.findtext("SPECID", "RPC00B").strip()
+    if spec != "RPC00B":
+        raise RpcFormatError(f"{name}: coefficients in {spec} order, only RPC00B is read from this format")
+    image = _element(rpb, ("IMAGE",), name)
+    fields: Fields = {}
+    for key, field in _MAXAR_NAMES.items():
+        path = f"{key}List/{key}" if field in COEFFICIENTS else key
+        if field in ERRORS and image.find(path) is None:
+            continue
+        fields[field] = numbers(_text(image, path, name), name, key)
+    return rpc_from_fields(fields, name, options.first_pixel or 0.0)
+
+
+def write_maxar(rpc: RPC) -> str:
+    """The `<RPB>` part of Maxar's image support data."""
+    fields = fields_from_rpc(rpc)
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        "<isd>",
+        "\t<RPB>",
+        "\t\t<SPECID>RPC00B</SPECID>",
+        "\t\t<IMAGE>",
+    ]
+    for key, field in _MAXAR_NAMES.items():
+        if field in COEFFICIENTS:
+            values = " ".join(map(format_number, fields[field]))
+            lines += [f"\t\t\t<{key}List>", f"\t\t\t\t<{key}>{values}</{key}>", f"\t\t\t</{key}List>"]
+        elif field in fields:
+            lines.append(f"\t\t\t<{key}>{format_number(fields[field][0])}</{key}>")
+    return "\n".join([*lines, "\t\t</IMAGE>", "\t</RPB>", "</isd>"]) + "\n"
+
+
+# --- DIMAP ------------------------------------------------------------------------------------------------
+
+
+def sniff_dimap(text: str) -> bool:
+    """A ``Dimap_Document`` with a rational function model, or the model alone."""
+    return re.search(r"<(\w+:)?Global_RFM", text) is not None
+
+
+def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
+    """Airbus' DIMAP: Pleiades, SPOT 6/7, PeruSat (v1, v2) and Pleiades Neo (v3).
+
+    The inverse model (ground to image) is taken, never the direct one. The first pixel's centre is (1, 1)
+    in v1 and v2 and (0, 0) in v3, unless `options.first_pixel` says otherwise. ERR_BIAS_ROW and _COL are
+    the error of the vendor's own fit in pixels, no geolocation accuracy: they are left out.
+    """
+    root = _root(text, name)
+    model = _element(root, ("Global_RFM",), name)
+    if model.find(".//F_COL") is not None:
+        return _read_dimap_v1(model, name, options)
+    inverse = _element(model, ("Inverse_Model", "GroundtoImage_Values"), name)
+    validity = _element(model, ("RFM_Validity",), name)
+    fields: Fields = {key: [number(_text(validity, key, name), name, key)] for key in OFFSETS + SCALES}
+    for key in COEFFICIENTS:
+        indexed = [f"{key}_{i}" for i in range(1, 21)]
+        fields[key] = [number(_text(inverse, k, name), name, k) for k in indexed]
+    default = 0.0 if inverse.tag == "GroundtoImage_Values" else 1.0
+    return rpc_from_fields(fields, name, default if options.first_pixel is None else options.first_pixel)
+
+
+def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
+    """DIMAP v1: forty numbers an element, scales A and offsets B by axis."""
+    fields: Fields = {}
+    for axis, field in (("ROW", "LINE"), ("COL", "SAMP")):
+        values = numbers(_text(_element(model, (f"F_{axis}",), name), ".", name), name, f"F_{axis}")
+        if len(values) != 40:
+            raise RpcFormatError(f"{name}: F_{axis} has {len(values)} coefficients, expected 40")
+        fields[f"{field}_NUM_COEFF"], fields[f"{field}_DEN_COEFF"] = values[:20], values[20:]
+    axes = {"Lon": "LONG", "Lat": "LAT", "Alt": "HEIGHT", "Col": "SAMP", "Row": "LINE"}
+    validity = _element(model, ("RFM_Validity",), name)
+    for axis, field in axes.items():
+        element = _element(validity, (axis,), name)
+        fields[f"{field}_SCALE"] = [number(_text(element, "A", name), name, f"{axis}/A")]
+        fields[f"{field}_OFF"] = [number(_text(element, "B", name), name, f"{axis}/B")]
+    return rpc_from_fields(fields, name, 1.0 if options.first_pixel is None else options.first_pixel)
+
+
+# --- EnMAP ------------------------------------------------------------------------------------------------
+
+_ENMAP_AXES = {"LINE": "ROW", "SAMP": "COL"}
+
+
+def sniff_enmap(text: str) -> bool:
+    """An RPC a band: ``<RPC><bandID number=...>`` with ``<ROW_NUM_1>``."""
+    return (
+        re.search(r"<bandID\s", text) is not None
+        and re.search(r"<ROW_NUM_0?1>", text, re.IGNORECASE) is not None
+    )
+
+
+def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
+    """EnMAP's metadata: `options.band` chooses among the bands' RPCs."""
+    root = _root(text, name)
+    bands = [
+        b for rpc in root.iter("RPC") for b in rpc.iter("bandID") if b.get("number") == str(options.band)
+    ]
+    if not bands:
+        raise RpcFormatError(f"{name}: no RPC of band {options.band}")
+    values = {e.tag.upper(): number(e.text or "", name, e.tag) for e in bands[0]}
+    fields: Fields = {}
+    for key in OFFSETS + SCALES:
+        axis, _, kind = key.partition("_")
+        fields[key] = [values[k] for k in (f"{_ENMAP_AXES.get(axis, axis)}_{kind}",) if k in values]
+    for key in COEFFICIENTS:
+        axis, part, _ = key.split("_")
+        stem = f"{_ENMAP_AXES[axis]}_{part}_"
+        fields[key] = [
+            values[k] for i in range(1, 21) for k in (f"{stem}{i}", f"{stem}{i:02d}") if k in values
+        ][:20]
+    return rpc_from_fields(fields, name, options.first_pixel or 0.0)
+
+
+# --- GDAL -------------------------------------------------------------------------------------------------
+
+
+def sniff_gdal(text: str) -> bool:
+    """A VRT or a PAM ``.aux.xml`` with ``<Metadata domain="RPC">``."""
+    return re.search(r"<(VRTDataset|PAMDataset)\b", text) is not None and 'domain="RPC"' in text
+
+
+def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
+    """GDAL's RPC metadata domain."""
+    root = _root(text, name)
+    domain = root.find("Metadata[@domain='RPC']")
+    if domain is None:
+        raise RpcFormatError(f'{name}: no <Metadata domain="RPC">')
+    known = {*OFFSETS, *SCALES, *ERRORS, *COEFFICIENTS}
+    fields = {
+        key: numbers(item.text or "", name, key)
+        for item in domain.iter("MDI")
+        if (key := item.get("key", "")) in known
+    }
+    return rpc_from_fields(fields, name, options.first_pixel or 0.0)
+
+
+def rpc_domain(rpc: RPC) -> str:
+    """The `<Metadata domain="RPC">` element of an RPC, numbers that read back to the bit."""
+    rows = [
+        f'    <MDI key="{key}">{" ".join(map(format_number, values))}</MDI>'
+        for key, values in sorted(fields_from_rpc(rpc).items())
+    ]
+    return "\n".join(['  <Metadata domain="RPC">', *rows, "  </Metadata>"])
