@@ -1,0 +1,372 @@
+"""What the geometry needs of a Sentinel-1 annotation file, and of a precise orbit file.
+
+Names are the annotation's own, in snake case; times are numpy datetime64[ns], which holds the microseconds
+of the files exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import numpy.typing as npt
+
+from barpc.errors import RpcFormatError
+from barpc.geodesy import Array
+from barpc.safexml import parse_xml
+
+TimeArray = npt.NDArray[np.datetime64]
+
+MISSIONS = {"S1A": "Sentinel-1A", "S1B": "Sentinel-1B", "S1C": "Sentinel-1C", "S1D": "Sentinel-1D"}
+"""Mission of an annotation -> mission of an orbit file."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateVectors:
+    """Earth-fixed orbit state vectors.
+
+    Parameters
+    ----------
+    time : (N,)
+        datetime64[ns], UTC.
+    position, velocity : (N, 3)
+        ECEF [m, m/s].
+    source : str
+        Where they come from, for messages: "Auxiliary", "Downlink", or the orbit file.
+    """
+
+    time: TimeArray
+    position: Array
+    velocity: Array
+    source: str
+
+
+@dataclass(frozen=True, eq=False)
+class Burst:
+    """One burst of a TOPS swath.
+
+    Parameters
+    ----------
+    time : datetime64[ns]
+        Zero-Doppler time of the burst's first line (`azimuthTime`).
+    first_valid, last_valid : (L,)
+        First and last valid sample of every line; -1 where a line is not valid.
+    """
+
+    time: np.datetime64
+    first_valid: npt.NDArray[np.int64]
+    last_valid: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class GroundRange:
+    """Slant range to ground range, as polynomials listed in time (`coordinateConversion`).
+
+    Parameters
+    ----------
+    time : (M,)
+        datetime64[ns].
+    slant_origin, ground_origin : (M,)
+        `sr0`, `gr0` [m].
+    ground_from_slant, slant_from_ground : (M, K)
+        Ascending powers of (slant - slant_origin), of (ground - ground_origin) [m].
+    """
+
+    time: TimeArray
+    slant_origin: Array
+    ground_origin: Array
+    ground_from_slant: Array
+    slant_from_ground: Array
+
+
+@dataclass(frozen=True, eq=False)
+class GridPoints:
+    """The product's own geolocation grid.
+
+    Parameters
+    ----------
+    time : (G,)
+        Azimuth time, datetime64[ns].
+    range_time : (G,)
+        Two-way slant range time [s].
+    image : (G, 2)
+        The annotation's (pixel, line).
+    ground : (G, 3)
+        lon, lat [deg], alt [m].
+    """
+
+    time: TimeArray
+    range_time: Array
+    image: Array
+    ground: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Annotation:
+    """One annotation file: one swath of an SLC, or a GRD.
+
+    Parameters
+    ----------
+    name : str
+        The file, for messages.
+    mission, product_type, mode, swath, polarisation : str
+        Upper case: S1A; SLC or GRD; IW, EW, S1 .. S6, WV; IW1, EW3, S4, IW (GRD); VV ...
+    states : StateVectors
+    first_line_time, last_line_time : datetime64[ns]
+    azimuth_time_interval : float
+        Between lines [s].
+    slant_range_time : float
+        Two-way, of the first sample [s].
+    range_sampling_rate : float
+        [Hz].
+    range_pixel_spacing : float
+        [m]; ground range in a GRD.
+    samples, lines : int
+        Size of the measurement file.
+    lines_per_burst : int
+        0 where there are no bursts.
+    bursts : tuple of Burst
+    ground_range : GroundRange or None
+        Of a GRD.
+    grid : GridPoints
+    rank : int
+        Pulses on their way between sending and receiving.
+    pulse_interval : float
+        [s].
+    bistatic_applied : bool
+        Whether the processor corrected the bistatic delay, at mid range.
+    """
+
+    name: str
+    mission: str
+    product_type: str
+    mode: str
+    swath: str
+    polarisation: str
+    states: StateVectors
+    first_line_time: np.datetime64
+    last_line_time: np.datetime64
+    azimuth_time_interval: float
+    slant_range_time: float
+    range_sampling_rate: float
+    range_pixel_spacing: float
+    samples: int
+    lines: int
+    lines_per_burst: int
+    bursts: tuple[Burst, ...]
+    ground_range: GroundRange | None
+    grid: GridPoints
+    rank: int
+    pulse_interval: float
+    bistatic_applied: bool
+
+    @property
+    def mid_range_time(self) -> float:
+        """Two-way slant range time of the middle sample of an SLC swath [s]."""
+        return self.slant_range_time + 0.5 * self.samples / self.range_sampling_rate
+
+
+def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation:
+    """Read a Sentinel-1 product annotation.
+
+    Parameters
+    ----------
+    source : bytes or Path
+        ``annotation/s1a-iw1-slc-vv-....xml`` of a product.
+    name : str, optional
+        What to call it in messages.
+
+    Returns
+    -------
+    annotation : Annotation
+
+    Raises
+    ------
+    RpcFormatError
+        Not a Sentinel-1 annotation, or a field that the geometry needs is missing or not a number.
+    """
+    name = name or (source.name if isinstance(source, Path) else "annotation")
+    root = parse_xml(source, name=str(source) if isinstance(source, Path) else name)
+    if root.tag != "product" or root.find("adsHeader/missionId") is None:
+        raise RpcFormatError(
+            f"{name}: not a Sentinel-1 product annotation (its root is <{root.tag}>); "
+            "give annotation/s1?-*.xml, not calibration, noise or rfi"
+        )
+    info, timing = "imageAnnotation/imageInformation/", "swathTiming/"
+    values, processing = _Fields(root, name), "imageAnnotation/processingInformation/"
+    downlink = "generalAnnotation/downlinkInformationList/downlinkInformation/downlinkValues/"
+    return Annotation(
+        name=name,
+        mission=values.text("adsHeader/missionId").upper(),
+        product_type=values.text("adsHeader/productType").upper(),
+        mode=values.text("adsHeader/mode").upper(),
+        swath=values.text("adsHeader/swath").upper(),
+        polarisation=values.text("adsHeader/polarisation").upper(),
+        states=_annotated_states(root, name),
+        first_line_time=values.time(info + "productFirstLineUtcTime"),
+        last_line_time=values.time(info + "productLastLineUtcTime"),
+        azimuth_time_interval=values.positive(info + "azimuthTimeInterval"),
+        slant_range_time=values.positive(info + "slantRangeTime"),
+        range_sampling_rate=values.positive("generalAnnotation/productInformation/rangeSamplingRate"),
+        range_pixel_spacing=values.positive(info + "rangePixelSpacing"),
+        samples=int(values.positive(info + "numberOfSamples")),
+        lines=int(values.positive(info + "numberOfLines")),
+        lines_per_burst=int(values.numbers(timing + "linesPerBurst")[0]),
+        bursts=tuple(_burst(b, name) for b in root.findall(timing + "burstList/burst")),
+        ground_range=_ground_range(root, name),
+        grid=_grid(root, name),
+        rank=int(values.numbers(downlink + "rank")[0]),
+        pulse_interval=values.positive(downlink + "pri"),
+        bistatic_applied=root.findtext(processing + "bistaticDelayCorrectionApplied", "").strip() == "true",
+    )
+
+
+def read_orbit_file(
+    path: Path, mission: str, window: tuple[np.datetime64, np.datetime64], margin: float
+) -> StateVectors:
+    """The state vectors of a precise or restituted orbit file (``.EOF``) around a time.
+
+    Parameters
+    ----------
+    path : Path
+        ``S1A_OPER_AUX_POEORB_....EOF``.
+    mission : str
+        Mission of the annotation, as "S1A".
+    window : (datetime64, datetime64)
+        First and last time of the image.
+    margin : float
+        Vectors so far beyond the window are returned too [s].
+
+    Returns
+    -------
+    states : StateVectors
+
+    Raises
+    ------
+    RpcFormatError
+        Not an orbit file, another satellite's, or no vector near that time.
+    """
+    root = parse_xml(path, strip_namespaces=True)
+    vectors = root.findall("Data_Block/List_of_OSVs/OSV")
+    if not vectors:
+        raise RpcFormatError(f"{path}: not a Sentinel-1 orbit file (no List_of_OSVs)")
+    owner = root.findtext("Earth_Explorer_Header/Fixed_Header/Mission", "").strip()
+    if owner != MISSIONS.get(mission, mission):
+        raise RpcFormatError(f"{path}: the orbit of {owner or 'no known mission'}, the image is of {mission}")
+    frame = root.findtext("Earth_Explorer_Header/Variable_Header/Ref_Frame", "EARTH_FIXED").strip()
+    if frame != "EARTH_FIXED":
+        raise RpcFormatError(f"{path}: state vectors in {frame}, EARTH_FIXED is needed")
+    fields = [_Fields(vector, str(path)) for vector in vectors]
+    times = np.array([f.time("UTC") for f in fields], dtype="datetime64[ns]")
+    pad = np.timedelta64(int(margin * 1e9), "ns")
+    near = np.flatnonzero((times >= window[0] - pad) & (times <= window[1] + pad))
+    if not len(near):
+        raise RpcFormatError(
+            f"{path}: covers {times.min()} to {times.max()}, the image is of {window[0]}; "
+            "take the orbit file of that day"
+        )
+    return _states([fields[i] for i in near], "UTC", "XYZ", ("V{}", "{}"), str(path))
+
+
+def seconds(time: Any, epoch: np.datetime64) -> Any:
+    """Seconds (float) from an epoch, exact to the nanosecond."""
+    return (time - epoch) / np.timedelta64(1, "ns") * 1e-9
+
+
+def parse_time(text: str, name: str) -> np.datetime64:
+    """A UTC time of an annotation ("2021-02-16T15:12:07.524369") or an orbit file ("UTC=...")."""
+    text = text.strip().removeprefix("UTC=").removesuffix("Z")
+    try:
+        time = np.datetime64(text, "ns")
+    except ValueError as error:
+        raise RpcFormatError(f"{name}: {text!r} is not a UTC time") from error
+    if np.isnat(time):
+        raise RpcFormatError(f"{name}: {text!r} is not a UTC time")
+    return time
+
+
+class _Fields:
+    """Fields of an XML element; what is missing or malformed is refused by name."""
+
+    def __init__(self, element: Element, name: str) -> None:
+        self.element, self.name = element, name
+
+    def text(self, path: str) -> str:
+        text = self.element.findtext(path)
+        if text is None or not text.strip():
+            raise RpcFormatError(f"{self.name}: no {path} below <{self.element.tag}>; is the file complete?")
+        return text.strip()
+
+    def time(self, path: str) -> np.datetime64:
+        return parse_time(self.text(path), self.name)
+
+    def numbers(self, path: str) -> Array:
+        try:
+            numbers = np.array(self.text(path).split(), dtype=np.float64)
+        except ValueError as error:
+            raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
+        if not np.isfinite(numbers).all():
+            raise RpcFormatError(f"{self.name}: {path} is not finite")
+        return numbers
+
+    def positive(self, path: str) -> float:
+        value = float(self.numbers(path)[0])
+        if value <= 0:
+            raise RpcFormatError(f"{self.name}: {path} is {value:g}, a positive number is needed")
+        return value
+
+
+def _states(
+    vectors: Sequence[_Fields], time: str, axes: str, tags: tuple[str, str], source: str
+) -> StateVectors:
+    """State vectors whose components are named by `tags` (velocity, position) with the axis filled in."""
+    position = [[v.numbers(tags[1].format(axis))[0] for axis in axes] for v in vectors]
+    velocity = [[v.numbers(tags[0].format(axis))[0] for axis in axes] for v in vectors]
+    times = np.array([v.time(time) for v in vectors], dtype="datetime64[ns]")
+    return StateVectors(times, np.reshape(position, (-1, 3)), np.reshape(velocity, (-1, 3)), source)
+
+
+def _annotated_states(root: Element, name: str) -> StateVectors:
+    vectors = [_Fields(v, name) for v in root.findall("generalAnnotation/orbitList/orbit")]
+    if any(v.text("frame") != "Earth Fixed" for v in vectors):
+        raise RpcFormatError(f"{name}: orbit state vectors are not Earth fixed; give an orbit file")
+    source = root.findtext("imageAnnotation/processingInformation/orbitSource", "annotation").strip()
+    return _states(vectors, "time", "xyz", ("velocity/{}", "position/{}"), source)
+
+
+def _burst(element: Element, name: str) -> Burst:
+    fields = _Fields(element, name)
+    first, last = (fields.numbers(tag).astype(np.int64) for tag in ("firstValidSample", "lastValidSample"))
+    if first.shape != last.shape:
+        raise RpcFormatError(f"{name}: a burst lists {len(first)} first and {len(last)} last valid samples")
+    return Burst(fields.time("azimuthTime"), first, last)
+
+
+def _ground_range(root: Element, name: str) -> GroundRange | None:
+    rows = root.findall("coordinateConversion/coordinateConversionList/coordinateConversion")
+    fields = [_Fields(row, name) for row in rows]
+    if not fields:
+        return None
+    forward, backward = ([f.numbers(tag) for f in fields] for tag in ("srgrCoefficients", "grsrCoefficients"))
+    if len({len(c) for c in forward}) > 1 or len({len(c) for c in backward}) > 1:
+        raise RpcFormatError(f"{name}: ground range polynomials of different lengths")
+    time = np.array([f.time("azimuthTime") for f in fields], dtype="datetime64[ns]")
+    if len(time) > 1 and not (np.diff(time) > np.timedelta64(0)).all():
+        raise RpcFormatError(f"{name}: the times of the ground range polynomials do not rise")
+    slant, ground = (np.array([f.numbers(tag)[0] for f in fields]) for tag in ("sr0", "gr0"))
+    return GroundRange(time, slant, ground, np.array(forward), np.array(backward))
+
+
+def _grid(root: Element, name: str) -> GridPoints:
+    points = root.findall("geolocationGrid/geolocationGridPointList/geolocationGridPoint")
+    fields = [_Fields(point, name) for point in points]
+    if not fields:
+        raise RpcFormatError(f"{name}: no geolocation grid; is the file complete?")
+    tags = ("slantRangeTime", "pixel", "line", "longitude", "latitude", "height")
+    table = np.array([[f.numbers(tag)[0] for tag in tags] for f in fields])
+    time = np.array([f.time("azimuthTime") for f in fields], dtype="datetime64[ns]")
+    return GridPoints(time, table[:, 0], table[:, 1:3], table[:, 3:6])

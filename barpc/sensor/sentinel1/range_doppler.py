@@ -1,0 +1,304 @@
+"""The Range-Doppler model: a ground point is seen when the satellite passes it at zero Doppler.
+
+The satellite's orbit is O(t) with velocity V(t). The azimuth time t of a ground point X is the zero of
+E(t) = V(t) . (X - O(t)); its two-way slant range time is tau = 2 |X - O(t)| / c. A frame turns (t, tau)
+into (col, row).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from barpc.errors import RpcError
+from barpc.geodesy import Array, ecef_from_ground, ecef_from_ground_jacobian, enu_basis, ground_from_ecef
+from barpc.sensor.sentinel1.annotation import Annotation
+from barpc.sensor.sentinel1.corrections import Bistatic, Delays
+from barpc.sensor.sentinel1.frames import SPEED_OF_LIGHT, Frame
+from barpc.sensor.sentinel1.orbit import Orbit
+from barpc.sensor.sentinel1.record import Record
+
+CHUNK = 8192
+"""Points worked on at a time."""
+
+NO_DELAYS = Delays()
+"""Pure geometry."""
+
+_STEPS = 12  # at most; three are enough near the image
+_SLACK = 10.0  # s: how far beyond the orbit the search for zero Doppler may wander
+_SETTLED = 1e-5  # s: quadratic convergence leaves less than 1e-12 s after a step so small
+_ANGLE_STEPS = 12
+_ANGLE_SETTLED = 1e-9  # rad, about a millimetre: what is left after such a step is below rounding
+
+
+@dataclass(frozen=True, eq=False)
+class RangeDoppler(Record):
+    """A Sentinel-1 image: itself a `SensorModel`.
+
+    Parameters
+    ----------
+    orbit : Orbit
+        Its time counts from `epoch`.
+    epoch : datetime64[ns]
+        Zero-Doppler time (UTC) of row 0.
+    frame : SlantFrame or GroundFrame
+        (azimuth time, slant range time) to (col, row).
+    size : (width, height)
+        [px].
+    alt_range : (low, high)
+        Altitudes that the image is used for [m above the ellipsoid].
+    look : "right" or "left"
+        Side of the track; a point on the other side projects to NaN.
+    delays : Delays
+        Smooth corrections between geometry and annotated times; none by default.
+    """
+
+    orbit: Orbit
+    epoch: np.datetime64
+    frame: Frame
+    size: tuple[int, int]
+    alt_range: tuple[float, float]
+    look: Literal["right", "left"] = "right"
+    delays: Delays = NO_DELAYS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.size) < 1 or not self.alt_range[0] <= self.alt_range[1]:
+            raise RpcError(f"Range-Doppler model: size {self.size}, altitudes {self.alt_range}")
+        if self.look not in ("right", "left"):
+            raise RpcError(f"Range-Doppler model: look {self.look!r}, expected 'right' or 'left'")
+
+    @classmethod
+    def from_annotation(
+        cls,
+        source: Path | Annotation,
+        *,
+        burst: int | None = None,
+        orbit: Path | None = None,
+        atmosphere: bool = False,
+        bistatic: Bistatic | None = None,
+        reference: Path | Annotation | None = None,
+    ) -> RangeDoppler:
+        """The model of one SLC swath, one of its bursts, or a GRD; see `build.from_annotation`."""
+        from barpc.sensor.sentinel1.build import from_annotation
+
+        return from_annotation(
+            source, burst=burst, orbit=orbit, atmosphere=atmosphere, bistatic=bistatic, reference=reference
+        )
+
+    def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
+        """Times at which ground points are seen: pure geometry, without `delays`.
+
+        Parameters
+        ----------
+        ground : (..., 3)
+            lon, lat [deg], alt [m above the WGS84 ellipsoid].
+
+        Returns
+        -------
+        azimuth_time : (...)
+            Zero-Doppler time [s from `epoch`]; NaN off the orbit's time span or on the other side.
+        range_time : (...)
+            Two-way slant range time [s].
+        """
+        ground = np.asarray(ground, dtype=np.float64)
+        flat = ground.reshape(-1, 3)
+        out = np.empty((2, len(flat)))
+        with np.errstate(all="ignore"):
+            for part in _chunks(len(flat)):
+                out[:, part] = self._geometry(ecef_from_ground(flat[part])).times
+        return out[0].reshape(ground.shape[:-1]), out[1].reshape(ground.shape[:-1])
+
+    def project(self, ground: Array) -> Array:
+        """Image points of ground points.
+
+        Parameters
+        ----------
+        ground : (..., 3)
+            lon, lat [deg], alt [m above the WGS84 ellipsoid].
+
+        Returns
+        -------
+        image : (..., 2)
+            col, row [px]; NaN off the orbit's time span or on the other side of the track.
+        """
+        ground = np.asarray(ground, dtype=np.float64)
+        flat = ground.reshape(-1, 3)
+        out = np.empty((len(flat), 2))
+        with np.errstate(all="ignore"):
+            for part in _chunks(len(flat)):
+                seen = self._geometry(ecef_from_ground(flat[part]))
+                times = seen.times
+                if self.delays:
+                    times = times + self.delays.shift(times, flat[part], seen.sight)
+                out[part] = self.frame.image(times)[0].T
+        return _nan_rows(out).reshape(*ground.shape[:-1], 2)
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Image points of ground points, with the derivative.
+
+        Parameters
+        ----------
+        ground : (..., 3)
+            lon, lat [deg], alt [m].
+
+        Returns
+        -------
+        image : (..., 2)
+            col, row [px].
+        jacobian : (..., 2, 3)
+            d(col, row) / d(lon, lat, alt) [px/deg, px/deg, px/m].
+        """
+        ground = np.asarray(ground, dtype=np.float64)
+        flat = ground.reshape(-1, 3)
+        image, jacobian = np.empty((len(flat), 2)), np.empty((len(flat), 2, 3))
+        with np.errstate(all="ignore"):
+            for part in _chunks(len(flat)):
+                image[part], jacobian[part] = self._jacobian(flat[part])
+        jacobian[~np.isfinite(image).all(axis=1)] = np.nan
+        shape = ground.shape[:-1]
+        return _nan_rows(image).reshape(*shape, 2), jacobian.reshape(*shape, 2, 3)
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Ground points seen at image points, at known altitudes (the inverse of `project`).
+
+        On the circle of zero Doppler and given slant range, Newton on the look angle until the point has
+        the altitude.
+
+        Parameters
+        ----------
+        image : (..., 2)
+            col, row [px].
+        alt : (...)
+            Altitude above the WGS84 ellipsoid [m].
+
+        Returns
+        -------
+        ground : (..., 3)
+            lon, lat [deg], alt [m]; NaN off the orbit's time span or where the range does not reach.
+        """
+        image, alt = np.asarray(image, dtype=np.float64), np.asarray(alt, dtype=np.float64)
+        shape = np.broadcast_shapes(image.shape[:-1], alt.shape)
+        flat = np.broadcast_to(image, (*shape, 2)).reshape(-1, 2)
+        alt = np.broadcast_to(alt, shape).reshape(-1)
+        out = np.empty((len(flat), 3))
+        with np.errstate(all="ignore"):
+            for part in _chunks(len(flat)):
+                out[part] = self._localize(flat[part].T, alt[part])
+        return out.reshape(*shape, 3)
+
+    def _geometry(self, ecef: Array) -> _Seen:
+        """Zero-Doppler geometry of ECEF points (N, 3)."""
+        point = ecef.T
+        low, high = self.orbit.span
+        time = np.where(np.isfinite(point[0]), self.orbit.center, np.nan)
+        for _ in range(_STEPS):
+            position, velocity, acceleration = self.orbit.states(time)
+            sight = position - point
+            rate = -_dot(acceleration, sight) - _dot(velocity, velocity)
+            moved = np.clip(time + _dot(velocity, sight) / rate, low - _SLACK, high + _SLACK)
+            step, time = np.abs(moved - time), moved
+            if not (step.max(initial=0.0, where=np.isfinite(step)) > _SETTLED):
+                break
+        position, velocity, acceleration = self.orbit.states(time)
+        sight = position - point
+        distance = np.sqrt(_dot(sight, sight))
+        sight /= distance
+        rate = -distance * _dot(acceleration, sight) - _dot(velocity, velocity)
+        side = self._sign() * _dot(np.cross(velocity, position, axis=0), sight)
+        time[~((time >= low) & (time <= high) & (side < 0) & (step <= _SETTLED))] = np.nan
+        times = np.stack([time, distance * (2.0 / SPEED_OF_LIGHT)])
+        return _Seen(times, sight, distance, velocity, -velocity / rate)
+
+    def _sign(self) -> float:
+        """Of velocity x position along the look: that vector points right of the track."""
+        return 1.0 if self.look == "right" else -1.0
+
+    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """`project_jacobian` of points (N, 3)."""
+        seen = self._geometry(ecef_from_ground(ground))
+        by_ecef = np.stack([seen.time_by_ecef.T, seen.sight.T * (-2.0 / SPEED_OF_LIGHT)])  # (2, N, 3)
+        ecef_by_ground = ecef_from_ground_jacobian(ground)
+        by_ground = np.einsum("inj,njk->ink", by_ecef, ecef_by_ground)
+        times = seen.times
+        if self.delays:
+            by_sight = seen.sight_by_ecef() @ ecef_by_ground
+            extra = self.delays.shift_jacobian(by_ground, ground, seen.sight, by_sight)
+            times, by_ground = times + self.delays.shift(times, ground, seen.sight), by_ground + extra
+        image, by_times = self.frame.image(times)
+        return image.T, np.einsum("ijn,jnk->nik", by_times, by_ground)
+
+    def _localize(self, image: Array, alt: Array) -> Array:
+        """`localize` of image points (2, N)."""
+        measured = self.frame.times(image)
+        times = measured
+        ground, sight = self._on_circle(times, alt)
+        for _ in range(3 if self.delays else 0):  # delays change by 1e-5 of a step: three rounds are exact
+            times = measured - self.delays.shift(times, ground, sight)
+            ground, sight = self._on_circle(times, alt)
+        return ground
+
+    def _on_circle(self, times: Array, alt: Array) -> tuple[Array, Array]:
+        """Points (N, 3) at times (2, N) and altitudes (N,), and the unit vectors (3, N) to the satellite."""
+        low, high = self.orbit.span
+        time = np.where((times[0] >= low) & (times[0] <= high), times[0], np.nan)
+        position, velocity, _ = self.orbit.states(time)
+        distance = 0.5 * SPEED_OF_LIGHT * times[1]
+        across = self._sign() * np.cross(velocity, position, axis=0)
+        across /= np.sqrt(_dot(across, across))
+        up = self._sign() * np.cross(across, velocity, axis=0)
+        up /= np.sqrt(_dot(up, up))
+        height = ground_from_ecef(position.T)[:, 2]
+        radius = np.sqrt(_dot(position, position)) - height + alt
+        cosine = (_dot(position, position) + distance**2 - radius**2) / (2 * distance * _dot(position, up))
+        angle = np.arccos(cosine)
+        for _ in range(_ANGLE_STEPS):
+            away = across * np.sin(angle) - up * np.cos(angle)
+            ground = ground_from_ecef((position + distance * away).T)
+            slope = distance * _dot(enu_basis(ground)[:, 2, :].T, across * np.cos(angle) + up * np.sin(angle))
+            step = (alt - ground[:, 2]) / slope
+            angle = angle + step
+            if not (np.abs(step).max(initial=0.0, where=np.isfinite(step)) > _ANGLE_SETTLED):
+                break
+        away = across * np.sin(angle) - up * np.cos(angle)
+        ground = ground_from_ecef((position + distance * away).T)
+        ground[~(np.abs(ground[:, 2] - alt) <= 1e-6)] = np.nan
+        ground[:, 2] = alt
+        return ground, -away
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Points at zero Doppler: times (2, N), sight (3, N) unit, distance (N,), velocity and dt/dX (3, N)."""
+
+    times: Array
+    sight: Array
+    distance: Array
+    velocity: Array
+    time_by_ecef: Array
+
+    def sight_by_ecef(self) -> Array:
+        """(N, 3, 3): d(sight)/dX, the satellite moving along with the zero-Doppler time."""
+        moved: Array = np.einsum("in,jn->nij", self.velocity, self.time_by_ecef) - np.eye(3)
+        moved += np.einsum("in,jn->nij", self.sight, self.sight)  # velocity has no part along the sight
+        moved /= self.distance[:, None, None]
+        return moved
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Scalar products (N,) of vectors (3, N)."""
+    product: Array = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return product
+
+
+def _chunks(count: int) -> list[slice]:
+    return [slice(start, start + CHUNK) for start in range(0, count, CHUNK)]
+
+
+def _nan_rows(points: Array) -> Array:
+    """Rows with anything that is not finite become NaN throughout, in place."""
+    points[~np.isfinite(points).all(axis=1)] = np.nan
+    return points
