@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from barpc.fit.certificate import RpcFit
 from barpc.fit.options import FitOptions, Normalization
-from barpc.fit.rpc import fit_rpc
+from barpc.fit.rpc import fit_rpc, fit_rpc_points
 
-__all__ = ["FitOptions", "Normalization", "RpcFit", "fit_rpc"]
+__all__ = ["FitOptions", "Normalization", "RpcFit", "fit_rpc", "fit_rpc_points"]

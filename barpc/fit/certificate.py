@@ -122,20 +122,22 @@ def roundtrip(rpc: RPC, ground: Array) -> float:
     return float(distance.max(initial=0.0)) if np.isfinite(distance).all() else float("inf")
 
 
-def coverage(image: Array, size: tuple[int, int]) -> float:
+def coverage(image: Array, corner: Array, extent: Array) -> float:
     """Share of an image inside the convex hull of image points.
 
     Parameters
     ----------
     image : (N, 2)
         col, row [px].
-    size : (width, height)
-        [px].
+    corner, extent : (2,)
+        Top-left corner, width and height of the image [px].
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     direction = np.stack([np.cos(angle), np.sin(angle)])  # a point is inside if no direction sees it beyond
-    extent = np.asarray(size, dtype=np.float64)
-    reach = ((image + 0.5) / extent @ direction).max(axis=0)
+    reach = np.full(len(angle), -np.inf)
+    for start in range(0, len(image), 1024):
+        part = (image[start : start + 1024] - corner) / extent
+        reach = np.maximum(reach, (part @ direction).max(axis=0))
     t = (np.arange(20) + 0.5) / 20
     cells = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
     return float((cells @ direction <= reach + 1e-9).all(axis=1).mean())

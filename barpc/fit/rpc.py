@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import numpy.typing as npt
 
 from barpc.errors import FitError
 from barpc.fit.certificate import Errors, RpcFit, coverage, roundtrip, smallest_denominator
 from barpc.fit.grid import check_points, control_points, widened
 from barpc.fit.options import FitOptions
-from barpc.fit.solve import normalization, solve
+from barpc.fit.points import screened
+from barpc.fit.solve import Solution, solve
 from barpc.geodesy import Array
 from barpc.sensor import SensorModel
+from barpc.sensor.rpc import RPC
+
+_CHUNK = 8192
 
 
 def fit_rpc(
@@ -46,58 +53,151 @@ def fit_rpc(
     """
     options = options or FitOptions()
     ground, image = control_points(model, size, widened(alt_range), options)
-    flat_ground, flat_image = ground.reshape(-1, 3), image.reshape(-1, 2)
-    ok = np.isfinite(flat_ground).all(axis=1) & np.isfinite(flat_image).all(axis=1)
+    cnp, cnp_image = ground.reshape(-1, 3), image.reshape(-1, 2)
+    ok = np.isfinite(cnp).all(axis=1) & np.isfinite(cnp_image).all(axis=1)
     if ok.mean() < 0.9:
         raise FitError(
             f"the model has no ground point for {1 - ok.mean():.0%} of the image over altitudes "
             f"{alt_range[0]:g} to {alt_range[1]:g} m: give an altitude range that it is made for"
         )
-    cnp, cnp_image = (flat_ground, flat_image) if ok.all() else (flat_ground[ok], flat_image[ok])
-    solution = solve(cnp, cnp_image, normalization(cnp, cnp_image, options), options)
-    rpc = solution.rpc
-    on_cnp, on_ckp, loop = Errors(), Errors(), 0.0
-    on_cnp.add(rpc.project(cnp) - cnp_image)
-    for middle in check_points(ground):
-        on_ckp.add(rpc.project(middle) - model.project(middle))
-        loop = max(loop, roundtrip(rpc, middle))
-    fit = RpcFit(
+    if not ok.all():
+        cnp, cnp_image = cnp[ok], cnp_image[ok]
+    vendor = underlying_rpc(model)
+
+    def attempt(method: str) -> RpcFit:
+        solution = solve(cnp, cnp_image, options, method, vendor=vendor)
+        on_ckp, loop = Errors(), 0.0
+        for middle in check_points(ground):
+            on_ckp.add(solution.rpc.project(middle) - model.project(middle))
+            loop = max(loop, roundtrip(solution.rpc, middle))
+        return _certified(solution, on_ckp, loop, size)
+
+    return _first_accepted(attempt, options, vendor)
+
+
+def fit_rpc_points(
+    ground: npt.ArrayLike,
+    image: npt.ArrayLike,
+    *,
+    sigma: npt.ArrayLike | None = None,
+    check: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+    size: tuple[int, int] | None = None,
+    vendor: RPC | None = None,
+    options: FitOptions | None = None,
+) -> RpcFit:
+    """Fit an RPC to given correspondences: GCPs, tables, exported grids.
+
+    Parameters
+    ----------
+    ground : (N, 3)
+        lon, lat [deg], alt [m above the ellipsoid]. Points that all have one altitude give an RPC without
+        altitude terms, to be used at that altitude.
+    image : (N, 2)
+        col, row [px].
+    sigma : (N,), optional
+        Relative standard deviations of the image points; equal if not given.
+    check : (ground, image), optional
+        Check points (M, 3) and (M, 2). Without them the certificate holds leave-one-out residuals.
+    size : (width, height), optional
+        Image whose coverage is stated [px]; the points' own extent if not given.
+    vendor : RPC, optional
+        Whose denominators may be kept.
+    options : FitOptions, optional
+        Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
+
+    Returns
+    -------
+    RpcFit
+        The RPC and its certificate.
+
+    Raises
+    ------
+    FitError
+        Too few points, not finite, swapped columns, points in a plane; or the RPC does not reach the
+        tolerance.
+    """
+    options = options or FitOptions()
+    cnp, cnp_image = screened(ground, image, options.allow_mirrored)
+    weight = relative_weight(sigma, len(cnp))
+    distinct = len(np.unique(cnp, axis=0)) if len(cnp) < 400 else len(cnp)
+    if distinct < min(len(cnp), 40):
+        raise FitError(f"points: only {distinct} of {len(cnp)} are distinct, too few for an RPC")
+    held_out = None if check is None else screened(*check, allow_mirrored=True)
+
+    def attempt(method: str) -> RpcFit:
+        solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
+        on_ckp, loop = Errors(), 0.0
+        if held_out is None:
+            on_ckp.add(solution.leave_one_out())
+        else:
+            on_ckp.add(solution.rpc.project(held_out[0]) - held_out[1])
+        for start in range(0, len(cnp), _CHUNK):
+            loop = max(loop, roundtrip(solution.rpc, cnp[start : start + _CHUNK]))
+        return _certified(solution, on_ckp, loop, size)
+
+    return _first_accepted(attempt, options, vendor)
+
+
+def underlying_rpc(model: object) -> RPC | None:
+    """The RPC that a model is built on: itself, or what its corrections stand in front of."""
+    while model is not None and not isinstance(model, RPC):
+        model = getattr(model, "sensor", None)
+    return model
+
+
+def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
+    """Weights (count,) of standard deviations (count,), 1 for the smallest; None for none."""
+    if sigma is None:
+        return None
+    value = np.asarray(sigma, dtype=np.float64)
+    if value.shape != (count,) or not (np.isfinite(value).all() and (value > 0).all()):
+        raise FitError(f"sigma: expected {count} positive numbers")
+    return np.asarray(value.min() / value)
+
+
+def _certified(solution: Solution, on_ckp: Errors, loop: float, size: tuple[int, int] | None) -> RpcFit:
+    problem, rpc = solution.problem, solution.rpc
+    ground, image = problem.ground, problem.image
+    on_cnp = Errors()
+    for start in range(0, len(ground), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        on_cnp.add(rpc.project(ground[part]) - image[part])
+    low, high = (-0.5, -0.5) if size else image.min(axis=0), size if size else np.ptp(image, axis=0)
+    return RpcFit(
         rpc=rpc,
         rmse_cnp=on_cnp.rmse,
         max_cnp=on_cnp.largest,
         rmse_ckp=on_ckp.rmse,
         max_ckp=on_ckp.largest,
-        min_denominator=smallest_denominator(rpc, cnp.min(axis=0), cnp.max(axis=0)),
+        min_denominator=smallest_denominator(rpc, ground.min(axis=0), ground.max(axis=0)),
         roundtrip=loop,
-        coverage=coverage(cnp_image, size),
+        coverage=coverage(image, np.asarray(low), np.asarray(high, dtype=np.float64)),
         h=solution.h,
         iterations=solution.iterations,
         num_cnp=on_cnp.count,
         num_ckp=on_ckp.count,
         method=solution.method,
     )
-    return accepted(fit, options)
 
 
-def accepted(fit: RpcFit, options: FitOptions) -> RpcFit:
-    """The fit itself.
+def _first_accepted(attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None) -> RpcFit:
+    """The fit by the method asked for; with ``auto``, the first that is accepted.
 
     Raises
     ------
     FitError
-        Its verdict at the tolerance is not empty.
+        None is; the message is about the best.
     """
-    verdict = fit.verdict(options.tolerance)
-    if verdict:
-        raise FitError(verdict)
-    return fit
-
-
-def unit_weight(sigma: Array | float | None, count: int) -> Array | None:
-    """Weights (count,) of standard deviations, relative to the smallest; None if all are equal."""
-    if sigma is None or np.ndim(sigma) == 0:
-        return None
-    value = np.asarray(sigma, dtype=np.float64)
-    if value.shape != (count,) or not (np.isfinite(value).all() and (value > 0).all()):
-        raise FitError(f"sigma: expected {count} positive numbers")
-    return np.asarray(value.min() / value)
+    methods = [str(options.method)]
+    if options.method == "auto":
+        methods = ["ridge", "lcurve"] + (["vendor-denominators"] if vendor is not None else [])
+    fits = []
+    for method in methods:
+        fit = attempt(method)
+        if not fit.verdict(options.tolerance):
+            return fit
+        fits.append(fit)
+    best = min(fits, key=lambda fit: (not fit.min_denominator > 0, float(fit.max_ckp.max())))
+    if np.isinf(options.tolerance):  # the caller judges for himself
+        return best
+    raise FitError(best.verdict(options.tolerance))

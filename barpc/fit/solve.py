@@ -1,32 +1,69 @@
-"""From correspondences to the coefficients of an RPC."""
+"""From points to the coefficients of an RPC: one function a method."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from barpc.errors import FitError
+from barpc.fit.lcurve import solve_lcurve
 from barpc.fit.options import ALTITUDE_FLOOR, FitOptions, Normalization
-from barpc.fit.ridge import Compressed, compress, solve_noise_scaled
-from barpc.geodesy import Array, wrap_longitude
-from barpc.sensor.rpc import MONOMIALS, RPC
+from barpc.fit.ridge import expected_size, noise_scaled, solution
+from barpc.fit.system import ALL, FLAT, Compressed, Problem
+from barpc.geodesy import Array
+from barpc.sensor.rpc import RPC
 
-_ALL = np.arange(20)
-_FLAT = np.array([i for i, monomial in enumerate(MONOMIALS) if "H" not in monomial])
+_FLAT_SPAN = 1e-3  # metres: altitudes that are one and the same
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """An RPC and how it was found: regularisation (2,) of col and row, passes over the points."""
+    """An RPC and how it was found.
+
+    Parameters
+    ----------
+    rpc : RPC
+        The result.
+    problem : Problem
+        What was solved.
+    solved : list of Compressed
+        Final systems of col and row, penalties included.
+    h : (2,)
+        Regularisation of col, row.
+    iterations : int
+        Passes over the points.
+    method : str
+        The solver.
+    """
 
     rpc: RPC
+    problem: Problem
+    solved: list[Compressed]
     h: Array
     iterations: int
     method: str
 
+    def leave_one_out(self) -> Array:
+        """Residuals (N, 2) [px] that each point would have if it had not been used.
 
-def normalization(ground: Array, image: Array, options: FitOptions) -> Normalization:
+        r / (1 - leverage), the leverage from the final system: exact for a linear problem.
+        """
+        residual = self.rpc.project(self.problem.ground) - self.problem.image
+        for axis, system in enumerate(self.solved):
+            denominator = self.rpc.coeffs[2 * axis + 1]
+            inverse = np.linalg.pinv(system.matrix)
+            free = len(system.matrix) > len(self.problem.active)
+            for part, rows in self.problem.rows(axis, denominator, free):
+                leverage = ((rows[:, :-1] @ inverse) ** 2).sum(axis=1)
+                residual[part, axis] /= np.maximum(1.0 - leverage, 1e-6)
+        return residual
+
+
+def normalization(
+    ground: Array, image: Array, options: FitOptions, vendor: RPC | None = None
+) -> Normalization:
     """Offsets and scales that take points into [-1, 1].
 
     Parameters
@@ -37,66 +74,124 @@ def normalization(ground: Array, image: Array, options: FitOptions) -> Normaliza
         col, row [px].
     options : FitOptions
         Its ``normalization`` is taken as it is, its ``quantize`` rounds what is found.
+    vendor : RPC, optional
+        Ground offsets and scales are taken from it.
     """
     if options.normalization is not None:
         return options.normalization
     low, high = ground.min(axis=0), ground.max(axis=0)
     left, right = image.min(axis=0), image.max(axis=0)
-    floor = np.array([1e-9, 1e-9, ALTITUDE_FLOOR])
-    found = Normalization(
-        0.5 * (low + high),
-        np.maximum(0.5 * (high - low), floor),
-        0.5 * (left + right),
-        np.maximum(0.5 * (right - left), 1e-6),
-    )
+    offset, scale = 0.5 * (low + high), 0.5 * (high - low)
+    if vendor is not None:
+        offset, scale = vendor.ground_offset, vendor.ground_scale
+    else:
+        scale = np.maximum(scale, [1e-9, 1e-9, ALTITUDE_FLOOR])
+    found = Normalization(offset, scale, 0.5 * (left + right), np.maximum(0.5 * (right - left), 1e-6))
     return found if options.quantize is None else options.quantize(found)
 
 
 def solve(
-    ground: Array, image: Array, norm: Normalization, options: FitOptions, weight: Array | None = None
+    ground: Array,
+    image: Array,
+    options: FitOptions,
+    method: str,
+    *,
+    weight: Array | None = None,
+    vendor: RPC | None = None,
 ) -> Solution:
-    """Fit the coefficients of an RPC to points, its offsets and scales given.
+    """Fit the coefficients of an RPC to points.
 
     Parameters
     ----------
     ground : (N, 3)
-        lon, lat [deg], alt [m].
+        lon (continuous), lat [deg], alt [m].
     image : (N, 2)
         col, row [px].
-    norm : Normalization
-        Offsets and scales.
     options : FitOptions
-        Solver and its parameters.
+        Parameters of the solvers.
+    method : {"ridge", "lcurve", "vendor-denominators"}
+        The solver.
     weight : (N,), optional
         Weights of the points (1 / standard deviation).
+    vendor : RPC, optional
+        Whose denominators "vendor-denominators" keeps.
+
+    Raises
+    ------
+    FitError
+        Too few points, or points that do not determine the coefficients.
     """
-    normalized = ((ground - norm.ground_offset) / norm.ground_scale).T
-    normalized[0] = (
-        wrap_longitude(ground[:, 0], norm.ground_offset[0]) - norm.ground_offset[0]
-    ) / norm.ground_scale[0]
-    target = ((image - norm.image_offset) / norm.image_scale).T
-    active = _FLAT if np.ptp(normalized[2]) < 1e-9 else _ALL
-    if len(ground) < 2 * len(active):
+    keeps = method == "vendor-denominators"
+    if keeps and vendor is None:
         raise FitError(
-            f"{len(ground)} points are too few: {2 * len(active) - 1} unknowns a coordinate need at least "
-            f"{2 * len(active)}"
+            "vendor-denominators: the model is not built on an RPC whose denominators could be kept"
         )
-    coeffs, h = np.zeros((4, 20)), np.zeros(2)
-    for i in range(2):
-        denominator = None
-        for _ in range(1 + options.weighted):
-            system = compress(normalized, target[i], active, denominator, weight)
-            solution, h[i] = solve_noise_scaled(system, options.tau)
-            coeffs[2 * i : 2 * i + 2] = expand(system, solution, active)
-            denominator = coeffs[2 * i + 1]
+    active = FLAT if np.ptp(ground[:, 2]) < _FLAT_SPAN else ALL
+    unknowns = len(active) if keeps else 2 * len(active) - 1
+    if len(ground) <= unknowns:
+        raise FitError(
+            f"{len(ground)} points are too few: each coordinate has {unknowns} unknowns, "
+            f"give {unknowns + 1} points or more"
+        )
+    norm = normalization(ground, image, options, vendor if keeps else None)
+    problem = Problem(ground, image, norm, active, weight)
+    return _METHODS[method](problem, options, vendor)
+
+
+def _assembled(
+    problem: Problem, coeffs: Array, solved: list[Compressed], h: Array, passes: int, method: str
+) -> Solution:
+    norm = problem.norm
     rpc = RPC(coeffs, norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
-    return Solution(rpc, h, 1 + options.weighted, "ridge")
+    return Solution(rpc, problem, solved, h, passes, method)
 
 
-def expand(system: Compressed, solution: Array, active: np.ndarray) -> Array:
-    """Numerator and denominator (2, 20) of a solution; monomials not in use are zero."""
-    out = np.zeros((2, 20))
-    out[0, active] = solution[: system.num_numerators]
-    out[1, 0] = 1.0
-    out[1, active[1:]] = solution[system.num_numerators :]
-    return out
+def _ridge(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
+    expected = expected_size(problem.active, options.tau)
+    coeffs, solved, h = np.zeros((4, 20)), [], np.zeros(2)
+    for axis in range(2):
+        own = slice(2 * axis, 2 * axis + 2)
+        denominator = None
+        for last in [False] * options.weighted + [True]:
+            raw = problem.compressed(axis, denominator)
+            system = noise_scaled(raw, expected)
+            x = solution(system, options.quantize_coeffs if last else None)
+            coeffs[own] = problem.expanded(x)
+            denominator = coeffs[2 * axis + 1]
+        solved.append(system)
+        h[axis] = raw.sigma / options.tau
+    return _assembled(problem, coeffs, solved, h, 1 + options.weighted, "ridge")
+
+
+def _lcurve(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
+    groups = [[0, 1]] if options.joint else [[0], [1]]
+    results = [solve_lcurve(problem, axes) for axes in groups]
+    coeffs = np.concatenate([result[0] for result in results])
+    solved = [system for result in results for system in result[1]]
+    if options.quantize_coeffs is not None:
+        pairs = [problem.expanded(solution(system, options.quantize_coeffs)) for system in solved]
+        coeffs = np.concatenate(pairs)
+    h = np.broadcast_to([result[2] for result in results], 2).copy()
+    return _assembled(problem, coeffs, solved, h, max(result[3] for result in results), "lcurve")
+
+
+def _vendor_denominators(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
+    coeffs, solved = np.zeros((4, 20)), []
+    for axis in range(2):
+        denominator = vendor.coeffs[2 * axis + 1] if vendor is not None else coeffs[1]
+        denominator = denominator / denominator[0]
+        if options.quantize_coeffs is not None:
+            denominator = options.quantize_coeffs(denominator)
+        raw = problem.compressed(axis, denominator, free=False)
+        system = noise_scaled(raw, expected_size(problem.active, options.tau)[: len(raw.matrix)])
+        x = solution(system, options.quantize_coeffs)
+        coeffs[2 * axis : 2 * axis + 2] = problem.expanded(x, denominator)
+        solved.append(system)
+    return _assembled(problem, coeffs, solved, np.zeros(2), 1, "vendor-denominators")
+
+
+_METHODS: dict[str, Callable[[Problem, FitOptions, RPC | None], Solution]] = {
+    "ridge": _ridge,
+    "lcurve": _lcurve,
+    "vendor-denominators": _vendor_denominators,
+}
