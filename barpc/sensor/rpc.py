@@ -12,68 +12,9 @@ import numpy as np
 
 from barpc.errors import RpcError
 from barpc.geodesy import Array, wrap_longitude
-
-CHUNK = 8192
-"""Points worked on at a time: the (20, CHUNK) monomials stay in cache."""
-
-MONOMIALS = (
-    "1", "L", "P", "H", "LP", "LH", "PH", "LL", "PP", "HH",
-    "PLH", "LLL", "LPP", "LHH", "LLP", "PPP", "PHH", "LLH", "PPH", "HHH",
-)  # fmt: skip
-"""The twenty monomials in RPC00B order; L = longitude, P = latitude, H = altitude, normalised."""
+from barpc.sensor.rational import CHUNK, MONOMIALS, Rational, monomials
 
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
-
-
-def _derivative_matrices() -> Array:
-    """(3, 20, 10): d(monomial i)/d(L, P, H) as a combination of the first ten monomials."""
-    index = {"".join(sorted(m)): i for i, m in enumerate(MONOMIALS[:10])}
-    index[""] = index.pop("1")
-    out = np.zeros((3, 20, 10))
-    for axis, letter in enumerate("LPH"):
-        for i, monomial in enumerate(MONOMIALS):
-            power = monomial.count(letter)
-            if power:
-                out[axis, i, index["".join(sorted(monomial.replace(letter, "", 1)))]] = power
-    return out
-
-
-_DERIVATIVE = _derivative_matrices()
-
-
-def monomials(normalized: Array) -> Array:
-    """The twenty monomials of normalised ground points.
-
-    Parameters
-    ----------
-    normalized : (3, N)
-        Normalised longitude, latitude, altitude, one row each.
-
-    Returns
-    -------
-    monomials : (20, N)
-        In RPC00B order (`MONOMIALS`).
-    """
-    x, y, z = normalized
-    out = np.empty((20, x.shape[0]))
-    out[0] = 1.0
-    out[1:4] = normalized
-    np.multiply(x, y, out=out[4])
-    np.multiply(x, z, out=out[5])
-    np.multiply(y, z, out=out[6])
-    np.multiply(normalized, normalized, out=out[7:10])
-    xx, yy, zz = out[7:10]
-    np.multiply(out[4], z, out=out[10])
-    np.multiply(xx, x, out=out[11])
-    np.multiply(yy, x, out=out[12])
-    np.multiply(zz, x, out=out[13])
-    np.multiply(xx, y, out=out[14])
-    np.multiply(yy, y, out=out[15])
-    np.multiply(zz, y, out=out[16])
-    np.multiply(xx, z, out=out[17])
-    np.multiply(yy, z, out=out[18])
-    np.multiply(zz, z, out=out[19])
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +52,7 @@ class RPC:
     image_scale: Array
     err_bias: float | None = None
     err_rand: float | None = None
-    _gradient: Array = field(init=False, repr=False)
+    _map: Rational = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         shapes = {
@@ -133,10 +74,7 @@ class RPC:
             object.__setattr__(self, name, value)
         if not self.coeffs[1::2].any(axis=1).all():
             raise RpcError("RPC coeffs: a denominator is zero everywhere")
-        # (12, 10): d/dL, d/dP, d/dH of the four polynomials on the first ten monomials
-        gradient = np.einsum("pi,aij->paj", self.coeffs, _DERIVATIVE).reshape(12, 10)
-        gradient.setflags(write=False)
-        object.__setattr__(self, "_gradient", gradient)
+        object.__setattr__(self, "_map", Rational(self.coeffs, _ACCURACY / np.abs(self.image_scale)))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, RPC) and self._content() == other._content()
@@ -147,6 +85,11 @@ class RPC:
     def _content(self) -> tuple[object, ...]:
         arrays = (self.coeffs, self.ground_offset, self.ground_scale, self.image_offset, self.image_scale)
         return (*(tuple(a.ravel().tolist()) for a in arrays), self.err_bias, self.err_rand)
+
+    @property
+    def _gradient(self) -> Array:
+        """(12, 10): d/d(lon, lat, alt), normalised, of the four polynomials, on the first ten monomials."""
+        return self._map.gradients.reshape(3, 4, 10).swapaxes(0, 1).reshape(12, 10)
 
     def normalize(self, ground: Array) -> Array:
         """Normalised longitude, latitude, altitude, one row each.
@@ -162,9 +105,9 @@ class RPC:
             Without unit; -1 to 1 in the RPC's box.
         """
         out = np.empty((3, len(ground)))
-        out[0] = wrap_longitude(ground[:, 0], self.ground_offset[0])
-        out[1:] = ground[:, 1:].T
-        out -= self.ground_offset[:, None]
+        np.subtract(ground.T, self.ground_offset[:, None], out=out)
+        if not np.abs(out[0]).max(initial=0.0) <= 180.0:
+            out[0] = wrap_longitude(ground[:, 0], self.ground_offset[0]) - self.ground_offset[0]
         out /= self.ground_scale[:, None]
         return out
 
@@ -184,14 +127,16 @@ class RPC:
         ground = np.asarray(ground, dtype=np.float64)
         flat = ground.reshape(-1, 3)
         out = np.empty((len(flat), 2))
+        work = np.empty((20, min(len(flat), CHUNK)))
         with np.errstate(all="ignore"):
             for start in range(0, len(flat), CHUNK):
-                part = slice(start, start + CHUNK)
-                poly = self.coeffs @ monomials(self.normalize(flat[part]))
-                out[part] = (poly[::2] / poly[1::2]).T
-            out *= self.image_scale
-            out += self.image_offset
-        out[~np.isfinite(out).all(axis=1)] = np.nan
+                piece = flat[start : start + CHUNK]
+                value = self._map.value(self.normalize(piece), work[:, : len(piece)])
+                value *= self.image_scale[:, None]
+                value += self.image_offset[:, None]
+                if not np.isfinite(value.sum()):
+                    value[:, ~np.isfinite(value).all(axis=0)] = np.nan
+                out[start : start + CHUNK] = value.T
         return out.reshape(*ground.shape[:-1], 2)
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
@@ -213,31 +158,29 @@ class RPC:
         flat = ground.reshape(-1, 3)
         image = np.empty((len(flat), 2))
         jacobian = np.empty((len(flat), 2, 3))
+        work = np.empty((20, min(len(flat), CHUNK)))
+        scale = (self.image_scale / self.ground_scale[:, None])[..., None]  # (3, 2, 1)
         with np.errstate(all="ignore"):
             for start in range(0, len(flat), CHUNK):
-                part = slice(start, start + CHUNK)
-                value, gradient = self._quotients(self.normalize(flat[part]))
-                image[part] = (value * self.image_scale[:, None] + self.image_offset[:, None]).T
-                scale = self.image_scale[:, None] / self.ground_scale
-                jacobian[part] = np.moveaxis(gradient * scale[..., None], 2, 0)
-        bad = ~np.isfinite(image).all(axis=1)
-        image[bad], jacobian[bad] = np.nan, np.nan
+                piece = flat[start : start + CHUNK]
+                value, gradient = self._map.value_and_gradient(
+                    self.normalize(piece), work=work[:, : len(piece)]
+                )
+                value *= self.image_scale[:, None]
+                value += self.image_offset[:, None]
+                gradient *= scale
+                if not np.isfinite(value.sum()):
+                    bad = ~np.isfinite(value).all(axis=0)
+                    value[:, bad], gradient[..., bad] = np.nan, np.nan
+                image[start : start + CHUNK] = value.T
+                jacobian[start : start + CHUNK] = gradient.T
         return image.reshape(*ground.shape[:-1], 2), jacobian.reshape(*ground.shape[:-1], 2, 3)
-
-    def _quotients(self, normalized: Array) -> tuple[Array, Array]:
-        """Normalised (col, row) (2, N) and their derivative (2, 3, N) by the normalised ground (3, N)."""
-        basis = monomials(normalized)
-        poly = self.coeffs @ basis
-        gradient = (self._gradient @ basis[:10]).reshape(4, 3, -1)
-        inverse = 1.0 / poly[1::2]
-        value = poly[::2] * inverse
-        return value, (gradient[::2] - value[:, None] * gradient[1::2]) * inverse[:, None]
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points seen at image points, at known altitudes (the inverse of `project`).
 
-        Newton's method on (lon, lat) with the analytic derivative, started at the RPC's centre; points
-        that do not settle are tried again with damped steps.
+        A cubic inverse, fitted once per RPC, and one Newton step; more, and damped, where that is not
+        proven to be enough. No point raises, and none is returned that does not project to `image`.
 
         Parameters
         ----------
@@ -265,61 +208,18 @@ class RPC:
         return out.reshape(*shape, 3)
 
     def _localize(self, image: Array, alt: Array) -> Array:
-        target = ((image - self.image_offset) / self.image_scale).T
-        state = np.zeros((3, len(image)))
-        state[2] = (alt - self.ground_offset[2]) / self.ground_scale[2]
-        tolerance = _ACCURACY / np.abs(self.image_scale) + 8 * np.finfo(float).eps * np.abs(target).T
-        error = self._newton(target, state, steps=6)
-        done = np.asarray((error <= tolerance.T).all(axis=0))
-        if not done.all():
-            todo = np.flatnonzero(~done & np.isfinite(target).all(axis=0) & np.isfinite(state[2]))
-            retry = np.zeros((3, len(todo)))
-            retry[2] = (alt[todo] - self.ground_offset[2]) / self.ground_scale[2]
-            error = self._damped_newton(target[:, todo], retry, steps=60)
-            done[todo] = (error <= 4 * tolerance[todo].T).all(axis=0)
-            state[:, todo] = retry
-        ground = state.T * self.ground_scale + self.ground_offset
-        ground[:, 2] = alt
-        ground[~done] = np.nan
+        target = np.subtract(image.T, self.image_offset[:, None])
+        target /= self.image_scale[:, None]
+        z = (alt - self.ground_offset[2]) / self.ground_scale[2]
+        x, ok = self._map.solve(target, z)
+        x *= self.ground_scale[:, None]
+        if not ok.all():  # beyond half a turn the longitude would wrap; there is no latitude beyond a pole
+            ok &= (np.abs(x[0]) <= 180.0) & (np.abs(x[1] + self.ground_offset[1]) <= 90.0)
+        x += self.ground_offset[:, None]
+        ground = np.empty((len(alt), 3))
+        ground[:, :2], ground[:, 2] = x[:2].T, alt
+        ground[~ok] = np.nan
         return ground
-
-    def _newton(self, target: Array, state: Array, steps: int) -> Array:
-        """Undamped steps on `state[:2]` in place; the absolute error (2, N) that is left."""
-        for _ in range(steps):
-            value, gradient = self._quotients(state)
-            residual = target - value
-            step = _solve_2x2(gradient[:, :2], residual)
-            state[:2] += step
-            if not (np.abs(step).max(initial=0.0) > 1e-9):  # quadratic: the next step is below rounding
-                break
-        return np.abs(target - self._quotients(state)[0])
-
-    def _damped_newton(self, target: Array, state: Array, steps: int) -> Array:
-        """Newton with steps halved until the error falls, never across a pole; keeps the best point."""
-        sign = np.sign(self.coeffs[1::2, :1])
-        value, gradient = self._quotients(state)
-        error = np.linalg.norm(target - value, axis=0)
-        for _ in range(steps):
-            step = _solve_2x2(gradient[:, :2], target - value)
-            step /= np.maximum(1.0, np.abs(step).max(axis=0))  # at most one box width at a time
-            factor, improved = np.ones_like(error), np.zeros(len(error), dtype=bool)
-            for _ in range(8):
-                trial = state.copy()
-                trial[:2] += factor * step
-                denominator = self.coeffs[1::2] @ monomials(trial)
-                trial_value, trial_gradient = self._quotients(trial)
-                trial_error = np.linalg.norm(target - trial_value, axis=0)
-                better = (trial_error < error) & (denominator * sign > 0).all(axis=0) & ~improved
-                state[:, better] = trial[:, better]
-                value[:, better], gradient[..., better] = trial_value[:, better], trial_gradient[..., better]
-                error[better] = trial_error[better]
-                improved |= better
-                factor[~improved] *= 0.5
-                if improved.all():
-                    break
-            if not improved.any():
-                break
-        return np.abs(target - value)
 
     def crop(self, col: float, row: float) -> RPC:
         """The RPC of a crop whose top-left pixel is (col, row) [px] of this image: exact, no refit."""
@@ -347,8 +247,4 @@ class RPC:
         return replace(self, image_offset=offset, image_scale=self.image_scale / step)
 
 
-def _solve_2x2(matrix: Array, rhs: Array) -> Array:
-    """Solve (2, 2, N) systems with right-hand sides (2, N) by Cramer's rule."""
-    (a, b), (c, d) = matrix
-    det = a * d - b * c
-    return np.stack([(d * rhs[0] - b * rhs[1]) / det, (a * rhs[1] - c * rhs[0]) / det])
+__all__ = ["CHUNK", "MONOMIALS", "RPC", "monomials"]
