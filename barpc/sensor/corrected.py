@@ -1,7 +1,8 @@
 """P_BA: a sensor model behind a rotation and a translation about its camera centre.
 
 The paper's corrected projection, P_BA(X) = P(R (X - T - C) + C) with X in ECEF (eq. 1 of Akiki et al.
-2021, "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging").
+2021, "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging"). R may change along the
+strip, as a polynomial of the image row.
 """
 
 from __future__ import annotations
@@ -70,19 +71,31 @@ class Correction:
         [m], ECEF.
     center : (3,)
         Camera centre [m], ECEF.
+    drift : (D, 3)
+        Rotation [rad] added by the powers u, u^2, ... of the normalised image row
+        u = (row - row_offset) / row_scale, where row is the uncorrected sensor's; D = 0: none.
+    row_offset, row_scale : float
+        Row of u = 0 and rows to u = 1 [px].
     """
 
     rotation: Array
     translation: Array
     center: Array
+    drift: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    row_offset: float = 0.0
+    row_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("rotation", "translation", "center"):
+        for name in ("rotation", "translation", "center", "drift"):
             value = np.array(getattr(self, name), dtype=np.float64)
-            if value.shape != (3,) or not np.isfinite(value).all():
-                raise RpcError(f"correction {name}: expected three finite numbers, found {value.tolist()}")
+            if value.shape[-1:] != (3,) or value.ndim != 1 + (name == "drift"):
+                raise RpcError(f"correction {name}: expected three numbers, found {value.tolist()}")
+            if not np.isfinite(value).all():
+                raise RpcError(f"correction {name}: not finite ({value.tolist()})")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+        if not (np.isfinite(self.row_offset) and np.isfinite(self.row_scale) and self.row_scale != 0):
+            raise RpcError(f"correction rows: offset {self.row_offset}, scale {self.row_scale}")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Correction) and self._content() == other._content()
@@ -91,12 +104,22 @@ class Correction:
         return hash(self._content())
 
     def _content(self) -> tuple[float, ...]:
-        return (*self.rotation.tolist(), *self.translation.tolist(), *self.center.tolist())
+        fixed = (*self.rotation.tolist(), *self.translation.tolist(), *self.center.tolist())
+        return (*fixed, *self.drift.ravel().tolist(), self.row_offset, self.row_scale)
 
-    def apply(self, ecef: Array) -> Array:
-        """R (X - T - C) + C for ECEF points X (..., 3) [m]."""
+    def rotation_at(self, row: Array) -> Array:
+        """Rotation vectors (..., 3) [rad] at image rows (...) [px] of the uncorrected sensor."""
+        u = (np.asarray(row, dtype=np.float64) - self.row_offset) / self.row_scale
+        powers = u[..., None] ** np.arange(1, len(self.drift) + 1)
+        return self.rotation + powers @ self.drift
+
+    def apply(self, ecef: Array, row: Array | None = None) -> Array:
+        """R (X - T - C) + C for ECEF points X (..., 3) [m]; R at the rows (...) where there is a drift."""
         moved = np.asarray(ecef, dtype=np.float64) - (self.translation + self.center)
-        return moved @ rotation_matrix(self.rotation).T + self.center
+        if row is None:
+            return moved @ rotation_matrix(self.rotation).T + self.center
+        turned: Array = (rotation_matrix(self.rotation_at(row)) @ moved[..., None])[..., 0] + self.center
+        return turned
 
 
 @dataclass(frozen=True)
@@ -122,7 +145,8 @@ class Corrected:
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
-        return self.sensor.project(ground_from_ecef(self.correction.apply(ecef_from_ground(ground))))
+        row = self.sensor.project(ground)[..., 1] if len(self.correction.drift) else None
+        return self.sensor.project(ground_from_ecef(self.correction.apply(ecef_from_ground(ground), row)))
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
@@ -147,7 +171,13 @@ class Corrected:
             d(image)/dR [px/rad].
         by_translation : (..., 2, 3)
             d(image)/dT [px/m].
+
+        Notes
+        -----
+        The derivative by the drift of degree d is `by_rotation` times u^d.
         """
+        if len(self.correction.drift):
+            return self._project_ecef_drift(ecef)
         moved = self.correction.apply(ecef)
         ground = ground_from_ecef(moved)
         image, by_ground = self.sensor.project_jacobian(ground)
@@ -156,6 +186,26 @@ class Corrected:
         lever = skew(moved - self.correction.center)
         by_rotation = -by_moved @ lever @ rotation_left_jacobian(self.correction.rotation)
         return image, by_ecef, by_rotation, -by_ecef
+
+    def _project_ecef_drift(self, ecef: Array) -> tuple[Array, Array, Array, Array]:
+        """`project_ecef` where R depends on the row, and so on X."""
+        correction = self.correction
+        before = ground_from_ecef(ecef)
+        first, first_by_ground = self.sensor.project_jacobian(before)
+        row_by_ecef = (first_by_ground[..., 1:, :] @ ground_from_ecef_jacobian(before))[..., 0, :]
+        rotation = correction.rotation_at(first[..., 1])
+        matrix = rotation_matrix(rotation)
+        moved = correction.apply(ecef, first[..., 1])
+        ground = ground_from_ecef(moved)
+        image, by_ground = self.sensor.project_jacobian(ground)
+        by_moved = by_ground @ ground_from_ecef_jacobian(ground)
+        by_rotation = -by_moved @ skew(moved - correction.center) @ rotation_left_jacobian(rotation)
+        by_translation = -by_moved @ matrix
+        u = (first[..., 1] - correction.row_offset) / correction.row_scale
+        degree = np.arange(1, len(correction.drift) + 1)
+        rate = (degree * u[..., None] ** (degree - 1)) @ correction.drift / correction.row_scale
+        by_row = by_rotation @ rate[..., None]
+        return image, by_row * row_by_ecef[..., None, :] - by_translation, by_rotation, by_translation
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points seen at image points, at known altitudes.

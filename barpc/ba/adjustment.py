@@ -1,0 +1,140 @@
+"""The entry: tracks in, corrections out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from barpc.ba.block import Block, join
+from barpc.ba.blocks import CameraPrior, Terrain, ground_control
+from barpc.ba.cameras import Cameras
+from barpc.ba.covariance import Covariance
+from barpc.ba.gauge import gauge_report
+from barpc.ba.heights import Heights, convergence_angles
+from barpc.ba.options import AdjustOptions, prior_sigmas
+from barpc.ba.problem import Problem
+from barpc.ba.result import Adjustment
+from barpc.ba.rounds import Observations, run_rounds
+from barpc.ba.solve import State, factorize_free
+from barpc.ba.structure import make_structure
+from barpc.ba.unknowns import make_unknowns
+from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.scene import GroundPoints, Tracks, View
+
+_FIRST_STEPS = 3
+
+
+def adjust_tracks(
+    views: Sequence[View],
+    tracks: Tracks,
+    options: AdjustOptions | None = None,
+    gcps: GroundPoints | None = None,
+    dem: Terrain | None = None,
+    *,
+    centers: Array | None = None,
+) -> Adjustment:
+    """Correct the cameras of a block so that its tie points agree.
+
+    Parameters
+    ----------
+    views : sequence of View
+        N views; `Tracks.view` counts them.
+    tracks : Tracks
+        Tie points.
+    options : AdjustOptions or None
+        None: the defaults.
+    gcps : GroundPoints or None
+        Points of known position and where they are seen.
+    dem : callable or None
+        lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN outside.
+    centers : (N, 3) or None
+        Camera centres [m], ECEF; None: regressed from the sensors.
+
+    Returns
+    -------
+    Adjustment
+
+    Raises
+    ------
+    TiePointError
+        A view has too few observations.
+    DisconnectedError
+        The views fall into groups that share no tie point.
+    AdjustError
+        There is no usable solution.
+    InputError
+        Views, tracks and options contradict each other.
+    """
+    start = time.process_time()
+    options = AdjustOptions() if options is None else options
+    views = tuple(views)
+    block = join(views, tracks, gcps, options)
+    unknowns = make_unknowns(views, options.model, options.drift, centers, options.center_method)
+    sigma = prior_sigmas(views, options)
+    problem = Problem(
+        Cameras(views, unknowns),
+        make_structure(block.view, block.point, len(views), block.num_points),
+        block.xy,
+        CameraPrior(np.zeros_like(sigma), sigma),
+        np.repeat([view.name not in options.fixed for view in views], unknowns.size),
+    )
+    state, heights = _start(problem, block, options, gcps, dem)
+    heights.warn()
+    before = problem.residuals(state.params, state.points)
+    observations = Observations(heights.hold(problem, state.points), block.sigma, options.noise_floor)
+    outcome = run_rounds(problem, observations, state, options, block.use, heights.hold)
+    problem = outcome.problem
+    reduced = problem.reduce(outcome.state.params, outcome.state.points, outcome.weight)
+    covariance = Covariance(reduced, factorize_free(problem, reduced.matrix), problem.free)
+    seen = np.zeros(block.num_points, dtype=bool)
+    seen[block.point[outcome.inlier]] = True
+    gauge = gauge_report(covariance, outcome.state.points, state.points, seen)
+    return Adjustment(
+        names=tuple(view.name for view in views),
+        sensors=unknowns.corrected(outcome.state.params, views),
+        params=outcome.state.params,
+        points=np.where(seen[:, None], outcome.state.points, np.nan)[: block.num_tracks],
+        residuals_before=block.in_order(before.T)[: len(tracks)],
+        residuals=block.in_order(outcome.problem.residuals(outcome.state.params, outcome.state.points).T)[
+            : len(tracks)
+        ],
+        inlier=block.in_order(outcome.inlier)[: len(tracks)],
+        view=tracks.view,
+        noise=outcome.noise,
+        cost_history=outcome.state.history,
+        steps=len(outcome.state.history),
+        status=f"{outcome.passes} passes of cutting; {covariance.factor.method} factorisation",
+        covariance=covariance,
+        gauge=gauge,
+        held=heights.weak[: block.num_tracks],
+        left_out=block.left_out,
+        gcp_residuals=_gcp_residuals(outcome.state.points[block.num_tracks :], gcps),
+        seconds=time.process_time() - start,
+        options=options,
+    )
+
+
+def _start(
+    problem: Problem, block: Block, options: AdjustOptions, gcps: GroundPoints | None, dem: Terrain | None
+) -> tuple[State, Heights]:
+    """Points triangulated with the delivered cameras, and what holds those that the rays do not."""
+    params = np.zeros_like(problem.camera_prior.mean)
+    points = block.first_points(gcps)
+    points[~np.isfinite(points)] = 0.0
+    control = [] if gcps is None else [ground_control(gcps, block.num_tracks + np.arange(len(gcps.names)))]
+    weak = convergence_angles(problem, params, points) < np.radians(options.min_convergence)
+    heights = Heights(tuple(control), weak, np.arange(block.num_tracks), block.alt_range, options, dem)
+    weight = block.use / block.sigma
+    for _ in range(_FIRST_STEPS):
+        points = heights.hold(problem, points).triangulate(params, points, weight)
+    return State(params, points), heights
+
+
+def _gcp_residuals(points: Array, gcps: GroundPoints | None) -> Array:
+    if gcps is None:
+        return np.zeros((0, 3))
+    offset = points - ecef_from_ground(gcps.lonlatalt)
+    enu: Array = (enu_basis(gcps.lonlatalt) @ offset[..., None])[..., 0]
+    return enu

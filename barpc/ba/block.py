@@ -1,0 +1,172 @@
+"""Tracks and GCPs as one block of observations sorted by view, checked for what cannot be adjusted."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from barpc.ba.options import AdjustOptions
+from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.geodesy import Array, ecef_from_ground
+from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, connected_groups
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Observations of tracks and of GCPs together, sorted by view.
+
+    Parameters
+    ----------
+    views : tuple of View
+        N views.
+    view, point : (K,)
+        Indices; points from `num_tracks` on are GCPs.
+    xy : (2, K)
+        Observed col, row [px].
+    sigma : (K,)
+        [px], view weights applied.
+    order : (K,)
+        Row of each observation in the tracks, then in the GCPs, as given.
+    use : (K,)
+        False for observations in views that are left out.
+    num_tracks, num_points : int
+        Tracks; tracks and GCPs.
+    left_out : tuple of str
+        Views outside the largest group.
+    """
+
+    views: tuple[View, ...]
+    view: IntArray
+    point: IntArray
+    xy: Array
+    sigma: Array
+    order: IntArray
+    use: BoolArray
+    num_tracks: int
+    num_points: int
+    left_out: tuple[str, ...]
+
+    @property
+    def alt_range(self) -> tuple[float, float]:
+        """Lowest and highest altitude [m] that any view is used for."""
+        return min(v.alt_range[0] for v in self.views), max(v.alt_range[1] for v in self.views)
+
+    def in_order(self, rows: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
+        """Rows (K, ...) back in the order they were given."""
+        out = np.empty_like(rows)
+        out[self.order] = rows
+        return out
+
+    def first_points(self, gcps: GroundPoints | None) -> Array:
+        """Where each point's first observing view puts it at its middle altitude (P, 3), ECEF [m]."""
+        _, first = np.unique(self.point, return_index=True)
+        points = np.full((self.num_points, 3), np.nan)
+        bounds = np.searchsorted(self.view[np.sort(first)], np.arange(len(self.views) + 1))
+        first = np.sort(first)
+        for v, view in enumerate(self.views):
+            rows = first[bounds[v] : bounds[v + 1]]
+            if len(rows):
+                alt = np.full(len(rows), sum(view.alt_range) / 2.0)
+                points[self.point[rows]] = ecef_from_ground(view.sensor.localize(self.xy[:, rows].T, alt))
+        if gcps is not None:
+            points[self.num_tracks :] = ecef_from_ground(gcps.lonlatalt)
+        return points
+
+
+def join(views: tuple[View, ...], tracks: Tracks, gcps: GroundPoints | None, options: AdjustOptions) -> Block:
+    """The block of tracks and GCPs.
+
+    Parameters
+    ----------
+    views : tuple of View
+        N views.
+    tracks, gcps, options
+        As in `barpc.ba.adjust_tracks`.
+
+    Returns
+    -------
+    Block
+
+    Raises
+    ------
+    TiePointError, DisconnectedError, InputError
+        See `barpc.ba.adjust_tracks`.
+    """
+    names = [view.name for view in views]
+    _check_names(names, options)
+    extra_view = gcps.view if gcps is not None else np.zeros(0, dtype=np.int64)
+    view = np.concatenate([tracks.view, extra_view])
+    if len(view) and view.max() >= len(views):
+        raise InputError(f"tracks name view {view.max()}, but there are {len(views)} views")
+    point, xy, sigma = tracks.point, tracks.xy, tracks.sigma
+    if gcps is not None:
+        point = np.concatenate([point, tracks.num_points + gcps.point])
+        xy, sigma = np.concatenate([xy, gcps.xy]), np.concatenate([sigma, gcps.xy_sigma])
+    num_points = tracks.num_points + (len(gcps.names) if gcps is not None else 0)
+    if len(np.unique(point * len(views) + view)) < len(view):
+        raise InputError("tracks: a track is observed twice in one view; keep one observation or none")
+    count = np.bincount(view, minlength=len(views))
+    few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero(count < options.min_observations)]
+    if few and not options.keep_largest:
+        raise TiePointError(
+            f"too few observations in {', '.join(few)}: at least {options.min_observations} are needed; "
+            "loosen the matching or leave these views out"
+        )
+    left_out = _left_out(names, view, point, tracks.num_points, options)
+    order = np.argsort(view, kind="stable")
+    weight = np.array([options.view_weights.get(name, 1.0) for name in names])
+    use = ~np.isin(view, np.flatnonzero(np.isin(names, left_out)))
+    return Block(
+        views,
+        view[order],
+        point[order],
+        np.ascontiguousarray(xy[order].T),
+        (sigma / weight[view])[order],
+        order,
+        use[order],
+        tracks.num_points,
+        num_points,
+        left_out,
+    )
+
+
+def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
+    if len(set(names)) < len(names):
+        raise InputError("two views have the same name")
+    unknown = (set(options.fixed) | set(options.view_weights)) - set(names)
+    if unknown:
+        raise InputError(f"no view is named {', '.join(sorted(unknown))}; there are {', '.join(names[:20])}")
+
+
+def _left_out(
+    names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, options: AdjustOptions
+) -> tuple[str, ...]:
+    """Views outside the largest connected group; GCPs tie their views to each other."""
+    point = np.where(point >= num_tracks, num_tracks, point)
+    order = np.lexsort((view, point))
+    same = point[order][1:] == point[order][:-1]
+    pairs = np.unique(np.column_stack([view[order][:-1], view[order][1:]])[same], axis=0)
+    groups = connected_groups(len(names), [(int(i), int(j)) for i, j in pairs])
+    if len(groups) == 1:
+        return ()
+    named = [[names[v] for v in group] for group in groups]
+    listed = "; ".join(", ".join(group[:5]) + (", ..." if len(group) > 5 else "") for group in named[:5])
+    if not options.keep_largest:
+        raise DisconnectedError(
+            f"the views fall into {len(groups)} groups without common tie points: {listed}; add overlapping "
+            "views, loosen the matching, or keep the largest group only",
+            named,
+        )
+    rest = tuple(name for group in named[1:] for name in group)
+    message = (
+        f"{len(rest)} views are not tied to the largest group and keep their cameras: {', '.join(rest[:10])}"
+    )
+    warnings.warn(message, BarpcWarning, stacklevel=4)
+    return rest

@@ -1,0 +1,141 @@
+"""What the observations cannot tell: the scene's shift, tilt and turn, and the weakest modes.
+
+A change of the camera unknowns moves the points by dX = -V^-1 W^T dp. The mean of that move and its
+best-fitting tilts, turn and scale are linear in dp: seven numbers with a covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barpc.ba.covariance import Covariance
+from barpc.ba.normal import solve_lower
+from barpc.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.scene import BoolArray
+
+MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale")
+"""The scene's motions [m]: shift; rise towards the east and the north, turn and scale, at the scene's edge."""
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A way in which the scene may move as a whole, independent of the other modes.
+
+    Parameters
+    ----------
+    sigma : float
+        Posterior standard deviation [m].
+    motion : (7,)
+        The move of one standard deviation in terms of `MOTIONS` [m].
+    meaning : str
+        Its largest motion.
+    """
+
+    sigma: float
+    motion: Array
+    meaning: str
+
+
+@dataclass(frozen=True)
+class GaugeReport:
+    """How the adjustment moved the scene, and how well that is known.
+
+    Parameters
+    ----------
+    shift : (3,)
+        Mean move of the points from their place under the delivered cameras, east, north, up [m].
+    sigma : (3,)
+        Posterior standard deviation of the scene's place, east, north, up [m].
+    motion_sigma : (7,)
+        The same for all `MOTIONS` [m].
+    modes : tuple of Mode
+        The weakest first.
+    radius : float
+        RMS distance of the points from their middle [m]: where tilts, turn and scale are measured.
+    """
+
+    shift: Array
+    sigma: Array
+    motion_sigma: Array
+    modes: tuple[Mode, ...]
+    radius: float
+
+
+def gauge_report(covariance: Covariance, points: Array, before: Array, use: BoolArray) -> GaugeReport:
+    """The report for an adjustment.
+
+    Parameters
+    ----------
+    covariance : Covariance
+        Of the adjustment.
+    points, before : (P, 3)
+        ECEF [m], after and before.
+    use : (P,)
+        Points that count.
+
+    Returns
+    -------
+    GaugeReport
+    """
+    middle = points[use].mean(axis=0)
+    enu = enu_basis(ground_from_ecef(middle))
+    local = (points[use] - middle) @ enu.T
+    radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
+    by_unknown = _motion_by_unknowns(covariance, local / radius, enu, use)
+    motion_covariance = by_unknown @ covariance.solve(by_unknown.T)
+    sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
+    shift = ((points[use] - before[use]) @ enu.T).mean(axis=0)
+    return GaugeReport(shift, sigma[:3], sigma, _modes(motion_covariance), radius)
+
+
+def _motion_by_unknowns(covariance: Covariance, local: Array, enu: Array, use: BoolArray) -> Array:
+    """(7, N q): the scene's motions by the camera unknowns, points at their optimum."""
+    reduced = covariance.reduced
+    structure = reduced.structure
+    pick = _motion_of_points(local) @ enu  # (7, n, 3) by ECEF moves
+    weights = np.zeros((len(use), 3, len(MOTIONS)))
+    weights[use] = np.moveaxis(pick, 0, -1)
+    lower = reduced.lower
+    whitened = np.empty_like(weights)  # L^-1 applied to each column: dX = -L^-T Y dp
+    for m in range(len(MOTIONS)):
+        whitened[..., m] = solve_lower(lower, weights[..., m].T).T
+    rows = np.einsum("kjq,kjm->mqk", reduced.cross, whitened[structure.point])
+    q = reduced.cross.shape[2]
+    summed = structure.sum_views(-rows.reshape(len(MOTIONS) * q, -1)).reshape(-1, len(MOTIONS), q)
+    return np.moveaxis(summed, 1, 0).reshape(len(MOTIONS), -1)
+
+
+def _motion_of_points(local: Array) -> Array:
+    """(7, n, 3): least-squares motions by the moves (east, north, up) of points at `local` (n, 3) radii."""
+    n = len(local)
+    e, o, u = local[:, 0], local[:, 1], np.zeros(n)
+    one, zero = np.ones(n), np.zeros(n)
+    design = np.stack(
+        [
+            np.column_stack([one, zero, zero]),
+            np.column_stack([zero, one, zero]),
+            np.column_stack([zero, zero, one]),
+            np.column_stack([zero, zero, e]),
+            np.column_stack([zero, zero, o]),
+            np.column_stack([-o, e, zero]),
+            np.column_stack([e, o, u]),
+        ]
+    )
+    flat = design.reshape(len(MOTIONS), -1)
+    gram = flat @ flat.T + 1e-9 * n * np.eye(len(MOTIONS))
+    solved: Array = np.linalg.solve(gram, flat).reshape(len(MOTIONS), n, 3)
+    return solved
+
+
+def _modes(motion_covariance: Array) -> tuple[Mode, ...]:
+    """Principal axes of the motions' covariance, the weakest first."""
+    values, vectors = np.linalg.eigh(motion_covariance)
+    modes = []
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        motion = vector * np.sqrt(max(value, 0.0))
+        largest = int(np.abs(motion).argmax())
+        motion = motion * (np.sign(motion[largest]) or 1.0)
+        modes.append(Mode(float(np.linalg.norm(motion)), motion, MOTIONS[largest]))
+    return tuple(modes)

@@ -1,0 +1,94 @@
+"""Tracks that the rays alone do not fix in height: which they are, and what holds them."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from barpc.ba.blocks import PointPrior, Terrain, flat_heights, join_point_priors, terrain_heights
+from barpc.ba.options import AdjustOptions
+from barpc.ba.problem import Problem
+from barpc.errors import BarpcWarning
+from barpc.geodesy import Array, ground_from_ecef
+from barpc.scene import BoolArray, IntArray
+
+_FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
+
+
+def convergence_angles(problem: Problem, params: Array, points: Array) -> Array:
+    """Largest angle (P,) [rad] between a point's rays and their mean, doubled: the angle of two rays."""
+    structure = problem.structure
+    by_point = problem.cameras.project(params, points.T[:, structure.point], structure.bounds, False).by_point
+    ray = np.cross(by_point[0], by_point[1], axis=0)
+    up = points.T[:, structure.point]
+    with np.errstate(all="ignore"):
+        ray *= np.sign((ray * up).sum(axis=0)) / np.linalg.norm(ray, axis=0)
+    ray = np.nan_to_num(ray)
+    mean = structure.sum_points(ray.T)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+    apart = np.linalg.norm(ray.T - mean[structure.point], axis=1)
+    largest = np.zeros(structure.num_points)
+    np.maximum.at(largest, structure.point, apart)
+    angle: Array = 4.0 * np.arcsin(np.minimum(0.5 * largest, 1.0))
+    return angle
+
+
+@dataclass(frozen=True)
+class Heights:
+    """The priors on points: GCPs, and heights for tracks that need (or are given) them.
+
+    Parameters
+    ----------
+    control : tuple of PointPrior
+        GCPs.
+    weak : (P,)
+        Points whose rays meet under too small an angle.
+    tracks : (T,)
+        Points that are tracks (GCPs are held already).
+    alt_range : tuple of float
+        Altitudes [m] to expect where no other track tells.
+    options : AdjustOptions
+        `dem_sigma`, `dem_for_all`.
+    dem : Terrain or None
+        None: weak tracks are held to the altitude of the others, within their spread.
+    """
+
+    control: tuple[PointPrior, ...]
+    weak: BoolArray
+    tracks: IntArray
+    alt_range: tuple[float, float]
+    options: AdjustOptions
+    dem: Terrain | None
+
+    def hold(self, problem: Problem, points: Array) -> Problem:
+        """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
+        held = self._held(points)
+        return problem.with_point_prior(join_point_priors([*self.control, *([] if held is None else [held])]))
+
+    def _held(self, points: Array) -> PointPrior | None:
+        dem, options = self.dem, self.options
+        weak = self.weak[self.tracks]
+        index = self.tracks if dem is not None and options.dem_for_all else self.tracks[weak]
+        if not len(index):
+            return None
+        if dem is not None:
+            return terrain_heights(points, index, dem, options.dem_sigma)
+        others = self.tracks[~weak]
+        if len(others) >= 10:
+            low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
+            return flat_heights(points, index, float(middle), max(float(high - low), _FLAT_SIGMA))
+        low, high = self.alt_range
+        return flat_heights(points, index, 0.5 * (low + high), max(0.5 * (high - low), _FLAT_SIGMA))
+
+    def warn(self) -> None:
+        """Say that tracks are held in height without a DEM."""
+        count = int(self.weak[self.tracks].sum())
+        if count and self.dem is None:
+            warnings.warn(
+                f"{count} of {len(self.tracks)} tracks are seen under less than "
+                f"{self.options.min_convergence:g} deg: without a DEM they are held in height and tell the cameras' relative heights nothing",
+                BarpcWarning,
+                stacklevel=4,
+            )

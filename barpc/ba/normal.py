@@ -1,0 +1,219 @@
+"""The reduced normal equations: points eliminated (Schur complement), cameras left.
+
+With whitened derivatives A_k by the point and B_k by the view's unknowns, V_p = sum A^T A = L L^T and
+Y_k = L^-1 A_k^T B_k, the camera matrix is S = diag(sum B^T B) - sum_p Y^T Y and its gradient
+g = sum B^T r - sum Y^T h, where h_p = L^-1 sum A^T r.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from barpc.ba.linear import Matrix
+from barpc.ba.structure import Structure
+from barpc.geodesy import Array
+
+CHUNK = 65536
+"""Pairs of observations multiplied at a time."""
+
+DENSE_UNKNOWNS = 900
+"""Up to so many camera unknowns the reduced matrix is a plain array."""
+
+TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
+"""Order of the elements of symmetric 3x3 matrices."""
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """The linearised problem with its points eliminated.
+
+    Parameters
+    ----------
+    matrix : (N q, N q) array or sparse
+        S.
+    gradient : (N q,)
+        g: derivative of half the cost by the camera unknowns, points at their (linear) optimum.
+    cost : float
+        Sum of squared whitened residuals.
+    gain : float
+        What moving the points alone would take off the cost: sum |h|^2.
+    lower : (6, P)
+        L: its elements 00, 10, 20, 11, 21, 22.
+    half : (P, 3)
+        h.
+    cross : (K, 3, q)
+        Y.
+    """
+
+    structure: Structure
+    matrix: Matrix
+    gradient: Array
+    cost: float
+    gain: float
+    lower: Array
+    half: Array
+    cross: Array
+
+    def point_step(self, step: Array) -> Array:
+        """The move of the points (P, 3) [m] that goes with a step (N, q) of the camera unknowns."""
+        moved = np.einsum("kjq,kq->kj", self.cross, step[self.structure.view])
+        return -solve_transposed(self.lower, (self.half + self.structure.sum_points(moved)).T).T
+
+
+def reduce_normal(
+    structure: Structure,
+    residual: Array,
+    by_point: Array,
+    by_unknown: Array,
+    point_matrix: Array,
+    point_gradient: Array,
+    camera_diagonal: Array,
+    camera_gradient: Array,
+) -> Reduced:
+    """Eliminate the points of a linearised problem.
+
+    Parameters
+    ----------
+    structure : Structure
+        Who sees what.
+    residual : (2, K)
+        Whitened residuals.
+    by_point, by_unknown : (2, 3, K), (2, q, K)
+        Their derivatives.
+    point_matrix, point_gradient : (6, P), (3, P)
+        What priors add to V (elements as in `Reduced.lower`) and to the points' gradient.
+    camera_diagonal, camera_gradient : (N, q)
+        What priors add to the diagonal of S and to g.
+
+    Returns
+    -------
+    Reduced
+        `cost` without the priors' part.
+    """
+    q = by_unknown.shape[1]
+    sums = structure.sum_points(point_products(by_point, residual)).T
+    lower = cholesky3(sums[:6] + point_matrix)
+    half = solve_lower(lower, sums[6:] + point_gradient)
+    whitened = _whiten(by_point, lower, structure)  # (2, 3, K): A L^-T
+    cross = np.empty((residual.shape[1], 3, q))
+    for j in range(3):
+        for a in range(q):
+            cross[:, j, a] = (by_unknown[:, a] * whitened[:, j]).sum(axis=0)
+    gradient = structure.sum_views((by_unknown * residual[:, None]).sum(axis=0))
+    pulled = np.einsum("kja,jk->ak", cross, half[:, structure.point])
+    gradient += camera_gradient - structure.sum_views(pulled)
+    diagonal = _diagonal_blocks(structure, by_unknown, cross)
+    diagonal[:, np.arange(q), np.arange(q)] += camera_diagonal
+    matrix = _assemble(structure, diagonal, _pair_blocks(structure, cross))
+    return Reduced(
+        structure,
+        matrix,
+        gradient.ravel(),
+        float((residual**2).sum()),
+        float((half**2).sum()),
+        lower,
+        half.T,
+        cross,
+    )
+
+
+def point_products(by_point: Array, residual: Array) -> Array:
+    """(K, 9): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
+    products = np.empty((residual.shape[1], 9))
+    for n, (i, j) in enumerate(TRIANGLE):
+        products[:, n] = by_point[0, i] * by_point[0, j] + by_point[1, i] * by_point[1, j]
+    for i in range(3):
+        products[:, 6 + i] = by_point[0, i] * residual[0] + by_point[1, i] * residual[1]
+    return products
+
+
+def cholesky3(matrix: Array) -> Array:
+    """Lower Cholesky factors (6, P) of symmetric 3x3 matrices, elements 00, 10, 20, 11, 21, 22.
+
+    A direction without information gets a factor of one metre's worth, so that it does not move.
+    """
+    a, b, c, d, e, f = matrix
+    tiny = 1e-12 * np.maximum(a + d + f, 1e-12)
+    l00 = np.sqrt(np.where(a > tiny, a, 1.0))
+    l10, l20 = b / l00, c / l00
+    rest = d - l10 * l10
+    l11 = np.sqrt(np.where(rest > tiny, rest, 1.0))
+    l21 = (e - l20 * l10) / l11
+    rest = f - l20 * l20 - l21 * l21
+    l22 = np.sqrt(np.where(rest > tiny, rest, 1.0))
+    return np.stack([l00, l10, l20, l11, l21, l22])
+
+
+def solve_lower(lower: Array, rhs: Array) -> Array:
+    """L^-1 b for factors (6, P) and right-hand sides (3, P)."""
+    l00, l10, l20, l11, l21, l22 = lower
+    x = rhs[0] / l00
+    y = (rhs[1] - l10 * x) / l11
+    return np.stack([x, y, (rhs[2] - l20 * x - l21 * y) / l22])
+
+
+def solve_transposed(lower: Array, rhs: Array) -> Array:
+    """L^-T b for factors (6, P) and right-hand sides (3, P)."""
+    l00, l10, l20, l11, l21, l22 = lower
+    z = rhs[2] / l22
+    y = (rhs[1] - l21 * z) / l11
+    return np.stack([(rhs[0] - l10 * y - l20 * z) / l00, y, z])
+
+
+def _whiten(by_point: Array, lower: Array, structure: Structure) -> Array:
+    """A L^-T, (2, 3, K)."""
+    l00, l10, l20, l11, l21, l22 = lower[:, structure.point]
+    out = np.empty_like(by_point)
+    np.divide(by_point[:, 0], l00, out=out[:, 0])
+    np.divide(by_point[:, 1] - l10 * out[:, 0], l11, out=out[:, 1])
+    np.divide(by_point[:, 2] - l20 * out[:, 0] - l21 * out[:, 1], l22, out=out[:, 2])
+    return out
+
+
+def _diagonal_blocks(structure: Structure, by_unknown: Array, cross: Array) -> Array:
+    """(N, q, q): sum B^T B - sum Y^T Y of every view."""
+    q = cross.shape[2]
+    out = np.empty((structure.num_views, q, q))
+    for v, (start, stop) in enumerate(zip(structure.bounds[:-1], structure.bounds[1:], strict=True)):
+        rows = np.moveaxis(by_unknown[..., start:stop], 1, 0).reshape(q, -1)
+        pulled = cross[start:stop].reshape(-1, q)
+        np.subtract(rows @ rows.T, pulled.T @ pulled, out=out[v])
+    return out
+
+
+def _pair_blocks(structure: Structure, cross: Array) -> Array:
+    """(M, q, q): -sum Y_i^T Y_j of every pair of views."""
+    q = cross.shape[2]
+    bounds = structure.pair_bounds
+    out = np.empty((len(bounds) - 1, q, q))
+    m = 0
+    while m < len(out):  # as many whole view pairs as fit the chunk, at least one
+        stop = max(m + 1, int(np.searchsorted(bounds, bounds[m] + CHUNK, side="right")) - 1)
+        base = bounds[m]
+        first = cross[structure.first[base : bounds[stop]]].reshape(-1, q)
+        second = cross[structure.second[base : bounds[stop]]].reshape(-1, q)
+        for n in range(m, stop):
+            part = slice(3 * (bounds[n] - base), 3 * (bounds[n + 1] - base))
+            np.matmul(-first[part].T, second[part], out=out[n])
+        m = stop
+    return out
+
+
+def _assemble(structure: Structure, diagonal: Array, pairs: Array) -> Matrix:
+    n, q, _ = diagonal.shape
+    i, j = structure.pair_view.T
+    if n * q <= DENSE_UNKNOWNS:
+        dense = np.zeros((n, q, n, q))
+        dense[np.arange(n), :, np.arange(n), :] = diagonal
+        dense[i, :, j, :] = pairs
+        dense[j, :, i, :] = pairs.transpose(0, 2, 1)
+        return dense.reshape(n * q, n * q)
+    row = np.concatenate([np.arange(n), i, j])
+    col = np.concatenate([np.arange(n), j, i])
+    order = np.lexsort((col, row))
+    data = np.concatenate([diagonal, pairs, pairs.transpose(0, 2, 1)])[order]
+    indptr = np.searchsorted(row[order], np.arange(n + 1))
+    return sp.bsr_array((data, col[order], indptr), shape=(n * q, n * q))

@@ -1,0 +1,156 @@
+"""The adjustment as a problem: observations and priors linearised together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+
+from barpc.ba.blocks import CameraPrior, JointPrior, PointPrior
+from barpc.ba.cameras import Cameras
+from barpc.ba.normal import (
+    TRIANGLE,
+    Reduced,
+    cholesky3,
+    point_products,
+    reduce_normal,
+    solve_lower,
+    solve_transposed,
+)
+from barpc.ba.structure import Structure
+from barpc.geodesy import Array
+from barpc.scene import BoolArray
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Observations sorted by view, cameras, priors.
+
+    Parameters
+    ----------
+    cameras : Cameras
+        N views with q unknowns each.
+    structure : Structure
+        Who sees what.
+    xy : (2, K)
+        Observed col, row [px].
+    camera_prior : CameraPrior
+        On every view's unknowns.
+    joint_prior : JointPrior or None
+        On several views together.
+    point_prior : PointPrior or None
+        GCPs and heights.
+    free : (N q,)
+        False for the unknowns of fixed views.
+    """
+
+    cameras: Cameras
+    structure: Structure
+    xy: Array
+    camera_prior: CameraPrior
+    free: BoolArray
+    joint_prior: JointPrior | None = None
+    point_prior: PointPrior | None = None
+
+    def with_point_prior(self, prior: PointPrior | None) -> Problem:
+        """The same problem with other priors on its points."""
+        return replace(self, point_prior=prior)
+
+    def residuals(self, params: Array, points: Array) -> Array:
+        """Projected - observed (2, K) [px], sorted by view."""
+        structure = self.structure
+        ecef = points.T[:, structure.point]
+        return self.cameras.project(params, ecef, structure.bounds).image - self.xy
+
+    def prior_cost(self, params: Array, points: Array) -> float:
+        """Sum of the squared residuals of all priors."""
+        cost = float((self.camera_prior.residual(params) ** 2).sum())
+        if self.joint_prior is not None:
+            cost += float((self.joint_prior.residual(params) ** 2).sum())
+        if self.point_prior is not None:
+            cost += float((self.point_prior.residual(points) ** 2).sum())
+        return cost
+
+    def cost(self, params: Array, points: Array, weight: Array) -> float:
+        """The whole sum of squares."""
+        residual = self.residuals(params, points) * weight
+        return float((residual**2).sum()) + self.prior_cost(params, points)
+
+    def reduce(self, params: Array, points: Array, weight: Array) -> Reduced:
+        """Linearise at a state and eliminate the points.
+
+        Parameters
+        ----------
+        params : (N, q)
+            Unknowns of the views.
+        points : (P, 3)
+            ECEF [m].
+        weight : (K,)
+            1 / sigma of every observation [1/px], 0 for one that does not count.
+
+        Returns
+        -------
+        Reduced
+        """
+        structure = self.structure
+        projected = self.cameras.project(params, points.T[:, structure.point], structure.bounds)
+        residual = (projected.image - self.xy) * weight
+        by_point, by_unknown = projected.by_point, projected.by_unknown
+        by_point *= weight
+        by_unknown *= weight
+        jacobian = self.camera_prior.jacobian()
+        reduced = reduce_normal(
+            structure,
+            residual,
+            by_point,
+            by_unknown,
+            *self._point_terms(points),
+            jacobian**2,
+            jacobian * self.camera_prior.residual(params),
+        )
+        reduced = replace(reduced, cost=reduced.cost + self.prior_cost(params, points))
+        return self._add_joint(reduced, params)
+
+    def triangulate(self, params: Array, points: Array, weight: Array) -> Array:
+        """One Gauss-Newton step of all points (P, 3) [m] with the cameras held."""
+        structure = self.structure
+        projected = self.cameras.project(params, points.T[:, structure.point], structure.bounds, False)
+        residual = (projected.image - self.xy) * weight
+        matrix, gradient = self._point_terms(points)
+        by_point = projected.by_point
+        by_point *= weight
+        sums = structure.sum_points(point_products(by_point, residual)).T
+        lower = cholesky3(sums[:6] + matrix)
+        step = solve_transposed(lower, solve_lower(lower, sums[6:] + gradient))
+        return points - step.T
+
+    def _point_terms(self, points: Array) -> tuple[Array, Array]:
+        """What the priors add to the points' normal matrices (6, P) and gradients (3, P)."""
+        matrix, gradient = np.zeros((6, len(points))), np.zeros((3, len(points)))
+        prior = self.point_prior
+        if prior is not None:
+            rows = prior.jacobian()
+            information = rows.transpose(0, 2, 1) @ rows
+            for n, (i, j) in enumerate(TRIANGLE):
+                matrix[n, prior.index] = information[:, i, j]
+            gradient[:, prior.index] = np.einsum("qij,qi->jq", rows, prior.residual(points))
+        return matrix, gradient
+
+    def _add_joint(self, reduced: Reduced, params: Array) -> Reduced:
+        prior = self.joint_prior
+        if prior is None:
+            return reduced
+        root = prior.jacobian()
+        gradient = reduced.gradient.copy()
+        gradient[prior.index] += root.T @ prior.residual(params)
+        matrix = reduced.matrix
+        information = root.T @ root
+        if isinstance(matrix, np.ndarray):
+            matrix = matrix.copy()
+            matrix[np.ix_(prior.index, prior.index)] += information
+        else:
+            row, col = np.meshgrid(prior.index, prior.index, indexing="ij")
+            extra = sp.coo_array((information.ravel(), (row.ravel(), col.ravel())), shape=matrix.shape)
+            return replace(reduced, matrix=sp.csr_array(matrix) + sp.csr_array(extra), gradient=gradient)
+        return replace(reduced, matrix=matrix, gradient=gradient)

@@ -1,0 +1,108 @@
+"""What an adjustment hands back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from barpc.ba.covariance import Covariance
+from barpc.ba.gauge import GaugeReport
+from barpc.ba.options import AdjustOptions
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.imagespace import ImageAffine, ImageCorrected
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """Corrections of a block of views, and how far they can be trusted.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Views, as given.
+    sensors : tuple of SensorModel
+        P_BA of every view: the delivered sensor behind its correction.
+    params : (N, q)
+        The unknowns in metres (or px for image models), see `barpc.ba.unknowns`.
+    points : (P, 3)
+        Tracks, ECEF [m]; NaN for a track that was cut altogether.
+    residuals_before, residuals : (K, 2)
+        Projected - observed [px], in the order of the tracks given; before: delivered cameras, points
+        triangulated with them.
+    inlier : (K,)
+        Observations that were kept.
+    noise : float
+        Observed over stated standard deviation of the observations.
+    cost_history : tuple of float
+        Sum of squared whitened residuals at each linearisation.
+    steps : int
+        Linearisations in all.
+    status : str
+        One line: what the solver did.
+    covariance : Covariance
+        Of the corrections, of points, of relative heights.
+    gauge : GaugeReport
+        Shift of the scene, what it is known to, the weakest modes.
+    held : (P,)
+        Tracks held in height because their rays meet under too small an angle.
+    left_out : tuple of str
+        Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
+    gcp_residuals : (G, 3)
+        East, north, up [m] of the adjusted GCPs minus their given place.
+    seconds : float
+        CPU time.
+    options : AdjustOptions
+        As given.
+    """
+
+    names: tuple[str, ...]
+    sensors: tuple[SensorModel, ...]
+    params: Array
+    points: Array
+    residuals_before: Array
+    residuals: Array
+    inlier: BoolArray
+    view: IntArray
+    noise: float
+    cost_history: tuple[float, ...]
+    steps: int
+    status: str
+    covariance: Covariance
+    gauge: GaugeReport
+    held: BoolArray
+    left_out: tuple[str, ...]
+    gcp_residuals: Array
+    seconds: float
+    options: AdjustOptions = field(repr=False)
+
+    @property
+    def corrections(self) -> tuple[Correction | ImageAffine, ...]:
+        """The correction of every view."""
+        found = []
+        for sensor in self.sensors:
+            assert isinstance(sensor, Corrected | ImageCorrected)
+            found.append(sensor.correction)
+        return tuple(found)
+
+    @property
+    def scene_shift(self) -> Array:
+        """Mean move of the points, east, north, up (3,) [m]."""
+        return self.gauge.shift
+
+    @property
+    def observations(self) -> IntArray:
+        """Observations kept, of every view (N,)."""
+        return np.bincount(self.view[self.inlier], minlength=len(self.names))
+
+    def rmse(self, before: bool = False) -> Array:
+        """Root mean square reprojection error (N,) [px] of every view's kept observations."""
+        residual = self.residuals_before if before else self.residuals
+        square = (residual[self.inlier] ** 2).sum(axis=1)
+        total = np.bincount(self.view[self.inlier], square, len(self.names))
+        with np.errstate(invalid="ignore"):
+            rmse: Array = np.sqrt(total / self.observations)
+        return rmse

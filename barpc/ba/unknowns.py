@@ -1,0 +1,210 @@
+"""The unknowns of a view: a row of numbers in metres (or pixels), and the correction that it stands for.
+
+Geometric models count a rotation in metres on the ground (angle x distance of the scene), so that every
+unknown moves the image by about one pixel a pixel's size. Image models count pixels at the image's edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from barpc.geodesy import Array, ecef_from_ground
+from barpc.scene import IntArray, View
+from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.geometry import camera_center
+from barpc.sensor.imagespace import ImageAffine, ImageCorrected
+
+_IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
+"""Image models: which of the terms 1, col, row each coordinate's correction has."""
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Layout of the unknowns of N views.
+
+    Parameters
+    ----------
+    model : str
+        A name of `barpc.ba.options.MODELS`.
+    drift : int
+        Degree of the rotation in the image row.
+    center : (N, 3)
+        Camera centres [m], ECEF.
+    distance : (N,)
+        From the centre to the scene [m]: a rotation unknown is angle x distance.
+    col_offset, col_scale, row_offset, row_scale : (N,)
+        Middle and half width or height of every image [px].
+    """
+
+    model: str
+    drift: int
+    center: Array
+    distance: Array
+    col_offset: Array
+    col_scale: Array
+    row_offset: Array
+    row_scale: Array
+
+    @property
+    def geometric(self) -> bool:
+        """Whether the unknowns act in space (else in the image)."""
+        return self.model not in _IMAGE_TERMS
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns q of a view."""
+        if not self.geometric:
+            return 2 * len(_IMAGE_TERMS[self.model])
+        return 3 * (self.rotates + self.translates + self.drift)
+
+    @property
+    def rotates(self) -> bool:
+        """Whether there is a rotation."""
+        return "rotation" in self.model
+
+    @property
+    def translates(self) -> bool:
+        """Whether there is a translation."""
+        return "translation" in self.model
+
+    def rotation(self, params: Array) -> Array:
+        """Rotation vectors (N, 3) [rad] at the middle row."""
+        if not self.rotates:
+            return np.zeros((len(params), 3))
+        rotation: Array = params[:, :3] / self.distance[:, None]
+        return rotation
+
+    def translation(self, params: Array) -> Array:
+        """Translations (N, 3) [m]."""
+        if not self.translates:
+            return np.zeros((len(params), 3))
+        start = 3 * self.rotates
+        return params[:, start : start + 3]
+
+    def drift_vectors(self, params: Array) -> Array:
+        """Rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
+        start = 3 * (self.rotates + self.translates)
+        vectors: Array = params[:, start:].reshape(len(params), self.drift, 3) / self.distance[:, None, None]
+        return vectors
+
+    def normalized_row(self, row: Array, index: IntArray) -> Array:
+        """Row [px] -> -1 at the top, 1 at the bottom of its image."""
+        normalized: Array = (row - self.row_offset[index]) / self.row_scale[index]
+        return normalized
+
+    def drift_rotation(self, params: Array, index: IntArray, row: Array) -> Array:
+        """Rotation (n, 3) [rad] that the drift adds at normalised rows (n,)."""
+        powers = row[:, None] ** np.arange(1, self.drift + 1)
+        return np.einsum("nd,ndi->ni", powers, self.drift_vectors(params)[index])
+
+    def drift_rate(self, params: Array, index: IntArray, row: Array) -> Array:
+        """d(rotation) / d(normalised row), (3, n) [rad]."""
+        degree = np.arange(1, self.drift + 1)
+        powers = degree * row[:, None] ** (degree - 1)
+        return np.einsum("nd,ndi->in", powers, self.drift_vectors(params)[index])
+
+    def stack(self, by_rotation: Array, by_translation: Array, index: IntArray, row: Array | None) -> Array:
+        """Derivatives (2, 3, n) by rotation [px/rad] and translation as derivatives (2, q, n) by unknowns."""
+        parts = []
+        by_metre = by_rotation / self.distance[index] if self.rotates else by_rotation
+        if self.rotates:
+            parts.append(by_metre)
+        if self.translates:
+            parts.append(by_translation)
+        if row is not None:
+            parts += [by_metre * row**power for power in range(1, self.drift + 1)]
+        return np.concatenate(parts, axis=1)
+
+    def in_image(
+        self, params: Array, local: IntArray, index: IntArray, image: Array, by_point: Array
+    ) -> tuple[Array, Array, Array]:
+        """Image models: corrected image points (2, n), and the derivatives by point and by unknown."""
+        scale = np.array([self.col_scale[index], self.row_scale[index]])
+        offset = np.array([self.col_offset[index], self.row_offset[index]])
+        basis = np.vstack([np.ones((1, image.shape[1])), (image - offset) / scale])
+        chosen = list(_IMAGE_TERMS[self.model])
+        m = len(chosen)
+        coefficients = np.zeros((2, 3, image.shape[1]))
+        coefficients[:, chosen] = np.moveaxis(params.reshape(-1, 2, m)[local], 0, -1)
+        moved = image + (coefficients * basis).sum(axis=1)
+        slope = coefficients[:, 1:] / scale
+        by_moved = by_point + slope[:, 0, None] * by_point[0] + slope[:, 1, None] * by_point[1]
+        by_unknown = np.zeros((2, 2 * m, image.shape[1]))
+        by_unknown[0, :m] = by_unknown[1, m:] = basis[chosen]
+        return moved, by_moved, by_unknown
+
+    def corrected(self, params: Array, views: Sequence[View]) -> tuple[SensorModel, ...]:
+        """Every view's sensor behind the correction that its unknowns (N, q) stand for."""
+        if not self.geometric:
+            return tuple(
+                ImageCorrected(view.sensor, self._affine(params[i], i)) for i, view in enumerate(views)
+            )
+        rotation, translation, drift = (
+            self.rotation(params),
+            self.translation(params),
+            self.drift_vectors(params),
+        )
+        return tuple(
+            Corrected(
+                view.sensor,
+                Correction(
+                    rotation[i],
+                    translation[i],
+                    self.center[i],
+                    drift[i],
+                    float(self.row_offset[i]) if self.drift else 0.0,
+                    float(self.row_scale[i]) if self.drift else 1.0,
+                ),
+            )
+            for i, view in enumerate(views)
+        )
+
+    def _affine(self, params: Array, i: int) -> ImageAffine:
+        normalized = np.zeros((2, 3))
+        normalized[:, list(_IMAGE_TERMS[self.model])] = params.reshape(2, -1)
+        slope = normalized[:, 1:] / [self.col_scale[i], self.row_scale[i]]
+        shift = normalized[:, 0] - slope @ [self.col_offset[i], self.row_offset[i]]
+        return ImageAffine(shift, slope)
+
+
+def make_unknowns(
+    views: Sequence[View], model: str, drift: int = 0, centers: Array | None = None, method: str = "line"
+) -> Unknowns:
+    """The layout for a block of views.
+
+    Parameters
+    ----------
+    views : sequence of View
+        N views.
+    model, drift : str, int
+        As in `barpc.ba.options.AdjustOptions`.
+    centers : (N, 3) or None
+        Camera centres [m], ECEF; None: regressed from the sensors by `method`.
+    method : str
+        See `barpc.sensor.geometry.camera_center`.
+
+    Returns
+    -------
+    Unknowns
+    """
+    size = np.array([view.size for view in views], dtype=np.float64).reshape(-1, 2)
+    middle = (size - 1.0) / 2.0
+    if model in _IMAGE_TERMS:
+        centers = np.zeros((len(views), 3))
+    elif centers is None:
+        found = [camera_center(v.sensor, v.size, v.alt_range, method).ecef for v in views]  # type: ignore[arg-type]
+        centers = np.array(found).reshape(-1, 3)
+    scene = np.array([_middle_of_scene(view) for view in views]).reshape(-1, 3)
+    distance = np.linalg.norm(centers - scene, axis=1)
+    half = size / 2.0
+    return Unknowns(model, drift, centers, distance, middle[:, 0], half[:, 0], middle[:, 1], half[:, 1])
+
+
+def _middle_of_scene(view: View) -> Array:
+    alt = sum(view.alt_range) / 2.0
+    middle = (np.array(view.size) - 1.0) / 2.0
+    return ecef_from_ground(view.sensor.localize(middle, np.array(alt)))
