@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,11 +11,9 @@ from barpc.errors import FitError
 from barpc.fit.lcurve import solve_lcurve
 from barpc.fit.options import ALTITUDE_FLOOR, FitOptions, Normalization
 from barpc.fit.ridge import expected_size, noise_scaled, solution
-from barpc.fit.system import ALL, FLAT, Compressed, Problem
+from barpc.fit.system import Compressed, Problem
 from barpc.geodesy import Array
 from barpc.sensor.rpc import RPC
-
-_FLAT_SPAN = 1e-3  # metres: altitudes that are one and the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,15 +124,15 @@ def solve(
         raise FitError(
             "vendor-denominators: the model is not built on an RPC whose denominators could be kept"
         )
-    active = FLAT if np.ptp(ground[:, 2]) < _FLAT_SPAN else ALL
-    unknowns = len(active) if keeps else 2 * len(active) - 1
+    norm = normalization(ground, image, options, vendor if keeps else None)
+    everything = Problem(ground, image, norm, weight=weight)
+    problem = replace(everything, active=everything.independent())
+    unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)
     if len(ground) <= unknowns:
         raise FitError(
             f"{len(ground)} points are too few: each coordinate has {unknowns} unknowns, "
             f"give {unknowns + 1} points or more"
         )
-    norm = normalization(ground, image, options, vendor if keeps else None)
-    problem = Problem(ground, image, norm, active, weight)
     return _METHODS[method](problem, options, vendor)
 
 

@@ -11,7 +11,7 @@ triangular factor of (M | y), which is made chunk by chunk: a squared condition 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from scipy.linalg.lapack import dtpqrt
 
 from barpc.fit.options import Normalization
 from barpc.geodesy import Array, wrap_longitude
-from barpc.sensor.rpc import MONOMIALS, monomials
+from barpc.sensor.rpc import monomials
 
 IntArray = npt.NDArray[np.int64]
 
@@ -28,8 +28,7 @@ CHUNK = 512
 _BLOCK = 8  # columns of a Householder block
 
 ALL = np.arange(20)
-FLAT = np.array([i for i, monomial in enumerate(MONOMIALS) if "H" not in monomial])
-"""The monomials of points that all have one altitude."""
+_DEPENDENT = 1e-9  # rms of what a monomial adds to those of lower degree, on these points
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +93,7 @@ class Problem:
     norm : Normalization
         Offsets and scales.
     active : (m,)
-        Monomials in use; the first is the constant one.
+        Monomials in use, the constant one first.
     weight : (N,), optional
         Weights of the points.
     """
@@ -102,8 +101,17 @@ class Problem:
     ground: Array
     image: Array
     norm: Normalization
-    active: IntArray
+    active: IntArray = field(default_factory=lambda: ALL)
     weight: Array | None = None
+
+    def independent(self) -> IntArray:
+        """The monomials that these points tell from those before them, which are of lower degree.
+
+        All twenty where altitudes abound; of points at one altitude those without H, of two altitudes
+        those of degree one in H. A dependent one would make a = b = 0 a solution.
+        """
+        diagonal = np.diag(self.compressed(0, free=False).matrix)
+        return np.asarray(self.active[np.abs(diagonal) > _DEPENDENT * np.sqrt(len(self.image))])
 
     def rows(
         self, axis: int, denominator: Array | None = None, free: bool = True
