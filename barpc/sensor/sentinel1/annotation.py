@@ -164,10 +164,17 @@ class Annotation:
     pulse_interval: float
     bistatic_applied: bool
 
-    @property
-    def mid_range_time(self) -> float:
-        """Two-way slant range time of the middle sample of an SLC swath [s]."""
-        return self.slant_range_time + 0.5 * self.samples / self.range_sampling_rate
+    def line_time(self, line: Array) -> TimeArray:
+        """Annotated times (...), datetime64[ns], of lines (...) of the measurement file."""
+        start, rest = np.array([self.first_line_time]), np.asarray(line, dtype=np.float64)
+        index = np.zeros(rest.shape, dtype=np.int64)
+        if self.bursts:
+            start = np.array([b.time for b in self.bursts])
+            index = np.clip(rest // self.lines_per_burst, 0, len(start) - 1).astype(np.int64)
+            rest = rest - index * self.lines_per_burst
+        since = np.rint(rest * self.azimuth_time_interval * 1e9).astype("timedelta64[ns]")
+        times: TimeArray = start[index] + since
+        return times
 
 
 def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation:

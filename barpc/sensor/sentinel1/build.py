@@ -61,7 +61,6 @@ def from_annotation(
     orbit: Path | None = None,
     atmosphere: bool = False,
     bistatic: Bistatic | None = None,
-    reference: Path | Annotation | None = None,
 ) -> RangeDoppler:
     """The model of one SLC swath (bursts stitched, or stripmap), one burst, or a GRD.
 
@@ -78,10 +77,8 @@ def from_annotation(
         Precise orbit file (``.EOF``) to use in place of the annotated state vectors.
     atmosphere : bool
         Add the path delay of the atmosphere (see `Delays`).
-    bistatic : "swath" or "full", optional
+    bistatic : "annotated" or "full", optional
         Add a bistatic correction (see `bistatic_constant`).
-    reference : Path or Annotation, optional
-        IW2 of the same product, for ``bistatic="full"``.
 
     Returns
     -------
@@ -102,8 +99,6 @@ def from_annotation(
         The geolocation grid does not belong to the orbit; it is not used but for its range of heights.
     """
     annotation = source if isinstance(source, Annotation) else read_annotation(source)
-    if isinstance(reference, Path):
-        reference = read_annotation(reference)
     first, lines = annotation.first_line_time, annotation.lines
     if burst is not None:
         if not 0 <= burst < len(annotation.bursts):
@@ -111,7 +106,7 @@ def from_annotation(
         first, lines = annotation.bursts[burst].time, annotation.lines_per_burst
     elif annotation.bursts:
         lines = max(b.first_row for b in burst_rows(annotation)) + annotation.lines_per_burst
-    constant = None if bistatic is None else bistatic_constant(annotation, bistatic, reference)
+    constant = None if bistatic is None else bistatic_constant(annotation, bistatic)
     model = RangeDoppler(
         orbit=_orbit(annotation, orbit, first),
         epoch=first,
@@ -125,7 +120,11 @@ def from_annotation(
 
 
 def mosaic(
-    sources: Sequence[Path | Annotation], *, orbit: Path | None = None, atmosphere: bool = False
+    sources: Sequence[Path | Annotation],
+    *,
+    orbit: Path | None = None,
+    atmosphere: bool = False,
+    bistatic: Bistatic | None = None,
 ) -> RangeDoppler:
     """One model for the swaths of an SLC product, side by side.
 
@@ -140,6 +139,8 @@ def mosaic(
         Precise orbit file.
     atmosphere : bool
         Add the path delay of the atmosphere.
+    bistatic : "annotated", optional
+        Add the bistatic correction of the product; the full one jumps between swaths.
 
     Returns
     -------
@@ -148,9 +149,11 @@ def mosaic(
     Raises
     ------
     InputError
-        A GRD, or swaths that are not of one product.
+        A GRD, swaths that are not of one product, or the full bistatic correction.
     """
     swaths = [s if isinstance(s, Annotation) else read_annotation(s) for s in sources]
+    if bistatic == "full":
+        raise InputError("the full bistatic correction jumps between swaths: take one swath, or 'annotated'")
     offsets = mosaic_offsets(swaths)
     nearest = min(swaths, key=lambda a: a.slant_range_time)
     epoch = min(a.first_line_time for a in swaths)
@@ -162,7 +165,7 @@ def mosaic(
         frame=_frame(nearest, epoch),
         size=(int(size[0]), int(size[1])),
         alt_range=_alt_range(swaths),
-        delays=Delays(atmosphere),
+        delays=Delays(atmosphere, None if bistatic is None else bistatic_constant(nearest, bistatic)),
     )
     for annotation in swaths:
         _warn_of_grid(annotation, model)

@@ -13,13 +13,14 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.geodesy import Array, enu_basis
-from barpc.sensor.sentinel1.annotation import Annotation
+from barpc.sensor.sentinel1.annotation import Annotation, seconds
 from barpc.sensor.sentinel1.frames import SPEED_OF_LIGHT
 
-Bistatic = Literal["swath", "full"]
+Bistatic = Literal["annotated", "full"]
 """Which bistatic correction; see `bistatic_constant`."""
 
 _RAD = np.pi / 180.0
+_SPREAD = 1e-5  # s: what lines and azimuth times of a grid may scatter
 _ZENITH = (2.41, -1.0 / 3411.0, 1.0 / 8.55e7)  # m, per m, per m^2 of altitude
 
 
@@ -104,22 +105,23 @@ class Delays:
         return out
 
 
-def bistatic_constant(annotation: Annotation, form: Bistatic, reference: Annotation | None) -> float:
+def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
     """The constant b of the bistatic correction of azimuth time, b - tau/2.
 
-    The satellite moves while the pulse is on its way; the processor corrects that for one range only.
+    The satellite flies on while the pulse is on its way. The processor allows for that at one range, the
+    middle of the whole product (IW2, EW3), which shows in its geolocation grid: the time of a grid line
+    less the grid's azimuth time is b - tau/2 to 2 us, with b half the two-way time of that range.
 
     Parameters
     ----------
     annotation : Annotation
-        One SLC swath.
-    form : "swath" or "full"
-        "swath": zero at the middle of the swath (Schubert et al., "Sentinel-1A Product Geolocation
-        Accuracy: Commissioning Phase Results", Remote Sensing 2015): +-0.05 line. "full": with the pulses
-        on their way, about the middle of IW2 (Gisinger et al., "Recent Findings on the Sentinel-1
-        Geolocation Accuracy Using the Australian Corner Reflector Array", IGARSS 2018): to 0.24 line.
-    reference : Annotation, optional
-        IW2 (EW3) of the same product, for "full".
+        One swath, or a GRD.
+    form : "annotated" or "full"
+        "annotated": that constant, so that the model meets the lines of the product's own grid: 0.04 to
+        0.14 line in an SLC, to 0.19 in a GRD (Schubert et al., "Sentinel-1A Product Geolocation Accuracy:
+        Commissioning Phase Results", Remote Sensing 2015). "full": also the pulses on their way, rank
+        times pulse interval, for one SLC swath: to 0.26 line (Gisinger et al., "Recent Findings on the
+        Sentinel-1 Geolocation Accuracy Using the Australian Corner Reflector Array", IGARSS 2018).
 
     Returns
     -------
@@ -129,18 +131,24 @@ def bistatic_constant(annotation: Annotation, form: Bistatic, reference: Annotat
     Raises
     ------
     InputError
-        Not one SLC swath, or no reference for "full".
+        The processor did not correct the bistatic delay, the grid does not tell how, or "full" is asked
+        for a GRD.
     """
-    if annotation.product_type != "SLC" or not annotation.bistatic_applied:
+    if not annotation.bistatic_applied:
         raise InputError(
-            f"{annotation.name}: the bistatic correction is for one SLC swath that the processor corrected "
-            "at mid range; leave it out"
+            f"{annotation.name}: no bistatic correction by the processor to complete; leave it out"
         )
-    if form == "swath":
-        return 0.5 * annotation.mid_range_time
-    if reference is None:
-        raise InputError(f"{annotation.name}: the full bistatic correction needs the annotation of IW2")
-    return annotation.rank * annotation.pulse_interval - 0.5 * reference.mid_range_time
+    grid = annotation.grid
+    late = seconds(annotation.line_time(grid.image[:, 1]), annotation.first_line_time)
+    late = late - seconds(grid.time, annotation.first_line_time) + 0.5 * grid.range_time
+    constant = float(np.median(late))
+    if not np.median(np.abs(late - constant)) <= _SPREAD:
+        raise InputError(f"{annotation.name}: the geolocation grid does not tell the bistatic correction")
+    if form == "annotated":
+        return constant
+    if annotation.product_type != "SLC":
+        raise InputError(f"{annotation.name}: the full bistatic correction is of one SLC swath")
+    return annotation.rank * annotation.pulse_interval - constant
 
 
 def _zenith(alt: Array) -> tuple[Array, Array]:

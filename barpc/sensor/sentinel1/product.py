@@ -20,7 +20,6 @@ MOSAIC = "mosaic"
 
 _NAME = re.compile(r"s1[a-d]-(?P<swath>\w+)-(slc|grd)-(?P<pol>vv|hh|vh|hv)-.*\.xml", re.IGNORECASE)
 _POLARISATIONS = ("vv", "hh", "vh", "hv")
-_REFERENCE = {"IW": "iw2", "EW": "ew3"}  # mid swath, to which the processor refers
 
 
 def open_product(
@@ -49,7 +48,7 @@ def open_product(
         One burst of the swath alone, from 0.
     atmosphere : bool
         Add the path delay of the atmosphere.
-    bistatic : "swath" or "full", optional
+    bistatic : "annotated" or "full", optional
         Add a bistatic correction.
 
     Returns
@@ -69,9 +68,10 @@ def open_product(
     precise = None if orbit is None else Path(orbit)
     name = None if swath is None else swath.lower()
     if name == MOSAIC:
-        if burst is not None or bistatic is not None:
-            raise InputError(f"{path}: a burst or a bistatic correction is of one swath, not of the mosaic")
-        return mosaic([file.read() for file in found.values()], orbit=precise, atmosphere=atmosphere)
+        if burst is not None:
+            raise InputError(f"{path}: burst {burst} of the mosaic; choose one swath")
+        swaths = [file.read() for file in found.values()]
+        return mosaic(swaths, orbit=precise, atmosphere=atmosphere, bistatic=bistatic)
     if name is None and len(found) == 1:
         name = next(iter(found))
     if name not in found:
@@ -79,15 +79,7 @@ def open_product(
         choices = [*sorted(found), MOSAIC] if len(found) > 1 else sorted(found)
         raise InputError(f"{path}: {wanted}; choose one of {', '.join(choices)}")
     annotation = found[name].read()
-    middle = found.get(_REFERENCE.get(annotation.mode, ""))
-    return from_annotation(
-        annotation,
-        burst=burst,
-        orbit=precise,
-        atmosphere=atmosphere,
-        bistatic=bistatic,
-        reference=None if bistatic != "full" or middle is None else middle.read(),
-    )
+    return from_annotation(annotation, burst=burst, orbit=precise, atmosphere=atmosphere, bistatic=bistatic)
 
 
 @dataclass(frozen=True, order=True)

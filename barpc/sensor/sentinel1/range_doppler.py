@@ -80,14 +80,11 @@ class RangeDoppler(Record):
         orbit: Path | None = None,
         atmosphere: bool = False,
         bistatic: Bistatic | None = None,
-        reference: Path | Annotation | None = None,
     ) -> RangeDoppler:
         """The model of one SLC swath, one of its bursts, or a GRD; see `build.from_annotation`."""
         from barpc.sensor.sentinel1.build import from_annotation
 
-        return from_annotation(
-            source, burst=burst, orbit=orbit, atmosphere=atmosphere, bistatic=bistatic, reference=reference
-        )
+        return from_annotation(source, burst=burst, orbit=orbit, atmosphere=atmosphere, bistatic=bistatic)
 
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
         """Times at which ground points are seen: pure geometry, without `delays`.
