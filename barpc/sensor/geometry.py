@@ -210,72 +210,82 @@ def triangulate(
     num = int(point.max()) + 1 if len(point) else 0
     if not num:
         return Triangulation(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, dtype=bool))
-    rows = [(sensors[v], np.flatnonzero(view == v)) for v in np.unique(view)]
-    weight = np.ones(len(xy)) if sigma is None else 1.0 / np.asarray(sigma, dtype=np.float64)
-    ground = _first_guess(rows, point, xy, np.broadcast_to(np.asarray(alt, dtype=np.float64), num))
-    residual = np.empty((len(xy), 2))
-    jacobian = np.empty((len(xy), 2, 3))
+    order = np.argsort(view, kind="stable")  # so that the rows of a view are a slice
+    at, goal = point[order], xy[order]
+    first = np.flatnonzero(np.diff(view[order], prepend=-1))
+    rows = [
+        (sensors[view[order[i]]], slice(i, j)) for i, j in zip(first, [*first[1:], len(view)], strict=True)
+    ]
+    weight = np.ones(len(xy)) if sigma is None else 1.0 / np.asarray(sigma, dtype=np.float64)[order]
+    ground = _first_guess(rows, at, goal, np.broadcast_to(np.asarray(alt, dtype=np.float64), num))
+    jacobian, residual = np.empty((3, 2, len(xy))), np.empty((2, len(xy)))
     ok = np.ones(num, dtype=bool)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for _ in range(steps):
             scale = metres_per_unit(ground)
-            for sensor, index in rows:
-                at = point[index]
-                image, by_ground = sensor.project_jacobian(ground[at])
-                residual[index] = image - xy[index]
-                jacobian[index] = by_ground / scale[at][:, None, :]
-            step, ok = _normal_step(jacobian, residual, weight, point, num)
-            ground -= np.where(ok[:, None], step, 0.0) / scale
-            if not np.abs(step[ok]).max(initial=0.0) > 1e-4:  # metres; quadratic: the next is below 1e-9
+            for sensor, part in rows:
+                image, by_ground = sensor.project_jacobian(ground[at[part]])
+                np.multiply((image - goal[part]).T, weight[part], out=residual[:, part])
+                np.multiply(by_ground.T, weight[part], out=jacobian[:, :, part])
+            step, ok = _normal_step(jacobian, residual, at, scale.T)
+            ground -= np.where(ok, step, 0.0).T / scale
+            if not np.abs(step[:, ok]).max(initial=0.0) > 1e-3:  # metres; quadratic: the next is below 1e-9
                 break
-        for sensor, index in rows:
-            residual[index] = sensor.project(ground[point[index]]) - xy[index]
+        left = np.empty((len(xy), 2))
+        for sensor, part in rows:
+            left[order[part]] = sensor.project(ground[at[part]]) - goal[part]
     bad = np.ones(num, dtype=bool)
     bad[point] = False
-    bad[point[~np.isfinite(residual).all(axis=1)]] = True
+    bad[point[~np.isfinite(left).all(axis=1)]] = True
     ok &= ~bad
     ground[~ok] = np.nan
-    residual[~ok[point]] = np.nan
-    return Triangulation(ecef_from_ground(ground), residual, ok)
+    left[~ok[point]] = np.nan
+    return Triangulation(ecef_from_ground(ground), left, ok)
 
 
 def _first_guess(
-    rows: list[tuple[SensorModel, npt.NDArray[np.int64]]],
+    rows: list[tuple[SensorModel, slice]],
     point: npt.NDArray[np.int64],
     xy: Array,
     alt: Array,
 ) -> Array:
     """Each track localised at `alt` in one of its views."""
     ground = np.full((len(alt), 3), np.nan)
-    for sensor, index in rows:
-        new = index[np.isnan(ground[point[index], 0])]
+    for sensor, part in rows:
+        new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start
         if len(new):
             ground[point[new]] = sensor.localize(xy[new], alt[point[new]])
     return ground
 
 
 def _normal_step(
-    jacobian: Array, residual: Array, weight: Array, point: npt.NDArray[np.int64], num: int
+    jacobian: Array, residual: Array, point: npt.NDArray[np.int64], scale: Array
 ) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Gauss-Newton steps (num, 3) [m], and for which points the rays determine one."""
-    a = jacobian * weight[:, None, None]
-    r = residual * weight[:, None]
-    upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    normal = np.empty((num, 3, 3))
-    for i, j in upper:
-        value = np.bincount(point, (a[:, :, i] * a[:, :, j]).sum(axis=1), minlength=num)
-        normal[:, i, j] = normal[:, j, i] = value
-    rhs = np.stack(
-        [np.bincount(point, (a[:, :, i] * r).sum(axis=1), minlength=num) for i in range(3)], axis=1
+    """Gauss-Newton steps (3, num) [m], and for which points the rays determine one.
+
+    `jacobian` (3, 2, K) by (lon, lat, alt) and `residual` (2, K) are weighted; `scale` (3, num) holds the
+    metres of a unit of each. The 3 x 3 systems are solved by their cofactors, one vector an entry.
+    """
+    num = scale.shape[1]
+
+    def total(u: Array, v: Array) -> Array:
+        weights: Array = u[0] * v[0] + u[1] * v[1]
+        return np.asarray(np.bincount(point, weights, minlength=num), dtype=np.float64)
+
+    a, b, c = jacobian
+    (e, n, u) = scale
+    aa, bb, cc = total(a, a) / (e * e), total(b, b) / (n * n), total(c, c) / (u * u)
+    ab, ac, bc = total(a, b) / (e * n), total(a, c) / (e * u), total(b, c) / (n * u)
+    ra, rb, rc = total(a, residual) / e, total(b, residual) / n, total(c, residual) / u
+    paa, pab, pac = bb * cc - bc * bc, ac * bc - ab * cc, ab * bc - ac * bb
+    pbb, pbc, pcc = aa * cc - ac * ac, ab * ac - aa * bc, aa * bb - ab * ab
+    det = aa * paa + ab * pab + ac * pac
+    # parallel rays: the determinant against the trace; 1e-10 is 0.0006 degrees
+    ok = np.isfinite(det) & (det > 1e-10 * (aa + bb + cc) ** 3 / 27)
+    step = np.stack(
+        [paa * ra + pab * rb + pac * rc, pab * ra + pbb * rb + pbc * rc, pac * ra + pbc * rb + pcc * rc]
     )
-    # parallel rays: the smallest pivot of a Cholesky factor, against the trace; 1e-10 is 0.0006 degrees
-    trace = normal[:, 0, 0] + normal[:, 1, 1] + normal[:, 2, 2]
-    det = np.linalg.det(normal)
-    ok = np.isfinite(det) & (det > 1e-10 * trace**3 / 27)
-    step = np.zeros((num, 3))
-    if ok.any():
-        step[ok] = np.linalg.solve(normal[ok], rhs[ok][..., None])[..., 0]
-    return step, ok
+    return step / det, ok
 
 
 @dataclass(frozen=True, eq=False)

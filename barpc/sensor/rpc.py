@@ -88,8 +88,8 @@ class RPC:
 
     @property
     def _gradient(self) -> Array:
-        """(12, 10): d/d(lon, lat, alt), normalised, of the four polynomials, on the first ten monomials."""
-        return self._map.gradients.reshape(3, 4, 10).swapaxes(0, 1).reshape(12, 10)
+        """Derivatives of the four polynomials by (lon, lat, alt), normalised, on ten monomials: (12, 10)."""
+        return np.asarray(self._map.gradients.reshape(3, 4, 10).swapaxes(0, 1).reshape(12, 10))
 
     def normalize(self, ground: Array) -> Array:
         """Normalised longitude, latitude, altitude, one row each.
