@@ -20,13 +20,8 @@ from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Correction, rotation_matrix
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC
-from barpc.simulate.orbit import Look, fly
+from barpc.simulate.orbit import fly, looks
 from barpc.simulate.sites import BlockOptions, Grid, Seen
-
-PITCH = 10.0
-"""Views of one site are spread from -PITCH to +PITCH degrees of incidence along the flight."""
-ROLL = 8.0
-"""Largest incidence across the flight [deg]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,28 +160,6 @@ def simulate_block(
     )
     truth = BlockTruth(corrections, drift, ground, outlier, check_ground, check)
     return Block(views, noisy, gcps, truth)
-
-
-def looks(count: int, turn: float = 0.0) -> list[Look]:
-    """So many looks at one place: pitch spread evenly, roll by the golden section.
-
-    Parameters
-    ----------
-    count : int
-        Number of views.
-    turn : float
-        Start of the sequence of rolls, in turns.
-    """
-    flight = Look().heading
-    out = []
-    for k in range(count):
-        pitch = PITCH * (2 * k / (count - 1) - 1.0) if count > 1 else 0.0
-        roll = ROLL * (2 * ((turn + 0.5 + 0.381966 * k) % 1.0) - 1.0)
-        tangent = np.tan(np.radians([pitch, roll]))
-        incidence = float(np.degrees(np.arctan(np.hypot(*tangent))))
-        azimuth = (flight + np.degrees(np.arctan2(tangent[1], tangent[0]))) % 360.0
-        out.append(Look(incidence, float(azimuth), altitude=694e3))
-    return out
 
 
 def _cameras(grid: Grid, num_views: int, options: BlockOptions) -> tuple[tuple[View, ...], list[Array]]:

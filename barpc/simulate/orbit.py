@@ -14,6 +14,10 @@ GM = 3.986004418e14
 """Gravitational constant of the Earth (WGS84) [m^3/s^2]."""
 EARTH_RATE = 7.292115e-5
 """Rotation of the Earth (WGS84) [rad/s]."""
+PITCH = 10.0
+"""Views of one site are spread from -PITCH to +PITCH degrees of incidence along the flight."""
+ROLL = 8.0
+"""Largest incidence across the flight [deg]."""
 _DEGREE = 4  # of the polynomials of time for position and attitude
 _NODES = 9  # times at which the guided motion is sampled for them
 
@@ -42,6 +46,34 @@ class Look:
     altitude: float = 694e3
     heading: float = 192.0
     scan: float | None = None
+
+
+def looks(count: int, turn: float = 0.0, altitude: float = 694e3) -> list[Look]:
+    """So many looks at one place: pitch spread evenly, roll by the golden section.
+
+    Parameters
+    ----------
+    count : int
+        Number of views.
+    turn : float
+        Start of the sequence of rolls, in turns.
+    altitude : float
+        Of the satellites above the ellipsoid [m].
+
+    Returns
+    -------
+    looks : list of Look
+    """
+    flight = Look().heading
+    out = []
+    for k in range(count):
+        pitch = PITCH * (2 * k / (count - 1) - 1.0) if count > 1 else 0.0
+        roll = ROLL * (2 * ((turn + 0.5 + 0.381966 * k) % 1.0) - 1.0)
+        tangent = np.tan(np.radians([pitch, roll]))
+        incidence = float(np.degrees(np.arctan(np.hypot(*tangent))))
+        azimuth = (flight + np.degrees(np.arctan2(tangent[1], tangent[0]))) % 360.0
+        out.append(Look(incidence, float(azimuth), altitude))
+    return out
 
 
 def standpoint(target: Array, look: Look) -> Array:

@@ -1,0 +1,166 @@
+"""A rendered scene as files: GeoTIFFs with the delivered RPCs, truth.json, GCPs."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from barpc import __version__
+from barpc.atomic import replacing, write_text
+from barpc.errors import OutputError
+from barpc.geodesy import Array
+from barpc.rpcio.tiff import put_tag
+from barpc.scene import BoolArray
+from barpc.sensor.rpc import RPC
+from barpc.simulate.images import ImageOptions, Scene, Shot
+
+Progress = Callable[[str, int, int], None]
+
+CONVENTION = (
+    "ground = lon [deg], lat [deg], altitude above the WGS84 ellipsoid [m]; image = col, row [px], (0, 0) "
+    "the centre of the top-left pixel. exact camera(X) = delivered RPC(R (X - T - C) + C), X in ECEF [m], R "
+    "the rotation vector `rotation` [rad], T `translation` [m], C `center` [m]. `drift` [rad] is what the "
+    "delivered camera turns too far over the image's height, about its axes x (along the scan), y, z (down)."
+)
+
+
+def write_scene(
+    out: Path | str,
+    options: ImageOptions | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Render a scene into a folder.
+
+    Parameters
+    ----------
+    out : Path or str
+        Folder; made where it is missing.
+    options : ImageOptions
+        The scene.
+    overwrite : bool
+        Replace files of these names.
+    progress : callable
+        Called with ("simulate", views done, views).
+
+    Returns
+    -------
+    paths : list of Path
+        The images. Beside them stand truth.json and, where GCPs were asked for, gcps.geojson.
+
+    Raises
+    ------
+    InputError
+        Options that contradict each other.
+    OutputError
+        The folder holds something and `overwrite` was not given.
+    """
+    options = options or ImageOptions()
+    folder = Path(out)
+    if folder.exists() and not overwrite and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(f"{folder}: exists already; choose another folder or give --overwrite")
+    scene = Scene(options)
+    ground = scene.candidates(4 * (options.checks + options.gcps) + 64)
+    paths, images, in_sight = [], [], []
+    for i, shot in enumerate(scene.shots):
+        picture = scene.picture(i)
+        path = folder / f"{shot.name}.tif"
+        _write_image(path, picture.numbers, shot.delivered, overwrite)
+        image, visible = scene.shows(i, ground, picture.altitude)
+        paths.append(path)
+        images.append(image)
+        in_sight.append(visible)
+        if progress:
+            progress("simulate", i + 1, options.views)
+    xy, seen = np.array(images), np.array(in_sight)
+    good = np.flatnonzero(seen.sum(axis=0) >= min(2, options.views))
+    gcps, checks = good[: options.gcps], good[options.gcps :][: options.checks]
+    truth = _truth(scene, ground[checks], xy[:, checks], seen[:, checks])
+    write_text(folder / "truth.json", json.dumps(truth, indent=1) + "\n", overwrite=overwrite)
+    if options.gcps:
+        rng = np.random.default_rng([options.seed, 99])
+        noisy = xy[:, gcps] + rng.normal(0, options.gcp_noise, (*seen[:, gcps].shape, 2))
+        points = _gcp_collection(scene.shots, ground[gcps], noisy, seen[:, gcps])
+        write_text(folder / "gcps.geojson", json.dumps(points, indent=1) + "\n", overwrite=overwrite)
+    return paths
+
+
+def _write_image(path: Path, numbers: npt.NDArray[np.uint16], rpc: RPC, overwrite: bool) -> None:
+    """A deflated, tiled GeoTIFF with the RPC in its tag."""
+    height, width = numbers.shape
+    with replacing(path, overwrite=overwrite) as partial:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            layout: dict[str, Any] = {"tiled": True, "blockxsize": 256, "blockysize": 256}
+            packing = {"compress": "deflate", "predictor": 2, "zlevel": 9}
+            with rasterio.open(
+                partial, "w", "GTiff", width, height, 1, dtype="uint16", nodata=0, **layout, **packing
+            ) as dataset:
+                dataset.write(numbers, 1)
+        put_tag(partial, rpc)
+
+
+def _truth(scene: Scene, ground: Array, xy: Array, seen: BoolArray) -> dict[str, Any]:
+    """What truth.json holds."""
+    return {
+        "generator": f"barpc simulate {__version__}",
+        "conventions": CONVENTION,
+        "options": asdict(scene.options),
+        "alt_range": scene.alt_range,
+        "dates": [asdict(surface.date) for surface in scene.surfaces],
+        "views": [_shot_record(shot) for shot in scene.shots],
+        "check_points": [
+            {
+                "ground": point.tolist(),
+                "image": {s.name: xy[k, i].tolist() for k, s in enumerate(scene.shots) if seen[k, i]},
+            }
+            for i, point in enumerate(ground)
+        ],
+    }
+
+
+def _shot_record(shot: Shot) -> dict[str, Any]:
+    correction = shot.correction
+    return {
+        "name": shot.name,
+        "file": f"{shot.name}.tif",
+        "date": shot.date,
+        "look": asdict(shot.look),
+        "radiometry": asdict(shot.radiometry),
+        "rotation": correction.rotation.tolist(),
+        "translation": correction.translation.tolist(),
+        "center": correction.center.tolist(),
+        "drift": shot.drift.tolist(),
+        "exact_rpc": _rpc_record(shot.exact_rpc),
+    }
+
+
+def _rpc_record(rpc: RPC) -> dict[str, Any]:
+    """The constructor's arguments of an RPC."""
+    fields = ("coeffs", "ground_offset", "ground_scale", "image_offset", "image_scale")
+    return {name: getattr(rpc, name).tolist() for name in fields}
+
+
+def _gcp_collection(shots: tuple[Shot, ...], ground: Array, xy: Array, seen: BoolArray) -> dict[str, Any]:
+    """GCPs as GeoJSON, a feature an observation: `ji` is (col, row), `filename` the image."""
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"ji": xy[k, i].tolist(), "filename": f"{shot.name}.tif", "id": f"gcp_{i:03d}"},
+            "geometry": {"type": "Point", "coordinates": ground[i].tolist()},
+        }
+        for i in range(len(ground))
+        for k, shot in enumerate(shots)
+        if seen[k, i]
+    ]
+    return {"type": "FeatureCollection", "features": features}
