@@ -20,6 +20,7 @@ EXIT_INTERRUPTED = 130
 
 COMMANDS = {
     "adjust": "Correct the cameras of overlapping images and write fresh RPCs.",
+    "check": "Measure how well cameras agree, without adjusting.",
     "simulate": "Make synthetic images with known cameras and truth.",
 }
 """Verb -> its line in `barpc --help`; the code is `barpc.cli.<verb>.command`."""

@@ -71,7 +71,9 @@ def load_views(
     files = [Path(path).absolute() for path in paths]
     if len(files) < min_views:
         found = files[0] if files else "none"
-        raise InputError(f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed")
+        raise InputError(
+            f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed"
+        )
     views: list[View] = []
     sources: list[RpcSource] = []
     left_out: list[tuple[str, str]] = []

@@ -1,0 +1,168 @@
+"""Options that several verbs share: their flags, and how flags and an options file fill a RunOptions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from barpc.pipeline.options import RunOptions
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+class Flag:
+    """A flag and the field of RunOptions that it sets.
+
+    Parameters
+    ----------
+    name : str
+        As typed.
+    target : str
+        The field, with its table before a dot.
+    help : str
+        A sentence.
+    **kwargs
+        For `click.option`.
+    """
+
+    def __init__(self, name: str, target: str, help: str, **kwargs: Any) -> None:
+        self.target = target
+        self.parameter = "flag_" + target.replace(".", "_")
+        if kwargs.get("is_flag"):
+            kwargs["default"] = None  # not given: the options file decides
+        self.decorate = click.option(name, self.parameter, help=help, **kwargs)
+
+
+COUNT = click.IntRange(1)
+TIE_FLAGS = (
+    Flag("--band", "tie.band", "Band of multi-band images, from 1.", type=COUNT),
+    Flag(
+        "--matches", "matches", "Tie points (CSV, npz, ASP text) to use instead of matching.", metavar="FILE"
+    ),
+    Flag("--detector", "tie.detector", "Keypoint detector.", metavar="NAME"),
+    Flag("--ip-per-image", "tie.keypoints_per_image", "Keypoints an image, at most.", type=COUNT),
+    Flag("--max-pairwise-matches", "tie.points_per_image", "Tie points an image, at most.", type=COUNT),
+    Flag(
+        "--min-overlap",
+        "tie.min_overlap",
+        "Share of a footprint that a pair must have in common.",
+        type=float,
+    ),
+    Flag(
+        "--min-triangulation-angle",
+        "tie.min_angle",
+        "Smallest angle between a pair's rays.",
+        type=float,
+        metavar="DEG",
+    ),
+    Flag("--search", "tie.search", "How far an RPC may be wrong.", type=float, metavar="PX"),
+    Flag("--num-passes", "num_passes", "Passes of matching and adjustment.", type=COUNT),
+)
+ADJUSTMENT_FLAGS = (
+    Flag(
+        "--model",
+        "adjust.model",
+        "Unknowns: rotation+translation, rotation, translation, shift, shift-drift or affine.",
+        metavar="NAME",
+    ),
+    Flag("--drift", "adjust.drift", "Degree of the rotation along the rows.", type=click.IntRange(0, 2)),
+    Flag(
+        "--sigma-attitude",
+        "adjust.sigma_attitude",
+        "Prior of the rotation, metres on the ground.",
+        type=float,
+        metavar="M",
+    ),
+    Flag("--sigma-position", "adjust.sigma_position", "Prior of the translation.", type=float, metavar="M"),
+    Flag("--loss", "adjust.loss", "Robust loss of the first rounds.", metavar="NAME"),
+    Flag(
+        "--robust-threshold", "adjust.robust_threshold", "Cut observations beyond so many sigmas.", type=float
+    ),
+    Flag(
+        "--center",
+        "adjust.center_method",
+        "How the camera centre is regressed.",
+        type=click.Choice(["line", "projective"]),
+    ),
+    Flag(
+        "--fixed", "adjust.fixed", "A view that keeps its camera (repeatable).", multiple=True, metavar="NAME"
+    ),
+    Flag("--keep-largest", "adjust.keep_largest", "Go on with the largest connected group.", is_flag=True),
+    Flag("--gcp", "gcp", "Ground control points: .gcp, GeoJSON, image tags.", multiple=True, metavar="FILE"),
+    Flag("--dem", "dem", "Terrain heights that hold weakly seen tie points.", metavar="FILE"),
+    Flag("--dem-sigma", "adjust.dem_sigma", "Standard deviation of the DEM.", type=float, metavar="M"),
+    Flag("--geoid", "geoid", "Geoid grid for a DEM of orthometric heights.", metavar="FILE"),
+)
+RUN_FLAGS = (
+    Flag("--overwrite", "overwrite", "Replace the results of an earlier run.", is_flag=True),
+    Flag(
+        "--images",
+        "images",
+        "Carry the new RPC in a small VRT that points at the image, in a full copy, or not.  [default: vrt]",
+        type=click.Choice(["vrt", "copy", "none"]),
+    ),
+    Flag("--rpc-format", "rpc_formats", "RPC files to write, of txt,rpb,geom,json,xml.  [default: txt]"),
+    Flag("--stop-after", "stop_after", "End early.", type=click.Choice(["matching", "adjustment"])),
+    Flag("--tolerance", "fit.tolerance", "Largest error of a refitted RPC.", type=float, metavar="PX"),
+    Flag("--force", "force", "Write RPCs that miss the tolerance; exit 3.", is_flag=True),
+    Flag("--keep-going", "keep_going", "Leave bad files out; exit 3 at the end.", is_flag=True),
+)
+_BY_PARAMETER = {flag.parameter: flag for flag in (*TIE_FLAGS, *ADJUSTMENT_FLAGS, *RUN_FLAGS)}
+
+
+def with_flags(*flags: Flag) -> Callable[[Function], Function]:
+    """Give a verb these flags, and those of every run: image and options files, workers, JSON."""
+
+    def decorate(function: Function) -> Function:
+        for option in (*_RUN_OPTIONS[::-1], *(flag.decorate for flag in flags[::-1])):
+            function = option(function)
+        return function
+
+    return decorate
+
+
+_RUN_OPTIONS = (
+    click.option("--image-list", metavar="FILE", help="More image paths from a file, one a line."),
+    click.option("--options", "options_file", metavar="FILE", help="Options from a TOML file; flags win."),
+    click.option("-j", "--jobs", type=COUNT, default=1, show_default=True, help="Worker processes."),
+    click.option("--dask", metavar="ADDRESS", help="Work on a dask.distributed cluster."),
+    click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
+)
+
+
+def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
+    """Images of the command line, then those of a list file (blank lines and # comments are skipped)."""
+    from barpc.errors import InputError
+
+    paths = list(images)
+    if image_list is not None:
+        try:
+            lines = Path(image_list).read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{image_list}: not a list of images: {error}") from error
+        folder = Path(image_list).parent
+        paths += [str(folder / line.strip()) for line in lines if line.strip() and not line.startswith("#")]
+    return paths
+
+
+def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOptions:
+    """Defaults, then the options file, then the flags that were given."""
+    from barpc.pipeline.options import RunOptions, read_options, with_values
+
+    options = RunOptions() if options_file is None else read_options(options_file)
+    values: dict[str, Any] = {}
+    for parameter, value in flags.items():
+        if value is None or value == ():
+            continue
+        target = _BY_PARAMETER[parameter].target
+        *table, field = target.split(".")
+        place = values.setdefault(table[0], {}) if table else values
+        if target == "rpc_formats":
+            value = [name.strip() for name in value.split(",")]
+        place[field] = list(value) if isinstance(value, tuple) else value
+    result: RunOptions = with_values(options, values, "command line")
+    return result

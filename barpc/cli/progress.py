@@ -1,0 +1,82 @@
+"""Progress bars on stderr, and the executors that `-j` and `--dask` ask for."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+
+Progress = Callable[[str, int, int], None]
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@contextmanager
+def progress_bars(quiet: bool) -> Iterator[Progress]:
+    """A callback `progress(stage, done, total)` that draws one bar a stage; silent in pipes and with -q."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda _stage, _done, _total: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description:<22}"),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        tasks: dict[str, object] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+
+        yield show
+
+
+@contextmanager
+def executor_for(jobs: int, dask: str | None) -> Iterator[Executor | None]:
+    """The executor of a run: None works in this process."""
+    if dask is not None:
+        from barpc.errors import InputError
+
+        try:
+            from distributed import Client
+        except ImportError as error:
+            raise InputError("--dask needs the extra: pip install 'barpc[cluster]'") from error
+        try:
+            client = Client(dask, timeout=20)  # type: ignore[no-untyped-call]
+        except (OSError, ValueError) as error:
+            raise InputError(f"--dask {dask}: no scheduler answers there ({error})") from error
+        with client:
+            yield client.get_executor()  # type: ignore[no-untyped-call]
+    elif jobs > 1:
+        import multiprocessing
+
+        before = {name: os.environ.get(name) for name in _THREADS}
+        os.environ.update(dict.fromkeys(_THREADS, "1"))
+        try:  # one BLAS thread a worker: the work is spread by processes, and sums keep their order
+            context = multiprocessing.get_context("spawn")
+            with ProcessPoolExecutor(jobs, mp_context=context) as pool:
+                yield pool
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
+    else:
+        yield None

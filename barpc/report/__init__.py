@@ -1,0 +1,7 @@
+"""What a run leaves for people and programs: summary.json, tables, the report."""
+
+from __future__ import annotations
+
+from barpc.report.run import Run, summarize
+
+__all__ = ["Run", "summarize"]
