@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.geodesy import Array
-from barpc.scene import IntArray
+from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
 
 _FEW = 30  # points below which an affine error is not told from a constant one
 _TUKEY = 4.685
+_WINDOW = 2048.0  # px, side of the windows of the verification
+_WINDOW_POINTS = 60  # that a window needs for a fit of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,16 @@ class Frame:
         """Coordinates along and across (..., 2) of points (..., 2) of image B [px]."""
         turned: Array = xy @ np.array([[self.axis[0], -self.axis[1]], [self.axis[1], self.axis[0]]])
         return turned
+
+    def select(self, rows: IntArray) -> Frame:
+        """The frame of some points."""
+        return replace(
+            self,
+            along=self.along[rows],
+            across=self.across[rows],
+            slope=self.slope[rows],
+            reach=self.reach[rows],
+        )
 
     def moved(self, along: Array | float, across: Array | float) -> Frame:
         """The frame with its points moved [px]."""
@@ -188,3 +200,40 @@ def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
 def mad(values: Array) -> float:
     """Robust standard deviation: 1.4826 times the median of the absolute values (about zero)."""
     return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
+
+
+def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, float]:
+    """Which values agree with an affine function of position, window by window.
+
+    Parameters
+    ----------
+    xy : (N, 2)
+        Positions [px].
+    values : (N,)
+        Errors across the epipolar lines [px].
+    floor : float
+        What is always tolerated [px].
+
+    Returns
+    -------
+    keep : (N,)
+        Within three robust standard deviations of the window's function.
+    spread : float
+        Robust standard deviation of all values that are kept [px].
+    """
+    keep = np.zeros(len(values), dtype=bool)
+    if not len(values):
+        return keep, 0.0
+    residual = values - robust_affine(xy, values)(xy)
+    for rows in _windows(xy):
+        if len(rows) >= _WINDOW_POINTS:
+            residual[rows] = values[rows] - robust_affine(xy[rows], values[rows])(xy[rows])
+        keep[rows] = np.abs(residual[rows]) <= max(3.0 * mad(residual[rows]), floor)
+    return keep, mad(residual[keep])
+
+
+def _windows(xy: Array) -> list[IntArray]:
+    cell = np.floor(xy / _WINDOW)
+    order = np.lexsort((cell[:, 0], cell[:, 1]))
+    cuts = np.flatnonzero((np.diff(cell[order], axis=0) != 0).any(axis=1)) + 1
+    return np.split(order, cuts)

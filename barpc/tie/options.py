@@ -18,7 +18,7 @@ class TieOptions:
     detector : str
         A row of `barpc.tie.features.DETECTORS`.
     matcher : str
-        A row of `barpc.tie.matching.MATCHERS`.
+        A row of `barpc.tie.guided.MATCHERS`.
     tile : int
         Side of the tiles that are read and searched for keypoints [px].
     cell : int
@@ -41,6 +41,8 @@ class TieOptions:
         Half the width of the band about the corrected epipolar line [px].
     ratio : float
         Largest descriptor distance of the best candidate over that of the second best.
+    false_share : float
+        Share of false matches that is accepted, as control bands estimate it.
     min_matches : int
         Verified matches that a pair needs to count.
     patch : int
@@ -66,6 +68,7 @@ class TieOptions:
     search: float = 700.0
     tolerance: float = 3.0
     ratio: float = 0.85
+    false_share: float = 0.01
     min_matches: int = 12
     patch: int = 21
     min_correlation: float = 0.8
