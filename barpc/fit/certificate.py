@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
@@ -55,6 +56,11 @@ class RpcFit:
     num_cnp: int
     num_ckp: int
     method: str
+
+    def summary(self) -> dict[str, Any]:
+        """The certificate as plain numbers and lists, col before row, lengths in px."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
+        return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def verdict(self, tolerance: float) -> str:
         """What is wrong with this fit at a tolerance [px], in words; empty if nothing is."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +13,7 @@ from barpc.geodesy import Array
 Method = Literal["auto", "ridge", "lcurve", "vendor-denominators"]
 Space = Literal["image", "ground"]
 Nodes = Literal["uniform", "chebyshev"]
+FormatName = Literal["nitf", "rpcm"]
 
 ALTITUDE_FLOOR = 50.0
 """Smallest altitude half range [m] that a model is sampled over, and smallest altitude scale of an RPC."""
@@ -78,10 +78,8 @@ class FitOptions:
         ``lcurve`` with one h for col and row (78 unknowns) instead of one each (39 + 39).
     normalization : Normalization, optional
         Offsets and scales to be used as they are.
-    quantize : callable, optional
-        Takes the `Normalization` found and gives the one that a file format can hold.
-    quantize_coeffs : callable, optional
-        Takes coefficients and gives the nearest ones that a file format can hold, elementwise.
+    precision : {"nitf", "rpcm"}, optional
+        Fit numbers that a format with few digits can hold (`barpc.fit.precision.PRECISIONS`).
     allow_mirrored : bool
         Accept points that show the ground mirrored (as radar images do) without suspecting that two
         columns are swapped.
@@ -96,8 +94,7 @@ class FitOptions:
     tau: float = 0.003
     joint: bool = False
     normalization: Normalization | None = None
-    quantize: Callable[[Normalization], Normalization] | None = None
-    quantize_coeffs: Callable[[Array], Array] | None = None
+    precision: FormatName | None = None
     allow_mirrored: bool = False
 
     def __post_init__(self) -> None:

@@ -26,6 +26,7 @@ def fit_rpc(
     alt_range: tuple[float, float],
     *,
     options: FitOptions | None = None,
+    strict: bool = True,
 ) -> RpcFit:
     """Fit an RPC to a sensor model over an image and an altitude range.
 
@@ -40,6 +41,9 @@ def fit_rpc(
         scene.
     options : FitOptions, optional
         Grid, solver, tolerance.
+    strict : bool
+        Raise where the RPC misses the tolerance; otherwise give the best one found, to be judged by its
+        `RpcFit.verdict`.
 
     Returns
     -------
@@ -72,7 +76,7 @@ def fit_rpc(
             loop = max(loop, roundtrip(solution.rpc, middle))
         return _certified(solution, on_ckp, loop, size)
 
-    return _first_accepted(attempt, options, vendor)
+    return _first_accepted(attempt, options, vendor, strict)
 
 
 def fit_rpc_points(
@@ -84,6 +88,7 @@ def fit_rpc_points(
     size: tuple[int, int] | None = None,
     vendor: RPC | None = None,
     options: FitOptions | None = None,
+    strict: bool = True,
 ) -> RpcFit:
     """Fit an RPC to given correspondences: GCPs, tables, exported grids.
 
@@ -104,6 +109,8 @@ def fit_rpc_points(
         Whose denominators may be kept.
     options : FitOptions, optional
         Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
+    strict : bool
+        As for `fit_rpc`.
 
     Returns
     -------
@@ -135,7 +142,7 @@ def fit_rpc_points(
             loop = max(loop, roundtrip(solution.rpc, cnp[start : start + _CHUNK]))
         return _certified(solution, on_ckp, loop, size)
 
-    return _first_accepted(attempt, options, vendor)
+    return _first_accepted(attempt, options, vendor, strict)
 
 
 def underlying_rpc(model: object) -> RPC | None:
@@ -180,13 +187,15 @@ def _certified(solution: Solution, on_ckp: Errors, loop: float, size: tuple[int,
     )
 
 
-def _first_accepted(attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None) -> RpcFit:
+def _first_accepted(
+    attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool
+) -> RpcFit:
     """The fit by the method asked for; with ``auto``, the first that is accepted.
 
     Raises
     ------
     FitError
-        None is; the message is about the best.
+        None is, and `strict`; the message is about the best.
     """
     methods = [str(options.method)]
     if options.method == "auto":
@@ -198,6 +207,6 @@ def _first_accepted(attempt: Callable[[str], RpcFit], options: FitOptions, vendo
             return fit
         fits.append(fit)
     best = min(fits, key=lambda fit: (not fit.min_denominator > 0, float(fit.max_ckp.max())))
-    if np.isinf(options.tolerance):  # the caller judges for himself
-        return best
-    raise FitError(best.verdict(options.tolerance))
+    if strict:
+        raise FitError(best.verdict(options.tolerance))
+    return best

@@ -10,6 +10,7 @@ import numpy as np
 from barpc.errors import FitError
 from barpc.fit.lcurve import solve_lcurve
 from barpc.fit.options import ALTITUDE_FLOOR, FitOptions, Normalization
+from barpc.fit.precision import PRECISIONS
 from barpc.fit.ridge import expected_size, noise_scaled, solution
 from barpc.fit.system import Compressed, Problem
 from barpc.geodesy import Array
@@ -71,7 +72,7 @@ def normalization(
     image : (N, 2)
         col, row [px].
     options : FitOptions
-        Its ``normalization`` is taken as it is, its ``quantize`` rounds what is found.
+        Its ``normalization`` is taken as it is, its ``precision`` rounds what is found.
     vendor : RPC, optional
         Ground offsets and scales are taken from it.
     """
@@ -85,7 +86,7 @@ def normalization(
     else:
         scale = np.maximum(scale, [1e-9, 1e-9, ALTITUDE_FLOOR])
     found = Normalization(offset, scale, 0.5 * (left + right), np.maximum(0.5 * (right - left), 1e-6))
-    return found if options.quantize is None else options.quantize(found)
+    return found if options.precision is None else PRECISIONS[options.precision].normalization(found)
 
 
 def solve(
@@ -136,6 +137,10 @@ def solve(
     return _METHODS[method](problem, options, vendor)
 
 
+def _quantize(options: FitOptions) -> Callable[[Array], Array] | None:
+    return None if options.precision is None else PRECISIONS[options.precision].coeffs
+
+
 def _assembled(
     problem: Problem, coeffs: Array, solved: list[Compressed], h: Array, passes: int, method: str
 ) -> Solution:
@@ -146,6 +151,7 @@ def _assembled(
 
 def _ridge(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
     expected = expected_size(problem.active, options.tau)
+    quantize = _quantize(options)
     coeffs, solved, h = np.zeros((4, 20)), [], np.zeros(2)
     for axis in range(2):
         own = slice(2 * axis, 2 * axis + 2)
@@ -153,7 +159,7 @@ def _ridge(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solutio
         for last in [False] * options.weighted + [True]:
             raw = problem.compressed(axis, denominator)
             system = noise_scaled(raw, expected)
-            x = solution(system, options.quantize_coeffs if last else None)
+            x = solution(system, quantize if last else None)
             coeffs[own] = problem.expanded(x)
             denominator = coeffs[2 * axis + 1]
         solved.append(system)
@@ -166,23 +172,25 @@ def _lcurve(problem: Problem, options: FitOptions, vendor: RPC | None) -> Soluti
     results = [solve_lcurve(problem, axes) for axes in groups]
     coeffs = np.concatenate([result[0] for result in results])
     solved = [system for result in results for system in result[1]]
-    if options.quantize_coeffs is not None:
-        pairs = [problem.expanded(solution(system, options.quantize_coeffs)) for system in solved]
+    quantize = _quantize(options)
+    if quantize is not None:
+        pairs = [problem.expanded(solution(system, quantize)) for system in solved]
         coeffs = np.concatenate(pairs)
     h = np.broadcast_to([result[2] for result in results], 2).copy()
     return _assembled(problem, coeffs, solved, h, max(result[3] for result in results), "lcurve")
 
 
 def _vendor_denominators(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
+    quantize = _quantize(options)
     coeffs, solved = np.zeros((4, 20)), []
     for axis in range(2):
         denominator = vendor.coeffs[2 * axis + 1] if vendor is not None else coeffs[1]
         denominator = denominator / denominator[0]
-        if options.quantize_coeffs is not None:
-            denominator = options.quantize_coeffs(denominator)
+        if quantize is not None:
+            denominator = quantize(denominator)
         raw = problem.compressed(axis, denominator, free=False)
         system = noise_scaled(raw, expected_size(problem.active, options.tau)[: len(raw.matrix)])
-        x = solution(system, options.quantize_coeffs)
+        x = solution(system, quantize)
         coeffs[2 * axis : 2 * axis + 2] = problem.expanded(x, denominator)
         solved.append(system)
     return _assembled(problem, coeffs, solved, np.zeros(2), 1, "vendor-denominators")
