@@ -1,0 +1,149 @@
+"""The whole tool on real images, measured on check points that it never saw."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.geodesy import ground_from_ecef
+from barpc.pipeline.outputs import check_grid
+from barpc.rpcio import read_rpc
+from barpc.scene import Tracks, View
+from barpc.sensor.geometry import epipolar_offset, triangulate
+
+from .conftest import check_points
+
+PAIRS = [("img_01", "img_02"), ("img_01", "img_03"), ("img_02", "img_03")]
+
+
+def epipolar(rpc_a, rpc_b, points):
+    offset, _ = epipolar_offset(rpc_a, rpc_b, points[:, :2], points[:, 2:], 200.0)
+    median = np.median(offset)
+    return median, 1.4826 * np.median(np.abs(offset - median))
+
+
+@pytest.mark.parametrize(("pair", "delivered"), list(zip(PAIRS, (0.69, 1.20, 0.53), strict=True)))
+def test_the_triplets_check_points_meet_within_three_hundredths_of_a_pixel(
+    shared_data, triplet, pair, delivered
+):
+    _, out = triplet
+    points = check_points(shared_data, *pair)
+    before = [read_rpc(shared_data / f"optical/phr_triplet_north/{name}.tif") for name in pair]
+    after = [read_rpc(out / f"{name}.vrt") for name in pair]
+    assert abs(epipolar(*before, points)[0]) == pytest.approx(delivered, abs=0.02)
+    median, spread = epipolar(*after, points)
+    assert abs(median) <= 0.02
+    noise = {
+        entry["pair"]: entry["ncc"]["mad"]
+        for entry in json.loads((shared_data / "truth/ties_index.json").read_text())
+    }
+    assert spread <= 1.1 * noise["-".join(pair)]
+
+
+def test_check_points_seen_in_three_images_are_met_to_a_tenth_of_a_pixel(shared_data, triplet):
+    _, out = triplet
+    second, third = (check_points(shared_data, "img_01", name) for name in ("img_02", "img_03"))
+    by_place = {tuple(row[:2]): row[2:] for row in third}
+    chained = np.array([[*row, *by_place[tuple(row[:2])]] for row in second if tuple(row[:2]) in by_place])
+    assert len(chained) > 300
+
+    view, point = np.tile([0, 1, 2], len(chained)), np.repeat(np.arange(len(chained)), 3)
+
+    def errors(sensors):
+        residuals = triangulate(sensors, view, point, chained.reshape(-1, 2), alt=200.0).residuals
+        return (residuals.reshape(-1, 6) ** 2).mean(axis=1)
+
+    folder = shared_data / "optical/phr_triplet_north"
+    delivered = [read_rpc(folder / f"img_0{i}.tif") for i in (1, 2, 3)]
+    assert np.sqrt(errors(delivered).mean()) > 0.3
+    adjusted = errors([read_rpc(out / f"img_0{i}.vrt") for i in (1, 2, 3)])
+    # one in a hundred of the chained check points is a gross mismatch (up to 2.4 px)
+    assert np.sqrt(np.sort(adjusted)[: int(0.99 * len(adjusted))].mean()) <= 0.10
+    # with them, nobody can do better than cameras adjusted to the check points themselves
+    views = [
+        View(f"img_0{i}", "", (1024, 560), rpc, (0.0, 1000.0)) for i, rpc in enumerate(delivered, start=1)
+    ]
+    own = Tracks(view, point, chained.reshape(-1, 2), np.full(len(view), 0.1))
+    best = adjust_tracks(views, own, AdjustOptions(loss="linear", robust_threshold=1e3))
+    assert best.inlier.all()
+    assert np.sqrt(adjusted.mean()) <= 1.01 * np.sqrt((best.residuals**2).mean())
+
+
+@pytest.mark.parametrize(("which", "delivered"), [("ventoux", 4.8), ("ventoux_biased", 20.6)])
+def test_ventoux_with_little_overlap_is_met_within_five_hundredths_of_a_pixel(
+    request, shared_data, which, delivered
+):
+    result, out = request.getfixturevalue(which)
+    points = check_points(shared_data, "left_image", "right_image")
+    before = [view.sensor for view in result.run.views]
+    assert abs(epipolar(*before, points)[0]) == pytest.approx(delivered, abs=0.1)
+    after = [read_rpc(out / f"{name}.vrt") for name in ("left_image", "right_image")]
+    median, spread = epipolar(*after, points)
+    assert abs(median) <= 0.05
+    assert spread <= 1.1 * 0.184
+
+
+@pytest.mark.parametrize("which", ["triplet", "ventoux", "ventoux_biased"])
+def test_the_files_hold_p_ba_to_a_millionth_of_a_pixel(request, which):
+    result, out = request.getfixturevalue(which)
+    for view, model in zip(result.run.views, result.adjustment.sensors, strict=True):
+        ground = check_grid(model, view.size, view.alt_range)
+        assert len(ground) == 9**3
+        truth = model.project(ground)
+        assert np.abs(view.sensor.project(ground) - truth).max() > 0.05  # doing nothing does not pass
+        for name in (f"{view.name}.vrt", f"{view.name}_RPC.TXT"):
+            assert np.abs(read_rpc(out / name).project(ground) - truth).max() <= 1e-6
+
+
+@pytest.mark.parametrize("which", ["triplet", "ventoux", "ventoux_biased"])
+def test_the_images_are_not_shifted_as_a_set(request, which):
+    result, _ = request.getfixturevalue(which)
+    views, tracks = result.run.views, result.tracks
+    keep = result.adjustment.inlier
+    ground = triangulate([v.sensor for v in views], tracks.view, tracks.point, tracks.xy, alt=200.0).points
+    shift = np.zeros((len(views), 2))
+    for i, view in enumerate(views):
+        at = ground_from_ecef(ground[tracks.point[keep & (tracks.view == i)]])
+        shift[i] = np.median(result.adjustment.sensors[i].project(at) - view.sensor.project(at), axis=0)
+    # half a pixel of a wrong convention would stand here as (0.5, 0.5)
+    assert np.abs(shift.mean(axis=0)).max() < 0.1
+    if which != "triplet":
+        assert np.abs(shift).max() > 0.5
+
+
+@pytest.mark.parametrize("which", ["triplet", "ventoux"])
+def test_the_scene_stays_where_the_cameras_put_it(request, which):
+    result, _ = request.getfixturevalue(which)
+    assert np.abs(result.adjustment.scene_shift).max() <= 1.0
+    scene = result.summary["scene"]
+    assert min(scene["sigma_enu_m"]) > 1.0  # and says that this is all that is known
+
+
+def test_camera_centres_are_at_the_height_of_the_orbit(triplet):
+    for view in triplet[0].summary["views"]:
+        assert view["camera_center"]["method"] == "line"
+        assert view["camera_center"]["altitude_m"] == pytest.approx(694e3, rel=0.05)
+
+
+def test_the_summary_is_plain_json_and_says_what_was_reached(triplet):
+    result, out = triplet
+    summary = json.loads((out / "summary.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert summary == json.loads(json.dumps(result.summary))
+    assert summary["passed"] is True
+    for view in summary["views"]:
+        assert view["status"] == "adjusted"
+        assert view["rmse_after"] < 0.3 * view["rmse_before"] + 0.05
+        assert view["num_observations"] > 1000
+        assert max(view["outputs"].values()) <= 1e-6
+    for pair in summary["pairs"]:
+        assert abs(pair["epipolar_after"]["median"]) < 0.03 < abs(pair["epipolar_before"]["median"])
+    assert {stage["stage"] for stage in summary["stages"]} >= {"tie points", "adjustment", "fit"}
+    assert "scene" in summary["verdict"][1]
+
+
+def test_inputs_are_left_as_they_were(shared_data, triplet):
+    for path in (shared_data / "optical/phr_triplet_north").iterdir():
+        assert path.suffix == ".tif"
