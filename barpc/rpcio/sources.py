@@ -74,6 +74,7 @@ def sidecars(image: Path | str) -> list[Sidecar]:
     except OSError:
         return []
     found: list[Sidecar] = []
+    metadata_only = f"{image.stem}.imd".lower() in present  # with it GDAL takes the image for Maxar's
     for kind, name, before_tag in _names(image.name):
         path = present.get(name.lower())
         if path is None or not path.is_file() or path.name == image.name:
@@ -81,7 +82,7 @@ def sidecars(image: Path | str) -> list[Sidecar]:
         if kind in ("xml", "dimap", "pam") and not _holds_rpc(path, kind):
             continue
         if path not in [sidecar.path for sidecar in found]:
-            found.append(Sidecar(kind, path, before_tag))
+            found.append(Sidecar(kind, path, before_tag and (kind in ("rpb", "xml") or not metadata_only)))
     return found
 
 

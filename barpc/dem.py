@@ -1,0 +1,268 @@
+"""Terrain heights from a DEM, always above the ellipsoid, and it is always said how they became so.
+
+DEM files are mostly orthometric: above a geoid, which lies up to 100 m from the ellipsoid. The vertical
+reference is read from the file; a geoid grid makes orthometric heights ellipsoidal. A reference that is not
+known, or heights that had to be taken as they are, raise a loud warning.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from rasterio.errors import CRSError
+from rasterio.warp import transform as warp_points
+from rasterio.windows import Window
+
+from barpc.errors import BarpcWarning, InputError
+from barpc.geodesy import Array
+from barpc.raster import open_raster
+
+_HGT_NAME = re.compile(r"([NS])(\d{2})([EW])(\d{3})", re.IGNORECASE)
+_HGT_VOID = -32768
+_GTX_VOID = -88.8888
+_MAX_CELLS = 400_000_000
+_VERTICAL = re.compile(r'(?:VERTCRS|VERT_CS|VERTICALCRS)\s*\[\s*"([^"]+)"')
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Heights at the nodes of a regular grid, read when they are asked for.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    shape : (rows, cols)
+        Number of nodes.
+    read : callable
+        (row0, row1, col0, col1) -> heights (row1 - row0, col1 - col0) [m], NaN in voids.
+    locate : callable
+        lon, lat (N,) [deg] -> row, col (N,), fractional, node centres at integers.
+    reference : str
+        Vertical reference: ``"ellipsoid"``, the name of a geoid or datum, or ``"unknown"``.
+    period : float
+        Columns in a full turn of longitude where the grid goes around the Earth, else 0.
+    """
+
+    path: Path
+    shape: tuple[int, int]
+    read: Callable[[int, int, int, int], Array]
+    locate: Callable[[Array, Array], tuple[Array, Array]]
+    reference: str
+    period: float = 0.0
+
+    @classmethod
+    def open(cls, path: Path | str) -> Grid:
+        """A grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS.
+
+        Raises
+        ------
+        InputError
+            The file is not what its name says, or has no CRS.
+        ImageError
+            The raster cannot be read.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise InputError(f"{path}: no such file")
+        opener = {".hgt": _open_hgt, ".gtx": _open_gtx}.get(path.suffix.lower(), _open_raster)
+        return opener(path)
+
+    def sample(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
+        """Bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
+        lon, lat = np.broadcast_arrays(np.asarray(lon, np.float64), np.asarray(lat, np.float64))
+        row, col = self.locate(lon.ravel(), lat.ravel())
+        if self.period:
+            col = col % self.period
+        height = np.full(lon.size, np.nan)
+        rows, cols = self.shape
+        edge = 1e-9 * max(rows, cols)  # a point on the outermost node, but for rounding
+        last = self.period or cols - 1
+        with np.errstate(invalid="ignore"):
+            inside = (row >= -edge) & (row <= rows - 1 + edge) & (col >= -edge) & (col <= last + edge)
+        if inside.any():
+            height[inside] = self._bilinear(np.clip(row[inside], 0, rows - 1), np.clip(col[inside], 0, last))
+        return height.reshape(lon.shape)
+
+    def _bilinear(self, row: Array, col: Array) -> Array:
+        r0 = np.minimum(np.floor(row).astype(np.int64), max(self.shape[0] - 2, 0))
+        c0 = np.floor(col).astype(np.int64)
+        if not self.period:
+            c0 = np.minimum(c0, max(self.shape[1] - 2, 0))
+        top, left = int(r0.min()), int(c0.min())
+        bottom, right = int(r0.max()) + 2, int(c0.max()) + 2
+        if (bottom - top) * (right - left) > _MAX_CELLS:
+            raise InputError(f"{self.path}: the points spread over {(bottom - top) * (right - left)} cells")
+        cells = self._cells(top, bottom, left, right)
+        height = np.zeros(len(row))
+        for i, row_weight in enumerate((r0 + 1 - row, row - r0)):
+            for j, col_weight in enumerate((c0 + 1 - col, col - c0)):
+                weight = row_weight * col_weight
+                value = cells[np.minimum(r0 + i - top, len(cells) - 1), c0 + j - left]
+                height += np.where(weight > 0, weight * value, 0.0)
+        return height
+
+    def _cells(self, top: int, bottom: int, left: int, right: int) -> Array:
+        bottom, width = min(bottom, self.shape[0]), self.shape[1]
+        if right <= width:
+            return self.read(top, bottom, left, right)
+        if not self.period:
+            return np.pad(self.read(top, bottom, left, width), ((0, 0), (0, right - width)), mode="edge")
+        first = self.read(top, bottom, 0, right - int(self.period))
+        rest = self.read(top, bottom, left, min(int(self.period), width))
+        return np.concatenate([rest, first], axis=1)
+
+
+def _open_hgt(path: Path) -> Grid:
+    name = _HGT_NAME.match(path.name)
+    side = {2 * 1201**2: 1201, 2 * 3601**2: 3601}.get(path.stat().st_size)
+    if name is None or side is None:
+        raise InputError(f"{path}: no SRTM tile (a name as N44E005.hgt and 1201 or 3601 nodes a side)")
+    south = int(name[2]) * (1 if name[1].upper() == "N" else -1)
+    west = int(name[4]) * (1 if name[3].upper() == "E" else -1)
+    data = np.memmap(path, dtype=">i2", mode="r", shape=(side, side))
+
+    def read(top: int, bottom: int, left: int, right: int) -> Array:
+        part = data[top:bottom, left:right]
+        return np.where(part == _HGT_VOID, np.nan, part.astype(np.float64))
+
+    def locate(lon: Array, lat: Array) -> tuple[Array, Array]:
+        return (south + 1 - lat) * (side - 1), (np.mod(lon - west + 180, 360) - 180) * (side - 1)
+
+    return Grid(path, (side, side), read, locate, "EGM96 height")
+
+
+def _open_gtx(path: Path) -> Grid:
+    with path.open("rb") as file:
+        head = file.read(40)
+    if len(head) < 40:
+        raise InputError(f"{path}: no GTX grid (shorter than its header)")
+    south, west, step_lat, step_lon = np.frombuffer(head, ">f8", 4).tolist()
+    rows, cols = (int(n) for n in np.frombuffer(head, ">i4", 2, 32))
+    if (
+        not (rows > 1 and cols > 1 and step_lat > 0 and step_lon > 0)
+        or path.stat().st_size != 40 + 4 * rows * cols
+    ):
+        raise InputError(f"{path}: no GTX grid (its header does not go with its size)")
+    data = np.memmap(path, dtype=">f4", mode="r", offset=40, shape=(rows, cols))
+    turn = 360.0 / step_lon
+    around = round(turn) if cols >= round(turn) - 1e-6 else 0
+
+    def read(top: int, bottom: int, left: int, right: int) -> Array:
+        part = data[top:bottom, left:right].astype(np.float64)
+        return np.where(np.abs(part - _GTX_VOID) < 1e-3, np.nan, part)
+
+    def locate(lon: Array, lat: Array) -> tuple[Array, Array]:
+        return (lat - south) / step_lat, np.mod(lon - west, 360.0) / step_lon
+
+    return Grid(path, (rows, cols), read, locate, "ellipsoid", float(around))
+
+
+def _open_raster(path: Path) -> Grid:
+    with open_raster(path) as dataset:
+        crs, shape, inverse = dataset.crs, dataset.shape, ~dataset.transform
+        extent = dataset.bounds
+        if crs is None:
+            raise InputError(f"{path}: a DEM or geoid grid needs a CRS, and this raster has none")
+    around = 0.0
+    geographic = bool(crs.is_geographic)
+    if geographic and extent.right - extent.left >= 360.0 - abs(1.0 / inverse.a) / 2:
+        around = float(round(360.0 * abs(inverse.a)))
+
+    def read(top: int, bottom: int, left: int, right: int) -> Array:
+        with open_raster(path) as dataset:
+            window = Window.from_slices((top, bottom), (left, right))
+            return np.asarray(dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan))
+
+    def locate(lon: Array, lat: Array) -> tuple[Array, Array]:
+        if geographic:
+            x: Array = extent.left + np.mod(lon - extent.left, 360.0)
+            y = lat
+        else:
+            try:
+                found = warp_points("EPSG:4326", crs, lon, lat)
+            except CRSError as error:
+                raise InputError(f"{path}: lon, lat cannot be brought into its CRS ({error})") from error
+            x, y = np.asarray(found[0]), np.asarray(found[1])
+        return (
+            inverse.d * x + inverse.e * y + inverse.f - 0.5,
+            inverse.a * x + inverse.b * y + inverse.c - 0.5,
+        )
+
+    return Grid(path, shape, read, locate, _vertical_reference(crs.to_wkt()), around)
+
+
+def _vertical_reference(wkt: str) -> str:
+    """What heights in a CRS count from: the name of its vertical part, or the ellipsoid of a 3-D CRS."""
+    match = _VERTICAL.search(wkt)
+    if match:
+        return "ellipsoid" if "ellipsoid" in match.group(1).lower() else match.group(1)
+    three_axes = re.search(r'CS\[ellipsoidal,\s*3|AXIS\["Ellipsoidal height"', wkt, re.IGNORECASE)
+    return "ellipsoid" if three_axes else "unknown"
+
+
+@dataclass(frozen=True, eq=False)
+class Dem:
+    """Altitudes of the terrain above the WGS84 ellipsoid: call it with lon, lat.
+
+    Parameters
+    ----------
+    grid : Grid
+        The heights as the file gives them.
+    geoid : Grid or None
+        Height of the geoid above the ellipsoid, added to `grid`.
+    description : str
+        Which vertical reference was read and what was done with it.
+    """
+
+    grid: Grid
+    geoid: Grid | None
+    description: str
+
+    @classmethod
+    def open(cls, path: Path | str, geoid: Path | str | None = None) -> Dem:
+        """Open a DEM, and the geoid grid that its heights need.
+
+        Parameters
+        ----------
+        path : path
+            ``.hgt``, or any raster with a CRS.
+        geoid : path, optional
+            ``.gtx`` or raster: height of the geoid above the ellipsoid.
+
+        Raises
+        ------
+        InputError
+            Not a DEM that is read, or a geoid for heights that are ellipsoidal already.
+
+        Warns
+        -----
+        BarpcWarning
+            The vertical reference is unknown, or orthometric heights are taken as they are.
+        """
+        grid = Grid.open(path)
+        known = grid.reference
+        if known == "ellipsoid" and geoid is not None:
+            raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
+        if geoid is not None:
+            done = f"made ellipsoidal with {Path(geoid).name}"
+        else:
+            done = "ellipsoidal" if known == "ellipsoid" else "TAKEN AS ELLIPSOIDAL"
+        description = f"{Path(path).name}: vertical reference {known}, {done}"
+        if known == "unknown" or (known != "ellipsoid" and geoid is None):
+            advice = (
+                "" if geoid is not None else "; give a geoid grid, or expect errors up to 100 m in height"
+            )
+            warnings.warn(f"DEM {description}{advice}", BarpcWarning, stacklevel=2)
+        return cls(grid, None if geoid is None else Grid.open(geoid), description)
+
+    def __call__(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
+        """Altitude above the ellipsoid (...) [m] at lon, lat (...) [deg]; NaN in voids and outside."""
+        height = self.grid.sample(lon, lat)
+        return height if self.geoid is None else height + self.geoid.sample(lon, lat)

@@ -1,0 +1,263 @@
+"""The hand-off: every file that was written is opened again as its consumers open it, and compared.
+
+A file that barpc reads back is no proof that another tool does. Each consumer of `CONSUMERS` reads a file
+in its own way; what it projects is compared with the model that the file should hold, on a grid over the
+image and its altitudes. A vendor's file beside an image, which would be read in its place, is named.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+from rasterio.transform import RPCTransformer
+
+from barpc.errors import OutputError
+from barpc.geodesy import Array, wrap_longitude
+from barpc.raster import open_raster
+from barpc.rpcio import Sidecar, read_rpc, sidecars
+from barpc.sensor import SensorModel
+
+TOLERANCE = 1e-6
+"""Largest difference [px] between a file and its model that passes."""
+
+Projection = Callable[[Array], Array]
+"""Ground points (N, 3) [deg, deg, m] -> image points (N, 2) [px], centre of the first pixel = (0, 0)."""
+
+_RASTERS = (".vrt", ".tif", ".tiff", ".ntf")
+_TEXTS = ("_rpc.txt", ".rpb", ".xml")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What one consumer makes of one file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    consumer : str
+        A key of `CONSUMERS`.
+    max_error : float
+        Largest distance to the model over the grid [px]; NaN where it was not read.
+    note : str
+        Why it was not read; empty otherwise.
+    """
+
+    path: Path
+    consumer: str
+    max_error: float
+    note: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the consumer sees the camera that was meant."""
+        return bool(self.max_error <= TOLERANCE)
+
+
+def control_grid(
+    model: SensorModel,
+    size: tuple[int, int],
+    alt_range: tuple[float, float],
+    nodes: tuple[int, int] = (11, 5),
+) -> tuple[Array, Array]:
+    """Ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
+    col, row, alt = np.meshgrid(
+        np.linspace(0, size[0] - 1, nodes[0]),
+        np.linspace(0, size[1] - 1, nodes[0]),
+        np.linspace(*alt_range, nodes[1]),
+        indexing="ij",
+    )
+    ground = model.localize(np.stack([col.ravel(), row.ravel()], axis=-1), alt.ravel())
+    ground = ground[np.isfinite(ground).all(axis=1)]
+    return ground, model.project(ground)
+
+
+def verify(
+    paths: Sequence[Path | str],
+    model: SensorModel,
+    size: tuple[int, int],
+    alt_range: tuple[float, float],
+) -> list[Reading]:
+    """Open files as their consumers do and compare what they project with the model.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Files written for one image: rasters, text files, ``.geom``, JSON.
+    model : SensorModel
+        What they should hold.
+    size : (width, height)
+        [px].
+    alt_range : (low, high)
+        [m above the ellipsoid].
+
+    Returns
+    -------
+    readings : list of Reading
+        One for each file and each consumer that reads its kind and is installed.
+
+    Raises
+    ------
+    OutputError
+        The model sees no point of its own image.
+    """
+    ground, image = control_grid(model, size, alt_range)
+    if not len(ground):
+        raise OutputError("hand-off: the model sees no ground point inside its own image")
+    readings = []
+    for path in map(Path, paths):
+        for name, consumer in CONSUMERS.items():
+            if path.name.lower().endswith(consumer.reads) and consumer.installed:
+                readings.append(_reading(path, name, consumer.open, ground, image))
+    return readings
+
+
+def _reading(
+    path: Path, name: str, opener: Callable[[Path], Projection], ground: Array, image: Array
+) -> Reading:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = opener(path)(ground)
+    except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
+        return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
+    error = float(np.linalg.norm(found - image, axis=1).max())
+    return Reading(path, name, error, "" if np.isfinite(error) else "it projects to no finite point")
+
+
+def shadows(image: Path | str) -> list[Sidecar]:
+    """The files beside an image that some tool reads instead of the RPC in the image itself.
+
+    A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and
+    CARS are given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
+    """
+    image = Path(image)
+    with open_raster(image) as dataset:
+        own, vrt = dataset.rpcs is not None, dataset.driver == "VRT"
+    return [s for s in sidecars(image) if s.kind == "geom" or (s.before_tag and not vrt) or not own]
+
+
+# --- consumers --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Consumer:
+    """A tool that reads RPCs: the ends of the file names it takes, its package, and how it opens one."""
+
+    reads: tuple[str, ...]
+    package: str
+    open: Callable[[Path], Projection]
+
+    @property
+    def installed(self) -> bool:
+        """Whether its package can be imported."""
+        return find_spec(self.package) is not None
+
+
+def _transformer(rpcs: Any) -> Projection:
+    def project(ground: Array) -> Array:
+        lon = wrap_longitude(ground[:, 0], rpcs.long_off)
+        with RPCTransformer(rpcs) as transformer:
+            row, col = transformer.rowcol(lon, ground[:, 1], ground[:, 2], op=lambda v: v)
+        return np.column_stack([col, row]) - 0.5  # GDAL counts from the corner of the first pixel
+
+    return project
+
+
+def _gdal_raster(path: Path) -> Projection:
+    with open_raster(path) as dataset:
+        if dataset.rpcs is None:
+            raise OutputError("no RPC")
+        return _transformer(dataset.rpcs)
+
+
+def _gdal_text(path: Path) -> Projection:
+    """GDAL reads text only beside an image: one of a single pixel is lent to it."""
+    stem = path.name[: -len("_rpc.txt")] if path.name.lower().endswith("_rpc.txt") else path.stem
+    with tempfile.TemporaryDirectory() as folder:
+        image = Path(folder) / f"{stem}.tif"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(image, "w", driver="GTiff", width=1, height=1, count=1, dtype="uint8") as made:
+                made.write(np.zeros((1, 1, 1), dtype=np.uint8))
+        shutil.copy(path, folder)
+        return _gdal_raster(image)
+
+
+def _rpcm(path: Path) -> Projection:
+    rpcm = import_module("rpcm.rpc_model")
+    if path.suffix == ".json":
+        model = rpcm.RPCModel(json.loads(path.read_text())["rpc"], dict_format="rpcm")
+    elif path.name.lower().endswith(_RASTERS):
+        model = rpcm.rpc_from_geotiff(str(path))
+    else:
+        model = rpcm.rpc_from_rpc_file(str(path))
+
+    def project(ground: Array) -> Array:
+        return np.column_stack(model.projection(*ground.T))
+
+    return project
+
+
+def _shareloc(path: Path) -> Projection:
+    model = import_module("shareloc.geomodels.rpc").RPC.load(str(path))
+
+    def project(ground: Array) -> Array:
+        row, col, _ = model.inverse_loc(*np.ascontiguousarray(ground.T))
+        return np.column_stack([col, row]) - 0.5  # its first pixel's centre is (0.5, 0.5)
+
+    return project
+
+
+def _orthority(path: Path) -> Projection:
+    factory = import_module("orthority.factory").RpcCameras
+    camera = factory.from_images((str(path),)).get(path.name)
+
+    def project(ground: Array) -> Array:
+        return np.asarray(camera.world_to_pixel(ground.T).T)
+
+    return project
+
+
+def _keywords(path: Path) -> Projection:
+    """An OSSIM keyword list, read as its readers do: every line split at the first colon, all keys asked for."""
+    pairs = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
+    rpcs = rasterio.rpc.RPC(
+        **{
+            key: float(pairs[key])
+            for axis in ("line", "samp", "lat", "long", "height")
+            for key in (f"{axis}_off", f"{axis}_scale")
+        },
+        **{
+            f"{axis}_{part}_coeff": [float(pairs[f"{axis}_{part}_coeff_{i:02d}"]) for i in range(20)]
+            for axis in ("line", "samp")
+            for part in ("num", "den")
+        },
+    )
+    if pairs["type"].strip() != "ossimRpcModel" or pairs["polynomial_format"].strip() != "B":
+        raise OutputError("type or polynomial_format is not what OSSIM expects")
+    return _transformer(rpcs)
+
+
+CONSUMERS: dict[str, Consumer] = {
+    "gdal": Consumer(_RASTERS, "rasterio", _gdal_raster),
+    "gdal, beside an image": Consumer(_TEXTS, "rasterio", _gdal_text),
+    "keywords": Consumer((".geom",), "rasterio", _keywords),
+    "rpcm": Consumer((*_RASTERS, "_rpc.txt", ".json"), "rpcm", _rpcm),
+    "shareloc": Consumer((*_RASTERS, ".geom"), "shareloc", _shareloc),
+    "orthority": Consumer(_RASTERS, "orthority", _orthority),
+    "barpc": Consumer((*_RASTERS, *_TEXTS, ".geom", ".json"), "barpc", lambda path: read_rpc(path).project),
+}
+"""Consumer -> how it reads. Those that are not installed are passed over."""
