@@ -202,7 +202,7 @@ def mad(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
 
 
-def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, float]:
+def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
     """Which values agree with an affine function of position, window by window.
 
     Parameters
@@ -218,18 +218,18 @@ def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, f
     -------
     keep : (N,)
         Within three robust standard deviations of the window's function.
-    spread : float
-        Robust standard deviation of all values that are kept [px].
+    residual : (N,)
+        Distance from that function [px].
     """
     keep = np.zeros(len(values), dtype=bool)
     if not len(values):
-        return keep, 0.0
+        return keep, values
     residual = values - robust_affine(xy, values)(xy)
     for rows in _windows(xy):
         if len(rows) >= _WINDOW_POINTS:
             residual[rows] = values[rows] - robust_affine(xy[rows], values[rows])(xy[rows])
         keep[rows] = np.abs(residual[rows]) <= max(3.0 * mad(residual[rows]), floor)
-    return keep, mad(residual[keep])
+    return keep, residual
 
 
 def _windows(xy: Array) -> list[IntArray]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from barpc.errors import TiePointError
 from barpc.scene import Tracks, View
@@ -16,11 +17,11 @@ from barpc.tie.matching import Matches, PairReport, match_pair
 from barpc.tie.options import TieOptions
 from barpc.tie.pairs import Pair, require_connected, select_pairs
 from barpc.tie.raster import sample_stretch
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage, how much is done, of how much."""
+from barpc.tie.refine import refine
+from barpc.tie.work import Progress, ordered
 
 _DEFAULTS = TieOptions()
+_SPARE = 1.3  # tracks registered for each one kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,27 +41,6 @@ class TieResult:
     tracks: Tracks
     pairs: tuple[PairReport, ...]
     keypoints: tuple[int, ...]
-
-
-def ordered(
-    executor: Executor | None,
-    function: Callable[..., Any],
-    tasks: Sequence[tuple[Any, ...]],
-    stage: str,
-    progress: Progress | None,
-) -> list[Any]:
-    """Results of `function(*task)` in the order of the tasks, whoever works on them."""
-    results = []
-    futures = [executor.submit(function, *task) for task in tasks] if executor is not None else []
-    try:
-        for done, task in enumerate(tasks, start=1):
-            results.append(futures[done - 1].result() if futures else function(*task))
-            if progress is not None:
-                progress(stage, done, len(tasks))
-    finally:
-        for future in futures:
-            future.cancel()
-    return results
 
 
 def detect(
@@ -165,11 +145,19 @@ def find_tracks(
     matched = match(views, keypoints, pairs, options, sensors=sensors, executor=executor, progress=progress)
     reports = tuple(report for _, report in matched)
     require_matches(views, pairs, reports)
-    tracks = thin(
-        link([len(k) for k in keypoints], [found for found, _ in matched]),
-        [view.size for view in views],
-        options.points_per_image,
+    sizes, most = [view.size for view in views], options.points_per_image
+    linked = link([len(k) for k in keypoints], [found for found, _ in matched])
+    tracks = refine(
+        views,
+        thin(linked, sizes, int(_SPARE * most)),
+        pairs,
+        options,
+        sensors=sensors,
+        executor=executor,
+        progress=progress,
     )
+    tracks = thin(tracks, sizes, most)
+    require_tracks(views, tracks, pairs, reports, options)
     return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
 
 
@@ -194,3 +182,25 @@ def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Seque
         raise TiePointError(f"too few tie points: {told}: {advice}")
     links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]
     require_connected(views, links, f"no tie points between them: {told}: {advice}")
+
+
+def require_tracks(
+    views: Sequence[View],
+    tracks: Tracks,
+    pairs: Sequence[Pair],
+    reports: Sequence[PairReport],
+    options: TieOptions,
+) -> None:
+    """Raise unless the tracks connect all views by at least `min_matches` observations a pair.
+
+    Raises
+    ------
+    TiePointError, DisconnectedError
+        As for `require_matches`.
+    """
+    left = []
+    for pair, report in zip(pairs, reports, strict=True):
+        common = len(np.intersect1d(*(tracks.point[tracks.view == view] for view in pair.views)))
+        status = "ok" if common >= options.min_matches else f"only {common} tracks after registration"
+        left.append(replace(report, status=status if report.status == "ok" else report.status))
+    require_matches(views, pairs, left)

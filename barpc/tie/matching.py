@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray, View
 from barpc.sensor import SensorModel
-from barpc.tie.epipolar import Affine, Frame, agreeing, frame, robust_affine
+from barpc.tie.epipolar import Affine, Frame, agreeing, frame, mad, robust_affine
 from barpc.tie.features import Keypoints
 from barpc.tie.guided import MATCHERS, Band, Matcher
 from barpc.tie.options import TieOptions
@@ -152,11 +152,12 @@ def match_pair(
         return nothing, replace(report, status="too few matches")
     found, control = search.trusted(*_local(search, where, tight), options.false_share)
     errors = where.errors(found[:, 0], search.b.xy[found[:, 1]])
-    keep, spread = agreeing(search.a.xy[found[:, 0]], errors[:, 1])
+    keep, residual = agreeing(search.a.xy[found[:, 0]], errors[:, 1])
     verified = found[keep]
     report = replace(report, matches=len(found), verified=len(verified), control_share=control)
     if len(verified) < options.min_matches:
         return nothing, replace(report, status="too few matches on common epipolar lines")
+    spread = mad(residual[keep])
     report = replace(
         report,
         inlier_share=len(verified) / len(found),

@@ -1,0 +1,284 @@
+"""Sub-pixel registration: every observation of a track is registered to ONE reference patch.
+
+The reference is the patch around the keypoint in the track's most central view, at a whole pixel, so that
+it needs no interpolation and defines the point exactly: errors do not chain from view to view. The patch
+of another view is pre-warped by the cameras' local derivative and registered by least squares with an
+affine distortion, gain and bias (Gruen 1985), in the inverse compositional form (Baker and Matthews 2004):
+the derivative is that of the reference, so one small pseudo-inverse a match serves all iterations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+from barpc.tie.raster import Box, FloatImage, read_pixels
+
+FloatArray = npt.NDArray[np.float32]
+
+_CHUNK = 256  # patches worked on at a time: they stay in cache
+_STEPS = 6
+_SETTLED = 0.003  # px; a step below it is the last
+_REACH = 2.0  # px; a patch that moves farther has left its point
+_WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
+_MIN_DETAIL = 1e-12  # relative variance below which a patch is flat
+_TAPS = 6  # samples on either side in the half-pixel interpolation
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Where the reference patches were found.
+
+    Parameters
+    ----------
+    xy : (N, 2)
+        col, row in the other image [px].
+    correlation : (N,)
+        Of the patches after registration.
+    sigma : (N,)
+        Standard deviation of a coordinate [px], from the residual noise and the patch's detail.
+    ok : (N,)
+        Settled, near its start, on valid pixels.
+    """
+
+    xy: Array
+    correlation: Array
+    sigma: Array
+    ok: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Observations of one view to be registered to patches of another.
+
+    Parameters
+    ----------
+    paths : two str
+        Rasters of the reference and of the other view.
+    sizes : two (width, height)
+        Of the rasters [px].
+    band : int
+        Band, from 1.
+    reference : (N, 2)
+        Whole pixels in the reference view.
+    start : (N, 2)
+        Where they are about, in the other view [px].
+    linear : (N, 2, 2)
+        d(other)/d(reference).
+    patch : int
+        Side of the patches [px], odd.
+    """
+
+    paths: tuple[str, str]
+    sizes: tuple[tuple[int, int], tuple[int, int]]
+    band: int
+    reference: Array
+    start: Array
+    linear: Array
+    patch: int
+
+
+def register_task(task: Task) -> Registration:
+    """Read what a task needs of both images, and register."""
+    cv2.setNumThreads(1)
+    margin = task.patch + _TAPS + int(_REACH)
+    images = []
+    for path, size, xy in zip(task.paths, task.sizes, (task.reference, task.start), strict=True):
+        box = _around(xy, margin, size)
+        pixels, valid = read_pixels(path, box, task.band)
+        images.append((pixels, valid, np.array(box[:2], dtype=np.float64)))
+    (first, valid_first, origin_first), (second, valid_second, origin_second) = images
+    found = register(
+        (first, second),
+        (_usable(valid_first, task.patch), _usable(valid_second, task.patch)),
+        task.reference - origin_first,
+        task.start - origin_second,
+        task.linear,
+        task.patch,
+    )
+    return Registration(found.xy + origin_second, found.correlation, found.sigma, found.ok)
+
+
+def _around(xy: Array, margin: int, size: tuple[int, int]) -> Box:
+    low = np.clip(np.floor(xy.min(axis=0)).astype(int) - margin, 0, np.array(size) - 1)
+    high = np.clip(np.ceil(xy.max(axis=0)).astype(int) + margin + 1, low + 1, size)
+    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+
+
+def _usable(valid: BoolArray, patch: int) -> BoolArray:
+    """Pixels about which a whole patch is valid and inside."""
+    kernel = np.ones((patch, patch), np.uint8)
+    eroded = cv2.erode(valid.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    usable: BoolArray = eroded > 0
+    return usable
+
+
+def register(
+    images: tuple[FloatImage, FloatImage],
+    usable: tuple[BoolArray, BoolArray],
+    reference: Array,
+    start: Array,
+    linear: Array,
+    patch: int,
+) -> Registration:
+    """Register patches of the second image to patches of the first.
+
+    Parameters
+    ----------
+    images : two (height, width) arrays
+        Reference image, other image.
+    usable : two (height, width) masks
+        Where a patch may be centred.
+    reference : (N, 2)
+        Centres in the reference image, whole pixels.
+    start : (N, 2)
+        First guess in the other image [px].
+    linear : (N, 2, 2)
+        First guess of d(other)/d(reference).
+    patch : int
+        Side of the patches [px], odd.
+
+    Returns
+    -------
+    registration : Registration
+        In the coordinates of `images`.
+    """
+    template = _Template(images[0], patch)
+    doubled = _double(images[1])
+    xy, correlation = np.array(start, dtype=np.float64), np.zeros(len(start))
+    sigma, ok = np.full(len(start), np.inf), np.zeros(len(start), dtype=bool)
+    possible = np.flatnonzero(_at(usable[0], reference) & _at(usable[1], start))
+    for first in range(0, len(possible), _CHUNK):
+        rows = possible[first : first + _CHUNK]
+        found = template.find(doubled, reference[rows].astype(np.int64), start[rows], linear[rows])
+        xy[rows], correlation[rows], sigma[rows], ok[rows] = (
+            found.xy,
+            found.correlation,
+            found.sigma,
+            found.ok,
+        )
+    return Registration(xy, correlation, sigma, ok & _at(usable[1], xy))
+
+
+def _at(mask: BoolArray, xy: Array) -> BoolArray:
+    col, row = np.rint(np.nan_to_num(xy, nan=-1.0)).astype(np.int64).T
+    inside = (col >= 0) & (row >= 0) & (col < mask.shape[1]) & (row < mask.shape[0])
+    out: BoolArray = inside & mask[row.clip(0, mask.shape[0] - 1), col.clip(0, mask.shape[1] - 1)]
+    return out
+
+
+def _double(image: FloatImage) -> FloatImage:
+    """Twice the samples a side, by a windowed sinc; the sample (2 row, 2 col) is the pixel (row, col).
+
+    On this grid a bicubic sample, taken to 1/32 of its step, is as good as a long kernel on the image.
+    """
+    offset = np.arange(-_TAPS, _TAPS) + 0.5
+    kernel = np.sinc(offset) * np.cos(0.5 * np.pi * offset / _TAPS) ** 2
+    kernel = (kernel / kernel.sum()).astype(np.float32)
+    one = np.ones(1, np.float32)
+    border = cv2.BORDER_REFLECT_101
+
+    def between(samples: FloatArray, along_columns: bool) -> FloatArray:
+        across, down = (kernel, one) if along_columns else (one, kernel)
+        anchor = (_TAPS - 1, 0) if along_columns else (0, _TAPS - 1)
+        return np.asarray(cv2.sepFilter2D(samples, -1, across, down, None, anchor, 0.0, border), np.float32)
+
+    out = np.empty((2 * image.shape[0], 2 * image.shape[1]), np.float32)
+    out[::2, ::2] = image
+    out[::2, 1::2] = between(image, True)
+    out[1::2, ::2] = between(image, False)
+    out[1::2, 1::2] = between(out[::2, 1::2].copy(), False)
+    return out
+
+
+class _Template:
+    """Reference patches of an image, ready to be found in another one."""
+
+    def __init__(self, image: FloatImage, patch: int) -> None:
+        self._image = image
+        derivative = np.array([1, -8, 0, 8, -1], np.float32) / 12
+        smooth = np.array([1, 2, 1], np.float32) / 4
+        self._by_col = cv2.sepFilter2D(image, -1, derivative, smooth)
+        self._by_row = cv2.sepFilter2D(image, -1, smooth, derivative)
+        half = patch // 2
+        row, col = np.mgrid[-half : half + 1, -half : half + 1]
+        self._half = half
+        self._col, self._row = col.ravel(), row.ravel()
+        weight = np.exp(-0.5 * (self._col**2 + self._row**2) / (_WEIGHT * half) ** 2)
+        self._effective = float(weight.sum() ** 2 / (weight**2).sum())  # pixels that count
+        self._weight = (weight / weight.sum()).astype(np.float32)
+
+    def _normalized(self, patches: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Patches of weighted mean 0 and variance 1, and their standard deviations (N, 1)."""
+        mean = (patches @ self._weight)[:, None]
+        centred = patches - mean
+        deviation = np.sqrt((centred * centred) @ self._weight)[:, None]
+        flat = deviation**2 <= _MIN_DETAIL * (1.0 + mean * mean)
+        deviation = np.where(flat, np.float32(np.inf), deviation)
+        return centred / deviation, deviation
+
+    def find(self, doubled: FloatImage, reference: IntArray, start: Array, linear: Array) -> Registration:
+        """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
+        cols, rows = reference[:, :1] + self._col, reference[:, 1:] + self._row
+        values, deviation = self._normalized(self._image[rows, cols])
+        by_col, by_row = self._by_col[rows, cols] / deviation, self._by_row[rows, cols] / deviation
+        x, y = (self._col / self._half).astype(np.float32), (self._row / self._half).astype(np.float32)
+        columns = [
+            by_col,
+            by_row,
+            by_col * x,
+            by_col * y,
+            by_row * x,
+            by_row * y,
+            values,
+            np.ones_like(values),
+        ]
+        jacobian = np.stack(columns, axis=1)
+        weighted = jacobian * self._weight
+        normal = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
+        normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
+        inverse = np.linalg.inv(normal)
+        solver = inverse.astype(np.float32) @ weighted
+        xy, step = self._iterate(doubled, solver, start.copy(), linear.copy())
+        sampled = self._normalized(self._sample(doubled, *xy))[0]
+        correlation = ((sampled * values) @ self._weight).astype(np.float64)
+        noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
+        sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise)
+        moved = np.hypot(*(xy[0] - start).T)
+        ok = (step <= 10 * _SETTLED) & (moved <= _REACH) & np.isfinite(sigma) & (sigma > 0)
+        return Registration(xy[0], correlation, sigma, ok)
+
+    def _iterate(
+        self, doubled: FloatImage, solver: FloatArray, centre: Array, linear: Array
+    ) -> tuple[tuple[Array, Array], Array]:
+        """Centres and distortions after the iterations, and the length of each one's last step [px]."""
+        length = np.full(len(centre), np.inf)
+        active = np.arange(len(centre))
+        for _ in range(_STEPS):
+            patches = self._normalized(self._sample(doubled, centre[active], linear[active]))[0]
+            solution = (solver[active] @ patches[:, :, None])[:, :, 0].astype(np.float64)
+            change = solution[:, :6] / np.maximum(solution[:, 6:7], 0.2)  # gain: how like the patches are
+            shift = np.clip(change[:, :2], -1.0, 1.0)
+            distortion = np.clip(change[:, 2:].reshape(-1, 2, 2) / self._half, -0.2, 0.2)
+            linear[active] = linear[active] @ np.linalg.inv(np.eye(2) + distortion)
+            centre[active] -= (linear[active] @ shift[:, :, None])[:, :, 0]
+            length[active] = np.hypot(*shift.T)
+            active = active[length[active] > _SETTLED]
+            if not len(active):
+                break
+        return (centre, linear), length
+
+    def _sample(self, doubled: FloatImage, centre: Array, linear: Array) -> FloatArray:
+        """Patches (N, P) of the other image about centres (N, 2) under distortions (N, 2, 2)."""
+        offsets = np.stack([self._col, self._row]).astype(np.float32)
+        where = 2.0 * (linear.astype(np.float32) @ offsets + centre.astype(np.float32)[:, :, None])
+        return np.asarray(
+            cv2.remap(doubled, where[:, 0], where[:, 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101),
+            np.float32,
+        )
