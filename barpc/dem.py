@@ -11,6 +11,7 @@ import re
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from rasterio.windows import Window
 from barpc.errors import BarpcWarning, InputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
+from barpc.sensor import SensorModel
 
 _HGT_NAME = re.compile(r"([NS])(\d{2})([EW])(\d{3})", re.IGNORECASE)
 _HGT_VOID = -32768
@@ -266,3 +268,51 @@ class Dem:
         """Altitude above the ellipsoid (...) [m] at lon, lat (...) [deg]; NaN in voids and outside."""
         height = self.grid.sample(lon, lat)
         return height if self.geoid is None else height + self.geoid.sample(lon, lat)
+
+
+def localize_on_terrain(
+    sensor: SensorModel,
+    image: Array,
+    terrain: Callable[[Array, Array], Array],
+    alt_range: tuple[float, float],
+) -> Array:
+    """Where lines of sight first meet the terrain, coming from the sensor.
+
+    The altitude range is walked down in 64 steps until a line is below the terrain, then halved.
+
+    Parameters
+    ----------
+    sensor : SensorModel
+        The camera.
+    image : (N, 2)
+        col, row [px].
+    terrain : callable
+        lon, lat [deg] -> altitude [m above the ellipsoid], such as a `Dem`.
+    alt_range : (low, high)
+        Altitudes between which the terrain lies [m].
+
+    Returns
+    -------
+    ground : (N, 3)
+        lon, lat [deg], alt [m], to a tenth of a millimetre; NaN where a line meets a void or no terrain.
+    """
+    image = np.asarray(image, dtype=np.float64)
+
+    def above(alt: Array) -> Array:
+        ground = sensor.localize(image, alt)
+        return np.asarray(alt - terrain(ground[:, 0], ground[:, 1]))
+
+    levels = np.linspace(alt_range[1], alt_range[0], 65)
+    upper, lower = np.full(len(image), np.nan), np.full(len(image), np.nan)
+    before = above(np.full(len(image), levels[0]))
+    for high, low in pairwise(levels):
+        now = above(np.full(len(image), low))
+        met = np.isnan(lower) & (before >= 0) & (now < 0)
+        upper[met], lower[met] = high, low
+        before = now
+    steps = int(np.ceil(np.log2(max(levels[0] - levels[1], 1e-3) / 1e-4)))
+    for _ in range(steps):
+        middle = (upper + lower) / 2
+        under = above(middle) < 0
+        lower, upper = np.where(under, middle, lower), np.where(under, upper, middle)
+    return sensor.localize(image, (upper + lower) / 2)

@@ -21,6 +21,16 @@ EXIT_INTERRUPTED = 130
 COMMANDS = {
     "adjust": "Correct the cameras of overlapping images and write fresh RPCs.",
     "check": "Measure how well cameras agree, without adjusting.",
+    "fit": "Fit an RPC to any camera or to points, and certify it.",
+    "info": "Say where an image's RPC comes from and how it looks at the ground.",
+    "project": "Ground points to image points.",
+    "localize": "Image points to ground points, at an altitude or on a DEM.",
+    "triangulate": "Corresponding image points to ground points.",
+    "angle": "Incidence and azimuth of images, convergence angle of pairs.",
+    "footprint": "Outlines of images on the ground as GeoJSON.",
+    "convert": "Write an RPC in another format.",
+    "crop": "Cut a window out of an image with its exact RPC.",
+    "apply": "Give images other RPCs in a new folder and prove that tools read them.",
     "simulate": "Make synthetic images with known cameras and truth.",
 }
 """Verb -> its line in `barpc --help`; the code is `barpc.cli.<verb>.command`."""

@@ -13,6 +13,7 @@ from barpc.rpcio.fields import (
     SCALES,
     Fields,
     ReadOptions,
+    fields_from_rpc,
     number,
     rpc_from_fields,
 )
@@ -77,6 +78,44 @@ def read_nitf(path: Path) -> RPC | None:
     if match.group(1) == b"A":
         fields |= {key: [fields[key][i] for i in _B_FROM_A] for key in COEFFICIENTS}
     return rpc_from_fields(fields, name)
+
+
+def nitf_record(rpc: RPC) -> str:
+    """The 1041 characters of an RPC00B extension.
+
+    The record holds integer image and height offsets and scales, 1e-4 degree and seven digits a
+    coefficient: an RPC that was not fitted for it (`barpc.fit`, precision "nitf") loses tenths of a pixel,
+    and what is read back says how much. An accuracy that is unknown is written as zero, as the format asks.
+
+    Raises
+    ------
+    RpcFormatError
+        A number does not fit its field, such as the negative offset of a crop.
+    """
+    fields = fields_from_rpc(rpc)
+    decimals = {"ERR": 2, "LAT": 4, "LONG": 4}
+    signed = {"LAT_OFF", "LONG_OFF", "HEIGHT_OFF", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE"}
+    cells = ["1"]
+    for key, width in _NITF:
+        value = fields.get(key, [0.0])[0]
+        sign = "+" if key in signed else ""
+        cell = format(value, f"{sign}0{width}.{decimals.get(key.split('_')[0], 0)}f")
+        if len(cell) != width or (not sign and value < 0):
+            raise RpcFormatError(f"NITF RPC00B: {key} = {value:g} does not fit {width} characters")
+        cells.append(cell)
+    cells += [_nitf_coefficient(value, key) for key in COEFFICIENTS for value in fields[key]]
+    return "".join(cells)
+
+
+def _nitf_coefficient(value: float, key: str) -> str:
+    """+d.ddddddE-d."""
+    mantissa, exponent = f"{value:+.6E}".split("E")
+    power = int(exponent)
+    if power < -9:
+        return "+0.000000E+0"
+    if power > 9:
+        raise RpcFormatError(f"NITF RPC00B: a coefficient of {key} is {value:g}, beyond the format")
+    return f"{mantissa}E{power:+d}"
 
 
 def sniff_alos(text: str) -> bool:

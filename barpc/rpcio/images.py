@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import os
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
 import rasterio
+from rasterio.errors import NotGeoreferencedWarning
 from rasterio.shutil import copy as raster_copy
+from rasterio.windows import Window
 
 from barpc.atomic import replacing, write_text
 from barpc.errors import ImageError, OutputError
 from barpc.raster import identify, open_raster
+from barpc.rpcio.fixed import nitf_record
 from barpc.rpcio.tiff import GEOREFERENCE_TAGS, put_tag
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.rpc import RPC
@@ -156,6 +160,92 @@ def write_rpc_copy(
 def _convert(dataset: Any, target: Path) -> None:
     options = {"BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
     raster_copy(dataset, str(target), driver="GTiff", **options)
+
+
+def write_rpc_nitf(
+    rpc: RPC, image_path: Path | str, nitf_path: Path | str, *, overwrite: bool = False
+) -> None:
+    """Write a NITF copy of an image with an RPC in its RPC00B extension (`nitf_record` says what it holds)."""
+    source, _ = identify(image_path)
+    target = Path(nitf_path).absolute()
+    _refuse_same(source, target)
+    record = nitf_record(rpc)
+    with open_raster(source) as dataset, replacing(target, overwrite=overwrite) as partial:
+        raster_copy(dataset, str(partial), driver="NITF", TRE=f"RPC00B={record}", RPC00B="NO")
+
+
+def write_crop(
+    rpc: RPC,
+    image_path: Path | str,
+    crop_path: Path | str,
+    window: tuple[int, int, int, int],
+    *,
+    overwrite: bool = False,
+) -> RPC:
+    """Cut a window out of an image, pixels and RPC: exact, no refit.
+
+    Parameters
+    ----------
+    rpc : RPC
+        The camera of `image_path`.
+    image_path, crop_path : Path or str
+        The image, and the tiled GeoTIFF to write.
+    window : (col, row, width, height)
+        Whole pixels, inside the image.
+    overwrite : bool
+        Replace an existing file, never the image itself.
+
+    Returns
+    -------
+    rpc : RPC
+        The crop's camera, as it stands in the file.
+
+    Raises
+    ------
+    ImageError
+        The window does not lie inside the image, or the image cannot be read.
+    OutputError
+        The crop exists, is the image itself, or cannot be written.
+    """
+    source, _ = identify(image_path)
+    target = Path(crop_path).absolute()
+    _refuse_same(source, target)
+    col, row, width, height = window
+    cropped = rpc.crop(col, row)
+    with open_raster(source) as dataset:
+        if not (0 <= col < col + width <= dataset.width and 0 <= row < row + height <= dataset.height):
+            raise ImageError(
+                f"{image_path}: window {window} is not inside the image of {dataset.width} x {dataset.height}"
+            )
+        with replacing(target, overwrite=overwrite) as partial:
+            _copy_window(dataset, partial, Window(col, row, width, height))
+            put_tag(partial, cropped, () if dataset.crs is not None else GEOREFERENCE_TAGS)
+    return cropped
+
+
+def _copy_window(dataset: Any, target: Path, window: Window) -> None:
+    profile = {
+        "driver": "GTiff",
+        "width": window.width,
+        "height": window.height,
+        "count": dataset.count,
+        "dtype": dataset.dtypes[0],
+        "nodata": dataset.nodata,
+        "tiled": True,
+        "compress": "deflate",
+        "BIGTIFF": "IF_SAFER",
+    }
+    if dataset.crs is not None:
+        profile |= {"crs": dataset.crs, "transform": dataset.window_transform(window)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(target, "w", **profile) as crop:
+            crop.colorinterp = dataset.colorinterp
+            for _, block in crop.block_windows(1):
+                part = Window(
+                    window.col_off + block.col_off, window.row_off + block.row_off, block.width, block.height
+                )
+                crop.write(dataset.read(window=part), window=block)
 
 
 def _refuse_same(source: Path, target: Path) -> None:

@@ -144,6 +144,24 @@ def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
     return incidence, azimuth
 
 
+def ground_sample_distance(sensor: SensorModel, image: Array, alt: npt.ArrayLike) -> Array:
+    """Metres on the ground (..., 2) between the centres of neighbouring pixels along col and along row.
+
+    Parameters
+    ----------
+    sensor : SensorModel
+        The camera.
+    image : (..., 2)
+        col, row [px].
+    alt : (...)
+        Altitude of the ground [m].
+    """
+    image = np.asarray(image, dtype=np.float64)
+    here = ecef_from_ground(sensor.localize(image, np.asarray(alt, dtype=np.float64)))
+    steps = [sensor.localize(image + step, np.asarray(alt, dtype=np.float64)) for step in np.eye(2)]
+    return np.stack([np.linalg.norm(ecef_from_ground(s) - here, axis=-1) for s in steps], axis=-1)
+
+
 def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
     """Angle (...) [deg] between the lines of sight of two cameras at ground points (..., 3)."""
     a, b = sight_enu(sensor_a, ground), sight_enu(sensor_b, ground)

@@ -1,0 +1,124 @@
+"""`barpc apply`: give images the RPCs that belong to them, in a new folder, and prove that tools read them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from barpc.cli.main import EXIT_GATE
+from barpc.cli.points import camera_options, load_camera
+from barpc.errors import InputError
+from barpc.handoff import Reading, shadows, verify
+from barpc.raster import open_raster
+from barpc.rpcio import FORMATS, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.sensor.geometry import altitude_range
+from barpc.sensor.rpc import RPC
+
+_ENDS = [*dict.fromkeys(s for row in FORMATS.values() for s in row.suffixes), ".vrt", ".tif"]
+
+
+@click.command("apply")
+@click.argument("images", nargs=-1, required=True, metavar="IMAGE...")
+@click.option(
+    "--rpc", "rpcs", required=True, metavar="PATH", help="An RPC file, or a folder of them by image name."
+)
+@click.option("-o", "--out-dir", required=True, metavar="DIR", help="New folder.")
+@click.option("--images", "carrier", type=click.Choice(["vrt", "copy"]), default="vrt", show_default=True)
+@click.option(
+    "--rpc-format", default="txt", show_default=True, help="Files to write beside: txt,rpb,geom,xml,json."
+)
+@click.option("--overwrite", is_flag=True, help="Replace files of an earlier run.")
+@camera_options
+def command(
+    images: tuple[str, ...],
+    rpcs: str,
+    out_dir: str,
+    carrier: str,
+    rpc_format: str,
+    overwrite: bool,
+    pixel_convention: str,
+    band: int,
+    as_json: bool,
+) -> int:
+    r"""Write images with other RPCs into a new folder, then open every file as GDAL, rpcm and others do.
+
+    The images themselves stay as they are; a vendor's file beside one, which would hide an RPC put into it,
+    is named.
+
+    \b
+    Example:
+      barpc apply scene/*.tif --rpc adjusted -o handoff
+    """
+    folder = Path(out_dir)
+    formats = [name.strip() for name in rpc_format.split(",") if name.strip()]
+    _check(images, folder, formats)
+    readings: list[Reading] = []
+    for image in images:
+        camera = load_camera(str(_rpc_file(Path(rpcs), Path(image))), pixel_convention, band)
+        written = _write(Path(image), camera.rpc, folder, carrier, formats, overwrite)
+        size = _size(image)
+        readings += verify(written, camera.rpc, size, altitude_range(camera.rpc))
+        for sidecar in shadows(image):
+            click.echo(
+                f"barpc: beside {image}: {sidecar.path.name} hides an RPC put into the image", err=True
+            )
+        for sidecar in shadows(written[0]):
+            if sidecar.path not in written:
+                click.echo(f"barpc: {sidecar.path} hides the RPC of {written[0]}: remove it", err=True)
+    if as_json:
+        rows = [
+            {"path": str(r.path), "consumer": r.consumer, "max_px": r.max_error, "note": r.note}
+            for r in readings
+        ]
+        click.echo(json.dumps(rows))
+    else:
+        for reading in readings:
+            click.echo(f"{reading.path}: {reading.consumer} {reading.note or f'{reading.max_error:.1e} px'}")
+    return 0 if all(reading.passed for reading in readings) else EXIT_GATE
+
+
+def _size(image: str) -> tuple[int, int]:
+    """Width and height of an image [px]."""
+    with open_raster(image) as dataset:
+        return dataset.width, dataset.height
+
+
+def _check(images: tuple[str, ...], folder: Path, formats: list[str]) -> None:
+    for name in formats:
+        if name not in FORMATS or FORMATS[name].write is None:
+            raise click.UsageError(f"--rpc-format {name}: not a format that is written")
+    stems = [Path(image).stem for image in images]
+    twins = sorted({stem for stem in stems if stems.count(stem) > 1})
+    if twins:
+        raise InputError(f"several images named {twins[0]}: apply them one folder at a time")
+    if any(Path(image).resolve().parent == folder.resolve() for image in images):
+        raise InputError(f"{folder}: the folder of the images; choose a new one")
+
+
+def _rpc_file(rpcs: Path, image: Path) -> Path:
+    if not rpcs.is_dir():
+        return rpcs
+    present = {entry.name.lower(): entry for entry in rpcs.iterdir()}
+    for end in _ENDS:
+        found = present.get(f"{image.stem}{end}".lower())
+        if found is not None:
+            return found
+    raise InputError(
+        f"{rpcs}: no RPC of {image.name} there (looked for {image.stem}_RPC.TXT, .RPB, .geom, .vrt, ...)"
+    )
+
+
+def _write(
+    image: Path, rpc: RPC, folder: Path, carrier: str, formats: list[str], overwrite: bool
+) -> list[Path]:
+    written = [folder / f"{image.stem}{'.vrt' if carrier == 'vrt' else '.tif'}"]
+    if carrier == "vrt":
+        write_rpc_vrt(rpc, image, written[0], overwrite=overwrite)
+    else:
+        write_rpc_copy(rpc, image, written[0], overwrite=overwrite)
+    for name in formats:
+        written.append(folder / f"{image.stem}{FORMATS[name].suffixes[0]}")
+        write_rpc(rpc, written[-1], format=name, overwrite=overwrite)
+    return written

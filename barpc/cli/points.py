@@ -1,0 +1,181 @@
+"""What the verbs on points and cameras share: arguments, tables of points, an image's camera and size."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+import numpy as np
+
+from barpc.errors import ImageError, InputError
+from barpc.geodesy import Array
+from barpc.raster import open_raster
+from barpc.rpcio import RpcSource, read_rpc_source
+from barpc.sensor.rpc import RPC
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+NUMBERS = {"ignore_unknown_options": True}
+"""Context settings under which -3.5 is a number, not an option."""
+
+CONVENTIONS = {"auto": None, "0": 0.0, "0.5": 0.5, "1": 1.0}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The RPC of an image or an RPC file, and the image's size where there is one."""
+
+    source: RpcSource
+    size: tuple[int, int] | None
+
+    @property
+    def rpc(self) -> RPC:
+        """The camera."""
+        return self.source.rpc
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """The image's size [px], or a usage error that asks for it."""
+        if self.size is None:
+            raise click.UsageError(f"{self.source.path} is no image: give its size with --size WIDTH HEIGHT")
+        return self.size
+
+
+def camera_options(function: Function) -> Function:
+    """Options of every verb that reads an RPC."""
+    for option in (
+        click.option(
+            "--band", default=1, show_default=True, help="Which RPC, where a file holds one a band."
+        ),
+        click.option(
+            "--pixel-convention",
+            type=click.Choice(list(CONVENTIONS)),
+            default="auto",
+            help="Coordinate that an RPC file gives to the centre of the first pixel, if not its format's own.",
+        ),
+        click.option("--json", "as_json", is_flag=True, help="JSON on stdout."),
+    ):
+        function = option(function)
+    return function
+
+
+def load_camera(
+    path: str, pixel_convention: str = "auto", band: int = 1, size: tuple[int, int] | None = None
+) -> Camera:
+    """The camera of an image or an RPC file, and the size of the image."""
+    source = read_rpc_source(path, first_pixel=CONVENTIONS[pixel_convention], band=band)
+    if size is None:
+        try:
+            with open_raster(path) as dataset:
+                size = (dataset.width, dataset.height)
+        except ImageError:  # an RPC file: there is no raster to ask
+            size = None
+    return Camera(source, size)
+
+
+def read_points(
+    numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None
+) -> Array:
+    """Points from arguments, a CSV file, or standard input ("-").
+
+    Parameters
+    ----------
+    numbers : sequence of float
+        Arguments, a multiple of the number of columns.
+    file : str or None
+        CSV with a header that has the columns, or without one in their order; blanks separate, too.
+    names : sequence of str
+        Columns.
+    fill : float, optional
+        Value of the last column where it is not given.
+
+    Returns
+    -------
+    points : (N, len(names))
+    """
+    if file is not None:
+        stream = sys.stdin if file == "-" else _open(file)
+        with stream:
+            return _table(stream, file, names, fill)
+    width = len(names) if fill is None else len(names) - 1
+    if not numbers or len(numbers) % width:
+        wanted = " ".join(names[:width]).upper()
+        raise click.UsageError(f"{len(numbers)} numbers; give {wanted} of each point, or --points FILE")
+    points = np.array(numbers, dtype=np.float64).reshape(-1, width)
+    return points if fill is None else np.column_stack([points, np.full(len(points), fill)])
+
+
+def _open(file: str) -> Any:
+    try:
+        return Path(file).open(encoding="utf-8-sig", newline="")
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror})") from error
+
+
+def _table(lines: Iterable[str], file: str, names: Sequence[str], fill: float | None) -> Array:
+    rows = [row for line in lines if (row := _cells(line))]
+    columns = list(range(len(names)))
+    if rows and not _is_number(rows[0][0]):
+        header = [cell.strip().lower() for cell in rows.pop(0)]
+        columns = [header.index(name) if name in header else -1 for name in names]
+        if -1 in columns[: -1 if fill is not None else None]:
+            raise InputError(f"{file}: columns {', '.join(names)} expected, found {', '.join(header)}")
+    points = np.empty((len(rows), len(names)))
+    for i, row in enumerate(rows):
+        for j, column in enumerate(columns):
+            missing = column < 0 or column >= len(row)
+            if missing and not (fill is not None and j == len(names) - 1):
+                raise InputError(f"{file}: point {i + 1} has {len(row)} columns, expected {', '.join(names)}")
+            text = str(fill) if missing else row[column]
+            if not _is_number(text):
+                raise InputError(f"{file}: point {i + 1}: {text!r} is no number")
+            points[i, j] = float(text)
+    return points
+
+
+def _cells(line: str) -> list[str]:
+    line = line.split("#", 1)[0].strip()
+    return next(csv.reader([line])) if "," in line else line.split()
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_json: bool) -> None:
+    """A table of points as CSV with a header, or as a JSON list of objects (null for NaN)."""
+    if as_json:
+        rows = [
+            {
+                name: (round(v, d) if np.isfinite(v) else None)
+                for name, v, d in zip(names, row, digits, strict=True)
+            }
+            for row in values.tolist()
+        ]
+        click.echo(json.dumps(rows))
+        return
+    click.echo(",".join(names))
+    for row in values.tolist():
+        click.echo(",".join(f"{v:.{d}f}" for v, d in zip(row, digits, strict=True)))
+
+
+def middle_altitude(rpc: RPC) -> float:
+    """The altitude in the middle of an RPC's range [m]."""
+    return float(rpc.ground_offset[2])
+
+
+def warn_failures(points: Array, what: str) -> None:
+    """Say on stderr how many points came out without a value."""
+    count = int((~np.isfinite(points).all(axis=1)).sum())
+    if count:
+        click.echo(f"barpc: {count} of {len(points)} points {what}", err=True)
