@@ -16,8 +16,8 @@ from barpc.tie.features import Keypoints
 
 FloatArray = npt.NDArray[np.float32]
 
-_MAX_TURN = np.radians(25.0)  # between the orientation seen and the one expected
-_MAX_ZOOM = np.log(1.7)  # the same for the scale
+_MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
+_MAX_ZOOM = np.log(1.8)  # the same for the scale
 _APART = 2.0  # px; nearer candidates are the same point
 _NONE = np.float32(-2.0)  # below every cosine
 

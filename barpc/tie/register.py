@@ -22,8 +22,9 @@ from barpc.tie.raster import Box, FloatImage, read_pixels
 FloatArray = npt.NDArray[np.float32]
 
 _CHUNK = 256  # patches worked on at a time: they stay in cache
-_STEPS = 6
+_STEPS = 12
 _SETTLED = 0.003  # px; a step below it is the last
+_SMALLER = 0.7  # side of the second try
 _REACH = 2.0  # px; a patch that moves farther has left its point
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _MIN_DETAIL = 1e-12  # relative variance below which a patch is flat
@@ -96,7 +97,7 @@ def register_task(task: Task) -> Registration:
     (first, valid_first, origin_first), (second, valid_second, origin_second) = images
     found = register(
         (first, second),
-        (_usable(valid_first, task.patch), _usable(valid_second, task.patch)),
+        (valid_first, valid_second),
         task.reference - origin_first,
         task.start - origin_second,
         task.linear,
@@ -121,7 +122,7 @@ def _usable(valid: BoolArray, patch: int) -> BoolArray:
 
 def register(
     images: tuple[FloatImage, FloatImage],
-    usable: tuple[BoolArray, BoolArray],
+    valid: tuple[BoolArray, BoolArray],
     reference: Array,
     start: Array,
     linear: Array,
@@ -129,12 +130,14 @@ def register(
 ) -> Registration:
     """Register patches of the second image to patches of the first.
 
+    What fails (at a border, on a steep slope) is tried again with a smaller patch.
+
     Parameters
     ----------
     images : two (height, width) arrays
         Reference image, other image.
-    usable : two (height, width) masks
-        Where a patch may be centred.
+    valid : two (height, width) masks
+        Pixels that mean something: a patch holds no others.
     reference : (N, 2)
         Centres in the reference image, whole pixels.
     start : (N, 2)
@@ -149,21 +152,20 @@ def register(
     registration : Registration
         In the coordinates of `images`.
     """
-    template = _Template(images[0], patch)
     doubled = _double(images[1])
-    xy, correlation = np.array(start, dtype=np.float64), np.zeros(len(start))
-    sigma, ok = np.full(len(start), np.inf), np.zeros(len(start), dtype=bool)
-    possible = np.flatnonzero(_at(usable[0], reference) & _at(usable[1], start))
-    for first in range(0, len(possible), _CHUNK):
-        rows = possible[first : first + _CHUNK]
-        found = template.find(doubled, reference[rows].astype(np.int64), start[rows], linear[rows])
-        xy[rows], correlation[rows], sigma[rows], ok[rows] = (
-            found.xy,
-            found.correlation,
-            found.sigma,
-            found.ok,
-        )
-    return Registration(xy, correlation, sigma, ok & _at(usable[1], xy))
+    best = Registration(
+        np.array(start), np.zeros(len(start)), np.full(len(start), np.inf), np.zeros(len(start), dtype=bool)
+    )
+    for side in (patch, int(_SMALLER * patch) | 1):
+        template = _Template(images[0], side)
+        usable = [_usable(mask, side) for mask in valid]
+        possible = np.flatnonzero(~best.ok & _at(usable[0], reference) & _at(usable[1], start))
+        for first in range(0, len(possible), _CHUNK):
+            rows = possible[first : first + _CHUNK]
+            found = template.find(doubled, reference[rows].astype(np.int64), start[rows], linear[rows])
+            best.xy[rows], best.correlation[rows], best.sigma[rows] = found.xy, found.correlation, found.sigma
+            best.ok[rows] = found.ok & _at(usable[1], found.xy)
+    return best
 
 
 def _at(mask: BoolArray, xy: Array) -> BoolArray:
