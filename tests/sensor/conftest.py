@@ -14,6 +14,7 @@ from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.simulate.orbit import Look, fly
+from tests.sensor.s1_product import Product
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,17 @@ def _pushbroom(lon: float) -> Pushbroom:
     return fly(np.array([lon, 43.2, 500.0]), Look(25.0, 100.0), (20000, 19000), 0.5)
 
 
+def _range_doppler(lon: float) -> Case:
+    model = Product(lon=lon - 5.0).model()
+    return Case(model, model.size, model.alt_range)
+
+
+def _corrected_range_doppler() -> Case:
+    case = _range_doppler(5.4)
+    correction = Correction([2e-6, -3e-6, 1e-6], [4.0, -3.0, 2.0], ecef_from_ground([10.0, 42.0, 7e5]))
+    return Case(Corrected(case.model, correction), case.size, case.alt_range)
+
+
 MODELS: dict[str, Callable[[], Case]] = {
     "rpc": lambda: Case(make_rpc(), (20000, 19000), (0.0, 1000.0)),
     "rpc across the antimeridian": lambda: Case(make_rpc(lon=179.98), (20000, 19000), (0.0, 1000.0)),
@@ -57,6 +69,9 @@ MODELS: dict[str, Callable[[], Case]] = {
     "corrected pushbroom": lambda: Case(
         Corrected(_pushbroom(5.4), _correction()), (20000, 19000), (0.0, 1000.0)
     ),
+    "range-doppler": lambda: _range_doppler(5.4),
+    "range-doppler across the antimeridian": lambda: _range_doppler(180.0),
+    "corrected range-doppler": _corrected_range_doppler,
 }
 
 

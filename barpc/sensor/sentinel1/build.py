@@ -24,7 +24,7 @@ from barpc.sensor.sentinel1.frames import Frame, GroundFrame, SlantFrame
 from barpc.sensor.sentinel1.orbit import MARGIN, Orbit, fit_orbit
 from barpc.sensor.sentinel1.range_doppler import RangeDoppler
 
-RELIEF = (500.0, 1000.0)
+RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
 
 _GRID_TOLERANCE = 5.0  # px and lines: a grid farther off does not belong to the orbit

@@ -1,9 +1,10 @@
 """The satellite's orbit: one polynomial of time through the annotated state vectors.
 
-Least squares on positions AND velocities, in Chebyshev polynomials of the time span. Positions are the
-exact part (2e-6 m against a smooth orbit in auxiliary products, 2e-4 m in downlinked ones), velocities the
-noisy part (1e-5 and 6e-3 m/s), so a metre per second counts as a metre: with equal weights by time span
-the noise of downlinked velocities moves the orbit by centimetres.
+Least squares on positions AND velocities, in Chebyshev polynomials of the time span. How far each can be
+trusted differs from product to product: positions to 2e-6 m in auxiliary products and 2e-4 m in downlinked
+ones, velocities to 1e-5 and 6e-3 m/s, and where the annotated times, whole microseconds, are not the true
+ones, positions ALONG the track to 3 mm only. So the standard deviations of positions along the track and
+across it and of velocities are estimated along with the orbit, from the residuals.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ MAX_DEGREE = 11
 
 _TOLERANCE = 1.0  # m: state vectors that scatter more are not one orbit
 _FLOOR = 2e-5  # m: a residual across the track that no pixel sees
+_DIGITS = np.array([1e-5, 1e-5, 1e-6])  # m, m, m/s: no standard deviation is smaller
+_ROUNDS = 5  # of estimating them: they settle in three
 _GAIN = 1.5  # a higher degree must lower the residual across the track by this factor
 
 
@@ -39,14 +42,15 @@ class Orbit(Record):
         ECEF position [m], ascending powers of x = (t - center) / half.
     center, half : float
         Middle and half length of the time span [s from the epoch of the model].
-    rms : float
-        Residual of the state vectors' positions, per degree of freedom [m].
+    sigma : (3,)
+        Standard deviations of the state vectors: positions along the track and across it [m], velocities
+        [m/s].
     """
 
     coeffs: Array
     center: float
     half: float
-    rms: float
+    sigma: Array
 
     @property
     def degree(self) -> int:
@@ -94,7 +98,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
 
     The degree is the lowest that no higher one (to `MAX_DEGREE`) betters by more than half in the
     residual ACROSS the track: about 5 for downlinked vectors, 6 for auxiliary ones, more for a long span.
-    Along the track the annotated times, whole microseconds, leave 2 mm that a high degree would follow.
+    Along the track a high degree would follow the rounding of the times.
 
     Parameters
     ----------
@@ -130,28 +134,46 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
         )
     degrees = range(3, min(MAX_DEGREE, len(time)) + 1)
     fits = [_fit(time, position, velocity, degree) for degree in degrees]
-    limit = _GAIN * max(_FLOOR, min(across for _, across in fits))
-    orbit = next(fit for fit, across in fits if across <= limit)
-    if not orbit.rms <= _TOLERANCE:
-        raise RpcError(f"orbit: the state vectors scatter by {orbit.rms:.3g} m about any smooth orbit")
+    limit = _GAIN * max(_FLOOR, min(float(fit.sigma[1]) for fit in fits))
+    orbit = next(fit for fit in fits if fit.sigma[1] <= limit)
+    if not orbit.sigma[:2].max() <= _TOLERANCE:
+        raise RpcError(
+            f"orbit: the state vectors scatter by {orbit.sigma.max():.3g} m about any smooth orbit"
+        )
     return orbit
 
 
-def _fit(time: Array, position: Array, velocity: Array, degree: int) -> tuple[Orbit, float]:
-    """Least squares of one degree, and the residual of the positions across the track [m]."""
+def _fit(time: Array, position: Array, velocity: Array, degree: int) -> Orbit:
+    """Least squares of one degree, weighted by the standard deviations that its own residuals show."""
     center, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
     x = (time - center) / half
     basis = chebyshev.chebvander(x, degree)
     slope = chebyshev.chebval(x, chebyshev.chebder(np.eye(degree + 1))).T / half
-    matrix, target = np.concatenate([basis, slope]), np.concatenate([position, velocity])
-    solution = np.linalg.lstsq(matrix, target, rcond=None)[0]
-    rest = (target - matrix @ solution)[: len(time)]
     along = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
-    across = rest - (rest * along).sum(axis=1, keepdims=True) * along
-    freedom = len(target) - len(solution)
-    total, side = (float(np.sqrt((r**2).sum() / freedom)) for r in (rest, across))
-    powers = np.stack([chebyshev.cheb2poly(c) for c in _padded(solution)], axis=1)
-    return Orbit(powers, float(center), float(half), total), side
+    across = np.eye(3) - along[:, :, None] * along[:, None, :]
+    groups = [
+        (_rows(along[:, None, :], basis), (along * position).sum(axis=1)),
+        (_rows(across, basis), np.einsum("nij,nj->ni", across, position).ravel()),
+        (_rows(np.broadcast_to(np.eye(3), across.shape), slope), velocity.ravel()),
+    ]
+    share = 1.0 - 0.5 * (degree + 1) / len(time)  # of the observations that the unknowns leave over
+    count = len(time) * np.array([1.0, 2.0, 3.0]) * share
+    sigma = np.ones(3)
+    for _ in range(_ROUNDS):
+        matrix = np.concatenate([a / s for (a, _), s in zip(groups, sigma, strict=True)])
+        target = np.concatenate([y / s for (_, y), s in zip(groups, sigma, strict=True)])
+        scale = np.linalg.norm(matrix, axis=0)
+        solution = np.linalg.lstsq(matrix / scale, target, rcond=None)[0] / scale
+        squares = np.array([((y - a @ solution) ** 2).sum() for a, y in groups])
+        sigma = np.maximum(np.sqrt(squares / count), _DIGITS)
+    powers = [chebyshev.cheb2poly(c) for c in _padded(solution.reshape(degree + 1, 3))]
+    return Orbit(np.stack(powers, axis=1), float(center), float(half), sigma)
+
+
+def _rows(directions: Array, basis: Array) -> Array:
+    """Observation equations of components along (N, C, 3) `directions`: rows (N C), columns (D + 1, 3)."""
+    rows: Array = directions[:, :, None, :] * basis[:, None, :, None]
+    return rows.reshape(rows.shape[0] * rows.shape[1], -1)
 
 
 def _padded(solution: Array) -> Array:

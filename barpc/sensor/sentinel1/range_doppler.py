@@ -109,6 +109,32 @@ class RangeDoppler(Record):
                 out[:, part] = self._geometry(ecef_from_ground(flat[part])).times
         return out[0].reshape(ground.shape[:-1]), out[1].reshape(ground.shape[:-1])
 
+    def incidence(self, ground: Array) -> Array:
+        """Incidence angles of the radar beam.
+
+        Not that of `barpc.sensor.geometry.view_angles`, which follows the ground points of one pixel over
+        altitude: for a radar they lie on a circle about the track, at a right angle to the beam.
+
+        Parameters
+        ----------
+        ground : (..., 3)
+            lon, lat [deg], alt [m above the WGS84 ellipsoid].
+
+        Returns
+        -------
+        incidence : (...)
+            Angle between the ellipsoid's normal and the beam [deg]; NaN where `azimuth_range` is.
+        """
+        ground = np.asarray(ground, dtype=np.float64)
+        flat = ground.reshape(-1, 3)
+        out = np.empty(len(flat))
+        with np.errstate(all="ignore"):
+            for part in _chunks(len(flat)):
+                seen = self._geometry(ecef_from_ground(flat[part]))
+                cosine = _dot(enu_basis(flat[part])[:, 2, :].T, seen.sight)
+                out[part] = np.where(np.isnan(seen.times[0]), np.nan, np.rad2deg(np.arccos(cosine)))
+        return out.reshape(ground.shape[:-1])
+
     def project(self, ground: Array) -> Array:
         """Image points of ground points.
 
