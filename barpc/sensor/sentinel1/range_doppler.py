@@ -8,13 +8,21 @@ into (col, row).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from barpc.errors import RpcError
-from barpc.geodesy import Array, ecef_from_ground, ecef_from_ground_jacobian, enu_basis, ground_from_ecef
+from barpc.geodesy import (
+    Array,
+    ecef_from_ground,
+    ecef_from_ground_jacobian,
+    enu_basis,
+    ground_from_ecef,
+    wrap_longitude,
+)
 from barpc.sensor.sentinel1.annotation import Annotation
 from barpc.sensor.sentinel1.corrections import Bistatic, Delays
 from barpc.sensor.sentinel1.frames import SPEED_OF_LIGHT, Frame
@@ -202,6 +210,7 @@ class RangeDoppler(Record):
         -------
         ground : (..., 3)
             lon, lat [deg], alt [m]; NaN off the orbit's time span or where the range does not reach.
+            Longitudes run on across the antimeridian.
         """
         image, alt = np.asarray(image, dtype=np.float64), np.asarray(alt, dtype=np.float64)
         shape = np.broadcast_shapes(image.shape[:-1], alt.shape)
@@ -211,7 +220,15 @@ class RangeDoppler(Record):
         with np.errstate(all="ignore"):
             for part in _chunks(len(flat)):
                 out[part] = self._localize(flat[part].T, alt[part])
+            out[:, 0] = wrap_longitude(out[:, 0], self._middle)
         return out.reshape(*shape, 3)
+
+    @cached_property
+    def _middle(self) -> float:
+        """Longitude of the middle of the image [deg]."""
+        image = 0.5 * np.array(self.size, dtype=np.float64)[:, None]
+        lon = float(self._localize(image, np.array([np.mean(self.alt_range)]))[0, 0])
+        return lon if np.isfinite(lon) else 0.0
 
     def _geometry(self, ecef: Array) -> _Seen:
         """Zero-Doppler geometry of ECEF points (N, 3)."""
