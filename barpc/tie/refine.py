@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from barpc.tie.register import Registration, Task, register_task
 from barpc.tie.work import Progress, ordered
 
 _FLOOR = 0.1  # px across the epipolar line that are always tolerated
+_DISTORTED = 2.2  # times the median sigma: the patch lies across a step of the ground
 _LEAST_SIGMA = 0.02  # px
 _UNKNOWN_ANGLE = 90.0  # deg, of views that were not paired
 _FEW = 20  # observations of a pair of views below which their sigmas are not scaled by their errors
@@ -62,77 +64,111 @@ def refine(
         return tracks
     cameras = [view.sensor for view in views] if sensors is None else sensors
     of_track = references(tracks, pairs, len(views))
-    rows = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
-    reference = of_track[tracks.point[rows]]
-    xy, sigma, keep = np.rint(tracks.xy), np.full(len(tracks), np.nan), np.zeros(len(tracks), dtype=bool)
-    linear, start = np.empty((len(rows), 2, 2)), np.empty((len(rows), 2))
-    groups = _grouped(tracks.view[reference], tracks.view[rows])
-    for group in groups:
-        r, v = _views(tracks, reference, rows, group)
-        alt = 0.5 * sum(common_range(views[r], views[v]))
-        linear[group] = linear_map(cameras[r], cameras[v], xy[reference[group]], alt)
-    rounding = (xy - tracks.xy)[reference]
-    start = tracks.xy[rows] + (linear @ rounding[:, :, None])[:, :, 0]
-    tile = np.floor(xy[reference] / options.tile).astype(np.int64)
-    parts = _grouped(tracks.view[reference], tracks.view[rows], tile[:, 1], tile[:, 0])
-    tasks = []
-    for part in parts:
-        r, v = _views(tracks, reference, rows, part)
-        at = (xy[reference[part]], start[part], linear[part])
-        both = (views[r], views[v])
-        tasks.append(
-            (
-                Task(
-                    (both[0].path, both[1].path),
-                    (both[0].size, both[1].size),
-                    options.band,
-                    *at,
-                    options.patch,
-                ),
-            )
-        )
-    found: list[Registration] = ordered(executor, register_task, tasks, "refine", progress)
-    for part, registration in zip(parts, found, strict=True):
-        xy[rows[part]], sigma[rows[part]] = registration.xy, registration.sigma
-        keep[rows[part]] = registration.ok & (registration.correlation >= options.min_correlation)
-    for group in groups:
-        group = group[keep[rows[group]]]
-        if not len(group):
-            continue
-        r, v = _views(tracks, reference, rows, group)
-        where = frame(cameras[r], cameras[v], xy[reference[group]], common_range(views[r], views[v]))
-        errors = where.errors(np.arange(len(group)), xy[rows[group]])[:, 1]
-        agree, residual = agreeing(xy[reference[group]], errors, _FLOOR)
-        scale = mad(residual / sigma[rows[group]]) if len(group) >= _FEW else 1.0
-        sigma[rows[group]] *= max(1.0, scale)
-        keep[rows[group]] = agree
-    return _finish(tracks, of_track, xy, sigma, keep)
+    other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
+    links = _Links(views, cameras, tracks, of_track[tracks.point[other]], other)
+    found = links.register(options, executor, progress)
+    good = links.verified(found, found.ok & (found.correlation >= options.min_correlation))
+    sigma = links.scaled(found, good)
+    return _shared(tracks, of_track, other[good], found.xy[good], sigma[good])
 
 
-def _views(tracks: Tracks, reference: IntArray, rows: IntArray, group: IntArray) -> tuple[int, int]:
-    return int(tracks.view[reference[group[0]]]), int(tracks.view[rows[group[0]]])
+@dataclass(frozen=True, eq=False)
+class _Links:
+    """Observations that are registered (`other`), each with the reference of its track; rows of `tracks`."""
+
+    views: Sequence[View]
+    cameras: Sequence[SensorModel]
+    tracks: Tracks
+    reference: IntArray
+    other: IntArray
+
+    def __len__(self) -> int:
+        return len(self.other)
+
+    @property
+    def origin(self) -> Array:
+        """Whole pixels at which the reference patches stand."""
+        return np.rint(self.tracks.xy[self.reference])
+
+    def of(self, part: IntArray) -> tuple[int, int]:
+        """The two views of links that have them in common."""
+        first = part[0]
+        return int(self.tracks.view[self.reference[first]]), int(self.tracks.view[self.other[first]])
+
+    def groups(self, *more: IntArray) -> list[IntArray]:
+        """Indices of the links between the same two views, and of equal values of `more`."""
+        table = np.stack([self.tracks.view[self.reference], self.tracks.view[self.other], *more])
+        order = np.lexsort(table[::-1])
+        cuts = np.flatnonzero((np.diff(table[:, order], axis=1) != 0).any(axis=0)) + 1
+        return np.split(order, cuts) if len(order) else []
+
+    def register(
+        self, options: TieOptions, executor: Executor | None, progress: Progress | None
+    ) -> Registration:
+        """Register all, tile by tile of the reference view."""
+        origin = self.origin
+        linear = np.empty((len(self), 2, 2))
+        for group in self.groups():
+            r, v = self.of(group)
+            alt = 0.5 * sum(common_range(self.views[r], self.views[v]))
+            linear[group] = linear_map(self.cameras[r], self.cameras[v], origin[group], alt)
+        rounding = (origin - self.tracks.xy[self.reference])[:, :, None]
+        start = self.tracks.xy[self.other] + (linear @ rounding)[:, :, 0]
+        parts = self.groups(*np.floor(origin[:, ::-1] / options.tile).astype(np.int64).T)
+        tasks = []
+        for part in parts:
+            first, second = (self.views[k] for k in self.of(part))
+            files, sizes = (first.path, second.path), (first.size, second.size)
+            where = (origin[part], start[part], linear[part])
+            tasks.append((Task(files, sizes, options.band, *where, options.patch),))
+        done: list[Registration] = ordered(executor, register_task, tasks, "refine", progress)
+        xy, (correlation, sigma) = np.empty((len(self), 2)), np.empty((2, len(self)))
+        ok = np.zeros(len(self), dtype=bool)
+        for part, one in zip(parts, done, strict=True):
+            xy[part], correlation[part], sigma[part], ok[part] = one.xy, one.correlation, one.sigma, one.ok
+        return Registration(xy, correlation, sigma, ok)
+
+    def residuals(self, found: Registration, group: IntArray) -> tuple[BoolArray, Array]:
+        """Which links between two views agree with their epipolar lines, and the distances from them [px]."""
+        r, v = self.of(group)
+        origin = self.origin[group]
+        limits = common_range(self.views[r], self.views[v])
+        where = frame(self.cameras[r], self.cameras[v], origin, limits)
+        return agreeing(origin, where.errors(np.arange(len(group)), found.xy[group])[:, 1], _FLOOR)
+
+    def verified(self, found: Registration, good: BoolArray) -> BoolArray:
+        """Those that are near their epipolar line and no less certain than others of the two views."""
+        verified = np.zeros(len(self), dtype=bool)
+        for group in self.groups():
+            group = group[good[group]]
+            if len(group):
+                group = group[found.sigma[group] <= _DISTORTED * np.median(found.sigma[group])]
+                verified[group] = self.residuals(found, group)[0]
+        return verified
+
+    def scaled(self, found: Registration, good: BoolArray) -> Array:
+        """Sigmas [px] made larger where the distances from the epipolar lines are."""
+        sigma = found.sigma.copy()
+        for group in self.groups():
+            group = group[good[group]]
+            if len(group) >= _FEW:
+                residual = self.residuals(found, group)[1]
+                sigma[group] *= max(1.0, mad(residual / sigma[group]))
+        return sigma
 
 
-def _grouped(*keys: IntArray) -> list[IntArray]:
-    """Indices of rows with equal keys, in ascending order of the keys."""
-    table = np.stack(keys)
-    order = np.lexsort(table[::-1])
-    cuts = np.flatnonzero((np.diff(table[:, order], axis=1) != 0).any(axis=0)) + 1
-    return np.split(order, cuts) if len(order) else []
-
-
-def _finish(tracks: Tracks, of_track: IntArray, xy: Array, sigma: Array, keep: BoolArray) -> Tracks:
-    """Kept rows and their references; the variance of a registration is shared by both its ends."""
-    variance = np.where(keep, 0.5 * np.nan_to_num(sigma) ** 2, 0.0)
-    count = np.bincount(tracks.point[keep], minlength=tracks.num_points)
-    total = np.bincount(tracks.point, weights=variance, minlength=tracks.num_points)
-    keep, variance = keep.copy(), variance.copy()
+def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma: Array) -> Tracks:
+    """Registered rows and their references; the variance of a registration is shared by both its ends."""
+    points = tracks.point[rows]
+    count = np.bincount(points, minlength=tracks.num_points)
+    variance = np.zeros(len(tracks))
+    variance[rows] = 0.5 * sigma**2
+    variance[of_track] = np.bincount(points, weights=variance[rows], minlength=tracks.num_points)
+    variance[of_track] /= np.maximum(count, 1)
+    placed, keep = np.rint(tracks.xy), np.zeros(len(tracks), dtype=bool)
+    placed[rows], keep[rows] = xy, True
     keep[of_track] = count > 0
-    variance[of_track] = total / np.maximum(count, 1)
-    refined = Tracks(
-        tracks.view, tracks.point, np.where(keep[:, None], xy, 0.0), np.sqrt(variance).clip(_LEAST_SIGMA)
-    )
-    return refined.select(keep)
+    return Tracks(tracks.view, tracks.point, placed, np.sqrt(variance).clip(_LEAST_SIGMA)).select(keep)
 
 
 def references(tracks: Tracks, pairs: Sequence[Pair], num_views: int) -> IntArray:
