@@ -1,10 +1,21 @@
 """Tracks to corrections: the bundle adjustment.
 
-`adjust_tracks` is the entry; `AdjustOptions` says how it runs, `Adjustment` what it found.
+`adjust_tracks` is the entry; `AdjustOptions` says how it runs, `Adjustment` what it found. `block_prior` keeps
+what a block knows for a later run with more views; `pair_heights` says how well a stereo pair knows heights.
 """
 
 from barpc.ba.adjustment import adjust_tracks
+from barpc.ba.incremental import BlockPrior, block_prior
 from barpc.ba.options import AdjustOptions
 from barpc.ba.result import Adjustment
+from barpc.ba.stereo import PairHeights, pair_heights
 
-__all__ = ["AdjustOptions", "Adjustment", "adjust_tracks"]
+__all__ = [
+    "AdjustOptions",
+    "Adjustment",
+    "BlockPrior",
+    "PairHeights",
+    "adjust_tracks",
+    "block_prior",
+    "pair_heights",
+]

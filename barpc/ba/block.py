@@ -54,6 +54,11 @@ class Block:
     left_out: tuple[str, ...]
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the views."""
+        return tuple(view.name for view in self.views)
+
+    @property
     def alt_range(self) -> tuple[float, float]:
         """Lowest and highest altitude [m] that any view is used for."""
         return min(v.alt_range[0] for v in self.views), max(v.alt_range[1] for v in self.views)
@@ -110,7 +115,9 @@ def join(views: tuple[View, ...], tracks: Tracks, gcps: GroundPoints | None, opt
         point = np.concatenate([point, tracks.num_points + gcps.point])
         xy, sigma = np.concatenate([xy, gcps.xy]), np.concatenate([sigma, gcps.xy_sigma])
     num_points = tracks.num_points + (len(gcps.names) if gcps is not None else 0)
-    if len(np.unique(point * len(views) + view)) < len(view):
+    key = point * len(views) + view
+    rows = np.arange(len(key)) if (np.diff(key) > 0).all() else np.argsort(key, kind="stable")
+    if not (np.diff(key[rows]) > 0).all():
         raise InputError("tracks: a track is observed twice in one view; keep one observation or none")
     count = np.bincount(view, minlength=len(views))
     few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero(count < options.min_observations)]
@@ -119,7 +126,7 @@ def join(views: tuple[View, ...], tracks: Tracks, gcps: GroundPoints | None, opt
             f"too few observations in {', '.join(few)}: at least {options.min_observations} are needed; "
             "loosen the matching or leave these views out"
         )
-    left_out = _left_out(names, view, point, tracks.num_points, options)
+    left_out = _left_out(names, view[rows], point[rows], tracks.num_points, options)
     order = np.argsort(view, kind="stable")
     weight = np.array([options.view_weights.get(name, 1.0) for name in names])
     use = ~np.isin(view, np.flatnonzero(np.isin(names, left_out)))
@@ -148,12 +155,11 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
 def _left_out(
     names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, options: AdjustOptions
 ) -> tuple[str, ...]:
-    """Views outside the largest connected group; GCPs tie their views to each other."""
+    """Views outside the largest connected group, rows sorted by point; GCPs tie their views to each other."""
     point = np.where(point >= num_tracks, num_tracks, point)
-    order = np.lexsort((view, point))
-    same = point[order][1:] == point[order][:-1]
-    pairs = np.unique(np.column_stack([view[order][:-1], view[order][1:]])[same], axis=0)
-    groups = connected_groups(len(names), [(int(i), int(j)) for i, j in pairs])
+    same = point[1:] == point[:-1]
+    keys = np.unique((view[:-1] * len(names) + view[1:])[same])
+    groups = connected_groups(len(names), [divmod(int(key), len(names)) for key in keys])
     if len(groups) == 1:
         return ()
     named = [[names[v] for v in group] for group in groups]
@@ -165,8 +171,7 @@ def _left_out(
             named,
         )
     rest = tuple(name for group in named[1:] for name in group)
-    message = (
-        f"{len(rest)} views are not tied to the largest group and keep their cameras: {', '.join(rest[:10])}"
-    )
+    listed = ", ".join(rest[:10])
+    message = f"{len(rest)} views are not tied to the largest group and keep their cameras: {listed}"
     warnings.warn(message, BarpcWarning, stacklevel=4)
     return rest

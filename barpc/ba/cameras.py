@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -17,10 +18,13 @@ from barpc.geodesy import Array, ground_from_ecef, ground_from_ecef_jacobian, wr
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import rotation_left_jacobian, rotation_matrix
-from barpc.sensor.rpc import RPC, monomials
+from barpc.sensor.rational import Rational, monomials
+from barpc.sensor.rpc import RPC
 
 CHUNK = 8192
 """Observations worked on at a time, so that temporaries stay in cache."""
+
+Wanted = Literal["image", "points", "unknowns"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class Cameras:
         self.is_rpc = np.array([isinstance(sensor, RPC) for sensor in self.sensors])
         self._stack = _RpcStack(self.sensors)
 
-    def project(self, params: Array, ecef: Array, bounds: IntArray, with_unknowns: bool = True) -> Projected:
+    def project(self, params: Array, ecef: Array, bounds: IntArray, wanted: Wanted = "unknowns") -> Projected:
         """Corrected image points with derivatives.
 
         Parameters
@@ -70,22 +74,24 @@ class Cameras:
             The point of every observation [m], sorted by view.
         bounds : (N + 1,)
             Observations of view v are bounds[v] : bounds[v + 1].
-        with_unknowns : bool
-            Whether the derivative by the unknowns is wanted (else it has no rows).
+        wanted : str
+            "image": no derivatives; "points": by the points; "unknowns": by the unknowns too. What is not
+            wanted has no rows.
 
         Returns
         -------
         Projected
         """
         count = ecef.shape[1]
-        image, by_point = np.empty((2, count)), np.empty((2, 3, count))
-        by_unknown = np.empty((2, self.unknowns.size if with_unknowns else 0, count))
+        image, by_point = np.empty((2, count)), np.empty((2, 0 if wanted == "image" else 3, count))
+        by_unknown = np.empty((2, self.unknowns.size if wanted == "unknowns" else 0, count))
         for views in self._chunks(bounds):
             for part in _parts(bounds[views.start], bounds[views.stop]):
                 of_view = np.clip(bounds[views.start : views.stop + 1], part.start, part.stop) - part.start
-                piece = self._project(params, ecef[:, part], views, of_view)
-                image[:, part], by_point[..., part] = piece.image, piece.by_point
-                by_unknown[..., part] = piece.by_unknown[:, : by_unknown.shape[1]]
+                piece = self._project(params, ecef[:, part], views, of_view, wanted)
+                image[:, part] = piece.image
+                by_point[..., part] = piece.by_point
+                by_unknown[..., part] = piece.by_unknown
         return Projected(image, by_point, by_unknown)
 
     def _chunks(self, bounds: IntArray) -> Iterator[slice]:
@@ -104,37 +110,46 @@ class Cameras:
                 yield slice(start, stop)
             start = stop
 
-    def _project(self, params: Array, ecef: Array, views: slice, bounds: IntArray) -> Projected:
+    def _project(
+        self, params: Array, ecef: Array, views: slice, bounds: IntArray, wanted: Wanted
+    ) -> Projected:
         index = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
         unknowns = self.unknowns
         if not unknowns.geometric:
             image, by_point = self._by_ecef(ecef, views, bounds)
-            return Projected(*unknowns.in_image(params[views], index - views.start, index, image, by_point))
-        rotation, translation = unknowns.rotation(params), unknowns.translation(params)
-        center = unknowns.center[index].T
-        first_by_point, row = None, None
+            return _only(Projected(*unknowns.in_image(params, index, image, by_point)), wanted)
+        rotation, translation = unknowns.rotation(params[views], views), unknowns.translation(params[views])
+        local, center = index - views.start, unknowns.center[index].T
+        row, first_by_point = None, None
         if unknowns.drift:
             first, first_by_point = self._by_ecef(ecef, views, bounds)
             row = unknowns.normalized_row(first[1], index)
-            vector = rotation[index] + unknowns.drift_rotation(params, index, row)
-            matrix = np.moveaxis(rotation_matrix(vector), 0, -1)
-            left = np.moveaxis(rotation_left_jacobian(vector), 0, -1)
-        else:
-            local = index - views.start
-            matrix = np.moveaxis(rotation_matrix(rotation[views]), 0, -1)[..., local]
-            left = np.moveaxis(rotation_left_jacobian(rotation[views]), 0, -1)[..., local]
-        lever = _times(matrix, (ecef - translation[index].T - center)[:, None])[:, 0]
+            rotation = rotation[local] + unknowns.drift_rotation(params, index, row)
+            local = np.arange(len(index))
+        matrix = _last(rotation_matrix(rotation))[..., local]
+        lever = _times(matrix, (ecef - translation[index - views.start].T - center)[:, None])[:, 0]
+        if wanted == "image":
+            return _only(Projected(self._image(lever + center, views, bounds), matrix, matrix), wanted)
         image, by_moved = self._by_ecef(lever + center, views, bounds)
-        by_translation = -_times(by_moved, matrix)
+        by_point = _times(by_moved, matrix)
+        if wanted == "points" and row is None:
+            return _only(Projected(image, by_point, by_point), wanted)
+        left = _last(rotation_left_jacobian(rotation))[..., local]
         by_rotation = _times(_cross(lever, by_moved), left)
-        by_point = -by_translation
-        if first_by_point is not None and row is not None:
+        by_unknown = unknowns.stack(by_rotation, -by_point, index, row)
+        if row is not None and first_by_point is not None:
             rate = unknowns.drift_rate(params, index, row)
-            by_point += (
-                (by_rotation * rate).sum(axis=1)[:, None] * first_by_point[1] / unknowns.row_scale[index]
-            )
-        by_unknown = unknowns.stack(by_rotation, by_translation, index, row)
-        return Projected(image, by_point, by_unknown)
+            by_row = (by_rotation * rate).sum(axis=1) / unknowns.row_scale[index]
+            by_point += by_row[:, None] * first_by_point[1]
+        return _only(Projected(image, by_point, by_unknown), wanted)
+
+    def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
+        """Uncorrected image points (2, n) without a derivative."""
+        ground = ground_from_ecef(ecef.T)
+        if self.is_rpc[views.start]:
+            return self._stack.image(ground, views, bounds)
+        image: Array = self.sensors[views.start].project(ground).T
+        return image
 
     def _by_ecef(self, ecef: Array, views: slice, bounds: IntArray) -> tuple[Array, Array]:
         """Uncorrected image points (2, n) and their derivative by ECEF (2, 3, n)."""
@@ -143,8 +158,8 @@ class Cameras:
             image, by_ground = self._stack.project(ground, views, bounds)
         else:
             points, jacobian = self.sensors[views.start].project_jacobian(ground)
-            image, by_ground = points.T, np.moveaxis(jacobian, 0, -1)
-        return image, _times(by_ground, np.moveaxis(ground_from_ecef_jacobian(ground), 0, -1))
+            image, by_ground = points.T, _last(jacobian)
+        return image, _times(by_ground, _last(ground_from_ecef_jacobian(ground)))
 
 
 class _RpcStack:
@@ -157,30 +172,62 @@ class _RpcStack:
         self.image_offset, self.image_scale = np.zeros((n, 2)), np.ones((n, 2))
         for i, sensor in enumerate(sensors):
             if isinstance(sensor, RPC):
-                self.coeffs[i], self.gradient[i] = sensor.coeffs, sensor._gradient
+                by_axis = Rational(sensor.coeffs, np.ones(2)).gradients.reshape(3, 4, 10)
+                self.coeffs[i], self.gradient[i] = sensor.coeffs, by_axis.swapaxes(0, 1).reshape(12, 10)
                 self.ground_offset[i], self.ground_scale[i] = sensor.ground_offset, sensor.ground_scale
                 self.image_offset[i], self.image_scale[i] = sensor.image_offset, sensor.image_scale
 
+    def image(self, ground: Array, views: slice, bounds: IntArray) -> Array:
+        """Image points (2, n) of ground points (n, 3) seen by consecutive views."""
+        index, basis = self._basis(ground, views, bounds)
+        poly = _polynomials(self.coeffs[views], basis, bounds)
+        with np.errstate(all="ignore"):
+            value = poly[::2] / poly[1::2]
+        image: Array = value * self.image_scale[index].T + self.image_offset[index].T
+        return image
+
     def project(self, ground: Array, views: slice, bounds: IntArray) -> tuple[Array, Array]:
         """Image points (2, n) and derivative (2, 3, n) of ground points (n, 3) seen by consecutive views."""
-        local = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
-        ground_scale, image_scale = self.ground_scale[local].T, self.image_scale[local].T
-        normalized = np.array(ground.T)
-        normalized[0] = wrap_longitude(normalized[0], self.ground_offset[local, 0])
-        normalized -= self.ground_offset[local].T
-        normalized /= ground_scale
-        basis = monomials(normalized)
-        poly, rates = np.empty((4, len(ground))), np.empty((12, len(ground)))
-        for v in range(views.start, views.stop):
-            part = slice(bounds[v - views.start], bounds[v - views.start + 1])
-            poly[:, part] = self.coeffs[v] @ basis[:, part]
-            rates[:, part] = self.gradient[v] @ basis[:10, part]
-        slope = rates.reshape(4, 3, -1)
+        index, basis = self._basis(ground, views, bounds)
+        poly = _polynomials(self.coeffs[views], basis, bounds)
+        slope = _polynomials(self.gradient[views], basis[:10], bounds).reshape(4, 3, -1)
+        image_scale = self.image_scale[index].T
         with np.errstate(all="ignore"):
             inverse = 1.0 / poly[1::2]
             value = poly[::2] * inverse
             jacobian = (slope[::2] - value[:, None] * slope[1::2]) * (inverse * image_scale)[:, None]
-        return value * image_scale + self.image_offset[local].T, jacobian / ground_scale
+        jacobian /= self.ground_scale[index].T
+        return value * image_scale + self.image_offset[index].T, jacobian
+
+    def _basis(self, ground: Array, views: slice, bounds: IntArray) -> tuple[IntArray, Array]:
+        """The view of every point (n,), and the monomials (20, n) of its normalised coordinates."""
+        index = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
+        normalized = np.array(ground.T)
+        normalized[0] = wrap_longitude(normalized[0], self.ground_offset[index, 0])
+        normalized -= self.ground_offset[index].T
+        normalized /= self.ground_scale[index].T
+        return index, monomials(normalized)
+
+
+def _polynomials(coeffs: Array, basis: Array, bounds: IntArray) -> Array:
+    """Polynomials (m, n) of consecutive views (v, m, 20), each at its own points: a small product a view."""
+    out = np.empty((coeffs.shape[1], basis.shape[1]))
+    for matrix, start, stop in zip(coeffs, bounds[:-1], bounds[1:], strict=True):
+        out[:, start:stop] = matrix @ basis[:, start:stop]
+    return out
+
+
+def _only(piece: Projected, wanted: Wanted) -> Projected:
+    """`piece` without the derivatives that are not wanted."""
+    if wanted == "unknowns":
+        return piece
+    by_point = piece.by_point if wanted == "points" else piece.by_point[:2, :0]
+    return Projected(piece.image, by_point, piece.by_point[:2, :0])
+
+
+def _last(matrices: Array) -> Array:
+    """(n, i, j) -> (i, j, n)."""
+    return np.moveaxis(matrices, 0, -1)
 
 
 def _parts(start: int, stop: int) -> Iterator[slice]:

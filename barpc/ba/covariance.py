@@ -85,10 +85,12 @@ class Covariance:
         q = self.num_unknowns
         place = (views[:, None] * q + np.arange(q)).ravel()
         if len(self.free) <= 2000 or "full" in self.__dict__:
-            return self.full[np.ix_(place, place)]
+            of_views: Array = self.full[np.ix_(place, place)]
+            return of_views
         unit = np.zeros((len(self.free), len(place)))
         unit[place, np.arange(len(place))] = 1.0
-        return self.solve(unit)[place]
+        solved: Array = self.solve(unit)[place]
+        return solved
 
 
 def _inverse_transposed(lower: Array) -> Array:

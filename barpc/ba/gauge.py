@@ -16,7 +16,9 @@ from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 
 MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale")
-"""The scene's motions [m]: shift; rise towards the east and the north, turn and scale, at the scene's edge."""
+"""The scene's motions [m]: shift; then rise to the east and north, turn and scale, at the scene's edge."""
+
+_SAMPLE = 5000  # points that stand for the scene's shape
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,10 @@ def gauge_report(covariance: Covariance, points: Array, before: Array, use: Bool
     -------
     GaugeReport
     """
+    shift_of_all = (points[use] - before[use]).mean(axis=0)
+    index = np.flatnonzero(use)
+    use = np.zeros_like(use)
+    use[index[:: len(index) // _SAMPLE + 1]] = True
     middle = points[use].mean(axis=0)
     enu = enu_basis(ground_from_ecef(middle))
     local = (points[use] - middle) @ enu.T
@@ -86,25 +92,27 @@ def gauge_report(covariance: Covariance, points: Array, before: Array, use: Bool
     by_unknown = _motion_by_unknowns(covariance, local / radius, enu, use)
     motion_covariance = by_unknown @ covariance.solve(by_unknown.T)
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
-    shift = ((points[use] - before[use]) @ enu.T).mean(axis=0)
-    return GaugeReport(shift, sigma[:3], sigma, _modes(motion_covariance), radius)
+    return GaugeReport(enu @ shift_of_all, sigma[:3], sigma, _modes(motion_covariance), radius)
 
 
 def _motion_by_unknowns(covariance: Covariance, local: Array, enu: Array, use: BoolArray) -> Array:
     """(7, N q): the scene's motions by the camera unknowns, points at their optimum."""
     reduced = covariance.reduced
     structure = reduced.structure
+    count, q = len(MOTIONS), covariance.num_unknowns
+    index = np.flatnonzero(use)
     pick = _motion_of_points(local) @ enu  # (7, n, 3) by ECEF moves
-    weights = np.zeros((len(use), 3, len(MOTIONS)))
-    weights[use] = np.moveaxis(pick, 0, -1)
-    lower = reduced.lower
-    whitened = np.empty_like(weights)  # L^-1 applied to each column: dX = -L^-T Y dp
-    for m in range(len(MOTIONS)):
-        whitened[..., m] = solve_lower(lower, weights[..., m].T).T
-    rows = np.einsum("kjq,kjm->mqk", reduced.cross, whitened[structure.point])
-    q = reduced.cross.shape[2]
-    summed = structure.sum_views(-rows.reshape(len(MOTIONS) * q, -1)).reshape(-1, len(MOTIONS), q)
-    return np.moveaxis(summed, 1, 0).reshape(len(MOTIONS), -1)
+    lower = reduced.lower[:, index]
+    whitened = np.zeros((len(use), 3, count))  # L^-1 of each motion's weights: dX = -L^-T Y dp
+    for m in range(count):
+        whitened[index, :, m] = solve_lower(lower, pick[m].T).T
+    rows = np.flatnonzero(use[structure.point])
+    products = np.swapaxes(reduced.cross[rows], 1, 2) @ whitened[structure.point[rows]]
+    by_unknown = np.zeros((structure.num_views, q * count))
+    bounds = np.searchsorted(rows, structure.bounds)
+    filled = np.flatnonzero(np.diff(bounds))
+    by_unknown[filled] = -np.add.reduceat(products.reshape(-1, q * count), bounds[filled], axis=0)
+    return by_unknown.reshape(-1, q, count).transpose(2, 0, 1).reshape(count, -1)
 
 
 def _motion_of_points(local: Array) -> Array:

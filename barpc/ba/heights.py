@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from barpc.ba.blocks import PointPrior, Terrain, flat_heights, join_point_priors, terrain_heights
+from barpc.ba.cameras import Projected
 from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
+from barpc.ba.structure import Structure
 from barpc.errors import BarpcWarning
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.scene import BoolArray, IntArray
@@ -17,10 +19,9 @@ from barpc.scene import BoolArray, IntArray
 _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
 
 
-def convergence_angles(problem: Problem, params: Array, points: Array) -> Array:
+def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:
     """Largest angle (P,) [rad] between a point's rays and their mean, doubled: the angle of two rays."""
-    structure = problem.structure
-    by_point = problem.cameras.project(params, points.T[:, structure.point], structure.bounds, False).by_point
+    by_point = projected.by_point
     ray = np.cross(by_point[0], by_point[1], axis=0)
     up = points.T[:, structure.point]
     with np.errstate(all="ignore"):
@@ -86,9 +87,8 @@ class Heights:
         """Say that tracks are held in height without a DEM."""
         count = int(self.weak[self.tracks].sum())
         if count and self.dem is None:
-            warnings.warn(
+            message = (
                 f"{count} of {len(self.tracks)} tracks are seen under less than "
-                f"{self.options.min_convergence:g} deg: without a DEM they are held in height and tell the cameras' relative heights nothing",
-                BarpcWarning,
-                stacklevel=4,
+                f"{self.options.min_convergence:g} deg: without a DEM they are held in height"
             )
+            warnings.warn(message, BarpcWarning, stacklevel=3)

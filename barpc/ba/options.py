@@ -98,7 +98,7 @@ class AdjustOptions:
     keep_largest: bool = False
     solver: str = "auto"
     max_steps: int = 30
-    tolerance: float = 1e-9
+    tolerance: float = 1e-6
     center_method: str = "line"
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from barpc.ba.blocks import CameraPrior, JointPrior, PointPrior
-from barpc.ba.cameras import Cameras
+from barpc.ba.cameras import Cameras, Projected
 from barpc.ba.normal import (
     TRIANGLE,
     Reduced,
@@ -61,7 +61,7 @@ class Problem:
         """Projected - observed (2, K) [px], sorted by view."""
         structure = self.structure
         ecef = points.T[:, structure.point]
-        return self.cameras.project(params, ecef, structure.bounds).image - self.xy
+        return self.cameras.project(params, ecef, structure.bounds, "image").image - self.xy
 
     def prior_cost(self, params: Array, points: Array) -> float:
         """Sum of the squared residuals of all priors."""
@@ -112,15 +112,16 @@ class Problem:
         reduced = replace(reduced, cost=reduced.cost + self.prior_cost(params, points))
         return self._add_joint(reduced, params)
 
-    def triangulate(self, params: Array, points: Array, weight: Array) -> Array:
-        """One Gauss-Newton step of all points (P, 3) [m] with the cameras held."""
+    def project_points(self, params: Array, points: Array) -> Projected:
+        """Image points and their derivative by the points, for `triangulate`."""
         structure = self.structure
-        projected = self.cameras.project(params, points.T[:, structure.point], structure.bounds, False)
+        return self.cameras.project(params, points.T[:, structure.point], structure.bounds, "points")
+
+    def triangulate(self, points: Array, projected: Projected, weight: Array) -> Array:
+        """One Gauss-Newton step of all points (P, 3) [m] with the cameras held."""
         residual = (projected.image - self.xy) * weight
         matrix, gradient = self._point_terms(points)
-        by_point = projected.by_point
-        by_point *= weight
-        sums = structure.sum_points(point_products(by_point, residual)).T
+        sums = self.structure.sum_points(point_products(projected.by_point * weight, residual)).T
         lower = cholesky3(sums[:6] + matrix)
         step = solve_transposed(lower, solve_lower(lower, sums[6:] + gradient))
         return points - step.T

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from barpc.ba.cameras import Cameras
 from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import GaugeReport
 from barpc.ba.options import AdjustOptions
@@ -31,10 +32,12 @@ class Adjustment:
     points : (P, 3)
         Tracks, ECEF [m]; NaN for a track that was cut altogether.
     residuals_before, residuals : (K, 2)
-        Projected - observed [px], in the order of the tracks given; before: delivered cameras, points
-        triangulated with them.
+        Projected - observed [px], in the order of the tracks given; before: cameras as they came (those of
+        an earlier block as it left them), points triangulated with them.
     inlier : (K,)
         Observations that were kept.
+    view : (K,)
+        The tracks' views.
     noise : float
         Observed over stated standard deviation of the observations.
     cost_history : tuple of float
@@ -43,6 +46,8 @@ class Adjustment:
         Linearisations in all.
     status : str
         One line: what the solver did.
+    cameras : Cameras
+        The views as the solver saw them.
     covariance : Covariance
         Of the corrections, of points, of relative heights.
     gauge : GaugeReport
@@ -71,6 +76,7 @@ class Adjustment:
     cost_history: tuple[float, ...]
     steps: int
     status: str
+    cameras: Cameras
     covariance: Covariance
     gauge: GaugeReport
     held: BoolArray

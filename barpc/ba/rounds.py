@@ -9,16 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from barpc.ba.loss import LOSSES
+from barpc.ba.normal import Reduced
 from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
-from barpc.ba.solve import State, minimise
+from barpc.ba.solve import State, gauss_newton, minimise
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
 _MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
-_ROUGH = 1e-4  # tolerance of a robust round: the weights change anyway
+_SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
+_SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
+_LEAST_FREEDOM = 20
 _ROBUST_ROUNDS = 12
 
 
@@ -32,8 +35,10 @@ class Outcome:
         With the priors on points as they ended.
     state : State
         Unknowns and points.
-    weight : (K,)
-        Final weights [1/px], 0 where an observation was cut.
+    reduced : Reduced
+        The last linearisation.
+    residual : (2, K)
+        Projected - observed [px].
     inlier : (K,)
         Observations in the final solve.
     noise : float
@@ -44,7 +49,8 @@ class Outcome:
 
     problem: Problem
     state: State
-    weight: Array
+    reduced: Reduced
+    residual: Array
     inlier: BoolArray
     noise: float
     passes: int
@@ -53,8 +59,9 @@ class Outcome:
 class Observations:
     """How much observations count: stated sigmas, the observed noise, and the cap on a view's information."""
 
-    def __init__(self, problem: Problem, sigma: Array, noise_floor: float) -> None:
+    def __init__(self, problem: Problem, sigma: Array, noise_floor: float, is_tie: BoolArray) -> None:
         self.structure, self.sigma, self.noise_floor = problem.structure, sigma, noise_floor
+        self.is_tie = is_tie
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True
@@ -74,12 +81,20 @@ class Observations:
         return np.where(np.isfinite(s), s, np.inf)
 
     def weight(self, use: BoolArray, noise: float) -> Array:
-        """1 / sigma (K,) [1/px] under the cap; 0 where not used."""
-        weight = use / (self.sigma * noise)
-        information = self.structure.sum_views((weight**2)[None])[:, 0]
-        cap = np.minimum(1.0, 1.0 / np.maximum(information * self.noise_floor**2, 1e-300))
-        capped: Array = weight * np.sqrt(cap)[self.structure.view]
-        return capped
+        """1 / sigma (K,) [1/px], tie points under the cap; 0 where not used."""
+        weight: Array = use / (self.sigma * noise)
+        information = self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0]
+        cap = 1.0 / np.sqrt(np.maximum(information * self.noise_floor**2, 1.0))
+        return np.where(self.is_tie, weight * cap[self.structure.view], weight)
+
+    def noise(self, residual: Array, use: BoolArray, problem: Problem) -> float:
+        """Observed over stated standard deviation of the observations in use; 1 where there are too few."""
+        whitened = residual[:, use] / self.sigma[use]
+        seen = np.unique(self.structure.point[use & ~self.has_prior[self.structure.point]])
+        freedom = whitened.size - 3 * len(seen) - int(problem.free.sum())
+        if freedom < _LEAST_FREEDOM:
+            return 1.0
+        return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
 
     def tied(self, use: BoolArray) -> BoolArray:
         """`use` without the observations whose point is left without a second one (or a prior)."""
@@ -96,6 +111,7 @@ def run_rounds(
     options: AdjustOptions,
     use: BoolArray,
     hold: Callable[[Problem, Array], Problem],
+    residual: Array,
 ) -> Outcome:
     """Robust rounds, cuts and the final least squares.
 
@@ -113,64 +129,58 @@ def run_rounds(
         Observations to start with.
     hold : callable
         The problem with its points' priors renewed at points (P, 3).
+    residual : (2, K)
+        Of `state` [px].
 
     Returns
     -------
     Outcome
     """
-    finite = np.isfinite(problem.residuals(state.params, state.points)).all(axis=0)
-    everything = use = observations.tied(use & finite)
-    noise, passes = 1.0, 0
+    everything = use = observations.tied(use & np.isfinite(residual).all(axis=0))
     problem = hold(problem, state.points)
-    if options.loss == "linear":
-        state = _minimise(problem, state, observations.weight(use, noise), options)
-    else:
-        state, noise = _robust(problem, observations, state, use, options)
-        for passes in range(1, options.num_passes + 1):
-            problem = hold(problem, state.points)
-            s = observations.squared(problem.residuals(state.params, state.points), use)
+    noise, passes = 1.0, 0
+    if options.loss != "linear":
+        state, residual, noise = _robust(problem, observations, state, residual, use, options)
+    while True:
+        problem = hold(problem, state.points)
+        passes += 1
+        kept = use
+        if options.loss != "linear":
+            s = observations.squared(residual, use)
             kept = observations.tied(everything & (s <= (options.robust_threshold * noise) ** 2))
-            if passes > 1 and (kept == use).all():
-                break
-            use = kept
-            state = _minimise(problem, state, observations.weight(use, noise), options)
-            noise = _noise(problem, observations, state, use)
-            _LOG.info("pass %d: %d of %d observations, noise %.3f", passes, use.sum(), len(use), noise)
-    noise = _noise(problem, observations, state, use) if options.estimate_noise else 1.0
-    weight = observations.weight(use, noise)
-    state = _minimise(hold(problem, state.points), state, weight, options)
-    return Outcome(problem, state, weight, use, noise, passes)
+        wanted = noise if options.estimate_noise else 1.0
+        weight = observations.weight(kept, wanted)
+        state, reduced = minimise(
+            problem, state, weight, options.solver, options.max_steps, options.tolerance
+        )
+        residual = problem.residuals(state.params, state.points)
+        same = passes > 1 and int((kept != use).sum()) <= _SAME * len(use)
+        use, before = kept, noise
+        noise = observations.noise(residual, use, problem)
+        _LOG.info("pass %d: %d of %d observations, noise %.3f", passes, use.sum(), len(use), noise)
+        settled = not options.estimate_noise or abs(noise / before - 1.0) < _SAME_NOISE
+        if passes > options.num_passes or (settled and (same or options.loss == "linear")):
+            return Outcome(problem, state, reduced, residual, use, noise, passes)
 
 
 def _robust(
-    problem: Problem, observations: Observations, state: State, use: BoolArray, options: AdjustOptions
-) -> tuple[State, float]:
-    """Reweighted rounds while the loss's scale shrinks to three standard deviations of the noise."""
+    problem: Problem,
+    observations: Observations,
+    state: State,
+    residual: Array,
+    use: BoolArray,
+    options: AdjustOptions,
+) -> tuple[State, Array, float]:
+    """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise."""
     loss = LOSSES[options.loss]
-    scale = np.inf
-    noise = 1.0
+    scale, noise = np.inf, 1.0
     for _ in range(_ROBUST_ROUNDS):
-        s = observations.squared(problem.residuals(state.params, state.points), use)
-        noise = float(np.sqrt(np.median(s[use]) / _MEDIAN)) if use.any() else 1.0
-        wanted = max(3.0 * noise, 1e-6)
-        if scale <= 1.2 * wanted:
+        s = observations.squared(residual, use)
+        noise = max(float(np.sqrt(np.median(s[use]) / _MEDIAN)), 1e-6) if use.any() else 1.0
+        if scale <= 3.6 * noise:
             break
-        scale = wanted
+        scale = 3.0 * noise
         weight = observations.weight(use, noise) * np.sqrt(loss(s / scale**2)[1])
-        state = minimise(problem, state, weight, options.solver, 2, _ROUGH)
-    return state, noise
-
-
-def _minimise(problem: Problem, state: State, weight: Array, options: AdjustOptions) -> State:
-    return minimise(problem, state, weight, options.solver, options.max_steps, options.tolerance)
-
-
-def _noise(problem: Problem, observations: Observations, state: State, use: BoolArray) -> float:
-    """Observed over stated standard deviation of the observations in use."""
-    residual = problem.residuals(state.params, state.points)[:, use] / observations.sigma[use]
-    structure = problem.structure
-    seen = np.unique(structure.point[use & ~observations.has_prior[structure.point]])
-    freedom = residual.size - 3 * len(seen) - int(problem.free.sum())
-    if freedom < 10:
-        return 1.0
-    return max(float(np.sqrt((residual**2).sum() / freedom)), 1e-6)
+        state = gauss_newton(problem, state, weight)
+        residual = problem.residuals(state.params, state.points)
+    return state, residual, noise

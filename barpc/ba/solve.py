@@ -20,11 +20,12 @@ from barpc.ba.normal import Reduced
 from barpc.ba.problem import Problem
 from barpc.errors import AdjustError
 from barpc.geodesy import Array
+from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
-SCIPY_VIEWS = 100
-"""Up to so many views "auto" takes scipy, whose dense decomposition grows as N^3."""
+SCIPY_UNKNOWNS = 600
+"""Up to so many camera unknowns "auto" takes scipy, whose dense decomposition grows as their cube."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,19 @@ class State:
     cost : float
         Sum of squared whitened residuals.
     history : tuple of float
-        The cost of every linearisation so far.
+        The cost at every linearisation so far.
     """
 
     params: Array
     points: Array
     cost: float = np.inf
     history: tuple[float, ...] = ()
+
+    def moved(self, step: Array, reduced: Reduced, cost: float) -> State:
+        """The state after a step (N, q) of the cameras and the points' step that goes with it."""
+        return replace(
+            self, params=self.params + step, points=self.points + reduced.point_step(step), cost=cost
+        )
 
 
 def minimise(
@@ -55,8 +62,8 @@ def minimise(
     weight: Array,
     solver: str = "auto",
     max_steps: int = 30,
-    tolerance: float = 1e-9,
-) -> State:
+    tolerance: float = 1e-6,
+) -> tuple[State, Reduced]:
     """Minimise at fixed weights from a state near the minimum.
 
     Parameters
@@ -72,11 +79,15 @@ def minimise(
     max_steps : int
         Linearisations.
     tolerance : float
-        Ends when a step would gain less than this fraction of the cost.
+        The step that is expected to gain less than this fraction of the cost is taken and is the last; the
+        iteration converges quadratically, so what remains is of the order of its square.
 
     Returns
     -------
-    State
+    state : State
+        The minimum.
+    reduced : Reduced
+        The last linearisation, one small step before it.
 
     Raises
     ------
@@ -84,78 +95,91 @@ def minimise(
         The cost is not finite, or no step lowers it.
     """
     start = time.process_time()
-    views = problem.structure.num_views
+    unknowns = int(problem.free.sum())
     if solver == "auto":
-        solver = "scipy" if views <= SCIPY_VIEWS and problem.joint_prior is None else "sparse"
+        solver = "scipy" if 0 < unknowns <= SCIPY_UNKNOWNS else "sparse"
+    result = None
     if solver == "scipy":
         try:
-            state = _scipy(problem, state, weight, max_steps, tolerance)
+            result = _scipy(problem, state, weight, max_steps, tolerance)
         except np.linalg.LinAlgError as error:  # its SVD may fail on a finite matrix
             _LOG.warning("least_squares failed (%s): going on by Levenberg-Marquardt", error)
-            state = _levenberg_marquardt(problem, state, weight, max_steps, tolerance)
-    else:
-        state = _levenberg_marquardt(problem, state, weight, max_steps, tolerance)
-    _LOG.info("%s: %d views, cost %.6g, %.2f s", solver, views, state.cost, time.process_time() - start)
-    return state
+    if result is None:
+        result = _levenberg_marquardt(problem, state, weight, max_steps, tolerance)
+    _LOG.info(
+        "%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result[0].cost, time.process_time() - start
+    )
+    return result
+
+
+def gauss_newton(problem: Problem, state: State, weight: Array) -> State:
+    """One undamped step: for rounds whose weights change anyway."""
+    reduced = problem.reduce(state.params, state.points, weight)
+    step, gain = camera_step(problem, reduced)
+    return state.moved(step, reduced, max(_finite(reduced.cost) - gain, 0.0))
+
+
+def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tuple[Array, float]:
+    """Gauss-Newton step (N, q) of the camera unknowns, and what cameras and points together would gain."""
+    free = problem.free
+    step = np.zeros(len(free))
+    gain = reduced.gain
+    if free.any():
+        gradient = reduced.gradient[free]
+        solution = factorize_free(problem, reduced.matrix, damping).solve(gradient)
+        step[free] = -solution
+        gain += float(gradient @ solution)
+    return step.reshape(problem.structure.num_views, -1), gain
+
+
+def factorize_free(problem: Problem, matrix: Matrix, damping: float = 0.0) -> Factor:
+    """Factor of the reduced matrix restricted to the views that are not fixed."""
+    return factorize(free_part(problem.free, matrix), damping)
+
+
+def free_part(free: BoolArray, matrix: Matrix) -> Matrix:
+    """A matrix (N q, N q) restricted to the unknowns that are free (N q,)."""
+    if free.all():
+        return matrix
+    if isinstance(matrix, np.ndarray):
+        return matrix[np.ix_(free, free)]
+    keep = np.flatnonzero(free)
+    return matrix.tocsr()[keep][:, keep]
 
 
 def _levenberg_marquardt(
     problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float
-) -> State:
+) -> tuple[State, Reduced]:
     """Gauss-Newton steps, damped only when one fails."""
     damping = 0.0
     reduced = problem.reduce(state.params, state.points, weight)
     state = replace(state, cost=_finite(reduced.cost), history=(*state.history, reduced.cost))
     for _ in range(max_steps):
         try:
-            step, expected = camera_step(problem, reduced, damping)
+            step, gain = camera_step(problem, reduced, damping)
         except np.linalg.LinAlgError:
             damping = max(10.0 * damping, 1e-8)
             continue
-        params, points = state.params + step, state.points + reduced.point_step(step)
-        if expected <= tolerance * state.cost:
-            return replace(state, params=params, points=points, cost=state.cost - expected)
-        trial = problem.reduce(params, points, weight)
+        ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
+        if gain <= tolerance * state.cost:
+            return ahead, reduced
+        trial = problem.reduce(ahead.params, ahead.points, weight)
         if trial.cost <= state.cost * (1.0 + 1e-12):
-            state = State(params, points, trial.cost, (*state.history, trial.cost))
+            state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
             reduced, damping = trial, damping / 10.0 if damping > 1e-8 else 0.0
         elif damping > 1e8:
             raise AdjustError(f"no step lowers the cost {state.cost:.6g}: the solution is not usable")
         else:
             damping = max(10.0 * damping, 1e-6)
     _LOG.warning("the adjustment did not settle in %d steps", max_steps)
-    return state
-
-
-def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tuple[Array, float]:
-    """Gauss-Newton step (N, q) of the camera unknowns, and what cameras and points together would gain."""
-    free = problem.free
-    gradient = reduced.gradient[free]
-    solution = factorize_free(problem, reduced.matrix, damping).solve(gradient)
-    step = np.zeros(len(free))
-    step[free] = -solution
-    return step.reshape(problem.structure.num_views, -1), float(gradient @ solution) + reduced.gain
-
-
-def factorize_free(problem: Problem, matrix: Matrix, damping: float = 0.0) -> Factor:
-    """Factor of the reduced matrix restricted to the views that are not fixed."""
-    return factorize(free_part(problem, matrix), damping)
-
-
-def free_part(problem: Problem, matrix: Matrix) -> Matrix:
-    """The reduced matrix restricted to the views that are not fixed."""
-    free = problem.free
-    if free.all():
-        return matrix
-    if isinstance(matrix, np.ndarray):
-        return matrix[np.ix_(free, free)]
-    keep = np.flatnonzero(free)
-    part: Matrix = matrix.tocsr()[keep][:, keep]
-    return part
+    return state, reduced
 
 
 class _Compressed:
-    """The problem as scipy sees it: camera unknowns in, N q + 1 residuals and their derivative out."""
+    """The problem as scipy sees it, in unknowns x = U0 p whitened by the first linearisation.
+
+    In them the matrix is nearly the identity: the gradient's size is what a step would gain.
+    """
 
     def __init__(self, problem: Problem, state: State, weight: Array) -> None:
         self.problem, self.weight = problem, weight
@@ -163,61 +187,78 @@ class _Compressed:
         self.state = replace(
             state, cost=_finite(self.reduced.cost), history=(*state.history, self.reduced.cost)
         )
-        self.key = state.params.ravel()[problem.free].tobytes()
-        self.factor = self._factor()
+        self.start = state.params
+        self.upper0 = self._cholesky()
+        self.key = np.zeros(len(self.upper0)).tobytes()
+        self._compress()
 
-    def _factor(self) -> tuple[Array, Array]:
-        matrix = free_part(self.problem, self.reduced.matrix)
-        if not isinstance(matrix, np.ndarray):
-            matrix = matrix.toarray()
-        upper = la.cholesky(matrix, check_finite=False)
+    def _cholesky(self) -> Array:
+        matrix = free_part(self.problem.free, self.reduced.matrix)
+        dense = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
+        upper: Array = la.cholesky(dense, check_finite=False)
+        return upper
+
+    def _compress(self) -> None:
+        upper = self._cholesky()
         gradient = self.reduced.gradient[self.problem.free]
-        return upper, la.solve_triangular(upper, gradient, trans="T", check_finite=False)
+        self.whitened = la.solve_triangular(upper, gradient, trans="T", check_finite=False)
+        square = float(self.whitened @ self.whitened)
+        self.rest = np.sqrt(max(self.reduced.cost - self.reduced.gain - square, 0.0))
+        self.slope = la.solve_triangular(self.upper0, upper.T, trans="T", check_finite=False).T
 
-    def _at(self, x: Array) -> None:
-        key = x.tobytes()
-        if key == self.key:
+    def params(self, x: Array) -> Array:
+        """The unknowns (N, q) of whitened ones."""
+        step = np.zeros(self.start.size)
+        step[self.problem.free] = la.solve_triangular(self.upper0, x, check_finite=False)
+        return self.start + step.reshape(self.start.shape)
+
+    def at(self, x: Array) -> None:
+        """Linearise at whitened unknowns, unless that was the last thing done."""
+        if x.tobytes() == self.key:
             return
-        params = self.state.params.copy().ravel()
-        params[self.problem.free] = x
-        params = params.reshape(self.state.params.shape)
-        points = self.state.points + self.reduced.point_step(params - self.state.params)
-        self.reduced = self.problem.reduce(params, points, self.weight)
-        self.state = State(params, points, self.reduced.cost, (*self.state.history, self.reduced.cost))
-        self.key, self.factor = key, self._factor()
+        step = self.params(x) - self.state.params
+        state = self.state.moved(step, self.reduced, np.inf)
+        self.reduced = self.problem.reduce(state.params, state.points, self.weight)
+        cost = self.reduced.cost
+        self.state = replace(state, cost=cost, history=(*self.state.history, cost))
+        self.key = x.tobytes()
+        self._compress()
 
     def residual(self, x: Array) -> Array:
-        self._at(x)
-        whitened = self.factor[1]
-        rest = self.reduced.cost - self.reduced.gain - float(whitened @ whitened)
-        return np.append(whitened, np.sqrt(max(rest, 0.0)))
+        """The N q + 1 residuals."""
+        self.at(x)
+        return np.append(self.whitened, self.rest)
 
     def jacobian(self, x: Array) -> Array:
-        self._at(x)
-        return np.vstack([self.factor[0], np.zeros((1, len(x)))])
+        """Their derivative."""
+        self.at(x)
+        return np.vstack([self.slope, np.zeros((1, len(x)))])
 
 
-def _scipy(problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float) -> State:
+def _scipy(
+    problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float
+) -> tuple[State, Reduced]:
     compressed = _Compressed(problem, state, weight)
-    start = state.params.ravel()[problem.free]
-    if len(start):
-        result = least_squares(
-            compressed.residual,
-            start,
-            compressed.jacobian,
-            method="trf",
-            x_scale=1e3,
-            ftol=max(tolerance, 1e-15),
-            xtol=None,
-            gtol=None,
-            max_nfev=max_steps,
-        )
-        if result.status < 0 or not np.isfinite(result.cost):
-            raise AdjustError(f"no usable solution: {result.message}")
-        compressed.residual(result.x)
-    state = compressed.state
-    move = compressed.reduced.point_step(np.zeros_like(state.params))
-    return replace(state, points=state.points + move, cost=compressed.reduced.cost - compressed.reduced.gain)
+    count = len(compressed.whitened)
+    result = least_squares(
+        compressed.residual,
+        np.zeros(count),
+        compressed.jacobian,
+        method="trf",
+        x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # the first step is not cut short
+        ftol=1e-15,
+        xtol=None,
+        gtol=float(np.sqrt(tolerance / count)) * max(compressed.rest, 1e-9),
+        max_nfev=max_steps,
+    )
+    if not np.isfinite(result.cost):
+        raise AdjustError(f"no usable solution: {result.message}")
+    compressed.at(result.x)
+    if result.status == 0:
+        _LOG.warning("the adjustment did not settle in %d steps", max_steps)
+    reduced = compressed.reduced
+    step, gain = camera_step(problem, reduced)  # what the last gradient still asks for
+    return compressed.state.moved(step, reduced, max(reduced.cost - gain, 0.0)), reduced
 
 
 def _finite(cost: float) -> float:

@@ -80,7 +80,9 @@ def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: 
     first, second = _pairs(by_point, starts)
     key = view[first] * num_views + view[second]
     order = np.argsort(key, kind="stable")
-    keys, at = np.unique(key[order], return_index=True)
+    key = key[order]
+    at = np.flatnonzero(np.diff(key, prepend=-1))
+    keys = key[at]
     pair_view = np.column_stack([keys // num_views, keys % num_views])
     pair_bounds = np.append(at, len(key))
     return Structure(

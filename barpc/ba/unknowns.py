@@ -71,11 +71,11 @@ class Unknowns:
         """Whether there is a translation."""
         return "translation" in self.model
 
-    def rotation(self, params: Array) -> Array:
-        """Rotation vectors (N, 3) [rad] at the middle row."""
+    def rotation(self, params: Array, views: slice = slice(None)) -> Array:
+        """Rotation vectors (n, 3) [rad] at the middle row, of the views whose unknowns (n, q) are given."""
         if not self.rotates:
             return np.zeros((len(params), 3))
-        rotation: Array = params[:, :3] / self.distance[:, None]
+        rotation: Array = params[:, :3] / self.distance[views, None]
         return rotation
 
     def translation(self, params: Array) -> Array:
@@ -83,7 +83,8 @@ class Unknowns:
         if not self.translates:
             return np.zeros((len(params), 3))
         start = 3 * self.rotates
-        return params[:, start : start + 3]
+        translation: Array = params[:, start : start + 3]
+        return translation
 
     def drift_vectors(self, params: Array) -> Array:
         """Rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
@@ -99,13 +100,15 @@ class Unknowns:
     def drift_rotation(self, params: Array, index: IntArray, row: Array) -> Array:
         """Rotation (n, 3) [rad] that the drift adds at normalised rows (n,)."""
         powers = row[:, None] ** np.arange(1, self.drift + 1)
-        return np.einsum("nd,ndi->ni", powers, self.drift_vectors(params)[index])
+        added: Array = np.einsum("nd,ndi->ni", powers, self.drift_vectors(params)[index])
+        return added
 
     def drift_rate(self, params: Array, index: IntArray, row: Array) -> Array:
         """d(rotation) / d(normalised row), (3, n) [rad]."""
         degree = np.arange(1, self.drift + 1)
         powers = degree * row[:, None] ** (degree - 1)
-        return np.einsum("nd,ndi->in", powers, self.drift_vectors(params)[index])
+        rate: Array = np.einsum("nd,ndi->in", powers, self.drift_vectors(params)[index])
+        return rate
 
     def stack(self, by_rotation: Array, by_translation: Array, index: IntArray, row: Array | None) -> Array:
         """Derivatives (2, 3, n) by rotation [px/rad] and translation as derivatives (2, q, n) by unknowns."""
@@ -120,7 +123,7 @@ class Unknowns:
         return np.concatenate(parts, axis=1)
 
     def in_image(
-        self, params: Array, local: IntArray, index: IntArray, image: Array, by_point: Array
+        self, params: Array, index: IntArray, image: Array, by_point: Array
     ) -> tuple[Array, Array, Array]:
         """Image models: corrected image points (2, n), and the derivatives by point and by unknown."""
         scale = np.array([self.col_scale[index], self.row_scale[index]])
@@ -129,7 +132,7 @@ class Unknowns:
         chosen = list(_IMAGE_TERMS[self.model])
         m = len(chosen)
         coefficients = np.zeros((2, 3, image.shape[1]))
-        coefficients[:, chosen] = np.moveaxis(params.reshape(-1, 2, m)[local], 0, -1)
+        coefficients[:, chosen] = np.moveaxis(params.reshape(-1, 2, m)[index], 0, -1)
         moved = image + (coefficients * basis).sum(axis=1)
         slope = coefficients[:, 1:] / scale
         by_moved = by_point + slope[:, 0, None] * by_point[0] + slope[:, 1, None] * by_point[1]

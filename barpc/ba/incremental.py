@@ -1,0 +1,127 @@
+"""Carrying an adjusted block into the next run: its reduced normal matrix as a prior on its views.
+
+Old tie points are not needed again: everything that they say about the old views is in the matrix. New tie
+points may observe old views; an observation that the old block has used must not come back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg as la
+
+from barpc.ba.blocks import CameraPrior, JointPrior
+from barpc.ba.solve import free_part
+from barpc.errors import InputError
+from barpc.geodesy import Array
+
+if TYPE_CHECKING:
+    from barpc.ba.result import Adjustment
+
+_FIELDS = ("params", "information", "center")
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPrior:
+    """What an adjustment knows about its views.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Its n views that were free.
+    model, drift : str, int
+        The unknowns (see `AdjustOptions`).
+    params : (n, q)
+        Their values.
+    information : (n q, n q)
+        Their joint information matrix, priors included.
+    center : (n, 3)
+        Camera centres [m], ECEF.
+    """
+
+    names: tuple[str, ...]
+    model: str
+    drift: int
+    params: Array
+    information: Array
+    center: Array
+
+    def save(self, path: Path) -> None:
+        """Write the prior to an .npz file."""
+        arrays = {name: getattr(self, name) for name in _FIELDS}
+        with Path(path).open("wb") as file:
+            np.savez_compressed(
+                file, names=np.array(self.names), model=self.model, drift=self.drift, **arrays
+            )
+
+    @classmethod
+    def load(cls, path: Path) -> BlockPrior:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        InputError
+            The file is missing or holds something else.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                names = tuple(str(name) for name in file["names"])
+                return cls(names, str(file["model"]), int(file["drift"]), *(file[name] for name in _FIELDS))
+        except (OSError, KeyError, ValueError) as error:
+            raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
+
+
+def block_prior(adjustment: Adjustment) -> BlockPrior:
+    """The prior that a later run starts from.
+
+    Parameters
+    ----------
+    adjustment : Adjustment
+        A finished block.
+
+    Returns
+    -------
+    BlockPrior
+    """
+    covariance, n = adjustment.covariance, len(adjustment.names)
+    part = free_part(covariance.free, covariance.reduced.matrix)
+    dense = part if isinstance(part, np.ndarray) else part.toarray()
+    views = np.flatnonzero(covariance.free.reshape(n, -1)[:, 0])
+    return BlockPrior(
+        tuple(adjustment.names[v] for v in views),
+        adjustment.options.model,
+        adjustment.options.drift,
+        adjustment.params[views],
+        dense,
+        adjustment.cameras.unknowns.center[views],
+    )
+
+
+def apply_prior(
+    prior: BlockPrior, names: tuple[str, ...], model: str, drift: int, cameras: CameraPrior
+) -> tuple[CameraPrior, JointPrior]:
+    """The priors of a run that goes on from an old block: the old views' own ones make way for the joint one.
+
+    Raises
+    ------
+    InputError
+        The old block's unknowns are others, or one of its views is missing.
+    """
+    if (prior.model, prior.drift) != (model, drift):
+        raise InputError(
+            f"the earlier block was adjusted with {prior.model} (drift {prior.drift}); use the same"
+        )
+    missing = sorted(set(prior.names) - set(names))
+    if missing:
+        raise InputError(f"views of the earlier block are missing: {', '.join(missing[:10])}")
+    place = {name: i for i, name in enumerate(names)}
+    views = np.array([place[name] for name in prior.names])
+    size = prior.params.shape[1]
+    mean, sigma = cameras.mean.copy(), cameras.sigma.copy()
+    mean[views], sigma[views] = prior.params, np.inf
+    index = (views[:, None] * size + np.arange(size)).ravel()
+    root = la.cholesky(prior.information)
+    return replace(cameras, mean=mean, sigma=sigma), JointPrior(index, prior.params.ravel(), root)
