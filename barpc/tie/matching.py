@@ -22,9 +22,13 @@ from barpc.tie.guided import MATCHERS, Band, Matcher
 from barpc.tie.options import TieOptions
 from barpc.tie.pairs import Pair
 
-_NEAR = 20.0  # px, the first blind pass
+_PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
+"""Blind passes: half width [px] (the last: `search`), keypoints of A that are tried."""
 _PEAK = 4.0  # px, width of the window in which true matches of a blind pass fall
-_PROBES = 1500  # keypoints of A tried in a blind pass
+_LEAST_PEAK = 8  # matches
+_SIGNIFICANT = 6.0  # standard deviations
+_CLEAR = 0.4  # share of the matches that makes wider passes needless
+_CLEAR_RATIO = 0.8
 _FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
 
@@ -185,10 +189,16 @@ class Coarse:
         Error across the epipolar lines as a function of position in A.
     band : Band
         Where to search next.
+    share : float
+        Part of the matches that stand in the peak.
+    significance : float
+        Matches in the peak beyond chance, in standard deviations.
     """
 
     across: Affine
     band: Band
+    share: float
+    significance: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +240,9 @@ class _Search:
 def find_offset(search: _Search, where: Frame) -> Coarse | None:
     """How wrong the cameras are, from blind passes of growing width; None where none finds a clear peak.
 
+    The first pass in whose peak most matches stand decides; without one, the pass with the most
+    significant peak.
+
     Parameters
     ----------
     search : _Search
@@ -237,40 +250,42 @@ def find_offset(search: _Search, where: Frame) -> Coarse | None:
     where : Frame
         Prediction of the points of A.
     """
+    best: Coarse | None = None
+    for width, probes in _PASSES:
+        found = _blind(search, where, min(width, search.options.search), probes)
+        if found is not None and (best is None or found.significance > best.significance):
+            best = found
+        if best is not None and best.share >= _CLEAR:
+            break
+    return best
+
+
+def _blind(search: _Search, where: Frame, width: float, probes: int) -> Coarse | None:
+    """One pass: a peak among the errors across the epipolar lines of some points, if there is one."""
     a, b, options = search.a, search.b, search.options
-    for width, probes in ((min(_NEAR, options.search), _PROBES), (options.search, 2 * _PROBES)):
-        chosen = np.linspace(0, len(a) - 1, min(len(a), probes)).astype(np.int64)
-        part = where.select(chosen)
-        found = search.matcher.match(
-            a.select(chosen), b, part, Band(-part.reach - width, part.reach + width, width)
-        )
-        index = found.index[found.ambiguity <= min(options.ratio, 0.8)]
-        errors = part.errors(index[:, 0], b.xy[index[:, 1]])
-        peak = _peak(errors[:, 1], width)
-        if peak is None:
-            continue
-        inside = np.abs(errors[:, 1] - peak) <= _PEAK
-        across = robust_affine(a.xy[chosen][index[inside, 0]], errors[inside, 1])
-        low, high = np.percentile(errors[inside, 0], [2, 98])
-        margin = 0.5 * (high - low) + 10.0
-        return Coarse(
-            across, Band(np.full(len(a), low - margin), np.full(len(a), high + margin), options.tolerance)
-        )
-    return None
-
-
-def _peak(errors: Array, width: float) -> float | None:
-    """Middle of the window that holds far more errors than chance would put there."""
-    if len(errors) < 8:
+    chosen = np.linspace(0, len(a) - 1, min(len(a), probes)).astype(np.int64)
+    part = where.select(chosen)
+    found = search.matcher.match(
+        a.select(chosen), b, part, Band(-part.reach - width, part.reach + width, width)
+    )
+    index = found.index[found.ambiguity <= min(options.ratio, _CLEAR_RATIO)]
+    errors = part.errors(index[:, 0], b.xy[index[:, 1]])
+    if len(errors) < _LEAST_PEAK:
         return None
-    values = np.sort(errors)
+    values = np.sort(errors[:, 1])
     count = np.searchsorted(values, values + _PEAK, side="right") - np.arange(len(values))
-    start = int(count.argmax())
-    middle = float(np.median(values[start : start + count[start]]))
-    chance = (len(values) - count[start]) * _PEAK / (2 * width)
-    if count[start] < 8 or count[start] < chance + 6 * np.sqrt(chance) + 4 or abs(middle) > width - _PEAK / 2:
+    start, most = int(count.argmax()), int(count.max())
+    middle = float(np.median(values[start : start + most]))
+    chance = (len(values) - most) * _PEAK / (2 * width)
+    significance = (most - chance) / np.sqrt(chance + 1.0)
+    if most < _LEAST_PEAK or significance < _SIGNIFICANT or abs(middle) > width - _PEAK:
         return None
-    return middle
+    inside = np.abs(errors[:, 1] - middle) <= _PEAK
+    across = robust_affine(a.xy[chosen][index[inside, 0]], errors[inside, 1])
+    low, high = np.percentile(errors[inside, 0], [2, 98])
+    margin = 0.5 * (high - low) + 10.0
+    band = Band(np.full(len(a), low - margin), np.full(len(a), high + margin), options.tolerance)
+    return Coarse(across, band, most / len(values), float(significance))
 
 
 def _local(search: _Search, where: Frame, tight: IntArray) -> tuple[Frame, Band]:
