@@ -26,7 +26,7 @@ from rasterio.transform import RPCTransformer
 from barpc.errors import OutputError
 from barpc.geodesy import Array, wrap_longitude
 from barpc.raster import open_raster
-from barpc.rpcio import Sidecar, read_rpc, sidecars
+from barpc.rpcio import read_rpc
 from barpc.sensor import SensorModel
 
 TOLERANCE = 1e-6
@@ -135,18 +135,6 @@ def _reading(
         return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
     error = float(np.linalg.norm(found - image, axis=1).max())
     return Reading(path, name, error, "" if np.isfinite(error) else "it projects to no finite point")
-
-
-def shadows(image: Path | str) -> list[Sidecar]:
-    """The files beside an image that some tool reads instead of the RPC in the image itself.
-
-    A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and
-    CARS are given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
-    """
-    image = Path(image)
-    with open_raster(image) as dataset:
-        own, vrt = dataset.rpcs is not None, dataset.driver == "VRT"
-    return [s for s in sidecars(image) if s.kind == "geom" or (s.before_tag and not vrt) or not own]
 
 
 # --- consumers --------------------------------------------------------------------------------------------

@@ -10,9 +10,9 @@ import click
 from barpc.cli.main import EXIT_GATE
 from barpc.cli.points import camera_options, load_camera
 from barpc.errors import InputError
-from barpc.handoff import Reading, shadows, verify
+from barpc.handoff import Reading, verify
 from barpc.raster import open_raster
-from barpc.rpcio import FORMATS, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio import FORMATS, shadows, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
 

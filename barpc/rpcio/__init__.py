@@ -9,7 +9,7 @@ from __future__ import annotations
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import FORMATS, Format, write_rpc
 from barpc.rpcio.images import write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
-from barpc.rpcio.sources import RpcSource, Sidecar, read_rpc, read_rpc_source, sidecars
+from barpc.rpcio.sources import RpcSource, Sidecar, read_rpc, read_rpc_source, shadows, sidecars
 
 __all__ = [
     "FORMATS",
@@ -19,6 +19,7 @@ __all__ = [
     "Sidecar",
     "read_rpc",
     "read_rpc_source",
+    "shadows",
     "sidecars",
     "write_crop",
     "write_rpc",

@@ -171,7 +171,7 @@ def write_rpc_nitf(
     _refuse_same(source, target)
     record = nitf_record(rpc)
     with open_raster(source) as dataset, replacing(target, overwrite=overwrite) as partial:
-        raster_copy(dataset, str(partial), driver="NITF", TRE=f"RPC00B={record}", RPC00B="NO")
+        raster_copy(dataset, str(partial), driver="NITF", TRE=f"RPC00B={record}")
 
 
 def write_crop(
@@ -236,7 +236,10 @@ def _copy_window(dataset: Any, target: Path, window: Window) -> None:
         "BIGTIFF": "IF_SAFER",
     }
     if dataset.crs is not None:
-        profile |= {"crs": dataset.crs, "transform": dataset.window_transform(window)}
+        a, b, x, d, e, y = dataset.transform[:6]
+        col, row = window.col_off, window.row_off
+        moved = rasterio.Affine(a, b, x + a * col + b * row, d, e, y + d * col + e * row)
+        profile |= {"crs": dataset.crs, "transform": moved}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(target, "w", **profile) as crop:

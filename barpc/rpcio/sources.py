@@ -113,6 +113,26 @@ def _holds_rpc(path: Path, kind: str) -> bool:
         return False
 
 
+def shadows(image: Path | str) -> list[Sidecar]:
+    """The files beside an image that some tool reads instead of the RPC in the image itself.
+
+    A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and
+    CARS are given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
+
+    Raises
+    ------
+    RpcFormatError
+        The image's own RPC does not parse.
+    ImageError
+        No such file.
+    """
+    image = Path(image)
+    head = _head(image)
+    vrt = head.lstrip().startswith(b"<VRTDataset")
+    own = vrt or _own_rpc(image, head) is not None
+    return [s for s in sidecars(image) if s.kind == "geom" or (s.before_tag and not vrt) or not own]
+
+
 def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:
     """The RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too."""
     return read_rpc_source(path, first_pixel=first_pixel, band=band).rpc
@@ -185,7 +205,7 @@ def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:
     own: RPC | None = None
     own_error: RpcError | None = None
     try:
-        own = read_tag(path) if is_tiff(head) else read_nitf(path) if is_nitf(head) else None
+        own = _own_rpc(path, head)
     except RpcError as error:  # reported unless a file beside the image goes before
         own_error = error
     first = next((sidecar for sidecar in beside if sidecar.before_tag), None)
@@ -204,6 +224,13 @@ def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:
         ignored.insert(0, "the image's own RPC")
     source = _sidecar_source(path, first, options)
     return RpcSource(source.rpc, source.format, source.path, source.notes + _passed_over(ignored))
+
+
+def _own_rpc(path: Path, head: bytes) -> RPC | None:
+    """The RPC inside a TIFF or NITF."""
+    if is_tiff(head):
+        return read_tag(path)
+    return read_nitf(path) if is_nitf(head) else None
 
 
 def _passed_over(names: list[str]) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ def decode(data: bytes) -> str:
 
 def sniff_txt(text: str) -> bool:
     """``LINE_OFF: ...`` and ``LINE_NUM_COEFF_1: ...``, one a line."""
-    return re.search(r"^\s*LINE_OFF\s*[:=]", text, re.MULTILINE) is not None and "LINE_NUM_COEFF_" in text
+    return re.search(r"^\s*LINE_NUM_COEFF_1\s*[:=]", text, re.MULTILINE | re.IGNORECASE) is not None
 
 
 def read_txt(text: str, name: str, options: ReadOptions) -> RPC:

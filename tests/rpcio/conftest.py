@@ -1,0 +1,137 @@
+"""An RPC with every coefficient at work, an image to carry it, and the files of every dialect."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from barpc.rpcio.fields import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc
+from barpc.sensor.rpc import RPC
+
+
+def make_rpc(lon: float = 5.4, lat: float = 43.2, **changes: float | None) -> RPC:
+    """25 degrees off nadir, GSD near 0.5 m; numbers that no short decimal hits."""
+    rng = np.random.default_rng(3)
+    coeffs = rng.normal(0, 2e-6, (4, 20))
+    coeffs[0, :4] += [1e-3, 1.0, 0.02, -0.04]
+    coeffs[2, :4] += [-2e-3, 0.03, -1.0, 0.025]
+    coeffs[1::2, 0] = 1.0
+    errors = {"err_bias": 3.1, "err_rand": 0.7} | changes
+    return RPC(coeffs, [lon, lat, 500 / 3], [0.12, 0.09, 1000 / 7], [999.1, 950.7], [1010.3, 980.9], **errors)
+
+
+@pytest.fixture
+def rpc() -> RPC:
+    return make_rpc()
+
+
+def write_image(path: Path, shape: tuple[int, int, int] = (1, 40, 60), **profile: object) -> Path:
+    """A raster of known pixels; keywords go to rasterio."""
+    count, height, width = shape
+    data = np.random.default_rng(5).integers(0, 60000, shape).astype(profile.pop("dtype", "uint16"))
+    options = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": data.dtype}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", **(options | profile)) as out:
+            out.write(data)
+    return path
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    (tmp_path / "in").mkdir()
+    return write_image(tmp_path / "in" / "scene.tif")
+
+
+def grid(rpc: RPC) -> np.ndarray:
+    """Ground points over an RPC's box (N, 3)."""
+    t = np.linspace(-1, 1, 7)
+    return np.stack(np.meshgrid(t, t, t), axis=-1).reshape(-1, 3) * rpc.ground_scale + rpc.ground_offset
+
+
+def dimap_v2(rpc: RPC) -> str:
+    """Pleiades' XML: 1-based offsets, and a direct model that is somebody else's."""
+    fields = fields_from_rpc(rpc)
+    model = "".join(
+        f"<{key}_{i}>{value!r}</{key}_{i}>" for key in COEFFICIENTS for i, value in enumerate(fields[key], 1)
+    )
+    shift = {"LINE_OFF": 1, "SAMP_OFF": 1}
+    validity = "".join(f"<{k}>{fields[k][0] + shift.get(k, 0)!r}</{k}>" for k in OFFSETS + SCALES)
+    direct = "".join(f"<{key}_{i}>7.5</{key}_{i}>" for key in COEFFICIENTS for i in range(1, 21))
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?><Dimap_Document><Rational_Function_Model><Global_RFM>'
+        f"<Direct_Model>{direct}</Direct_Model><Inverse_Model>{model}<ERR_BIAS_ROW>0.001</ERR_BIAS_ROW>"
+        f"</Inverse_Model><RFM_Validity>{validity}</RFM_Validity></Global_RFM>"
+        "</Rational_Function_Model></Dimap_Document>"
+    )
+
+
+def dimap_v3(rpc: RPC) -> str:
+    """Pleiades Neo's XML: 0-based offsets, other names."""
+    fields = fields_from_rpc(rpc)
+    model = "".join(
+        f"<{key}_{i}>{value!r}</{key}_{i}>" for key in COEFFICIENTS for i, value in enumerate(fields[key], 1)
+    )
+    validity = "".join(f"<{k}>{fields[k][0]!r}</{k}>" for k in OFFSETS + SCALES)
+    return (
+        "<Dimap_Document><Rational_Function_Model><Global_RFM>"
+        f"<GroundtoImage_Values>{model}</GroundtoImage_Values><RFM_Validity>"
+        "<ImagetoGround_Validity_Domain><FIRST_COL>4901</FIRST_COL></ImagetoGround_Validity_Domain>"
+        f"{validity}</RFM_Validity></Global_RFM></Rational_Function_Model></Dimap_Document>"
+    )
+
+
+def dimap_v1(rpc: RPC) -> str:
+    """The first DIMAP: forty numbers an element, A and B by axis."""
+    fields = fields_from_rpc(rpc)
+    lists = {
+        axis: " ".join(repr(v) for part in ("NUM", "DEN") for v in fields[f"{name}_{part}_COEFF"])
+        for axis, name in (("ROW", "LINE"), ("COL", "SAMP"))
+    }
+    axes = {"Lon": "LONG", "Lat": "LAT", "Alt": "HEIGHT", "Col": "SAMP", "Row": "LINE"}
+    validity = "".join(
+        f"<{axis}><A>{fields[f'{name}_SCALE'][0]!r}</A>"
+        f"<B>{fields[f'{name}_OFF'][0] + (axis in ('Col', 'Row'))!r}</B></{axis}>"
+        for axis, name in axes.items()
+    )
+    return (
+        f"<Dimap><Global_RFM><F_COL>{lists['COL']}</F_COL><F_ROW>{lists['ROW']}</F_ROW>"
+        f"<RFM_Validity>{validity}</RFM_Validity></Global_RFM></Dimap>"
+    )
+
+
+def enmap(rpc: RPC) -> str:
+    """EnMAP's metadata: one RPC a band, here the second; the first is shifted by a hundred rows."""
+    bands = ""
+    for band, offset in ((1, 100.0), (2, 0.0)):
+        fields = fields_from_rpc(rpc)
+        fields["LINE_OFF"] = [fields["LINE_OFF"][0] + offset]
+        rename = {"LINE": "ROW", "SAMP": "COL"}
+        items = ""
+        for key in OFFSETS + SCALES:
+            axis, _, kind = key.partition("_")
+            items += f"<{rename.get(axis, axis)}_{kind}>{fields[key][0]!r}</{rename.get(axis, axis)}_{kind}>"
+        for key in COEFFICIENTS:
+            axis, part, _ = key.split("_")
+            name = f"{rename[axis]}_{part}"
+            items += "".join(f"<{name}_{i}>{v!r}</{name}_{i}>" for i, v in enumerate(fields[key], 1))
+        bands += f'<bandID number="{band}">{items}</bandID>'
+    return f"<level_X><product><navigation><RPC>{bands}</RPC></navigation></product></level_X>"
+
+
+def yaml(rpc: RPC) -> str:
+    """What orthority writes."""
+    fields = {key.lower(): values for key, values in fields_from_rpc(rpc).items()}
+    lines = ["scene.tif:", "    im_size: [60, 40]", "    rpc:"]
+    for key, values in fields.items():
+        if len(values) == 1:
+            lines.append(f"        {key}: {values[0]!r}")
+        else:
+            first, rest = ", ".join(map(repr, values[:9])), ", ".join(map(repr, values[9:]))
+            lines.append(f"        {key}: [{first},\n            {rest}]")
+    return "\n".join(lines) + "\n"

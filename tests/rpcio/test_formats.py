@@ -1,0 +1,186 @@
+"""Every syntax of RPC files: what is written reads back to the bit, and dialects read as meant."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from barpc.errors import OutputError, RpcFormatError
+from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
+from barpc.rpcio.fields import number
+from barpc.rpcio.fixed import nitf_record
+from barpc.rpcio.formats import parse
+from barpc.rpcio.text import write_rpb, write_txt
+from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, grid, make_rpc, yaml
+
+WRITABLE = [row for row in FORMATS.values() if row.write is not None]
+NAMES = [f"scene{suffix}" for row in WRITABLE for suffix in row.suffixes]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_written_reads_back_to_the_bit(name, rpc, tmp_path):
+    write_rpc(rpc, tmp_path / name)
+    assert read_rpc(tmp_path / name) == rpc
+
+
+@pytest.mark.parametrize("row", WRITABLE, ids=lambda row: row.name)
+def test_an_unknown_accuracy_is_never_written_as_perfect(row):
+    unknown = make_rpc(err_bias=None, err_rand=None)
+    text = row.write(unknown)
+    found, name = parse(text.encode(), "memory")
+    assert name == row.name
+    assert (found.err_bias, found.err_rand) == (None, None)
+    if row.name != "geom":  # OSSIM asks for the keys, and takes 0 for unknown
+        assert not re.search(r"err", text, re.IGNORECASE)
+
+
+def test_an_accuracy_of_zero_in_a_file_is_unknown(rpc):
+    text = write_rpb(rpc).replace("errBias = 3.1", "errBias = 0.0")
+    assert parse(text.encode(), "memory")[0].err_bias is None
+
+
+def test_an_existing_file_is_kept_unless_overwriting_is_asked_for(rpc, tmp_path):
+    path = tmp_path / "a_RPC.TXT"
+    path.write_text("mine")
+    with pytest.raises(OutputError, match="exists already"):
+        write_rpc(rpc, path)
+    assert path.read_text() == "mine"
+    write_rpc(rpc, path, overwrite=True)
+    assert read_rpc(path) == rpc
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.doc", "a"])
+def test_a_name_that_no_format_has_is_refused_with_the_ones_that_are(name, rpc, tmp_path):
+    with pytest.raises(RpcFormatError, match=r"choose one of txt .*\.geom"):
+        write_rpc(rpc, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+DIALECTS = {
+    "DIMAP v1": (dimap_v1, "dimap"),
+    "DIMAP v2": (dimap_v2, "dimap"),
+    "DIMAP v3": (dimap_v3, "dimap"),
+    "orthority's YAML": (yaml, "yaml"),
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_a_dialect_that_is_only_read_gives_the_camera_that_went_in(dialect, rpc):
+    make, expected = DIALECTS[dialect]
+    found, name = parse(make(rpc).encode(), "memory")
+    assert name == expected
+    np.testing.assert_allclose(found.project(grid(rpc)), rpc.project(grid(rpc)), rtol=0, atol=1e-9)
+
+
+def test_enmap_has_an_rpc_for_every_band(rpc, tmp_path):
+    path = tmp_path / "METADATA.XML"
+    path.write_text(enmap(rpc))
+    shift = read_rpc(path).project(grid(rpc)) - read_rpc(path, band=2).project(grid(rpc))
+    np.testing.assert_allclose(shift, [[0.0, 100.0]] * len(shift), atol=1e-9)
+    with pytest.raises(RpcFormatError, match="no RPC of band 3"):
+        read_rpc(path, band=3)
+
+
+@pytest.mark.parametrize(("first", "shift"), [(None, 0.0), (1.0, 0.0), (0.5, 0.5), (0.0, 1.0)])
+def test_the_pixel_convention_of_a_dimap_can_be_overruled(first, shift, rpc, tmp_path):
+    """Airbus counts from 1; SPOT 6/7 is disputed: some tools subtract nothing."""
+    path = tmp_path / "RPC_S6.XML"
+    path.write_text(dimap_v2(rpc))
+    found = read_rpc(path, first_pixel=first)
+    np.testing.assert_allclose(found.image_offset, rpc.image_offset + shift, rtol=0, atol=1e-12)
+
+
+def test_the_direct_model_and_the_fit_error_of_a_dimap_are_left_behind(rpc):
+    found, _ = parse(dimap_v2(rpc).encode(), "memory")
+    assert found.err_bias is None  # ERR_BIAS_ROW is in pixels, of the vendor's own fit
+    for row in WRITABLE:
+        assert "7.5" not in row.write(found)
+
+
+def test_maxar_xml_reads_in_a_namespace_too(rpc):
+    text = FORMATS["xml"].write(rpc)
+    spaced = re.sub(r"<(/?)([A-Za-z]+)", r"<\1lv1b:\2", text).replace("<lv1b:isd>", '<lv1b:isd xmlns:lv1b="http://x">')
+    assert parse(spaced.encode(), "memory") == (rpc, "xml")
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda t: t.replace("\n", "\r\n"), "CRLF"),
+        (lambda t: t.replace("\n", "\r\r\n"), "CR CR LF"),
+        (lambda t: "\ufeff" + t, "a byte order mark"),
+        (lambda t: re.sub(r"(LAT_OFF: \S+)", r"\1 degrees", t), "units"),
+        (lambda t: re.sub(r"(LAT_OFF: \S+)", r"\1 °", t), "a degree sign"),
+        (lambda t: re.sub(r": (\d)", r": +00\1", t), "signs and leading zeros"),
+        (lambda t: t.replace("e-", "D-"), "D exponents"),
+        (lambda t: t.replace("LINE_", "line_"), "lower case"),
+        (lambda t: t.replace(": ", " = "), "equals signs"),
+        (lambda t: "\n".join(reversed(t.splitlines())), "another order"),
+    ],
+    ids=lambda v: v if isinstance(v, str) else "",
+)
+def test_the_text_format_is_read_with(change, what, rpc):
+    assert parse(change(write_txt(rpc)).encode(), "memory") == (rpc, "txt")
+
+
+def test_a_latin_1_degree_sign_is_read(rpc):
+    assert parse(write_txt(rpc).replace("LAT_OFF: 43.2", "LAT_OFF: 43.2 °").encode("latin-1"), "m")[0] == rpc
+
+
+def test_a_denominator_that_does_not_start_with_one_is_kept(rpc):
+    text = write_txt(rpc).replace("LINE_DEN_COEFF_1: 1\n", "LINE_DEN_COEFF_1: 0.99995\n")
+    assert parse(text.encode(), "memory")[0].coeffs[3, 0] == 0.99995
+
+
+def test_both_dialects_of_json_are_read(rpc):
+    rpcm = FORMATS["json"].write(rpc)
+    plain = {key.lower(): v[0] if len(v) == 1 else v for key, v in _fields(rpc).items()}
+    gdal = {key: str(v[0]) if len(v) == 1 else " ".join(map(repr, v)) for key, v in _fields(rpc).items()}
+    bare = json.loads(rpcm)["rpc"]
+    for document in (json.loads(rpcm), bare, plain, {"rpcs": plain}, gdal):
+        assert parse(json.dumps(document).encode(), "memory") == (rpc, "json")
+
+
+def _fields(rpc):
+    from barpc.rpcio.fields import fields_from_rpc
+
+    return fields_from_rpc(rpc)
+
+
+def test_alos_columns_are_read(tmp_path):
+    offsets = ["006500", "03550", " 35.6812", " 139.7671", " 0500"]
+    scales = ["006501", "03551", "  0.3000", "   0.3500", " 0510"]
+    lists = [[f"{value:+.5f}E-{i}" for i in range(10)] * 2 for value in (1.25, 2.25, 3.25, 4.25)]
+    cells = [f"{cell:>12}" for row in lists for cell in row]
+    path = tmp_path / "RPC-ALPSMW000000000-O1B1___W.txt"
+    path.write_text("".join([*offsets, *scales, *cells]) + "\r\n")
+    source = read_rpc_source(path)
+    assert source.format == "alos"
+    np.testing.assert_array_equal(source.rpc.ground_offset, [139.7671, 35.6812, 500.0])
+    np.testing.assert_array_equal(source.rpc.ground_scale, [0.35, 0.3, 510.0])
+    np.testing.assert_array_equal(source.rpc.image_offset, [3550.0, 6500.0])
+    np.testing.assert_array_equal(source.rpc.image_scale, [3551.0, 6501.0])
+    np.testing.assert_array_equal(source.rpc.coeffs[:, 2], [3.25e-2, 4.25e-2, 1.25e-2, 2.25e-2])
+
+
+def test_a_nitf_record_has_1041_characters_and_says_when_a_number_does_not_fit(rpc):
+    assert len(nitf_record(rpc)) == 1041
+    with pytest.raises(RpcFormatError, match="LINE_OFF = -49.3 does not fit"):
+        nitf_record(rpc.crop(0, 1000))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("+005124.00 pixels", 5124.0), ("-1.5D-03", -0.0015), (".5", 0.5), ("7", 7.0), ("1e3\tm", 1000.0)],
+)
+def test_a_number_is_read_with_its_unit_left_out(text, value):
+    assert number(text, "file", "KEY") == value
+
+
+@pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "1e400", "0x10", "1_000", "12abc", "--1", "1.2.3"])
+def test_what_is_no_finite_number_is_refused_with_file_and_key(text):
+    with pytest.raises(RpcFormatError, match="file: KEY is not"):
+        number(text, "file", "KEY")

@@ -1,0 +1,185 @@
+"""RPCs in rasters: copies whose pixels stay, VRTs that point at the original, crops, NITF."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from barpc.errors import ImageError, OutputError, RpcFormatError
+from barpc.raster import open_raster
+from barpc.rpcio import read_rpc, read_rpc_source, write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.rpcio.tiff import read_tag
+from tests.rpcio.conftest import grid, make_rpc, write_image
+
+
+def pixels(path: Path) -> np.ndarray:
+    with open_raster(path) as dataset:
+        return np.asarray(dataset.read())
+
+
+KINDS = {
+    "uint16": {},
+    "uint8 in bands": {"shape": (3, 40, 60), "dtype": "uint8", "photometric": "rgb"},
+    "float32": {"dtype": "float32"},
+    "tiled and compressed": {"shape": (1, 300, 500), "tiled": True, "compress": "deflate"},
+    "JPEG": {"shape": (1, 64, 64), "dtype": "uint8", "compress": "jpeg"},
+    "BigTIFF": {"BIGTIFF": "YES"},
+    "big-endian": {"ENDIANNESS": "BIG"},
+    "big-endian BigTIFF": {"ENDIANNESS": "BIG", "BIGTIFF": "YES"},
+    "with nodata": {"nodata": 7},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_copy_has_the_rpc_to_the_bit_and_untouched_pixels(kind, rpc, tmp_path):
+    image = write_image(tmp_path / "scene.tif", **KINDS[kind])
+    before = image.read_bytes()
+    write_rpc_copy(rpc, image, tmp_path / "out" / "copy.tif")
+    source = read_rpc_source(tmp_path / "out" / "copy.tif")
+    assert (source.rpc, source.format) == (rpc, "tag")
+    np.testing.assert_array_equal(pixels(tmp_path / "out" / "copy.tif"), pixels(image))
+    assert image.read_bytes() == before
+    with open_raster(tmp_path / "out" / "copy.tif") as copy, open_raster(image) as original:
+        assert copy.nodata == original.nodata
+        assert copy.colorinterp == original.colorinterp
+        assert copy.rpcs.line_off == pytest.approx(rpc.image_offset[1], rel=1e-14)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_vrt_has_the_rpc_to_the_bit_and_the_pixels_of_the_image(kind, rpc, tmp_path):
+    image = write_image(tmp_path / "scene.tif", **KINDS[kind])
+    write_rpc_vrt(rpc, image, tmp_path / "out" / "scene.vrt")
+    assert read_rpc(tmp_path / "out" / "scene.vrt") == rpc
+    np.testing.assert_array_equal(pixels(tmp_path / "out" / "scene.vrt"), pixels(image))
+    with open_raster(tmp_path / "out" / "scene.vrt") as vrt, open_raster(image) as original:
+        assert vrt.nodata == original.nodata
+        assert vrt.colorinterp == original.colorinterp
+        assert vrt.rpcs.line_num_coeff == rpc.coeffs[2].tolist()
+
+
+def test_a_second_copy_replaces_the_tag_of_the_first(rpc, image, tmp_path):
+    write_rpc_copy(rpc, image, tmp_path / "a.tif")
+    write_rpc_copy(rpc.crop(3, 4), tmp_path / "a.tif", tmp_path / "b.tif")
+    assert read_rpc(tmp_path / "b.tif") == rpc.crop(3, 4)
+    np.testing.assert_array_equal(pixels(tmp_path / "b.tif"), pixels(image))
+
+
+def test_overviews_and_masks_of_a_copy_stay(rpc, tmp_path):
+    image = write_image(tmp_path / "scene.tif", shape=(1, 512, 512), tiled=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(image, "r+") as out:
+            out.write_mask(np.eye(512, dtype=bool))
+            out.build_overviews([2, 4])
+    write_rpc_copy(rpc, image, tmp_path / "copy.tif")
+    write_rpc_vrt(rpc, image, tmp_path / "scene.vrt")
+    with open_raster(tmp_path / "copy.tif") as copy:
+        assert copy.overviews(1) == [2, 4]
+        np.testing.assert_array_equal(copy.dataset_mask() > 0, np.eye(512, dtype=bool))
+    with open_raster(tmp_path / "scene.vrt") as vrt:
+        np.testing.assert_array_equal(vrt.dataset_mask() > 0, np.eye(512, dtype=bool))
+
+
+def test_a_cloud_optimised_image_is_copied_and_no_longer_claims_its_layout(rpc, tmp_path):
+    image = write_image(tmp_path / "scene.tif", shape=(1, 600, 600), driver="COG", dtype="uint8")
+    assert b"KNOWN_INCOMPATIBLE_EDITION=NO\n " in image.read_bytes()
+    write_rpc_copy(rpc, image, tmp_path / "copy.tif")
+    assert b"KNOWN_INCOMPATIBLE_EDITION=YES\n" in (tmp_path / "copy.tif").read_bytes()
+    assert read_rpc(tmp_path / "copy.tif") == rpc
+    np.testing.assert_array_equal(pixels(tmp_path / "copy.tif"), pixels(image))
+
+
+def test_a_geotransform_without_crs_is_left_out_and_one_with_crs_is_kept(rpc, tmp_path):
+    """Without CRS it is the origin of a crop, which the RPC that is written has already."""
+    origin = rasterio.Affine(1.0, 0, 5000, 0, -1, -5000)
+    crop = write_image(tmp_path / "crop.tif", transform=origin)
+    map_ = write_image(tmp_path / "map.tif", transform=rasterio.Affine(1e-5, 0, 5, 0, -1e-5, 44), crs=4326)
+    for image, kept in ((crop, False), (map_, True)):
+        write_rpc_copy(rpc, image, tmp_path / "copy.tif", overwrite=True)
+        write_rpc_vrt(rpc, image, tmp_path / "copy.vrt", overwrite=True)
+        for written in ("copy.tif", "copy.vrt"):
+            with open_raster(tmp_path / written) as out, open_raster(image) as original:
+                assert (out.transform == original.transform) is kept
+                assert out.crs == original.crs
+
+
+def test_a_vrt_and_its_image_may_move_together(rpc, image, tmp_path):
+    write_rpc_vrt(rpc, image, tmp_path / "out" / "scene.vrt")
+    write_rpc_vrt(rpc, image, tmp_path / "out" / "fixed.vrt", relative=False)
+    expected = pixels(image)
+    np.testing.assert_array_equal(pixels(tmp_path / "out" / "fixed.vrt"), expected)
+    (tmp_path / "moved").mkdir()
+    for name in ("in", "out"):
+        shutil.move(tmp_path / name, tmp_path / "moved" / name)
+    np.testing.assert_array_equal(pixels(tmp_path / "moved" / "out" / "scene.vrt"), expected)
+
+
+def test_the_input_is_never_written_to(rpc, image, tmp_path):
+    before = image.read_bytes()
+    (tmp_path / "link.tif").symlink_to(image)
+    for target in (image, tmp_path / "link.tif"):
+        for write in (write_rpc_copy, write_rpc_vrt, write_rpc_nitf):
+            with pytest.raises(OutputError, match="never written to"):
+                write(rpc, image, target, overwrite=True)
+        with pytest.raises(OutputError, match="never written to"):
+            write_crop(rpc, image, target, (0, 0, 5, 5), overwrite=True)
+    assert image.read_bytes() == before
+
+
+def test_a_crop_has_the_window_s_pixels_and_sees_the_same_ground(rpc, tmp_path):
+    image = write_image(tmp_path / "scene.tif", shape=(2, 300, 400), dtype="float32", nodata=-1)
+    cropped = write_crop(rpc, image, tmp_path / "crop.tif", (37, 51, 290, 200))
+    np.testing.assert_array_equal(pixels(tmp_path / "crop.tif"), pixels(image)[:, 51:251, 37:327])
+    found = read_rpc(tmp_path / "crop.tif")
+    assert found == cropped
+    np.testing.assert_allclose(found.project(grid(rpc)), rpc.project(grid(rpc)) - [37, 51], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("window", [(-1, 0, 5, 5), (0, 0, 61, 5), (0, 39, 5, 2), (0, 0, 0, 5)])
+def test_a_window_outside_the_image_writes_nothing(window, rpc, image, tmp_path):
+    with pytest.raises(ImageError, match="not inside the image of 60 x 40"):
+        write_crop(rpc, image, tmp_path / "crop.tif", window)
+    assert not (tmp_path / "crop.tif").exists()
+
+
+def test_resampling_moves_pixel_centres_with_their_corners(rpc):
+    """Downscaled by s: offset (off + 0.5)/s - 0.5, scale / s."""
+    half = rpc.window(0, 0, 2, 2)
+    np.testing.assert_allclose(half.image_offset, (rpc.image_offset + 0.5) / 2 - 0.5, rtol=0, atol=1e-12)
+    projected = (rpc.project(grid(rpc)) + 0.5) / 2 - 0.5
+    np.testing.assert_allclose(half.project(grid(rpc)), projected, rtol=0, atol=1e-9)
+
+
+def test_a_nitf_copy_holds_what_its_record_can_hold(image, tmp_path):
+    """Numbers that fit the record come back to the bit; others are off by what the record cuts off."""
+    rpc = make_rpc()
+    fitting = type(rpc)(
+        np.round(rpc.coeffs, 6),
+        [5.4, 43.2, 500.0],
+        [0.12, 0.09, 500.0],
+        [999.0, 950.0],
+        [1010.0, 980.0],
+        3.1,
+        0.7,
+    )
+    write_rpc_nitf(fitting, image, tmp_path / "a.ntf")
+    source = read_rpc_source(tmp_path / "a.ntf")
+    assert (source.rpc, source.format) == (fitting, "nitf")
+    np.testing.assert_array_equal(pixels(tmp_path / "a.ntf"), pixels(image))
+    with open_raster(tmp_path / "a.ntf") as dataset:
+        assert dataset.rpcs.line_off == 950.0
+
+
+def test_the_tag_of_a_tiff_that_is_cut_off_is_an_error_in_one_line(rpc, image, tmp_path):
+    write_rpc_copy(rpc, image, tmp_path / "a.tif")
+    data = (tmp_path / "a.tif").read_bytes()
+    for size in (4, 8, 12, len(data) - 800, len(data) - 400, len(data) - 5):
+        (tmp_path / "cut.tif").write_bytes(data[:size])
+        with pytest.raises(RpcFormatError, match=r"cut\.tif"):
+            read_tag(tmp_path / "cut.tif")
