@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprint
 
 _SLAB = 8192  # check points handed out at a time, about
+_SAMPLES = 400  # of a DEM along each side of the image
 
 
 def spaced(low: float, high: float, count: int, nodes: Nodes) -> Array:
@@ -30,6 +31,45 @@ def widened(alt_range: tuple[float, float]) -> tuple[float, float]:
         raise FitError(f"altitude range {low:g} to {high:g} m is not an interval")
     lacking = max(0.0, ALTITUDE_FLOOR - 0.5 * (high - low))
     return low - lacking, high + lacking
+
+
+def terrain_range(
+    model: SensorModel,
+    size: tuple[int, int],
+    alt_range: tuple[float, float],
+    dem: Callable[[Array, Array], Array],
+    margin: float,
+) -> tuple[float, float]:
+    """Altitudes of a DEM over an image, with a margin.
+
+    Parameters
+    ----------
+    model : SensorModel
+        The camera.
+    size : (width, height)
+        [px].
+    alt_range : (low, high)
+        Altitudes [m] that the footprint is looked for at.
+    dem : callable
+        (lon, lat) [deg] -> altitude [m above the ellipsoid], NaN where it has none.
+    margin : float
+        Added below and above [m]; the paper takes 500.
+
+    Raises
+    ------
+    FitError
+        The DEM has no altitude under the image.
+    """
+    (west, east), (south, north) = _ground_box(model, size, alt_range)
+    lon, lat = np.meshgrid(np.linspace(west, east, _SAMPLES), np.linspace(south, north, _SAMPLES))
+    alt = dem(lon.ravel(), lat.ravel())
+    alt = alt[np.isfinite(alt)]
+    if not len(alt):
+        raise FitError(
+            f"the DEM has no altitude under the image (lon {west:.4f} to {east:.4f}, lat {south:.4f} to "
+            f"{north:.4f}): give one that covers it, or an altitude range"
+        )
+    return float(alt.min()) - margin, float(alt.max()) + margin
 
 
 def control_points(
