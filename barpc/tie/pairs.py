@@ -184,16 +184,17 @@ def select_pairs(
         raise TiePointError(f"{len(views)} image given: tie points need at least two that overlap")
     cameras = [view.sensor for view in views] if sensors is None else sensors
     wanted = {(min(pair), max(pair)) for pair in only}
-    pairs: list[Pair] = []
-    for reach in (
-        0.0,
-        options.search,
-    ):  # outlines grown by the search only where the plain ones do not connect
-        found = overlapping_pairs(views, cameras, options, reach)
+    pairs = overlapping_pairs(views, cameras, options)
+    partners = np.bincount([i for pair in pairs for i in pair.views], minlength=len(views))
+    groups = connected_groups(len(views), [pair.views for pair in pairs])
+    if len(groups) > 1 or partners.min() < min(
+        2, len(views) - 1
+    ):  # a camera may be wrong by more than the overlap
         known = {pair.views for pair in pairs}
-        pairs += [p for p in found if p.views not in known and (not wanted or p.views in wanted)]
-        if len(connected_groups(len(views), [pair.views for pair in pairs])) == 1:
-            break
+        lonely = (partners < 2) | ~np.isin(np.arange(len(views)), groups[0])
+        grown = overlapping_pairs(views, cameras, options, options.search)
+        pairs += [p for p in grown if p.views not in known and lonely[list(p.views)].any()]
+    pairs = [pair for pair in pairs if not wanted or pair.views in wanted]
     require_connected(
         views,
         [pair.views for pair in pairs],
@@ -201,7 +202,7 @@ def select_pairs(
         f"{options.max_angle:g} deg between them; remove the stray images or lower the minimum overlap",
     )
     ranked = sorted(pairs, key=lambda pair: (-pair.score, pair.views))
-    partners = [0] * len(views)
+    taken = [0] * len(views)
     parent = list(range(len(views)))
 
     def root(i: int) -> int:
@@ -213,10 +214,10 @@ def select_pairs(
     for pair in ranked:
         i, j = pair.views
         joins = root(i) != root(j)
-        if joins or min(partners[i], partners[j]) < options.neighbours:
+        if joins or min(taken[i], taken[j]) < options.neighbours:
             chosen.append(pair)
-            partners[i] += 1
-            partners[j] += 1
+            taken[i] += 1
+            taken[j] += 1
             parent[max(root(i), root(j))] = min(root(i), root(j))
     return sorted(chosen, key=lambda pair: pair.views)
 
