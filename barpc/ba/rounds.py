@@ -19,10 +19,12 @@ from barpc.scene import BoolArray
 _LOG = logging.getLogger(__name__)
 
 _MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
+_LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that they stay below, about
+_LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
 _SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
 _SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
 _LEAST_FREEDOM = 20
-_ROBUST_ROUNDS = 12
+_ROBUST_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -66,18 +68,24 @@ class Observations:
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True
 
-    def freedom(self, use: BoolArray) -> Array:
-        """Degrees of freedom (K,) of an observation once its point is estimated: 1/2 of two views', to 2."""
+    def freedom(self, counted: Array) -> Array:
+        """Degrees of freedom (K,) of an observation once its point is estimated: 1/2 of two views', to 2.
+
+        `counted` (K,) says how much each observation counts; a track with one that counts for nothing is a
+        track of the others.
+        """
         structure = self.structure
-        count = structure.sum_points(use[:, None].astype(np.float64))[:, 0]
+        largest = np.zeros(structure.num_points)
+        np.maximum.at(largest, structure.point, counted)
+        count = structure.sum_points(counted[:, None])[:, 0] / np.maximum(largest, 1e-300)
         rows = 2.0 * np.maximum(count, 1.0)
         free = np.where(self.has_prior, rows, np.maximum(rows - 3.0, 0.25))
         freedom: Array = (2.0 * free / rows)[structure.point]
         return freedom
 
-    def squared(self, residual: Array, use: BoolArray) -> Array:
+    def squared(self, residual: Array, counted: Array) -> Array:
         """|r|^2 (K,) over its expectation under the stated sigmas."""
-        s: Array = (residual**2).sum(axis=0) / self.sigma**2 / self.freedom(use)
+        s: Array = (residual**2).sum(axis=0) / self.sigma**2 / self.freedom(counted)
         return np.where(np.isfinite(s), s, np.inf)
 
     def weight(self, use: BoolArray, noise: float) -> Array:
@@ -146,7 +154,7 @@ def run_rounds(
         passes += 1
         kept = use
         if options.loss != "linear":
-            s = observations.squared(residual, use)
+            s = observations.squared(residual, use.astype(np.float64))
             kept = observations.tied(everything & (s <= (options.robust_threshold * noise) ** 2))
         wanted = noise if options.estimate_noise else 1.0
         weight = observations.weight(kept, wanted)
@@ -171,16 +179,33 @@ def _robust(
     use: BoolArray,
     options: AdjustOptions,
 ) -> tuple[State, Array, float]:
-    """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise."""
+    """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
+
+    The noise is a median that counts observations by their weights: as the scale shrinks, it leaves the
+    wrong ones behind. It cannot fall below what the best fifth of all observations shows, nor below half of
+    what is stated, or a few that fit by chance would be left.
+    """
     loss = LOSSES[options.loss]
-    scale, noise = np.inf, 1.0
+    counted, scale, noise = use.astype(np.float64), np.inf, 1.0
+    s = observations.squared(residual, counted)
     for _ in range(_ROBUST_ROUNDS):
-        s = observations.squared(residual, use)
-        noise = max(float(np.sqrt(np.median(s[use]) / _MEDIAN)), 1e-6) if use.any() else 1.0
+        least = float(np.sqrt(np.quantile(s[use], _LOW) / _LOW)) if use.any() else 1.0
+        noise = max(float(np.sqrt(_median(s, counted) / _MEDIAN)), least, _LEAST_NOISE)
         if scale <= 3.6 * noise:
             break
-        scale = 3.0 * noise
-        weight = observations.weight(use, noise) * np.sqrt(loss(s / scale**2)[1])
-        state = gauss_newton(problem, state, weight)
+        scale = 3.0 * noise if np.isinf(scale) else max(3.0 * noise, 0.5 * scale)
+        counted = use * loss(s / scale**2)[1]
+        state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted))
         residual = problem.residuals(state.params, state.points)
+        s = observations.squared(residual, counted)
+        counted = use * loss(s / scale**2)[1]
     return state, residual, noise
+
+
+def _median(values: Array, weights: Array) -> float:
+    """Median of `values`, each counted as often as its weight says."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    if not len(total) or not total[-1] > 0:
+        return 1.0
+    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
