@@ -17,6 +17,7 @@ from rasterio.windows import Window
 from barpc.atomic import replacing, write_text
 from barpc.errors import ImageError, OutputError
 from barpc.raster import identify, open_raster
+from barpc.rpcio.digits import printable
 from barpc.rpcio.fixed import nitf_record
 from barpc.rpcio.tiff import GEOREFERENCE_TAGS, put_tag
 from barpc.rpcio.xml import rpc_domain
@@ -126,7 +127,8 @@ def write_rpc_copy(
     """Write a GeoTIFF copy of an image that carries an RPC in its tag.
 
     A TIFF is copied byte by byte (pixels, compression, overviews and masks untouched, BigTIFF as well); any
-    other raster is converted. A geotransform without CRS is left out, as in `write_rpc_vrt`.
+    other raster is converted. A geotransform without CRS is left out, as in `write_rpc_vrt`. Offsets and
+    scales of more digits than GDAL hands on are rounded and the coefficients make up for it (`printable`).
 
     Parameters
     ----------
@@ -154,7 +156,7 @@ def write_rpc_copy(
                 shutil.copyfile(source, partial)
             else:
                 _convert(dataset, partial)
-            put_tag(partial, rpc, drop)
+            put_tag(partial, printable(rpc), drop)
 
 
 def _convert(dataset: Any, target: Path) -> None:
@@ -211,7 +213,7 @@ def write_crop(
     target = Path(crop_path).absolute()
     _refuse_same(source, target)
     col, row, width, height = window
-    cropped = rpc.crop(col, row)
+    cropped = printable(rpc.crop(col, row))
     with open_raster(source) as dataset:
         if not (0 <= col < col + width <= dataset.width and 0 <= row < row + height <= dataset.height):
             raise ImageError(

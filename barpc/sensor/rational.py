@@ -43,7 +43,8 @@ def _derivative_matrices() -> Array:
     return out
 
 
-_DERIVATIVE = _derivative_matrices()
+DERIVATIVE = _derivative_matrices()
+"""The derivatives of the monomials on the first ten: (3, 20, 10)."""
 
 
 def monomials(normalized: Array, out: Array | None = None) -> Array:
@@ -113,7 +114,7 @@ class Rational:
         self.coeffs = coeffs
         self.accuracy = accuracy
         # d/dL, d/dP, d/dH of the four polynomials on the first ten monomials, by axis: (12, 10)
-        self.gradients = np.einsum("pi,aij->apj", coeffs, _DERIVATIVE).reshape(12, 10)
+        self.gradients = np.einsum("pi,aij->apj", coeffs, DERIVATIVE).reshape(12, 10)
 
     def value(self, x: Array, work: Array | None = None) -> Array:
         """Values (2, N) at points (3, N); `work` (20, N) is overwritten."""

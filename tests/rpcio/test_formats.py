@@ -102,7 +102,9 @@ def test_the_direct_model_and_the_fit_error_of_a_dimap_are_left_behind(rpc):
 
 def test_maxar_xml_reads_in_a_namespace_too(rpc):
     text = FORMATS["xml"].write(rpc)
-    spaced = re.sub(r"<(/?)([A-Za-z]+)", r"<\1lv1b:\2", text).replace("<lv1b:isd>", '<lv1b:isd xmlns:lv1b="http://x">')
+    spaced = re.sub(r"<(/?)([A-Za-z]+)", r"<\1lv1b:\2", text).replace(
+        "<lv1b:isd>", '<lv1b:isd xmlns:lv1b="http://x">'
+    )
     assert parse(spaced.encode(), "memory") == (rpc, "xml")
 
 
@@ -168,7 +170,7 @@ def test_alos_columns_are_read(tmp_path):
 
 def test_a_nitf_record_has_1041_characters_and_says_when_a_number_does_not_fit(rpc):
     assert len(nitf_record(rpc)) == 1041
-    with pytest.raises(RpcFormatError, match="LINE_OFF = -49.3 does not fit"):
+    with pytest.raises(RpcFormatError, match=r"LINE_OFF = -49\.3 does not fit"):
         nitf_record(rpc.crop(0, 1000))
 
 
@@ -180,7 +182,9 @@ def test_a_number_is_read_with_its_unit_left_out(text, value):
     assert number(text, "file", "KEY") == value
 
 
-@pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "1e400", "0x10", "1_000", "12abc", "--1", "1.2.3"])
+@pytest.mark.parametrize(
+    "text", ["", "nan", "inf", "-inf", "1e400", "0x10", "1_000", "12abc", "--1", "1.2.3"]
+)
 def test_what_is_no_finite_number_is_refused_with_file_and_key(text):
     with pytest.raises(RpcFormatError, match="file: KEY is not"):
         number(text, "file", "KEY")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.errors import ImageError, OutputError, RpcFormatError
+from barpc.handoff import CONSUMERS
 from barpc.raster import open_raster
 from barpc.rpcio import read_rpc, read_rpc_source, write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.rpcio.digits import survives
 from barpc.rpcio.tiff import read_tag
 from tests.rpcio.conftest import grid, make_rpc, write_image
 
@@ -61,6 +64,25 @@ def test_a_vrt_has_the_rpc_to_the_bit_and_the_pixels_of_the_image(kind, rpc, tmp
         assert vrt.nodata == original.nodata
         assert vrt.colorinterp == original.colorinterp
         assert vrt.rpcs.line_num_coeff == rpc.coeffs[2].tolist()
+
+
+def test_offsets_of_more_digits_than_gdal_hands_on_move_nothing(rpc, image, tmp_path):
+    """As they are, they would: 4e-14 degrees are 7e-9 px."""
+    long = replace(
+        rpc,
+        ground_offset=rpc.ground_offset + [1 / 3e8, 1 / 7e8, 1 / 3e5],
+        ground_scale=rpc.ground_scale * (1 + 1 / 3e9),
+        image_scale=rpc.image_scale * (20 + 1 / 3e9),
+    )
+    assert not survives(long)
+    write_rpc_copy(long, image, tmp_path / "a.tif")
+    found = read_rpc(tmp_path / "a.tif")
+    assert survives(found)
+    np.testing.assert_allclose(found.project(grid(long)), long.project(grid(long)), rtol=0, atol=2e-10)
+    by_gdal = CONSUMERS["gdal"].open(tmp_path / "a.tif")(grid(long))
+    np.testing.assert_allclose(by_gdal, long.project(grid(long)), rtol=0, atol=2e-10)
+    write_rpc_copy(found, image, tmp_path / "b.tif")
+    assert read_rpc(tmp_path / "b.tif") == found
 
 
 def test_a_second_copy_replaces_the_tag_of_the_first(rpc, image, tmp_path):
