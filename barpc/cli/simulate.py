@@ -37,7 +37,7 @@ from barpc.cli.progress import progress_bars
 @click.option("--attitude", default=15.0, show_default=True, help="Attitude error, microradians a component.")
 @click.option("--position", default=1.0, show_default=True, help="Position error, metres a component.")
 @click.option("--drift", default=0.0, show_default=True, help="Attitude drift over an image, microradians.")
-@click.option("--snr", default=150.0, show_default=True, help="Signal to noise in full sun; 0: no noise.")
+@click.option("--snr", default=100.0, show_default=True, help="Signal to noise in full sun; 0: no noise.")
 @click.option("--saturation", default=4095, show_default=True, help="Largest pixel value.")
 @click.option(
     "--sun-azimuth",

@@ -89,7 +89,7 @@ class ImageOptions:
     attitude: float = 15e-6
     position: float = 1.0
     drift: float = 0.0
-    snr: float = 150.0
+    snr: float = 100.0
     saturation: int = 4095
     sun_azimuth: tuple[float, ...] = (150.0,)
     sun_elevation: float = 50.0

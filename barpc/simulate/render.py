@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 from scipy.interpolate import CubicSpline
 
 from barpc.errors import InputError
@@ -31,6 +32,8 @@ class Radiometry:
 
     Parameters
     ----------
+    blur : float
+        Standard deviation of the optics' and the motion's blur [px].
     gain : float
         Number of a white plane in full sun.
     gamma : float
@@ -45,10 +48,11 @@ class Radiometry:
         Part of the image under clouds.
     """
 
+    blur: float = 0.5
     gain: float = 2000.0
     gamma: float = 1.0
     offset: float = 60.0
-    snr: float = 150.0
+    snr: float = 100.0
     saturation: int = 4095
     clouds: float = 0.0
 
@@ -108,8 +112,8 @@ def render(sensor: SensorModel, size: tuple[int, int], surface: Surface, samples
 
 
 def expose(brightness: Float32, radiometry: Radiometry, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
-    """Numbers (H, W) that the detector delivers: clouds, gamma, gain, offset, noise, saturation, rounding."""
-    light = brightness
+    """Numbers (H, W) that the detector delivers: blur, clouds, gamma, gain, offset, noise, saturation, rounding."""
+    light = ndimage.gaussian_filter(brightness, radiometry.blur, mode="nearest")
     if radiometry.clouds:
         light = _clouded(light, radiometry.clouds, rng)
     signal = radiometry.gain * np.power(light, np.float32(radiometry.gamma))
