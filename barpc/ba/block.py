@@ -15,6 +15,8 @@ from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointEr
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, connected_groups
 
+_LISTED = 10  # views named in a message
+
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
@@ -121,6 +123,7 @@ def join(views: tuple[View, ...], tracks: Tracks, gcps: GroundPoints | None, opt
         raise InputError("tracks: a track is observed twice in one view; keep one observation or none")
     count = np.bincount(view, minlength=len(views))
     few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero(count < options.min_observations)]
+    few = few if len(few) <= _LISTED else [*few[:_LISTED], f"{len(few) - _LISTED} more"]
     if few and not options.keep_largest:
         raise TiePointError(
             f"too few observations in {', '.join(few)}: at least {options.min_observations} are needed; "
@@ -149,7 +152,7 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
         raise InputError("two views have the same name")
     unknown = (set(options.fixed) | set(options.view_weights)) - set(names)
     if unknown:
-        raise InputError(f"no view is named {', '.join(sorted(unknown))}; there are {', '.join(names[:20])}")
+        raise InputError(f"no view is named {', '.join(sorted(unknown))}; there are {', '.join(names[:_LISTED])}")
 
 
 def _left_out(
@@ -171,7 +174,7 @@ def _left_out(
             named,
         )
     rest = tuple(name for group in named[1:] for name in group)
-    listed = ", ".join(rest[:10])
+    listed = ", ".join(rest[:_LISTED])
     message = f"{len(rest)} views are not tied to the largest group and keep their cameras: {listed}"
     warnings.warn(message, BarpcWarning, stacklevel=4)
     return rest

@@ -151,7 +151,9 @@ class Seen:
                 break
             ground, view, point, xy = self._draw(max(64, int(1.2 * (count - have))), visible)
             times = np.bincount(point, minlength=len(ground))
-            good = np.flatnonzero(times >= fewest)[: count - have]
+            good = np.flatnonzero(times >= fewest)
+            wanted = min(len(good), count - have)  # points are sorted by site: take evenly, not the first
+            good = good[np.arange(wanted) * len(good) // max(wanted, 1)]
             index = np.full(len(ground), -1)
             index[good] = have + np.arange(len(good))
             keep = index[point] >= 0
