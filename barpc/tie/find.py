@@ -150,7 +150,7 @@ def find_tracks(
     tracks = refine(
         views,
         thin(linked, sizes, int(_SPARE * most)),
-        pairs,
+        {found.pair: report.spread for found, report in matched if len(found)},
         options,
         sensors=sensors,
         executor=executor,

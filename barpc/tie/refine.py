@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -14,21 +14,20 @@ from barpc.sensor import SensorModel
 from barpc.tie.epipolar import agreeing, frame, linear_map, mad
 from barpc.tie.matching import common_range
 from barpc.tie.options import TieOptions
-from barpc.tie.pairs import Pair
 from barpc.tie.register import Registration, Task, register_task
 from barpc.tie.work import Progress, ordered
 
 _FLOOR = 0.1  # px across the epipolar line that are always tolerated
 _DISTORTED = 2.2  # times the median sigma: the patch lies across a step of the ground
 _LEAST_SIGMA = 0.02  # px
-_UNKNOWN_ANGLE = 90.0  # deg, of views that were not paired
+_LEAST_REACH = 5.0  # px of half a segment, below which altitudes are not compared
 _FEW = 20  # observations of a pair of views below which their sigmas are not scaled by their errors
 
 
 def refine(
     views: Sequence[View],
     tracks: Tracks,
-    pairs: Sequence[Pair],
+    spreads: Mapping[tuple[int, int], float],
     options: TieOptions,
     *,
     sensors: Sequence[SensorModel] | None = None,
@@ -43,8 +42,8 @@ def refine(
         The images.
     tracks : Tracks
         As `link` made them.
-    pairs : sequence of Pair
-        Their angles tell which view of a track is the most central one.
+    spreads : mapping of (int, int) to float
+        `PairReport.spread` of the pairs of views: tells which view of a track makes the best reference.
     options : TieOptions
         `patch`, `min_correlation`, `band`, `tile`.
     sensors : sequence of SensorModel, optional
@@ -63,7 +62,7 @@ def refine(
     if not len(tracks):
         return tracks
     cameras = [view.sensor for view in views] if sensors is None else sensors
-    of_track = references(tracks, pairs, len(views))
+    of_track = references(tracks, spreads, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Links(views, cameras, tracks, of_track[tracks.point[other]], other)
     found = links.register(options, executor, progress)
@@ -97,10 +96,7 @@ class _Links:
 
     def groups(self, *more: IntArray) -> list[IntArray]:
         """Indices of the links between the same two views, and of equal values of `more`."""
-        table = np.stack([self.tracks.view[self.reference], self.tracks.view[self.other], *more])
-        order = np.lexsort(table[::-1])
-        cuts = np.flatnonzero((np.diff(table[:, order], axis=1) != 0).any(axis=0)) + 1
-        return np.split(order, cuts) if len(order) else []
+        return _grouped(self.tracks.view[self.reference], self.tracks.view[self.other], *more)
 
     def register(
         self, options: TieOptions, executor: Executor | None, progress: Progress | None
@@ -128,23 +124,47 @@ class _Links:
             xy[part], correlation[part], sigma[part], ok[part] = one.xy, one.correlation, one.sigma, one.ok
         return Registration(xy, correlation, sigma, ok)
 
-    def residuals(self, found: Registration, group: IntArray) -> tuple[BoolArray, Array]:
-        """Which links between two views agree with their epipolar lines, and the distances from them [px]."""
+    def errors(self, found: Registration, group: IntArray) -> tuple[Array, Array]:
+        """Along and across the epipolar lines (M, 2) [px] between two views; half the segments' length (M,)."""
         r, v = self.of(group)
-        origin = self.origin[group]
         limits = common_range(self.views[r], self.views[v])
-        where = frame(self.cameras[r], self.cameras[v], origin, limits)
-        return agreeing(origin, where.errors(np.arange(len(group)), found.xy[group])[:, 1], _FLOOR)
+        where = frame(self.cameras[r], self.cameras[v], self.origin[group], limits)
+        return where.errors(np.arange(len(group)), found.xy[group]), where.reach
 
     def verified(self, found: Registration, good: BoolArray) -> BoolArray:
-        """Those that are near their epipolar line and no less certain than others of the two views."""
+        """Those near their epipolar line, no less certain than others, at one altitude with their track."""
         verified = np.zeros(len(self), dtype=bool)
+        altitude, reach = (
+            np.zeros(len(self)),
+            np.zeros(len(self)),
+        )  # from the middle of the range, in its halves
         for group in self.groups():
             group = group[good[group]]
             if len(group):
                 group = group[found.sigma[group] <= _DISTORTED * np.median(found.sigma[group])]
-                verified[group] = self.residuals(found, group)[0]
-        return verified
+                errors, reach[group] = self.errors(found, group)
+                verified[group] = agreeing(self.origin[group], errors[:, 1], _FLOOR)[0]
+                altitude[group] = errors[:, 0] / np.maximum(reach[group], 1e-9)
+        return verified & ~self._torn(verified, altitude, reach)
+
+    def _torn(self, good: BoolArray, altitude: Array, reach: Array) -> BoolArray:
+        """Links that disagree in altitude with all their neighbours in the track, up to an affine function."""
+        rows = np.flatnonzero(good & (reach >= _LEAST_REACH))
+        first, second = rows[:-1], rows[1:]
+        same = self.reference[first] == self.reference[second]
+        first, second = first[same], second[same]
+        apart = (altitude[first] - altitude[second]) * np.minimum(reach[first], reach[second])
+        compared, agreed = np.zeros((2, len(self)), dtype=bool)
+        views = self.tracks.view
+        for group in _grouped(
+            views[self.reference[first]], views[self.other[first]], views[self.other[second]]
+        ):
+            agree = agreeing(self.origin[first[group]], apart[group], 3 * _FLOOR)[0]
+            for end in (first[group], second[group]):
+                compared[end] = True
+                agreed[end[agree]] = True
+        torn: BoolArray = compared & ~agreed
+        return torn
 
     def scaled(self, found: Registration, good: BoolArray) -> Array:
         """Sigmas [px] made larger where the distances from the epipolar lines are."""
@@ -152,9 +172,18 @@ class _Links:
         for group in self.groups():
             group = group[good[group]]
             if len(group) >= _FEW:
-                residual = self.residuals(found, group)[1]
+                across = self.errors(found, group)[0][:, 1]
+                residual = agreeing(self.origin[group], across, _FLOOR)[1]
                 sigma[group] *= max(1.0, mad(residual / sigma[group]))
         return sigma
+
+
+def _grouped(*keys: IntArray) -> list[IntArray]:
+    """Indices of rows with equal keys, in ascending order of the keys."""
+    table = np.stack(keys)
+    order = np.lexsort(table[::-1])
+    cuts = np.flatnonzero((np.diff(table[:, order], axis=1) != 0).any(axis=0)) + 1
+    return np.split(order, cuts) if len(order) else []
 
 
 def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma: Array) -> Tracks:
@@ -171,20 +200,21 @@ def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma
     return Tracks(tracks.view, tracks.point, placed, np.sqrt(variance).clip(_LEAST_SIGMA)).select(keep)
 
 
-def references(tracks: Tracks, pairs: Sequence[Pair], num_views: int) -> IntArray:
-    """Row of the reference observation of every track (P,): the view with the least angles to the others.
+def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_views: int) -> IntArray:
+    """Row of the reference observation of every track (P,): the view that is most like the others.
 
     Parameters
     ----------
     tracks : Tracks
         Rows grouped by track.
-    pairs : sequence of Pair
-        Angles between views.
+    spreads : mapping of (int, int) to float
+        Spread across the epipolar line of the pairs that were matched [px]: it grows with the angle
+        between two views and with everything else that makes them look different.
     num_views : int
         Number of views.
     """
-    key = np.array([i * num_views + j for i, j in (pair.views for pair in pairs)], dtype=np.int64)
-    angle = np.array([pair.angle for pair in pairs])[np.argsort(key)]
+    key = np.array([min(pair) * num_views + max(pair) for pair in spreads] or [-1], dtype=np.int64)
+    spread = np.array(list(spreads.values()) or [0.0])[np.argsort(key)]
     key = np.sort(key)
     starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
     length = np.diff(starts)[tracks.point]
@@ -194,8 +224,8 @@ def references(tracks: Tracks, pairs: Sequence[Pair], num_views: int) -> IntArra
     low = np.minimum(tracks.view[left], tracks.view[right])
     wanted = low * num_views + np.maximum(tracks.view[left], tracks.view[right])
     place = np.searchsorted(key, wanted).clip(0, len(key) - 1)
-    apart = np.where(key[place] == wanted, angle[place], np.where(left == right, 0.0, _UNKNOWN_ANGLE))
-    cost = np.bincount(left, weights=apart, minlength=len(tracks))
+    unlike = np.where(key[place] == wanted, spread[place], np.where(left == right, 0.0, 2.0 * spread.max()))
+    cost = np.bincount(left, weights=unlike, minlength=len(tracks))
     order = np.lexsort((cost, tracks.point))
     first: IntArray = order[starts[:-1]]
     return first
