@@ -26,7 +26,7 @@ MONOMIALS = (
 )  # fmt: skip
 """The twenty monomials in RPC00B order; L = longitude, P = latitude, H = altitude, normalised."""
 
-_REACH = 1.25
+REACH = 1.25
 """The cubic inverse is trusted this far out of the box; what lies beyond is solved with care."""
 
 
@@ -168,7 +168,7 @@ class Rational:
         if long.any():
             long = ~(self._step(target, x) <= inverse.safe_step)
         out = np.abs(x).max(axis=0)
-        bad = np.flatnonzero(long | ~(out <= _REACH))
+        bad = np.flatnonzero(long | ~(out <= REACH))
         ok = np.ones(len(z), dtype=bool)
         if len(bad):
             ok[bad] = self._solve_with_care(target[:, bad], x, bad)

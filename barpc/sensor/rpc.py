@@ -12,7 +12,7 @@ import numpy as np
 
 from barpc.errors import RpcError
 from barpc.geodesy import Array, wrap_longitude
-from barpc.sensor.rational import CHUNK, MONOMIALS, Rational, monomials
+from barpc.sensor.rational import CHUNK, MONOMIALS, REACH, BoolArray, Rational, monomials
 
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 
@@ -212,14 +212,26 @@ class RPC:
         target /= self.image_scale[:, None]
         z = (alt - self.ground_offset[2]) / self.ground_scale[2]
         x, ok = self._map.solve(target, z)
+        reach = max(x.max(initial=0.0), -x.min(initial=0.0))
         x *= self.ground_scale[:, None]
-        if not ok.all():  # beyond half a turn the longitude would wrap; there is no latitude beyond a pole
-            ok &= (np.abs(x[0]) <= 180.0) & (np.abs(x[1] + self.ground_offset[1]) <= 90.0)
         x += self.ground_offset[:, None]
         ground = np.empty((len(alt), 3))
         ground[:, :2], ground[:, 2] = x[:2].T, alt
+        span = REACH * np.abs(self.ground_scale)
+        if not (reach <= REACH and span[0] < 180.0 and np.abs(self.ground_offset[1]) + span[1] < 90.0):
+            ok &= self._holds(ground, image)
         ground[~ok] = np.nan
         return ground
+
+    def _holds(self, ground: Array, image: Array) -> BoolArray:
+        """Whether ground points (N, 3), as rounded to degrees, are on Earth and project to `image` (N, 2).
+
+        Far out a unit in the last place of a degree can be many pixels; beyond half a turn a longitude
+        would wrap, and beyond a pole there is no latitude.
+        """
+        tolerance = 10 * _ACCURACY + 1e-12 * np.abs(image)
+        on_earth = (np.abs(ground[:, 0] - self.ground_offset[0]) <= 180.0) & (np.abs(ground[:, 1]) <= 90.0)
+        return np.asarray(on_earth & (np.abs(self.project(ground) - image) <= tolerance).all(axis=1))
 
     def crop(self, col: float, row: float) -> RPC:
         """The RPC of a crop whose top-left pixel is (col, row) [px] of this image: exact, no refit."""

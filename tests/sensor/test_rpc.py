@@ -1,0 +1,274 @@
+"""The RPC beyond the contract of all sensor models: accuracy, far points, poles, longitudes, crops."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from barpc.errors import RpcError
+from barpc.geodesy import ecef_from_ground_jacobian, ground_from_ecef_jacobian
+from barpc.rpcio import read_rpc
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.rational import MONOMIALS, monomials
+from barpc.sensor.rpc import RPC
+from tests.sensor.conftest import make_rpc
+
+VENDORS = [
+    "optical/phr_triplet_north/img_01.tif",
+    "optical/phr_ventoux/left_image.geom",
+    "optical/qb2_single/qb2_basic1b.tif",
+    "rpc_formats/20191015_073816_ssc1d3_0011_basic_l1a_panchromatic_dn_RPC.TXT",
+    "rpc_formats/JAX_068_001_RGB.json",
+    "rpc_formats/WV02_10300100D0772D00.r100.xml",
+    "rpc_formats/ikonos-1.geom",
+    "rpc_formats/md_dg.RPB",
+    "rpc_formats/md_ov_rpc.txt",
+    "rpc_formats/qb-1.geom",
+    "rpc_formats/rpc_IKONOS.txt",
+    "rpc_formats/rpc_PLANET_L1A.txt",
+    "rpc_formats/rpc_PLEIADES.xml",
+    "rpc_formats/rpc_SPOT6.xml",
+    "rpc_formats/rpc_unsupported.xml",
+    "rpc_formats/rpc_WV2.xml",
+    "rpc_formats/wv3_20.NTF",
+]
+vendors = pytest.mark.parametrize("file", VENDORS)
+
+
+def box(rpc: RPC, reach: float, count: int = 20_000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Image points in `reach` times the RPC's box, and altitudes in three times its range at most."""
+    rng = np.random.default_rng(seed)
+    image = rpc.image_offset + rng.uniform(-reach, reach, (count, 2)) * rpc.image_scale
+    return image, rpc.ground_offset[2] + rng.uniform(-1, 1, count) * min(reach, 3) * rpc.ground_scale[2]
+
+
+def rounding(rpc: RPC, ground: np.ndarray) -> float:
+    """What half a unit in the last place of lon and lat moves in the image [px]."""
+    _, jacobian = rpc.project_jacobian(ground)
+    return float(
+        (np.abs(jacobian[:, :, :2]) * 0.5 * np.spacing(np.abs(ground[:, None, :2]))).sum(axis=2).max()
+    )
+
+
+@vendors
+def test_localising_inside_the_box_is_exact_but_for_the_rounding_of_degrees(file, shared_data):
+    rpc = read_rpc(shared_data / file)
+    image, alt = box(rpc, 1.0)
+    ground = rpc.localize(image, alt)
+    assert np.isfinite(ground).all()
+    error = np.abs(rpc.project(ground) - image).max()
+    assert error <= 1e-9 + 1.1 * rounding(rpc, ground)
+    assert error <= 3e-9
+
+
+@vendors
+@pytest.mark.parametrize("reach", [3.0, 100.0, 1e4])
+def test_far_out_no_point_raises_and_none_is_silently_wrong(file, reach, shared_data):
+    rpc = read_rpc(shared_data / file)
+    image, alt = box(rpc, reach)
+    ground = rpc.localize(image, alt)
+    found = np.isfinite(ground).all(axis=1)
+    assert np.isnan(ground[~found]).all()
+    error = np.abs(rpc.project(ground[found]) - image[found])
+    assert (error <= 1e-8 + 1e-12 * np.abs(image[found])).all()
+    if reach == 3.0:
+        assert found.all()
+
+
+@vendors
+def test_a_point_found_far_out_lies_on_the_sheet_of_the_centre(file, shared_data):
+    """A quotient of cubics has other preimages; across a pole or a fold they are no view of the camera."""
+    rpc = read_rpc(shared_data / file)
+    image, alt = box(rpc, 300.0, 4000)
+    ground = rpc.localize(image, alt)
+    ground = ground[np.isfinite(ground).all(axis=1)]
+    denominators = rpc.coeffs[1::2] @ monomials(rpc.normalize(np.vstack([rpc.ground_offset, ground])))
+    assert (np.sign(denominators) == np.sign(denominators[:, :1])).all()
+    _, jacobian = rpc.project_jacobian(np.vstack([rpc.ground_offset, ground]))
+    orientation = np.sign(np.linalg.det(jacobian[:, :, :2]))
+    assert (orientation == orientation[0]).all()
+
+
+@vendors
+def test_the_jacobian_is_the_central_difference(file, shared_data):
+    rpc = read_rpc(shared_data / file)
+    ground = rpc.localize(*box(rpc, 0.9, 200))
+    value, jacobian = rpc.project_jacobian(ground)
+    np.testing.assert_allclose(value, rpc.project(ground), rtol=0, atol=1e-9 + 1e-13 * np.abs(value).max())
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-4 * abs(rpc.ground_scale[axis])
+        numeric = (rpc.project(ground + step) - rpc.project(ground - step)) / (2 * step[axis])
+        scale = np.abs(jacobian[:, :, axis]).max()
+        np.testing.assert_allclose(jacobian[:, :, axis], numeric, rtol=0, atol=2e-6 * scale)
+
+
+def test_the_derivative_by_ecef_goes_through_the_geodetic_one():
+    rpc = make_rpc()
+    ground = rpc.localize(*box(rpc, 1.0, 100))
+    _, by_ground = rpc.project_jacobian(ground)
+    still = Corrected(rpc, Correction([0.0] * 3, [0.0] * 3, [7e6, 0.0, 0.0]))
+    _, jacobian = still.project_jacobian(ground)
+    np.testing.assert_allclose(jacobian, by_ground, rtol=1e-9, atol=1e-6)
+    identity = ecef_from_ground_jacobian(ground) @ ground_from_ecef_jacobian(ground)
+    np.testing.assert_allclose(identity, np.broadcast_to(np.eye(3), identity.shape), atol=1e-12)
+
+
+def test_a_chunk_border_shows_nowhere():
+    rpc = make_rpc()
+    image, alt = box(rpc, 1.0, 8192 * 2 + 5)
+    ground = rpc.localize(image, alt)
+    pieces = np.concatenate(
+        [rpc.localize(image[i : i + 1000], alt[i : i + 1000]) for i in range(0, len(alt), 1000)]
+    )
+    np.testing.assert_allclose(pieces, ground, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        rpc.project(ground),
+        np.concatenate([rpc.project(g) for g in np.array_split(ground, 7)]),
+        rtol=0,
+        atol=1e-10,
+    )
+    value, jacobian = rpc.project_jacobian(ground)
+    np.testing.assert_allclose(value, image, rtol=0, atol=2e-9)
+    assert jacobian.shape == (len(alt), 2, 3)
+
+
+def test_one_bad_point_among_many_is_nan_alone():
+    rpc = make_rpc()
+    image, alt = box(rpc, 1.0, 1000)
+    image[17, 0], image[18, 1], alt[19] = np.nan, np.inf, np.nan
+    ground = rpc.localize(image, alt)
+    bad = np.isin(np.arange(1000), [17, 18, 19])
+    np.testing.assert_array_equal(np.isnan(ground).any(axis=1), bad)
+    clean = rpc.localize(image[~bad], alt[~bad])
+    np.testing.assert_allclose(ground[~bad], clean, rtol=0, atol=1e-13)
+    projected = rpc.project(ground)
+    np.testing.assert_array_equal(np.isnan(projected).any(axis=1), bad)
+    _, jacobian = rpc.project_jacobian(ground)
+    np.testing.assert_array_equal(np.isnan(jacobian).all(axis=(1, 2)), bad)
+
+
+def test_an_empty_batch_and_a_single_point_keep_their_shapes():
+    rpc = make_rpc()
+    assert rpc.project(np.empty((0, 3))).shape == (0, 2)
+    assert rpc.localize(np.empty((0, 2)), np.empty(0)).shape == (0, 3)
+    assert rpc.project_jacobian(np.empty((0, 3)))[1].shape == (0, 2, 3)
+    assert rpc.localize(np.array([5.0, 6.0]), np.array(3.0)).shape == (3,)
+    assert rpc.localize(np.array([5.0, 6.0]), np.zeros((2, 4))).shape == (2, 4, 3)
+
+
+def test_a_vanishing_denominator_gives_nan_not_infinity():
+    coeffs = np.zeros((4, 20))
+    coeffs[0, 1] = coeffs[2, 2] = coeffs[1, 0] = coeffs[3, 0] = 1.0
+    coeffs[1, 1] = 1.0  # a pole at normalised longitude -1
+    rpc = RPC(coeffs, [0.0] * 3, [1.0] * 3, [0.0] * 2, [1000.0] * 2)
+    image = rpc.project([[-1.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    assert np.isnan(image[0]).all()
+    np.testing.assert_allclose(image[1], [1000 / 3, 0.0])
+    beyond = rpc.localize([[1500.0, 0.0]], [0.0])  # seen only across the pole, at longitude -3
+    assert np.isnan(beyond).all()
+
+
+@pytest.mark.parametrize("lon", [179.97, -179.97, 180.0, -180.0])
+def test_longitudes_count_by_whole_turns(lon):
+    rpc = make_rpc(lon=lon)
+    image, alt = box(rpc, 1.0, 500)
+    ground = rpc.localize(image, alt)
+    assert np.abs(ground[:, 0] - lon).max() < 1.0  # continuous across the antimeridian
+    for turn in (-360.0, 360.0):
+        np.testing.assert_allclose(rpc.project(ground + [turn, 0, 0]), image, rtol=0, atol=2e-8)
+    wrapped = (ground[:, :1] + 180) % 360 - 180
+    np.testing.assert_allclose(rpc.project(np.hstack([wrapped, ground[:, 1:]])), image, rtol=0, atol=2e-8)
+
+
+def test_an_offset_of_0_to_360_is_the_same_camera():
+    here, there = make_rpc(lon=-60.0), make_rpc(lon=300.0)
+    ground = here.localize(*box(here, 1.0, 500))
+    np.testing.assert_allclose(there.project(ground), here.project(ground), rtol=0, atol=2e-8)
+
+
+def test_there_is_no_ground_beyond_a_pole():
+    rpc = make_rpc(lat=89.95)
+    image, alt = box(rpc, 1.0, 4000)
+    ground = rpc.localize(image, alt)
+    lost = np.isnan(ground).any(axis=1)
+    assert 0 < lost.sum() < len(lost)
+    assert np.nanmax(ground[:, 1]) <= 90.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    lon=st.floats(-180, 180),
+    lat=st.floats(-85, 85),
+    scale=st.floats(1e-3, 0.5),
+    seed=st.integers(0, 1000),
+)
+def test_any_camera_of_this_kind_localises_what_it_projects(lon, lat, scale, seed):
+    base = make_rpc(lon, lat, seed)
+    rpc = replace(base, ground_scale=base.ground_scale * [scale, scale, 1.0])
+    image, alt = box(rpc, 1.0, 50, seed)
+    ground = rpc.localize(image, alt)
+    assert np.abs(rpc.project(ground) - image).max() <= 1e-9 + 1.1 * rounding(rpc, ground)
+
+
+def test_a_crop_and_a_window_of_step_one_are_the_same_to_the_bit():
+    rpc = make_rpc()
+    assert rpc.crop(12.5, 7.0) == rpc.window(12.5, 7.0)
+    np.testing.assert_array_equal(rpc.crop(3, 4).image_offset, rpc.image_offset - [3, 4])
+
+
+def test_equality_and_hash_go_by_content_and_survive_pickling():
+    rpc, twin = make_rpc(), make_rpc()
+    rpc.localize([[1.0, 2.0]], [0.0])  # the inverse that is kept is no part of the content
+    assert rpc == twin
+    assert hash(rpc) == hash(twin)
+    assert pickle.loads(pickle.dumps(rpc)) == rpc
+    assert rpc != replace(rpc, err_bias=None)
+    assert rpc != replace(rpc, image_offset=rpc.image_offset + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"coeffs": np.zeros((4, 19))}, "shape"),
+        ({"coeffs": np.full((4, 20), np.nan)}, "not finite"),
+        ({"coeffs": np.zeros((4, 20))}, "zero everywhere"),
+        ({"ground_scale": [1.0, 0.0, 1.0]}, "scale is zero"),
+        ({"image_offset": [np.inf, 0.0]}, "not finite"),
+    ],
+)
+def test_a_camera_that_cannot_be_used_is_refused_when_it_is_made(change, message):
+    with pytest.raises(RpcError, match=message):
+        replace(make_rpc(), **change)
+
+
+def test_the_monomials_are_those_of_rpc00b():
+    x, y, z = np.random.default_rng(0).normal(size=(3, 5))
+    values = monomials(np.stack([x, y, z]))
+    for name, row in zip(MONOMIALS, values, strict=True):
+        expected = np.ones(5)
+        for letter in name.replace("1", ""):
+            expected = expected * {"L": x, "P": y, "H": z}[letter]
+        np.testing.assert_allclose(row, expected, rtol=1e-14)
+
+
+@pytest.mark.slow
+@vendors
+def test_rpcm_and_the_localisation_agree(file: str, shared_data: Path):
+    rpcm = pytest.importorskip("rpcm.rpc_model")
+    from barpc.rpcio.structured import write_json
+
+    rpc = read_rpc(shared_data / file)
+    import json
+
+    model = rpcm.RPCModel(json.loads(write_json(rpc))["rpc"], dict_format="rpcm")
+    image, alt = box(rpc, 0.9, 300)
+    ground = rpc.localize(image, alt)
+    col, row = model.projection(ground[:, 0], ground[:, 1], alt)
+    assert np.abs(np.column_stack([col, row]) - image).max() <= 3e-9
