@@ -17,10 +17,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from barpc.cli.main import cli
 from barpc.errors import BarpcWarning, FitError, InputError, RpcError, RpcFormatError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.geodesy import ecef_from_ground
+from barpc.rpcio import read_rpc
 from barpc.safexml import parse_xml
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.sentinel1 import (
@@ -463,6 +466,30 @@ def test_an_rpc_of_a_moved_swath_is_fitted_by_the_same_function(model: RangeDopp
     assert fit.rmse_ckp[0] <= 1.5e-4
     ground = model.localize(*scatter(model, (0.0, 500.0), 20))
     assert 0.5 <= np.abs(moved.project(ground) - model.project(ground)).max() <= 10.0
+
+
+def test_the_command_line_fits_swaths_bursts_and_mosaics(
+    safe: Path, tmp_path: Path, model: RangeDoppler
+) -> None:
+    runner, out = CliRunner(), tmp_path / "iw1_RPC.TXT"
+    for flags in (
+        ["--swath", "iw1", "--pol", "vh"],
+        ["--swath", "mosaic"],
+        ["--swath", "iw3", "--burst", "2"],
+    ):
+        result = runner.invoke(
+            cli, ["fit", str(safe), *flags, "-o", str(out), "--overwrite"], standalone_mode=False
+        )
+        assert result.exception is None
+        assert "within tolerance" in result.stdout
+    eof = tmp_path / "S1A.EOF"
+    eof.write_bytes(IW["IW1"].eof())
+    flags = ["--swath", "iw1", "--orbit", str(eof), "--atmosphere", "--bistatic", "full", "--overwrite"]
+    result = runner.invoke(cli, ["fit", str(safe), *flags, "-o", str(out)], standalone_mode=False)
+    assert result.exception is None
+    delayed = open_product(safe, swath="iw1", orbit=eof, atmosphere=True, bistatic="full")
+    ground = model.localize(*scatter(model, (0.0, 500.0), 100))
+    assert np.abs(read_rpc(out).project(ground) - delayed.project(ground)).max() <= 1e-3
 
 
 def test_a_point_costs_less_than_two_microseconds(model: RangeDoppler) -> None:
