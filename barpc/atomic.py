@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from barpc.errors import OutputError
@@ -55,7 +55,8 @@ def replacing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
             raise
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # renamed away, or never made
+            partial.unlink()
 
 
 def _sync(path: Path) -> None:

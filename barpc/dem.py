@@ -79,7 +79,7 @@ class Grid:
     def sample(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
         lon, lat = np.broadcast_arrays(np.asarray(lon, np.float64), np.asarray(lat, np.float64))
-        row, col = self.locate(lon.ravel(), lat.ravel())
+        row, col = (_snapped(index) for index in self.locate(lon.ravel(), lat.ravel()))
         if self.period:
             col = col % self.period
         height = np.full(lon.size, np.nan)
@@ -119,6 +119,12 @@ class Grid:
         first = self.read(top, bottom, 0, right - int(self.period))
         rest = self.read(top, bottom, left, min(int(self.period), width))
         return np.concatenate([rest, first], axis=1)
+
+
+def _snapped(index: Array) -> Array:
+    """Fractional indices, on the node where they are within a millionth of it: a void beyond has no weight."""
+    node = np.rint(index)
+    return np.where(np.abs(index - node) < 1e-6, node, index)
 
 
 def _open_hgt(path: Path) -> Grid:

@@ -27,7 +27,7 @@ def polygon(ring: Array) -> dict[str, Any]:
     ring = np.asarray(ring, dtype=np.float64)
     turn = 360.0 * np.rint(_winding(ring) / 360.0)
     if turn:
-        ring = _around_pole(ring, turn)
+        ring = _clip(_clip(_around_pole(ring, turn), -180.0, 1.0), 180.0, -1.0)
     if _area(ring) < 0:
         ring = ring[::-1]
     first = int(np.floor((ring[:, 0].min() + 180.0) / 360.0))
@@ -61,10 +61,11 @@ def _winding(ring: Array) -> float:
 
 
 def _around_pole(ring: Array, turn: float) -> Array:
-    """The area between an outline around a pole and that pole, as a ring from one meridian to the next."""
-    step = np.diff(ring[:, 0])
-    lon = ring[0, 0] + np.concatenate([[0.0], np.cumsum(step - 360.0 * np.rint(step / 360.0))])
-    lon, lat = np.append(lon, lon[0] + turn), np.append(ring[:, 1], ring[0, 1])
+    """The area between an outline around a pole and that pole, three turns of it: from it one is cut."""
+    step = np.diff(ring[:, 0], append=ring[:1, 0])
+    turns = np.tile(step - 360.0 * np.rint(step / 360.0), 3)
+    lon = ring[0, 0] % 360.0 - 1.5 * turn + np.concatenate([[0.0], np.cumsum(turns)])
+    lat = np.append(np.tile(ring[:, 1], 3), ring[0, 1])
     pole = 90.0 if lat.mean() > 0 else -90.0
     return np.column_stack([np.concatenate([lon, lon[[-1, 0]]]), np.concatenate([lat, [pole, pole]])])
 

@@ -1,0 +1,195 @@
+"""Terrain heights: known tiles, vertical references, voids, where lines of sight meet the ground."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.dem import Dem, Grid, localize_on_terrain
+from barpc.errors import BarpcWarning, InputError
+from barpc.geodesy import ecef_from_ground
+from barpc.rpcio import read_rpc
+from barpc.sensor.geometry import altitude_range
+from tests.sensor.conftest import make_rpc
+
+STEP = 0.01
+
+
+def write_dem(path: Path, crs: object, heights: np.ndarray | None = None, **profile: object) -> Path:
+    """A plane of heights h = 100 + 10 col + row, nodes every hundredth of a degree from 5 E, 44 N."""
+    if heights is None:
+        row, col = np.mgrid[:21, :31]
+        heights = (100.0 + 10 * col + row).astype(np.float32)
+    transform = rasterio.Affine(STEP, 0, 5 - STEP / 2, 0, -STEP, 44 + STEP / 2)
+    options = {"driver": "GTiff", "width": heights.shape[1], "height": heights.shape[0], "count": 1}
+    options |= {"dtype": heights.dtype, "crs": crs, "transform": transform, "nodata": -9999.0} | profile
+    with rasterio.open(path, "w", **options) as out:
+        out.write(heights, 1)
+    return path
+
+
+def write_geoid(path: Path, height: float = 50.0) -> Path:
+    """A constant global .gtx with nodes every ten degrees."""
+    header = np.array([-90.0, -180.0, 10.0, 10.0], ">f8").tobytes() + np.array([19, 36], ">i4").tobytes()
+    path.write_bytes(header + np.full((19, 36), height, ">f4").tobytes())
+    return path
+
+
+def test_heights_between_nodes_are_bilinear(tmp_path):
+    dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
+    lon, lat = 5 + STEP * np.array([0.0, 3.5, 30.0]), 44 - STEP * np.array([0.0, 7.25, 20.0])
+    np.testing.assert_allclose(dem(lon, lat), [100.0, 142.25, 420.0], atol=1e-6)
+    assert dem(5.005, 43.995) == pytest.approx(105.5)
+
+
+def test_outside_and_where_a_void_has_weight_there_is_no_height(tmp_path):
+    row, col = np.mgrid[:21, :31]
+    heights = (100.0 + 10 * col + row).astype(np.float32)
+    heights[5, 5] = -9999.0
+    dem = Dem.open(write_dem(tmp_path / "a.tif", 4979, heights))
+    at = 5 + STEP * np.array([4.5, 5.5, 4.0, 4.0, 6.0, -0.1, 30.1])
+    lat = 44 - STEP * np.array([4.5, 5.5, 4.0, 5.0, 5.0, 3.0, 3.0])
+    expected = [np.nan, np.nan, 144.0, 145.0, 165.0, np.nan, np.nan]
+    np.testing.assert_allclose(dem(at, lat), expected, atol=1e-6)
+
+
+def test_ellipsoidal_heights_are_taken_without_a_word(tmp_path):
+    dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
+    assert "reference ellipsoid, ellipsoidal" in dem.description
+
+
+def test_heights_above_a_geoid_are_made_ellipsoidal_and_it_is_said(tmp_path):
+    path = write_dem(tmp_path / "a.tif", "EPSG:4326+5773")
+    dem = Dem.open(path, write_geoid(tmp_path / "g.gtx"))
+    assert dem(5.0, 44.0) == pytest.approx(150.0)
+    assert "EGM96 height, made ellipsoidal with g.gtx" in dem.description
+
+
+def test_heights_above_a_geoid_without_a_grid_raise_a_loud_warning(tmp_path):
+    with pytest.warns(BarpcWarning, match="EGM96 height, TAKEN AS ELLIPSOIDAL.*100 m"):
+        dem = Dem.open(write_dem(tmp_path / "a.tif", "EPSG:4326+5773"))
+    assert dem(5.0, 44.0) == pytest.approx(100.0)
+
+
+def test_an_unknown_reference_raises_a_loud_warning_with_and_without_a_grid(tmp_path):
+    path = write_dem(tmp_path / "a.tif", 4326)
+    with pytest.warns(BarpcWarning, match="reference unknown, TAKEN AS ELLIPSOIDAL"):
+        Dem.open(path)
+    with pytest.warns(BarpcWarning, match="reference unknown, made ellipsoidal"):
+        dem = Dem.open(path, write_geoid(tmp_path / "g.gtx"))
+    assert dem(5.0, 44.0) == pytest.approx(150.0)
+
+
+def test_a_geoid_for_ellipsoidal_heights_is_a_contradiction(tmp_path):
+    with pytest.raises(InputError, match="ellipsoidal already"):
+        Dem.open(write_dem(tmp_path / "a.tif", 4979), write_geoid(tmp_path / "g.gtx"))
+
+
+def test_a_projected_dem_is_met_in_its_own_crs(tmp_path):
+    """UTM 31, nodes every kilometre, h = northing in kilometres - 4800."""
+    row, _ = np.mgrid[:60, :80]
+    transform = rasterio.Affine(1000, 0, 600_000 - 500, 0, -1000, 4_900_000 + 500)
+    path = write_dem(
+        tmp_path / "a.tif", "EPSG:32631+5773", (100.0 - row).astype(np.float32), transform=transform
+    )
+    dem = Dem.open(path, write_geoid(tmp_path / "g.gtx", 0.0))
+    pyproj = pytest.importorskip("pyproj")
+    lon, lat = pyproj.Transformer.from_crs(32631, 4326, always_xy=True).transform(630_250.0, 4_880_500.0)
+    assert dem(lon, lat) == pytest.approx(80.5, abs=1e-6)
+
+
+def test_a_grid_that_goes_around_the_earth_has_no_seam(tmp_path):
+    path = tmp_path / "g.gtx"
+    header = np.array([-90.0, -180.0, 10.0, 10.0], ">f8").tobytes() + np.array([19, 36], ">i4").tobytes()
+    lon = np.radians(np.arange(-180, 180, 10.0))
+    path.write_bytes(header + np.tile(np.cos(lon), (19, 1)).astype(">f4").tobytes())
+    grid = Grid.open(path)
+    expected = (-1.0 + np.cos(np.radians(170))) / 2
+    np.testing.assert_allclose(grid.sample([175.0, -185.0, 535.0, -175.0], 0.0), expected, atol=1e-6)
+    assert grid.sample(180.0, 90.0) == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [("N44E005.hgt", b"x" * 10), ("tile.hgt", b"\0" * 2 * 1201**2), ("g.gtx", b""), ("g.gtx", b"\0" * 400)],
+)
+def test_a_file_that_is_not_what_its_name_says_is_refused(name, data, tmp_path):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=name.replace(".", r"\.")):
+        Grid.open(tmp_path / name)
+
+
+def test_a_dem_without_crs_is_refused(tmp_path):
+    with pytest.raises(InputError, match="needs a CRS"):
+        Grid.open(write_dem(tmp_path / "a.tif", None))
+    with pytest.raises(InputError, match="no such file"):
+        Grid.open(tmp_path / "b.tif")
+
+
+def test_srtm_over_mont_ventoux_is_what_gdal_reads_plus_the_geoid(shared_data):
+    folder = shared_data / "dem"
+    dem = Dem.open(folder / "N44E005.hgt", folder / "egm96_15.gtx")
+    assert dem.grid.reference == "EGM96 height"
+    with rasterio.open(folder / "N44E005.hgt") as tile:
+        heights = tile.read(1).astype(float)
+    rng = np.random.default_rng(0)
+    row, col = rng.integers(0, 1201, (2, 500))
+    known = heights[row, col] != -32768
+    found = dem.grid.sample(5 + col / 1200, 45 - row / 1200)
+    np.testing.assert_allclose(found[known], heights[row, col][known], atol=1e-6)
+    assert np.isnan(found[~known]).all()
+    with rasterio.open(folder / "egm96_15.gtx") as grid:
+        geoid = float(next(grid.sample([(5.25, 44.25)]))[0])
+    assert dem(5.25, 44.25) - dem.grid.sample(5.25, 44.25) == pytest.approx(geoid, abs=1e-5)
+
+
+def test_the_image_of_ventoux_lies_on_heights_of_512_to_567_metres(shared_data):
+    """Where its stereo pair puts it; SRTM is 90 m wide and tens of metres off on slopes."""
+    dem = Dem.open(shared_data / "dem" / "N44E005.hgt", shared_data / "dem" / "egm96_15.gtx")
+    rpc = read_rpc(shared_data / "optical" / "phr_ventoux" / "left_image.tif")
+    image = np.stack(np.meshgrid(np.arange(0, 500, 50.0), np.arange(330, 500, 20.0)), axis=-1).reshape(-1, 2)
+    ground = localize_on_terrain(rpc, image, dem, altitude_range(rpc))
+    assert np.isfinite(ground).all()
+    assert 505 < ground[:, 2].min() < ground[:, 2].max() < 575
+    np.testing.assert_allclose(ground[:, 2], dem(ground[:, 0], ground[:, 1]), atol=1e-3)
+    np.testing.assert_allclose(rpc.project(ground), image, atol=1e-8)
+
+
+def test_a_line_of_sight_stops_at_the_first_ridge():
+    """A wall of 300 m between the camera and the point behind it hides the point."""
+    rpc = make_rpc()
+    image = np.array([[9000.0, 9000.0], [11000.0, 9000.0]])
+    foot, top = rpc.localize(image[:1], [400.0])[0], rpc.localize(image[:1], [800.0])[0]
+    wall = (foot + top) / 2
+    width = np.abs(top - foot)[:2].max() / 20
+
+    def terrain(lon, lat):
+        near = (np.abs(lon - wall[0]) < width) & (np.abs(lat - wall[1]) < width)
+        return np.where(near, 900.0, 400.0)
+
+    ground = localize_on_terrain(rpc, image, terrain, (0.0, 1000.0))
+    assert ground[0, 2] > 550
+    assert ground[1, 2] == pytest.approx(400.0, abs=1e-3)
+
+
+def test_where_no_terrain_is_met_there_is_no_point():
+    rpc = make_rpc()
+    nothing = localize_on_terrain(
+        rpc, np.array([[9000.0, 9000.0]]), lambda lon, lat: np.full_like(lon, np.nan), (0, 9)
+    )
+    below = localize_on_terrain(
+        rpc, np.array([[9000.0, 9000.0]]), lambda lon, lat: np.full_like(lon, -50.0), (0, 9)
+    )
+    assert np.isnan(nothing).all()
+    assert np.isnan(below).all()
+
+
+def test_a_warning_is_only_given_where_it_is_due(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
+    assert np.isfinite(ecef_from_ground([5.0, 44.0, float(dem(5.0, 44.0))])).all()

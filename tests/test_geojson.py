@@ -1,0 +1,68 @@
+"""Footprints as RFC 7946 asks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import shape
+
+from barpc.geojson import collection, feature, polygon
+from barpc.sensor.geometry import footprint
+from tests.sensor.conftest import make_rpc
+
+
+def ring(west: float, south: float, east: float, north: float) -> np.ndarray:
+    return np.array([[west, south], [west, north], [east, north], [east, south]])
+
+
+def test_a_polygon_is_closed_counter_clockwise_and_in_range():
+    geometry = polygon(ring(5, 43, 6, 44))
+    coordinates = np.array(geometry["coordinates"][0])
+    assert geometry["type"] == "Polygon"
+    np.testing.assert_array_equal(coordinates[0], coordinates[-1])
+    assert shape(geometry).exterior.is_ccw
+    assert shape(geometry).equals(shapely.box(5, 43, 6, 44))
+
+
+@pytest.mark.parametrize("turn", [-360.0, 0.0, 360.0])
+def test_the_antimeridian_cuts_a_footprint_in_two(turn):
+    geometry = shape(polygon(ring(179.5 + turn, 10, 181 + turn, 11)))
+    expected = shapely.union_all([shapely.box(179.5, 10, 180, 11), shapely.box(-180, 10, -179, 11)])
+    assert geometry.geom_type == "MultiPolygon"
+    assert geometry.equals(expected)
+    assert all(part.exterior.is_ccw for part in geometry.geoms)
+
+
+def test_a_footprint_that_only_touches_the_antimeridian_is_one_polygon():
+    assert shape(polygon(ring(179, 10, 180, 11))).equals(shapely.box(179, 10, 180, 11))
+    assert shape(polygon(ring(180, 10, 181, 11))).equals(shapely.box(-180, 10, -179, 11))
+
+
+def test_longitudes_of_0_to_360_come_out_in_range():
+    assert shape(polygon(ring(300, 10, 301, 11))).equals(shapely.box(-60, 10, -59, 11))
+
+
+@pytest.mark.parametrize(("lat", "pole"), [(80.0, 90.0), (-80.0, -90.0)])
+def test_an_outline_around_a_pole_holds_the_pole(lat, pole):
+    lon = np.arange(0.0, 360.0, 10.0)
+    for order in (1, -1):
+        geometry = shape(polygon(np.column_stack([lon, np.full_like(lon, lat)])[::order]))
+        assert geometry.is_valid
+        assert geometry.area == pytest.approx(3600.0)
+        assert geometry.covers(shapely.Point(17.0, (lat + pole) / 2))
+        assert not geometry.intersects(shapely.Point(17.0, 0.0))
+
+
+def test_a_camera_across_the_antimeridian_keeps_its_area():
+    here = shape(polygon(footprint(make_rpc(lon=5.0), (20000, 19000), 500.0)))
+    there = shape(polygon(footprint(make_rpc(lon=180.0), (20000, 19000), 500.0)))
+    assert there.geom_type == "MultiPolygon"
+    assert there.area == pytest.approx(here.area, rel=1e-9)
+    assert there.bounds[0] >= -180
+    assert there.bounds[2] <= 180
+
+
+def test_features_carry_their_properties():
+    document = collection([feature(ring(5, 43, 6, 44), name="a", alt=3.0)])
+    assert document["features"][0]["properties"] == {"name": "a", "alt": 3.0}
