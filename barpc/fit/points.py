@@ -30,23 +30,26 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
         A wrong shape, numbers that are not finite or out of range, columns that look swapped, points on
         a line or in a plane.
     """
-    ground = np.array(ground, dtype=np.float64)
-    image = np.array(image, dtype=np.float64)
+    ground = np.asarray(ground, dtype=np.float64)
+    image = np.asarray(image, dtype=np.float64)
     if ground.ndim != 2 or ground.shape[1:] != (3,) or image.shape != (len(ground), 2):
         raise FitError(f"points: expected (N, 3) and (N, 2), found {ground.shape} and {image.shape}")
+    if not len(ground):
+        raise FitError("points: none at all, an RPC takes forty or more")
     bad = np.flatnonzero(~(np.isfinite(ground).all(axis=1) & np.isfinite(image).all(axis=1)))
     if len(bad):
         raise FitError(f"points: {len(bad)} of {len(ground)} are not finite (the first is point {bad[0]})")
     for axis, (name, low, high) in enumerate(_RANGES):
         value = ground[:, axis]
-        if len(value) and (value.min() < low or value.max() > high):
+        if value.min() < low or value.max() > high:
             wrong = value.min() if value.min() < low else value.max()
             raise FitError(
                 f"points: {wrong:g} is not a {name}: are the columns swapped? Give lon, lat [deg], alt [m]"
             )
-    if len(ground):
+    if np.ptp(ground[:, 0]) > 180.0:
+        ground = ground.copy()
         ground[:, 0] = wrap_longitude(ground[:, 0], ground[0, 0])
-        _check_geometry(ground, image, allow_mirrored)
+    _check_geometry(ground, image, allow_mirrored)
     return ground, image
 
 

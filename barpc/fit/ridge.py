@@ -18,7 +18,7 @@ from barpc.sensor.rpc import MONOMIALS
 
 _DEGREE = np.array([0, *(len(monomial) for monomial in MONOMIALS[1:])])
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
-_DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.03])
+_DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -26,7 +26,7 @@ def expected_size(active: IntArray, tau: float) -> Array:
     """Size (k,) expected of each unknown; infinite where nothing is expected.
 
     Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `tau` of degree one, a tenth of it
-    of degree two, 3 % of it of degree three: what vendors' RPCs show, with room.
+    of degree two, a hundredth of degree three: what vendors' RPCs show, with room.
     """
     degree = _DEGREE[active]
     return np.concatenate([_NUMERATOR[degree], tau * _DENOMINATOR[degree[1:]]])

@@ -135,7 +135,8 @@ def fit_rpc_points(
         solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
         on_ckp, loop = Errors(), 0.0
         if held_out is None:
-            on_ckp.add(solution.leave_one_out())
+            for residual in solution.leave_one_out():
+                on_ckp.add(residual)
         else:
             on_ckp.add(solution.rpc.project(held_out[0]) - held_out[1])
         for start in range(0, len(cnp), _CHUNK):

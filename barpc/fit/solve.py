@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,20 +44,28 @@ class Solution:
     iterations: int
     method: str
 
-    def leave_one_out(self) -> Array:
-        """Residuals (N, 2) [px] that each point would have if it had not been used.
+    def leave_one_out(self) -> Iterator[Array]:
+        """Residuals (n, 2) [px] that points would have if they had not been used, some hundred at a time.
 
         r / (1 - leverage), the leverage from the final system: exact for a linear problem.
         """
-        residual = self.rpc.project(self.problem.ground) - self.problem.image
-        for axis, system in enumerate(self.solved):
-            denominator = self.rpc.coeffs[2 * axis + 1]
-            inverse = np.linalg.pinv(system.matrix)
-            free = len(system.matrix) > len(self.problem.active)
-            for part, rows in self.problem.rows(axis, denominator, free):
-                leverage = ((rows[:, :-1] @ inverse) ** 2).sum(axis=1)
-                residual[part, axis] /= np.maximum(1.0 - leverage, 1e-6)
-        return residual
+        inverses = [np.linalg.pinv(system.matrix) for system in self.solved]
+        rows = [
+            self.problem.rows(axis, self.rpc.coeffs[2 * axis + 1], len(inverse) > len(self.problem.active))
+            for axis, inverse in enumerate(inverses)
+        ]
+        for both in zip(*rows, strict=True):
+            part = both[0][0]
+            residual = self.rpc.project(self.problem.ground[part]) - self.problem.image[part]
+            for axis, (_, block) in enumerate(both):
+                leverage = ((block[:, :-1] @ inverses[axis]) ** 2).sum(axis=1)
+                residual[:, axis] /= np.maximum(1.0 - leverage, 1e-6)
+            yield residual
+
+
+def tidy(values: Array) -> Array:
+    """Values of at most twelve significant digits: they survive every reader that prints fifteen."""
+    return np.array([float(f"{value:.12g}") for value in values])
 
 
 def normalization(
@@ -84,8 +92,9 @@ def normalization(
     if vendor is not None:
         offset, scale = vendor.ground_offset, vendor.ground_scale
     else:
-        scale = np.maximum(scale, [1e-9, 1e-9, ALTITUDE_FLOOR])
-    found = Normalization(offset, scale, 0.5 * (left + right), np.maximum(0.5 * (right - left), 1e-6))
+        offset, scale = tidy(offset), tidy(np.maximum(scale, [1e-9, 1e-9, ALTITUDE_FLOOR]))
+    middle, half = tidy(0.5 * (left + right)), tidy(np.maximum(0.5 * (right - left), 1e-6))
+    found = Normalization(offset, scale, middle, half)
     return found if options.precision is None else PRECISIONS[options.precision].normalization(found)
 
 

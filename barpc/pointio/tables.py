@@ -218,8 +218,10 @@ def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspon
             f"{path}: {len(bands)} bands are {layers} layers of lon and lat, but {len(altitudes)} altitudes "
             "are known; give one altitude a layer"
         )
-    col, row = to_image * np.meshgrid(np.arange(bands.shape[2]), np.arange(bands.shape[1]))
-    image = np.broadcast_to(np.stack([col, row], axis=-1) - 0.5, (layers, *col.shape, 2)).reshape(-1, 2)
+    row, col = np.indices(bands.shape[1:], dtype=np.float64)
+    a, b, c, d, e, f = to_image[:6]
+    nodes = np.stack([a * col + b * row + c, d * col + e * row + f], axis=-1) - 0.5
+    image = np.broadcast_to(nodes, (layers, *nodes.shape)).reshape(-1, 2)
     alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
     ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)
     ok = np.isfinite(ground).all(axis=1)

@@ -1,0 +1,243 @@
+"""An RPC fitted to P_BA is P_BA: the paper's central step, at four orders of magnitude below its errors."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.errors import FitError
+from barpc.fit import FitOptions, Normalization, fit_rpc, fit_rpc_points
+from barpc.fit.grid import check_points, control_points
+from barpc.fit.precision import PRECISIONS
+from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
+from barpc.sensor.rpc import RPC
+from barpc.simulate.orbit import Look, fly
+from tests.fit.cameras import Camera, random_points, synthetic
+
+PECULIAR = "rpc_formats/md_ov_rpc.txt"  # P_BA of this RPC is no rational cubic: 1.2e-6 px remain in col
+
+
+def miss(camera: Camera) -> float:
+    """How far [px] the RPC before the adjustment is from P_BA: what a fit that did nothing would miss."""
+    ground, image = random_points(camera, 50, np.random.default_rng(0))
+    return float(np.abs(camera.rpc.project(ground) - image).max())
+
+
+@pytest.mark.parametrize("grid", [(12, 12, 7), (10, 10, 6)])
+def test_every_vendors_rpc_is_refitted_to_a_hundred_millionth_of_a_pixel(
+    vendors: list[Camera], grid: tuple[int, int, int]
+) -> None:
+    options = FitOptions(grid=grid)
+    fits = {c.name: fit_rpc(c.model, c.size, c.alt_range, options=options) for c in vendors}
+    assert len(fits) >= 28
+    assert min(map(miss, vendors)) >= 1.0
+    peculiar = fits.pop(PECULIAR)
+    rmse = np.array([fit.rmse_ckp for fit in fits.values()])
+    assert rmse[:, 0].mean() <= 5e-9
+    assert rmse[:, 1].mean() <= 5e-9
+    assert rmse.max() <= 2e-8
+    assert max(fit.max_ckp.max() for fit in fits.values()) <= 1e-7
+    assert max(fit.max_cnp.max() for fit in fits.values()) <= 1e-7
+    assert min(fit.min_denominator for fit in fits.values()) >= 0.5
+    assert all(fit.method == "ridge" and fit.coverage == 1.0 for fit in fits.values())
+    assert peculiar.rmse_ckp[0] <= 2e-6
+    assert peculiar.rmse_ckp[1] <= 5e-9
+    assert peculiar.max_ckp.max() <= 5e-6
+
+
+def test_the_certificate_holds_on_points_that_neither_grid_contains(camera: Camera) -> None:
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range)
+    ground, image = random_points(camera, 5000, np.random.default_rng(1))
+    error = fit.rpc.project(ground) - image
+    assert miss(camera) >= 1.0
+    assert np.abs(error).max() <= 3 * fit.max_ckp.max() <= 1e-7
+    assert np.all(np.sqrt((error**2).mean(axis=0)) <= 3 * fit.rmse_ckp)
+
+
+@pytest.mark.parametrize("space", ["image", "ground"])
+@pytest.mark.parametrize("nodes", ["chebyshev", "uniform"])
+def test_every_grid_reaches_the_rounding_of_coordinates(camera: Camera, space: str, nodes: str) -> None:
+    options = FitOptions(space=space, nodes=nodes)  # type: ignore[arg-type]
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
+    assert fit.max_ckp.max() <= 1e-7
+    assert fit.coverage == 1.0
+
+
+def test_the_error_does_not_grow_with_the_area(vendors: list[Camera]) -> None:
+    for camera in vendors:
+        if camera.name == PECULIAR:
+            continue
+        errors = []
+        for share in (0.05, 0.25, 1.0):
+            width, height = (max(1, round(n * np.sqrt(share))) for n in camera.size)
+            errors.append(fit_rpc(camera.model, (width, height), camera.alt_range).rmse_ckp.max())
+        assert max(errors) < 10 * min(errors), camera.name
+
+
+def test_an_rpc_holds_outside_its_box(vendors: list[Camera]) -> None:
+    """A quarter more in longitude and latitude and 2,500 m more of altitude, Pleiades."""
+    pleiades = [c for c in vendors if "PHR1B" in c.name or "PLEIADES" in c.name]
+    assert len(pleiades) >= 5
+    for camera in pleiades:
+        rpc = fit_rpc(camera.model, camera.size, camera.alt_range).rpc
+        t = np.linspace(-1.25, 1.25, 9)
+        lon, lat = (rpc.ground_offset[i] + t * rpc.ground_scale[i] for i in (0, 1))
+        alt = np.linspace(camera.alt_range[0] - 2500, camera.alt_range[1] + 2500, 9)
+        ground = np.stack(np.meshgrid(lon, lat, alt), axis=-1)
+        assert np.abs(rpc.project(ground) - camera.model.project(ground)).max() <= 1e-3
+
+
+def test_a_rigorous_model_is_fitted_by_the_same_function() -> None:
+    model = fly(np.array([5.4, 43.2, 300.0]), Look(20.0, 60.0), (6000, 5000), 0.5)
+    fit = fit_rpc(model, (6000, 5000), (0.0, 600.0))
+    assert fit.max_ckp.max() <= 1e-4
+    assert fit.roundtrip <= 1e-8
+
+
+def test_a_scene_across_the_antimeridian_is_one_scene() -> None:
+    camera = synthetic(lon=179.99)
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range)
+    assert fit.max_ckp.max() <= 1e-7
+    assert fit.rpc.ground_scale[0] < 1.0
+
+
+def test_a_flat_scene_keeps_its_altitude_terms(camera: Camera) -> None:
+    fit = fit_rpc(camera.model, camera.size, (300.0, 300.0))
+    ground, image = random_points(replace(camera, alt_range=(255.0, 345.0)), 500, np.random.default_rng(2))
+    assert fit.rpc.ground_scale[2] >= 50.0
+    assert np.abs(fit.rpc.project(ground) - image).max() <= 1e-7
+
+
+def test_fixed_offsets_and_scales_are_kept_whatever_their_sign(camera: Camera) -> None:
+    norm = Normalization([5.0, 43.0, 0.0], [0.5, -0.25, 1000.0], [9000.0, 9000.0], [12000.0, -12000.0])
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(normalization=norm))
+    assert fit.rpc.ground_scale.tolist() == [0.5, -0.25, 1000.0]
+    assert fit.rpc.image_scale.tolist() == [12000.0, -12000.0]
+    assert fit.max_ckp.max() <= 1e-7
+
+
+def test_the_vendors_denominators_may_be_kept(camera: Camera) -> None:
+    options = FitOptions(method="vendor-denominators")
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
+    assert np.array_equal(fit.rpc.coeffs[1::2], camera.rpc.coeffs[1::2])
+    assert fit.max_ckp.max() <= 1e-2
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera, joint: bool) -> None:
+    options = FitOptions(method="lcurve", joint=joint)
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
+    assert fit.rmse_ckp.max() <= 2e-4
+    assert (fit.h[0] == fit.h[1]) == joint
+
+
+def test_numbers_fitted_for_nitf_survive_it(vendors: list[Camera]) -> None:
+    """Copying a good RPC into that format costs whole pixels."""
+    limits = PRECISIONS["nitf"]
+    for camera in vendors:
+        fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(precision="nitf"))
+        rpc = fit.rpc
+        assert np.array_equal(limits.coeffs(rpc.coeffs), rpc.coeffs)
+        assert np.array_equal(np.round(rpc.ground_offset, 4), rpc.ground_offset)
+        assert np.array_equal(np.round(rpc.image_scale), rpc.image_scale)
+        assert fit.max_ckp.max() <= 0.01
+
+
+def test_an_rpc_that_misses_the_tolerance_is_refused_or_handed_out_with_its_verdict(camera: Camera) -> None:
+    options = FitOptions(tolerance=1e-13)
+    with pytest.raises(FitError, match=r"misses its check points by up to .* wanted 1e-13"):
+        fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options, strict=False)
+    assert "wanted 1e-13" in fit.verdict(1e-13)
+    assert fit.verdict(0.01) == ""
+
+
+def test_a_model_without_ground_under_its_image_is_refused(camera: Camera) -> None:
+    with pytest.raises(FitError, match="altitude range"):
+        fit_rpc(camera.model, camera.size, (1e7, 2e7))
+    with pytest.raises(FitError, match="not an interval"):
+        fit_rpc(camera.model, camera.size, (500.0, 0.0))
+
+
+def test_check_points_lie_strictly_between_control_points(camera: Camera) -> None:
+    ground, image = control_points(camera.model, camera.size, camera.alt_range, FitOptions(grid=(9, 8, 7)))
+    middles = np.concatenate(list(check_points(ground)))
+    assert len(middles) == 8 * 7 * 6
+    seen = camera.model.project(middles)
+    assert seen.min() > -0.5
+    assert np.all(seen.max(axis=0) < np.array(camera.size) - 0.5)
+    assert camera.alt_range[0] < middles[:, 2].min() < middles[:, 2].max() < camera.alt_range[1]
+    assert np.array_equal(image[0, 0, :, 0], np.full(7, -0.5))
+
+
+def test_memory_does_not_grow_with_the_number_of_points(camera: Camera) -> None:
+    ground, image = control_points(camera.model, camera.size, camera.alt_range, FitOptions(grid=(80, 80, 32)))
+    ground, image = ground.reshape(-1, 3)[:200_000], image.reshape(-1, 2)[:200_000]
+    for count, limit in ((25_000, 8e6), (200_000, 16e6)):
+        tracemalloc.start()
+        fit_rpc_points(ground[:count], image[:count])
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak <= limit
+
+
+def test_a_fitted_rpc_survives_its_files(camera: Camera, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    rpc = fit_rpc(camera.model, camera.size, camera.alt_range).rpc
+    image = tmp_path / "image.tif"
+    with rasterio.open(
+        image,
+        "w",
+        driver="GTiff",
+        width=8,
+        height=8,
+        count=1,
+        dtype="uint8",
+        transform=rasterio.Affine(1, 0, 0.5, 0, 1, 0.5),
+    ) as file:
+        file.write(np.zeros((1, 8, 8), np.uint8))
+    write_rpc(rpc, tmp_path / "image_RPC.TXT")
+    write_rpc_copy(rpc, image, tmp_path / "copy.tif")
+    ground, _ = random_points(camera, 1000, np.random.default_rng(3))
+    text, tag = read_rpc(tmp_path / "image_RPC.TXT"), read_rpc(tmp_path / "copy.tif")
+    assert text == rpc
+    assert np.abs(tag.project(ground) - rpc.project(ground)).max() <= 6e-8
+    assert miss(camera) >= 1.0
+
+
+def test_the_coefficients_stand_in_rpc00b_order_for_rpcm_and_gdal(camera: Camera) -> None:
+    rpcm = pytest.importorskip("rpcm")
+    rasterio = pytest.importorskip("rasterio")
+    transform = pytest.importorskip("rasterio.transform")
+    rpc = fit_rpc(camera.model, camera.size, camera.alt_range).rpc
+    assert all(len(np.unique(row)) == 20 for row in rpc.coeffs)
+    ground, image = random_points(camera, 200, np.random.default_rng(4))
+    assert np.abs(peer_rpcm(rpcm, rpc).projection(*ground.T) - image.T).max() <= 1e-7
+    gdal = rasterio.rpc.RPC(
+        height_off=rpc.ground_offset[2], height_scale=rpc.ground_scale[2],
+        lat_off=rpc.ground_offset[1], lat_scale=rpc.ground_scale[1],
+        long_off=rpc.ground_offset[0], long_scale=rpc.ground_scale[0],
+        samp_off=rpc.image_offset[0], samp_scale=rpc.image_scale[0],
+        line_off=rpc.image_offset[1], line_scale=rpc.image_scale[1],
+        samp_num_coeff=rpc.coeffs[0].tolist(), samp_den_coeff=rpc.coeffs[1].tolist(),
+        line_num_coeff=rpc.coeffs[2].tolist(), line_den_coeff=rpc.coeffs[3].tolist(),
+    )  # fmt: skip
+    with transform.RPCTransformer(gdal) as transformer:
+        row, col = transformer.rowcol(*ground.T, op=lambda v: v)
+    assert np.abs(np.column_stack([col, row]) - 0.5 - image).max() <= 1e-7
+
+
+def peer_rpcm(rpcm: object, rpc: RPC) -> object:
+    """The same RPC as rpcm's object."""
+    values = {}
+    for i, name in enumerate(("SAMP_NUM", "SAMP_DEN", "LINE_NUM", "LINE_DEN")):
+        values[f"{name}_COEFF"] = " ".join(f"{c:.17g}" for c in rpc.coeffs[i])
+    for i, name in enumerate(("LONG", "LAT", "HEIGHT")):
+        values[f"{name}_OFF"], values[f"{name}_SCALE"] = rpc.ground_offset[i], rpc.ground_scale[i]
+    for i, name in enumerate(("SAMP", "LINE")):
+        values[f"{name}_OFF"], values[f"{name}_SCALE"] = rpc.image_offset[i], rpc.image_scale[i]
+    return rpcm.rpc_model.RPCModel({k: str(v) for k, v in values.items()})  # type: ignore[attr-defined]

@@ -1,0 +1,201 @@
+"""Fitting given correspondences: noise, tables, grids - and what must not be fitted in silence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.errors import FitError
+from barpc.fit import FitOptions, fit_rpc_points
+from barpc.geodesy import Array
+from barpc.pointio.tables import read_correspondences
+from barpc.rpcio import read_rpc
+from tests.fit.cameras import Camera, random_points, synthetic
+
+NOISY = FitOptions(tolerance=20.0)
+
+
+def rms(residual: Array) -> float:
+    return float(np.sqrt((residual**2).mean()))
+
+
+@pytest.fixture(scope="module")
+def points(camera: Camera) -> tuple[Array, Array]:
+    return random_points(camera, 600, np.random.default_rng(5))
+
+
+def test_exact_points_give_an_exact_rpc(camera: Camera, points: tuple[Array, Array]) -> None:
+    fit = fit_rpc_points(*points)
+    ground, image = random_points(camera, 2000, np.random.default_rng(6))
+    assert np.abs(fit.rpc.project(ground) - image).max() <= 1e-6
+    assert np.abs(camera.rpc.project(ground) - image).max() >= 1.0
+    assert 0.9 < fit.coverage <= 1.0
+
+
+@pytest.mark.parametrize(("count", "factor"), [(60, 2.5), (300, 1.3), (4000, 1.1)])
+def test_noise_neither_makes_poles_nor_costs_more_than_the_unknowns_do(
+    vendors: list[Camera], count: int, factor: float
+) -> None:
+    """0.3 px of noise and 39 unknowns leave 0.3 sqrt(39 / N) px, times a factor for the image's corners."""
+    rng = np.random.default_rng(count)
+    for camera in vendors[::2]:
+        ground, image = random_points(camera, count, rng)
+        fit = fit_rpc_points(ground, image + rng.normal(0, 0.3, image.shape), options=NOISY)
+        truth_ground, truth_image = random_points(camera, 1000, rng)
+        assert fit.min_denominator >= 0.5, camera.name
+        assert rms(fit.rpc.project(truth_ground) - truth_image) <= 0.3 * factor * np.sqrt(39 / count), (
+            camera.name
+        )
+        assert abs(rms(fit.rmse_ckp) - 0.3) <= 0.3 * max(0.1, 12 / np.sqrt(count))
+
+
+def test_leave_one_out_residuals_are_those_of_fits_without_the_point(camera: Camera) -> None:
+    rng = np.random.default_rng(8)
+    ground, image = random_points(camera, 60, rng)
+    image = image + rng.normal(0, 0.3, image.shape)
+    one_by_one = []
+    for i in range(len(ground)):
+        others = np.arange(len(ground)) != i
+        fit = fit_rpc_points(ground[others], image[others], options=NOISY)
+        one_by_one.append(fit.rpc.project(ground[i]) - image[i])
+    predicted = fit_rpc_points(ground, image, options=NOISY).rmse_ckp
+    assert predicted == pytest.approx(np.sqrt((np.array(one_by_one) ** 2).mean(axis=0)), rel=0.15)
+
+
+def test_precise_points_count_more(camera: Camera, points: tuple[Array, Array]) -> None:
+    rng = np.random.default_rng(9)
+    ground, image = points
+    sigma = np.where(np.arange(len(ground)) % 2, 3.0, 0.03)
+    image = image + rng.normal(size=image.shape) * sigma[:, None]
+    truth = random_points(camera, 500, rng)
+    weighted = fit_rpc_points(ground, image, sigma=sigma, options=NOISY).rpc.project(truth[0]) - truth[1]
+    equal = fit_rpc_points(ground, image, options=NOISY).rpc.project(truth[0]) - truth[1]
+    assert rms(weighted) <= 0.05
+    assert rms(weighted) < 0.1 * rms(equal)
+
+
+def test_the_papers_radar_points_are_met_as_well_as_by_its_own_code(shared_data: Path) -> None:
+    folder = shared_data / "sar" / "rpcfit"
+    train = [np.load(folder / f"s1_train{d}d.npy") for d in (3, 2)]
+    test = [np.load(folder / f"s1_test{d}d.npy") for d in (3, 2)]
+    fit = fit_rpc_points(*train, check=(test[0], test[1]))
+    assert fit.rmse_ckp[1] <= 1.11e-4
+    assert fit.rmse_ckp[0] <= 1.08e-4
+    assert fit.min_denominator >= 0.5
+    paper = fit_rpc_points(*train, check=(test[0], test[1]), options=FitOptions(method="lcurve", joint=True))
+    assert paper.rmse_ckp == pytest.approx([1.073e-4, 1.102e-4], rel=2e-3)
+
+
+@pytest.mark.parametrize("highest", [1300.0, 5000.0])
+def test_a_physical_models_grid_is_fitted_better_than_by_its_vendor(
+    shared_data: Path, highest: float
+) -> None:
+    points = read_correspondences(shared_data / "physical" / "GRID_P1BP--2017092838284574CP.tif")
+    vendor = read_rpc(shared_data / "physical" / "RPC_P1BP--2017092838284574CP.XML")
+    low = points.ground[:, 2] <= 1202.5
+    used = points.ground[:, 2] <= highest
+    fit = fit_rpc_points(points.ground[used], points.image[used])
+    error = fit.rpc.project(points.ground[low]) - points.image[low]
+    vendors_error = vendor.project(points.ground[low]) - points.image[low]
+    assert np.all(np.abs(vendors_error.mean(axis=0)) <= 1e-3)  # (0, 0) is the centre of the first pixel
+    assert np.all(error.std(axis=0) <= 0.05 * vendors_error.std(axis=0))
+    assert fit.max_ckp.max() <= 2e-4
+    assert fit.min_denominator >= 0.5
+
+
+def test_layers_at_two_altitudes_do_not_make_the_zero_solution(camera: Camera) -> None:
+    image = np.stack(np.meshgrid(np.linspace(0, 20000, 9), np.linspace(0, 19000, 9)), axis=-1).reshape(-1, 2)
+    image = np.concatenate([image, image])
+    ground = camera.model.localize(image, np.repeat([0.0, 1000.0], 81))
+    fit = fit_rpc_points(ground, image)
+    assert fit.min_denominator >= 0.5
+    assert not fit.rpc.coeffs[:, 9].any()  # HH
+    assert np.abs(fit.rpc.project(ground) - image).max() <= 1e-3
+
+
+def test_points_at_one_altitude_give_an_rpc_for_that_altitude(camera: Camera) -> None:
+    image = np.random.default_rng(10).uniform(0, 19000, (200, 2))
+    ground = camera.model.localize(image, np.full(200, 200.0))
+    fit = fit_rpc_points(ground, image)
+    assert np.abs(fit.rpc.project(ground) - image).max() <= 1e-3
+    assert fit.rpc.ground_scale[2] == 50.0
+    assert np.isfinite(fit.rpc.coeffs).all()
+
+
+@pytest.mark.parametrize("shift", [360.0, -360.0])
+def test_longitudes_of_another_turn_are_the_same_points(
+    camera: Camera, points: tuple[Array, Array], shift: float
+) -> None:
+    ground, image = points
+    fit = fit_rpc_points(ground + [shift, 0.0, 0.0], image)
+    assert np.abs(fit.rpc.project(ground) - image).max() <= 1e-6
+
+
+def test_points_across_the_antimeridian_are_one_scene() -> None:
+    camera = synthetic(lon=179.99)
+    ground, image = random_points(camera, 500, np.random.default_rng(11))
+    ground[:, 0] = (ground[:, 0] + 180.0) % 360.0 - 180.0
+    assert np.ptp(ground[:, 0]) > 359.0
+    fit = fit_rpc_points(ground, image)
+    assert np.abs(fit.rpc.project(ground) - image).max() <= 1e-6
+    assert fit.rpc.ground_scale[0] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ([1, 0, 2, 3, 4], "mirrored"),
+        ([0, 1, 2, 4, 3], "mirrored"),
+        ([2, 1, 0, 3, 4], "not a longitude"),
+        ([0, 2, 1, 3, 4], "not a latitude"),
+        ([3, 4, 2, 0, 1], "not a l"),
+    ],
+)
+def test_swapped_columns_are_found(points: tuple[Array, Array], columns: list[int], message: str) -> None:
+    table = np.column_stack(points)[:, columns]
+    with pytest.raises(FitError, match=message):
+        fit_rpc_points(table[:, :3], table[:, 3:])
+
+
+def test_a_mirrored_image_may_be_allowed(points: tuple[Array, Array]) -> None:
+    ground, image = points
+    mirrored = image * [-1.0, 1.0] + [20000.0, 0.0]
+    with pytest.raises(FitError, match="allow_mirrored"):
+        fit_rpc_points(ground, mirrored)
+    fit = fit_rpc_points(ground, mirrored, options=FitOptions(allow_mirrored=True))
+    assert np.abs(fit.rpc.project(ground) - mirrored).max() <= 1e-6
+
+
+def test_bad_points_are_refused_with_the_reason(points: tuple[Array, Array]) -> None:
+    ground, image = points
+    hole = ground.copy()
+    hole[17, 2] = np.nan
+    plane = ground.copy()
+    plane[:, 2] = 100.0 + 2000.0 * (ground[:, 0] - 5.4) + 1000.0 * (ground[:, 1] - 43.2)
+    constant = image.copy()
+    constant[:, 0] = 5.0
+    line = np.column_stack([image[:, 0], 2.0 * image[:, 0] + 5.0])
+    for bad_ground, bad_image, message in (
+        (hole, image, "1 of 600 are not finite .* point 17"),
+        (ground[:39], image[:39], "39 points are too few"),
+        (np.tile(ground[:12], (5, 1)), np.tile(image[:12], (5, 1)), "only 12 of 60 are distinct"),
+        (plane, image, "in a plane"),
+        (ground, constant, "all have col 5"),
+        (ground, line, "on a line"),
+        (ground * [0.0, 1.0, 1.0], image, "all have lon 0"),
+        (ground[:, :2], image, "expected"),
+        (ground[:0], image[:0], "none at all"),
+    ):
+        with pytest.raises(FitError, match=message):
+            fit_rpc_points(bad_ground, bad_image)
+    with pytest.raises(FitError, match="sigma"):
+        fit_rpc_points(ground, image, sigma=np.zeros(len(ground)))
+
+
+def test_points_that_no_camera_made_are_refused(points: tuple[Array, Array]) -> None:
+    ground, image = points
+    shuffled = np.random.default_rng(12).permutation(image)
+    with pytest.raises(FitError, match=r"misses its check points|pole"):
+        fit_rpc_points(ground, shuffled, options=FitOptions(tolerance=100.0))
