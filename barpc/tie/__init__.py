@@ -1,14 +1,15 @@
 """Images to tracks: windowed reading, detection, matching, linking.
 
-`find_tracks` runs all stages; `select_pairs`, `detect`, `match`, `link` and `thin` are the stages.
+`find_tracks` runs all stages: `select_pairs`, `detect`, `match`, `link`, `thin`, `refine`.
 """
 
 from barpc.tie.features import Keypoints
 from barpc.tie.find import TieResult, detect, find_tracks, match, require_matches
-from barpc.tie.link import link, thin
+from barpc.tie.link import common_tracks, link, thin
 from barpc.tie.matching import Matches, PairReport, match_pair
 from barpc.tie.options import TieOptions
 from barpc.tie.pairs import Pair, select_pairs
+from barpc.tie.refine import refine
 
 __all__ = [
     "Keypoints",
@@ -17,11 +18,13 @@ __all__ = [
     "PairReport",
     "TieOptions",
     "TieResult",
+    "common_tracks",
     "detect",
     "find_tracks",
     "link",
     "match",
     "match_pair",
+    "refine",
     "require_matches",
     "select_pairs",
     "thin",

@@ -12,6 +12,9 @@ from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray, Tracks
 from barpc.tie.matching import Matches
 
+_QUOTAS = (4, 8, 16)
+"""Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
+
 
 def link(num_keypoints: Sequence[int], matches: Sequence[Matches]) -> Tracks:
     """Join matches that share keypoints; a track that meets a view twice is thrown away.
@@ -82,34 +85,45 @@ def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
     count = np.bincount(tracks.view, minlength=len(sizes))
     if not len(tracks) or (count <= most).all():
         return tracks
-    quota = 4
-    side = np.sqrt([quota * width * height / most for width, height in sizes])
+    side = np.sqrt([_QUOTAS[0] * width * height / most for width, height in sizes])
     columns = np.array([int(width / s) + 2 for (width, _), s in zip(sizes, side, strict=True)])
     rows = np.array([int(height / s) + 2 for (_, height), s in zip(sizes, side, strict=True)])
     first_cell = np.concatenate([[0], np.cumsum(columns * rows)])
     col, row = np.floor((tracks.xy + 0.5) / side[tracks.view][:, None]).astype(np.int64).clip(0).T
     cell = first_cell[tracks.view] + row * columns[tracks.view] + col
-    keep = _fill(tracks, cell.tolist(), int(first_cell[-1]), quota, most, len(sizes))
+    keep = _fill(tracks, cell.tolist(), int(first_cell[-1]), most, len(sizes))
     return tracks.select(keep[tracks.point])
 
 
-def _fill(
-    tracks: Tracks, cell: list[int], num_cells: int, quota: int, most: int, num_views: int
-) -> BoolArray:
-    """Mask of the tracks that are taken, greedily."""
+def _fill(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views: int) -> BoolArray:
+    """Mask of the tracks that are taken, greedily, in rounds of growing quota where images have empty parts."""
     starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
     worst = np.maximum.reduceat(tracks.sigma, starts[:-1])
     # Knuth's multiplicative hash: an order without direction among equals
     shuffle = (np.arange(tracks.num_points) * 2654435761) % (1 << 32)
-    order = np.lexsort((shuffle, np.round(worst, 2), -np.diff(starts)))
+    waiting = np.lexsort((shuffle, np.round(worst, 2), -np.diff(starts))).tolist()
     bounds, views = starts.tolist(), tracks.view.tolist()
     filled, total = [0] * num_cells, [0] * num_views
     keep = np.zeros(tracks.num_points, dtype=bool)
-    for track in order.tolist():
-        rows = range(bounds[track], bounds[track + 1])
-        if any(filled[cell[r]] < quota for r in rows) and all(total[views[r]] < most for r in rows):
+    for quota in _QUOTAS:
+        left = []
+        for track in waiting:
+            rows = range(bounds[track], bounds[track + 1])
+            if any(total[views[r]] >= most for r in rows):
+                continue
+            if not any(filled[cell[r]] < quota for r in rows):
+                left.append(track)
+                continue
             keep[track] = True
             for r in rows:
                 filled[cell[r]] += 1
                 total[views[r]] += 1
+        waiting = left
     return keep
+
+
+def common_tracks(tracks: Tracks, first: int, second: int) -> tuple[Array, Array]:
+    """Image points (M, 2), (M, 2) [px] of the tracks that two views have in common, in the same order."""
+    a, b = tracks.view == first, tracks.view == second
+    _, rows_a, rows_b = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
+    return tracks.xy[a][rows_a], tracks.xy[b][rows_b]
