@@ -11,6 +11,7 @@ import pytest
 from barpc.geodesy import ecef_from_ground
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.simulate.orbit import Look, fly
@@ -56,6 +57,16 @@ def _corrected_range_doppler() -> Case:
     return Case(Corrected(case.model, correction), case.size, case.alt_range)
 
 
+def _grid(lon: float) -> DirectGrid:
+    cols, rows, alts = (
+        np.arange(-500.0, 21000, 1000),
+        np.arange(-500.0, 20000, 900),
+        np.arange(-100.0, 1200, 300),
+    )
+    nodes = np.stack(np.meshgrid(cols, rows), axis=-1)
+    return DirectGrid(cols, rows, alts, _pushbroom(lon).localize(nodes, alts[:, None, None])[..., :2])
+
+
 MODELS: dict[str, Callable[[], Case]] = {
     "rpc": lambda: Case(make_rpc(), (20000, 19000), (0.0, 1000.0)),
     "rpc across the antimeridian": lambda: Case(make_rpc(lon=179.98), (20000, 19000), (0.0, 1000.0)),
@@ -66,6 +77,8 @@ MODELS: dict[str, Callable[[], Case]] = {
     ),
     "pushbroom": lambda: Case(_pushbroom(5.4), (20000, 19000), (0.0, 1000.0)),
     "pushbroom across the antimeridian": lambda: Case(_pushbroom(180.0), (20000, 19000), (0.0, 1000.0)),
+    "localisation grid": lambda: Case(_grid(5.4), (20000, 19000), (0.0, 1000.0)),
+    "localisation grid across the antimeridian": lambda: Case(_grid(180.0), (20000, 19000), (0.0, 1000.0)),
     "corrected pushbroom": lambda: Case(
         Corrected(_pushbroom(5.4), _correction()), (20000, 19000), (0.0, 1000.0)
     ),
