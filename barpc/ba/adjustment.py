@@ -10,7 +10,6 @@ import numpy as np
 from barpc.ba.block import Block, join
 from barpc.ba.blocks import CameraPrior, Terrain, ground_control
 from barpc.ba.cameras import Cameras
-from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import gauge_report
 from barpc.ba.heights import Heights, convergence_angles
 from barpc.ba.incremental import BlockPrior, apply_prior
@@ -18,7 +17,7 @@ from barpc.ba.options import AdjustOptions, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Observations, run_rounds
-from barpc.ba.solve import State, factorize_free
+from barpc.ba.solve import State
 from barpc.ba.structure import make_structure
 from barpc.ba.unknowns import make_unknowns
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
@@ -84,31 +83,31 @@ def adjust_tracks(
         heights.hold(problem, state.points), block.sigma, options.noise_floor, block.point < block.num_tracks
     )
     outcome = run_rounds(problem, observations, state, options, block.use, heights.hold, before)
-    problem = outcome.problem
-    covariance = Covariance(outcome.reduced, factorize_free(problem, outcome.reduced.matrix), problem.free)
+    final = outcome.minimum.state
+    covariance = outcome.minimum.covariance(problem.free)
     seen = np.zeros(block.num_points, dtype=bool)
     seen[block.point[outcome.inlier]] = True
-    gauge = gauge_report(covariance, outcome.state.points, state.points, seen)
+    gauge = gauge_report(covariance, final.points, state.points, seen)
     cameras = problem.cameras
     return Adjustment(
         names=block.names,
-        sensors=cameras.unknowns.corrected(outcome.state.params, views),
-        params=outcome.state.params,
-        points=np.where(seen[:, None], outcome.state.points, np.nan)[: block.num_tracks],
+        sensors=cameras.unknowns.corrected(final.params, views),
+        params=final.params,
+        points=np.where(seen[:, None], final.points, np.nan)[: block.num_tracks],
         residuals_before=block.in_order(before.T)[: len(tracks)],
         residuals=block.in_order(outcome.residual.T)[: len(tracks)],
         inlier=block.in_order(outcome.inlier)[: len(tracks)],
         view=tracks.view,
         noise=outcome.noise,
-        cost_history=outcome.state.history,
-        steps=len(outcome.state.history),
+        cost_history=final.history,
+        steps=len(final.history),
         status=f"{outcome.passes} passes of cutting; {covariance.factor.method} factorisation",
         cameras=cameras,
         covariance=covariance,
         gauge=gauge,
         held=heights.weak[: block.num_tracks],
         left_out=block.left_out,
-        gcp_residuals=_gcp_residuals(outcome.state.points[block.num_tracks :], gcps),
+        gcp_residuals=_gcp_residuals(final.points[block.num_tracks :], gcps),
         seconds=time.process_time() - start,
         options=options,
     )

@@ -152,7 +152,9 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
         raise InputError("two views have the same name")
     unknown = (set(options.fixed) | set(options.view_weights)) - set(names)
     if unknown:
-        raise InputError(f"no view is named {', '.join(sorted(unknown))}; there are {', '.join(names[:_LISTED])}")
+        raise InputError(
+            f"no view is named {', '.join(sorted(unknown))}; there are {', '.join(names[:_LISTED])}"
+        )
 
 
 def _left_out(

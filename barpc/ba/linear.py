@@ -66,6 +66,8 @@ def factorize(matrix: Matrix, damping: float = 0.0) -> Factor:
         raise AdjustError(
             "the normal equations are not finite: a camera cannot be evaluated at its tie points"
         )
+    if not len(diagonal):
+        return Factor(lambda b: b, "none")
     if isinstance(matrix, np.ndarray):
         damped = matrix + np.diag(damping * diagonal) if damping else matrix
         cholesky = la.cho_factor(damped, check_finite=False)

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from barpc.ba.loss import LOSSES
-from barpc.ba.normal import Reduced
 from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
-from barpc.ba.solve import State, gauss_newton, minimise
+from barpc.ba.solve import Minimum, State, gauss_newton, minimise
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
@@ -35,10 +34,8 @@ class Outcome:
     ----------
     problem : Problem
         With the priors on points as they ended.
-    state : State
-        Unknowns and points.
-    reduced : Reduced
-        The last linearisation.
+    minimum : Minimum
+        Unknowns, points, the last linearisation.
     residual : (2, K)
         Projected - observed [px].
     inlier : (K,)
@@ -50,8 +47,7 @@ class Outcome:
     """
 
     problem: Problem
-    state: State
-    reduced: Reduced
+    minimum: Minimum
     residual: Array
     inlier: BoolArray
     noise: float
@@ -158,9 +154,8 @@ def run_rounds(
             kept = observations.tied(everything & (s <= (options.robust_threshold * noise) ** 2))
         wanted = noise if options.estimate_noise else 1.0
         weight = observations.weight(kept, wanted)
-        state, reduced = minimise(
-            problem, state, weight, options.solver, options.max_steps, options.tolerance
-        )
+        found = minimise(problem, state, weight, options.solver, options.max_steps, options.tolerance)
+        state = found.state
         residual = problem.residuals(state.params, state.points)
         same = passes > 1 and int((kept != use).sum()) <= _SAME * len(use)
         use, before = kept, noise
@@ -168,7 +163,7 @@ def run_rounds(
         _LOG.info("pass %d: %d of %d observations, noise %.3f", passes, use.sum(), len(use), noise)
         settled = not options.estimate_noise or abs(noise / before - 1.0) < _SAME_NOISE
         if passes > options.num_passes or (settled and (same or options.loss == "linear")):
-            return Outcome(problem, state, reduced, residual, use, noise, passes)
+            return Outcome(problem, found, residual, use, noise, passes)
 
 
 def _robust(

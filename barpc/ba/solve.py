@@ -15,6 +15,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.optimize import least_squares
 
+from barpc.ba.covariance import Covariance
 from barpc.ba.linear import Factor, Matrix, factorize
 from barpc.ba.normal import Reduced
 from barpc.ba.problem import Problem
@@ -56,6 +57,32 @@ class State:
         )
 
 
+@dataclass(frozen=True)
+class Minimum:
+    """Where a minimisation ended.
+
+    Parameters
+    ----------
+    state : State
+        The minimum.
+    reduced : Reduced
+        The last linearisation, one small step before it.
+    factor : Factor or None
+        Of its matrix, free unknowns only, where it was factorised.
+    """
+
+    state: State
+    reduced: Reduced
+    factor: Factor | None = None
+
+    def covariance(self, free: BoolArray) -> Covariance:
+        """The posterior covariance, by the last linearisation."""
+        factor = self.factor
+        if factor is None:
+            factor = factorize(free_part(free, self.reduced.matrix))
+        return Covariance(self.reduced, factor, free)
+
+
 def minimise(
     problem: Problem,
     state: State,
@@ -63,7 +90,7 @@ def minimise(
     solver: str = "auto",
     max_steps: int = 30,
     tolerance: float = 1e-6,
-) -> tuple[State, Reduced]:
+) -> Minimum:
     """Minimise at fixed weights from a state near the minimum.
 
     Parameters
@@ -84,10 +111,7 @@ def minimise(
 
     Returns
     -------
-    state : State
-        The minimum.
-    reduced : Reduced
-        The last linearisation, one small step before it.
+    Minimum
 
     Raises
     ------
@@ -107,7 +131,7 @@ def minimise(
     if result is None:
         result = _levenberg_marquardt(problem, state, weight, max_steps, tolerance)
     _LOG.info(
-        "%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result[0].cost, time.process_time() - start
+        "%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, time.process_time() - start
     )
     return result
 
@@ -115,26 +139,20 @@ def minimise(
 def gauss_newton(problem: Problem, state: State, weight: Array) -> State:
     """One undamped step: for rounds whose weights change anyway."""
     reduced = problem.reduce(state.params, state.points, weight)
-    step, gain = camera_step(problem, reduced)
+    step, gain, _ = camera_step(problem, reduced)
     return state.moved(step, reduced, max(_finite(reduced.cost) - gain, 0.0))
 
 
-def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tuple[Array, float]:
-    """Gauss-Newton step (N, q) of the camera unknowns, and what cameras and points together would gain."""
+def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tuple[Array, float, Factor]:
+    """Gauss-Newton step (N, q) of the cameras, what it and the points' would gain, and the factor."""
     free = problem.free
     step = np.zeros(len(free))
-    gain = reduced.gain
-    if free.any():
-        gradient = reduced.gradient[free]
-        solution = factorize_free(problem, reduced.matrix, damping).solve(gradient)
-        step[free] = -solution
-        gain += float(gradient @ solution)
-    return step.reshape(problem.structure.num_views, -1), gain
-
-
-def factorize_free(problem: Problem, matrix: Matrix, damping: float = 0.0) -> Factor:
-    """Factor of the reduced matrix restricted to the views that are not fixed."""
-    return factorize(free_part(problem.free, matrix), damping)
+    gradient = reduced.gradient[free]
+    factor = factorize(free_part(free, reduced.matrix), damping)
+    solution = factor.solve(gradient)
+    step[free] = -solution
+    gain = reduced.gain + float(gradient @ solution)
+    return step.reshape(problem.structure.num_views, -1), gain, factor
 
 
 def free_part(free: BoolArray, matrix: Matrix) -> Matrix:
@@ -149,20 +167,20 @@ def free_part(free: BoolArray, matrix: Matrix) -> Matrix:
 
 def _levenberg_marquardt(
     problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float
-) -> tuple[State, Reduced]:
+) -> Minimum:
     """Gauss-Newton steps, damped only when one fails."""
     damping = 0.0
     reduced = problem.reduce(state.params, state.points, weight)
     state = replace(state, cost=_finite(reduced.cost), history=(*state.history, reduced.cost))
     for _ in range(max_steps):
         try:
-            step, gain = camera_step(problem, reduced, damping)
+            step, gain, factor = camera_step(problem, reduced, damping)
         except np.linalg.LinAlgError:
             damping = max(10.0 * damping, 1e-8)
             continue
         ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
         if gain <= tolerance * state.cost:
-            return ahead, reduced
+            return Minimum(ahead, reduced, factor if not damping else None)
         trial = problem.reduce(ahead.params, ahead.points, weight)
         if trial.cost <= state.cost * (1.0 + 1e-12):
             state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
@@ -172,7 +190,7 @@ def _levenberg_marquardt(
         else:
             damping = max(10.0 * damping, 1e-6)
     _LOG.warning("the adjustment did not settle in %d steps", max_steps)
-    return state, reduced
+    return Minimum(state, reduced)
 
 
 class _Compressed:
@@ -235,9 +253,7 @@ class _Compressed:
         return np.vstack([self.slope, np.zeros((1, len(x)))])
 
 
-def _scipy(
-    problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float
-) -> tuple[State, Reduced]:
+def _scipy(problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float) -> Minimum:
     compressed = _Compressed(problem, state, weight)
     count = len(compressed.whitened)
     result = least_squares(
@@ -257,8 +273,8 @@ def _scipy(
     if result.status == 0:
         _LOG.warning("the adjustment did not settle in %d steps", max_steps)
     reduced = compressed.reduced
-    step, gain = camera_step(problem, reduced)  # what the last gradient still asks for
-    return compressed.state.moved(step, reduced, max(reduced.cost - gain, 0.0)), reduced
+    step, gain, factor = camera_step(problem, reduced)  # what the last gradient still asks for
+    return Minimum(compressed.state.moved(step, reduced, max(reduced.cost - gain, 0.0)), reduced, factor)
 
 
 def _finite(cost: float) -> float:

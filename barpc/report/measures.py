@@ -1,4 +1,4 @@
-"""What tie points say about cameras: errors of views, epipolar offsets of pairs, the shift of the scene."""
+"""What tie points say about cameras: errors of views, epipolar offsets and geometry of pairs."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barpc.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.scene import BoolArray, IntArray, Tracks
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import Triangulation, convergence_angle, epipolar_offset, triangulate
+from barpc.sensor.corrected import Corrected
+from barpc.sensor.geometry import Triangulation, convergence_angle, epipolar_offset, sight_enu, triangulate
 
 MAX_PER_PAIR = 2000
 """Matches of a pair that its epipolar offset is measured on, evenly taken."""
@@ -124,23 +125,109 @@ def pair_offset(ties: PairTies, tracks: Tracks, sensors: Sequence[SensorModel], 
     return PairOffset(float(np.median(offset)), robust_spread(offset), rms, len(offset))
 
 
-def pair_angle(ties: PairTies, tracks: Tracks, sensors: Sequence[SensorModel], ground: Array) -> float:
-    """Median convergence angle [deg] of a pair at its tie points; `ground` (P, 3) are all tracks' points."""
-    at = ground[tracks.point[ties.a[:: max(1, len(ties.a) // 100)]]]
+def pair_geometry(ties: PairTies, sensors: Sequence[SensorModel], at: Array) -> tuple[float, float, float]:
+    """Median over ground points (n, 3) of a pair's convergence angle, B/H, and metres of height a pixel.
+
+    Parameters
+    ----------
+    ties : PairTies
+        The pair.
+    sensors : sequence of SensorModel
+        The cameras of all views.
+    at : (n, 3)
+        lon, lat [deg], alt [m].
+
+    Returns
+    -------
+    convergence : float
+        Angle between the lines of sight [deg].
+    base_to_height : float
+        Distance of two cameras at the height 1 over the horizontal plane, along these lines of sight.
+    height_per_px : float
+        Height [m] whose parallax is one pixel (of the finer image); infinite for parallel rays.
+    """
     at = at[np.isfinite(at).all(axis=1)]
-    i, j = ties.views
-    return float(np.median(convergence_angle(sensors[i], sensors[j], at))) if len(at) else float("nan")
+    if not len(at):
+        return float("nan"), float("nan"), float("nan")
+    a, b = (sensors[i] for i in ties.views)
+    sight_a, sight_b = sight_enu(a, at), sight_enu(b, at)
+    base = np.linalg.norm(sight_a[:, :2] / sight_a[:, 2:] - sight_b[:, :2] / sight_b[:, 2:], axis=1)
+    finer = np.minimum(ground_sampling(a, at), ground_sampling(b, at))
+    with np.errstate(divide="ignore"):
+        height = float(np.median(finer / base))
+    return float(np.median(convergence_angle(a, b, at))), float(np.median(base)), height
 
 
-def triangulate_tracks(tracks: Tracks, sensors: Sequence[SensorModel], alt: float) -> Triangulation:
-    """All tracks intersected through given cameras, started at an altitude [m]."""
-    return triangulate(sensors, tracks.view, tracks.point, tracks.xy, tracks.sigma, alt=alt)
+def ground_sampling(sensor: SensorModel, ground: Array) -> Array:
+    """Side [m] (...) of the square on level ground that has the area of a pixel, at points (..., 3)."""
+    _, jacobian = sensor.project_jacobian(ground)
+    metric = jacobian[..., :2] / metres_per_unit(ground)[..., None, :2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(1.0 / np.sqrt(np.abs(np.linalg.det(metric))))
 
 
-def scene_shift(before: Array, after: Array) -> Array:
-    """Mean displacement of triangulated points (P, 3) [m, ECEF], as east, north, up (3,) [m]."""
-    both = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
-    if not both.any():
-        return np.full(3, np.nan)
-    middle = ground_from_ecef(before[both].mean(axis=0))
-    return np.asarray(enu_basis(middle) @ (after[both] - before[both]).mean(axis=0))
+def coverage(xy: Array, size: tuple[int, int], cells: int = 8) -> float:
+    """Share of the cells of a square grid over an image that hold one of the image points (n, 2) or more."""
+    place = ((xy + 0.5) / size * cells).astype(np.int64).clip(0, cells - 1)
+    return len(np.unique(place[:, 0] * cells + place[:, 1])) / cells**2
+
+
+def shift_in_image(before: Corrected, covariance: Array, ground: Array) -> tuple[Array, Array]:
+    """How far a correction moves a ground point in the image, and the standard deviation of that.
+
+    Parameters
+    ----------
+    before : Corrected
+        P_BA.
+    covariance : (q, q)
+        Of its unknowns: rotation (metres: angle x distance) and translation [m], then any drift, which is
+        zero in the middle row.
+    ground : (3,)
+        A ground point near the middle of the image.
+
+    Returns
+    -------
+    shift, sigma : (2,)
+        col, row [px].
+    """
+    ecef = ecef_from_ground(ground)
+    image, _, by_rotation, by_translation = before.project_ecef(ecef)
+    distance = np.linalg.norm(ecef - before.correction.center)
+    jacobian = np.hstack([by_rotation / distance, by_translation])
+    part = covariance[:6, :6]
+    variance = np.einsum("ij,jk,ik->i", jacobian, part, jacobian)
+    return image - before.sensor.project(ground), np.sqrt(np.maximum(variance, 0.0))
+
+
+def triangulate_tracks(
+    tracks: Tracks, sensors: Sequence[SensorModel], alt: float, keep: BoolArray
+) -> Triangulation:
+    """All tracks intersected through given cameras from the observations that count.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Tie points.
+    sensors : sequence of SensorModel
+        The cameras.
+    alt : float
+        Where the iteration starts [m].
+    keep : (K,)
+        Observations that count; the residuals of the others are measured against the same points.
+
+    Returns
+    -------
+    Triangulation
+        Of all tracks; a track with fewer than two observations that count is NaN.
+    """
+    point, view = tracks.point[keep], tracks.view[keep]
+    found = triangulate(sensors, view, point, tracks.xy[keep], tracks.sigma[keep], alt=alt)
+    points = np.full((tracks.num_points, 3), np.nan)
+    points[: len(found.points)] = found.points
+    residuals = np.full((len(tracks), 2), np.nan)
+    residuals[keep] = found.residuals
+    ground = ground_from_ecef(points)
+    for i in np.unique(tracks.view[~keep]):
+        rows = np.flatnonzero(~keep & (tracks.view == i))
+        residuals[rows] = sensors[i].project(ground[tracks.point[rows]]) - tracks.xy[rows]
+    return Triangulation(points, residuals, np.isfinite(points).all(axis=1))

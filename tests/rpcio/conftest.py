@@ -18,12 +18,12 @@ def make_rpc(lon: float = 5.4, lat: float = 43.2, **changes: float | None) -> RP
     """25 degrees off nadir, GSD near 0.5 m; every number but the offsets and scales with all its digits."""
     rng = np.random.default_rng(3)
     coeffs = rng.normal(0, 2e-6, (4, 20))
-    coeffs[0, :4] += [1e-3, 1.0, 0.02, -0.04]
-    coeffs[2, :4] += [-2e-3, 0.03, -1.0, 0.025]
+    coeffs[0, :4] += [1e-3, 1.0, 0.02, -0.11]
+    coeffs[2, :4] += [-2e-3, 0.03, -1.0, 0.07]
     coeffs[1::2, 0] = 1.0
     errors = {"err_bias": 3.1, "err_rand": 0.7} | changes
     return RPC(
-        coeffs, [lon, lat, 166.6667], [0.12, 0.09, 142.8571], [999.1, 950.7], [1010.3, 980.9], **errors
+        coeffs, [lon, lat, 166.6667], [0.0062, 0.0045, 142.8571], [999.1, 950.7], [1010.3, 980.9], **errors
     )
 
 

@@ -184,7 +184,7 @@ def test_a_nitf_copy_holds_what_its_record_can_hold(image, tmp_path):
     fitting = type(rpc)(
         np.round(rpc.coeffs, 6),
         [5.4, 43.2, 500.0],
-        [0.12, 0.09, 500.0],
+        [0.0062, 0.0045, 500.0],
         [999.0, 950.0],
         [1010.0, 980.0],
         3.1,

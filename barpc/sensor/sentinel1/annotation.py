@@ -6,6 +6,7 @@ of the files exactly.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,9 @@ TimeArray = npt.NDArray[np.datetime64]
 
 MISSIONS = {"S1A": "Sentinel-1A", "S1B": "Sentinel-1B", "S1C": "Sentinel-1C", "S1D": "Sentinel-1D"}
 """Mission of an annotation -> mission of an orbit file."""
+
+_LARGEST = 1e9  # no number of an annotation that is read here comes near
+_TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?)Z?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +220,7 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
         states=_annotated_states(root, name),
         first_line_time=values.time(info + "productFirstLineUtcTime"),
         last_line_time=values.time(info + "productLastLineUtcTime"),
-        azimuth_time_interval=values.positive(info + "azimuthTimeInterval"),
+        azimuth_time_interval=values.positive(info + "azimuthTimeInterval", most=1.0),
         slant_range_time=values.positive(info + "slantRangeTime"),
         range_sampling_rate=values.positive("generalAnnotation/productInformation/rangeSamplingRate"),
         range_pixel_spacing=values.positive(info + "rangePixelSpacing"),
@@ -286,14 +290,11 @@ def seconds(time: Any, epoch: np.datetime64) -> Any:
 
 def parse_time(text: str, name: str) -> np.datetime64:
     """A UTC time of an annotation ("2021-02-16T15:12:07.524369") or an orbit file ("UTC=...")."""
-    text = text.strip().removeprefix("UTC=").removesuffix("Z")
+    match = _TIME.fullmatch(text.strip())
     try:
-        time = np.datetime64(text, "ns")
+        return np.datetime64(match["time"] if match else "none", "ns")
     except ValueError as error:
-        raise RpcFormatError(f"{name}: {text!r} is not a UTC time") from error
-    if np.isnat(time):
-        raise RpcFormatError(f"{name}: {text!r} is not a UTC time")
-    return time
+        raise RpcFormatError(f"{name}: {text[:40]!r} is not a UTC time") from error
 
 
 class _Fields:
@@ -316,14 +317,14 @@ class _Fields:
             numbers = np.array(self.text(path).split(), dtype=np.float64)
         except ValueError as error:
             raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
-        if not np.isfinite(numbers).all():
-            raise RpcFormatError(f"{self.name}: {path} is not finite")
+        if not (np.abs(numbers) <= _LARGEST).all():
+            raise RpcFormatError(f"{self.name}: {path} holds a number that is not finite or absurdly large")
         return numbers
 
-    def positive(self, path: str) -> float:
+    def positive(self, path: str, most: float = _LARGEST) -> float:
         value = float(self.numbers(path)[0])
-        if value <= 0:
-            raise RpcFormatError(f"{self.name}: {path} is {value:g}, a positive number is needed")
+        if not 0 < value <= most:
+            raise RpcFormatError(f"{self.name}: {path} is {value:g}, expected above 0 and at most {most:g}")
         return value
 
 

@@ -1,0 +1,296 @@
+"""The verbs on cameras and points, as hands type them."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.cli import main
+from barpc.raster import open_raster
+from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
+from barpc.sensor.geometry import triangulate
+from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
+
+POINT = ["5.4005", "43.1995", "200"]
+
+
+def run(*args: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(arg) for arg in args])
+    return int(stop.value.code or 0)
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    raw = write_image(tmp_path / "raw.tif", shape=(1, 400, 600))
+    write_rpc_copy(make_rpc().crop(900, 900), raw, tmp_path / "in" / "scene.tif")
+    return tmp_path / "in" / "scene.tif"
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Path:
+    raw = write_image(tmp_path / "raw2.tif", shape=(1, 400, 600))
+    rpc = make_rpc().crop(880, 910)
+    tilted = np.array(rpc.coeffs)
+    tilted[0, 3] += 0.09
+    write_rpc_copy(type(rpc)(tilted, rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale),
+                   raw, tmp_path / "in" / "other.tif")  # fmt: skip
+    return tmp_path / "in" / "other.tif"
+
+
+def test_project_and_localize_are_each_other_s_inverse(image, capsys):
+    assert run("project", image, *POINT) == 0
+    header, line = capsys.readouterr().out.splitlines()
+    assert header == "col,row"
+    expected = read_rpc(image).project([float(v) for v in POINT])
+    np.testing.assert_allclose([float(v) for v in line.split(",")], expected, atol=1e-6)
+    assert run("localize", image, *line.split(","), "--alt", "200", "--json") == 0
+    (point,) = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(
+        [point["lon"], point["lat"], point["alt"]], [float(v) for v in POINT], atol=1e-8
+    )
+
+
+def test_negative_numbers_are_numbers(image, capsys):
+    assert run("project", image, "5.4", "43.2", "-3.5") == 0
+    assert run("localize", image, "-10", "-20.5", "--alt", "-3") == 0
+    assert "nan" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "lon,lat,alt\n5.4005,43.1995,200\n5.4015,43.1985,100\n",
+        "# comment\n5.4005 43.1995 200\n\n5.4015 43.1985 100\n",
+        "alt, name, lat, lon\n200,a,43.1995,5.4005\n100,b,43.1985,5.4015\n",
+    ],
+)
+def test_points_come_from_a_file_or_standard_input(text, image, tmp_path, capsys, monkeypatch):
+    (tmp_path / "points.csv").write_text(text)
+    assert run("project", image, "--points", tmp_path / "points.csv") == 0
+    from_file = capsys.readouterr().out
+    monkeypatch.setattr("sys.stdin", io.StringIO(text))
+    assert run("project", image, "--points", "-") == 0
+    assert capsys.readouterr().out == from_file
+    assert len(from_file.splitlines()) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lon,lat\n5,43\n", ""),
+        ("x,y,z\n1,2,3\n", "columns lon, lat, alt expected"),
+        ("5,43,abc\n", "is no number"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_an_error_that_names_it(text, message, image, tmp_path, capsys):
+    (tmp_path / "points.csv").write_text(text)
+    assert run("project", image, "--points", tmp_path / "points.csv") == 1
+    error = capsys.readouterr().err
+    assert "points.csv" in error
+    assert message in error
+
+
+def test_a_point_that_fails_is_nan_counted_and_null_in_json(image, capsys):
+    assert run("localize", image, "1e12", "0") == 0
+    captured = capsys.readouterr()
+    assert captured.out.splitlines()[1].startswith("nan,nan")
+    assert "1 of 1 points" in captured.err
+    assert run("localize", image, "1e12", "0", "--json") == 0
+    assert json.loads(capsys.readouterr().out)[0]["lon"] is None
+
+
+@pytest.mark.parametrize("args", [["5", "43"], ["5"], [], ["5", "43", "1", "2"]])
+def test_a_wrong_number_of_numbers_is_a_usage_error(args, image, capsys):
+    assert run("project", image, *args) == 2
+    assert "LON LAT ALT" in capsys.readouterr().err
+
+
+def test_triangulate_finds_the_point_that_two_images_see(image, other, capsys):
+    rpcs = [read_rpc(image), read_rpc(other)]
+    ground = rpcs[0].localize([300.0, 200.0], 150.0)
+    seen = [rpc.project(ground) for rpc in rpcs]
+    args = [a for xy in seen for a in ("--at", *xy)]
+    assert run("triangulate", image, other, *args, "--json") == 0
+    (point,) = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose([point["lon"], point["lat"], point["alt"]], ground, atol=1e-4)
+    assert point["error"] == pytest.approx(0.0, abs=1e-4)
+    noisy = triangulate(rpcs, [0, 1], [0, 0], np.array(seen) + [[0, 0], [0, 2]])
+    args = [a for xy in np.array(seen) + [[0, 0], [0, 2]] for a in ("--at", *xy)]
+    assert run("triangulate", image, other, *args, "--json") == 0
+    expected = np.sqrt((noisy.residuals**2).sum(axis=1).mean())
+    assert json.loads(capsys.readouterr().out)[0]["error"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_triangulate_from_a_table_skips_what_an_image_does_not_see(image, other, tmp_path, capsys):
+    rows = "col1,row1,col2,row2\n300,200,320,190\n300,200,nan,nan\n"
+    (tmp_path / "ties.csv").write_text(rows)
+    assert run("triangulate", image, other, "--points", tmp_path / "ties.csv") == 0
+    captured = capsys.readouterr()
+    assert [("nan" in line) for line in captured.out.splitlines()[1:]] == [False, True]
+    assert "1 of 2 points could not be intersected" in captured.err
+    assert run("triangulate", image, "--at", 1, 2) == 2
+
+
+def test_angle_of_two_images(image, other, capsys):
+    assert run("angle", image, other, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [view["name"] for view in report["views"]] == ["scene", "other"]
+    (pair,) = report["pairs"]
+    assert pair["b_over_h"] == pytest.approx(2 * np.tan(np.radians(pair["convergence"]) / 2))
+    assert 1 < pair["convergence"] < 60
+    assert run("angle", image) == 0
+    assert "incidence" in capsys.readouterr().out
+
+
+def test_footprint_is_geojson_with_a_polygon_an_image(image, other, tmp_path, capsys):
+    assert run("footprint", image, other) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [f["properties"]["name"] for f in document["features"]] == ["scene", "other"]
+    assert run("footprint", image, "-o", tmp_path / "f.geojson") == 0
+    assert json.loads((tmp_path / "f.geojson").read_text())["type"] == "FeatureCollection"
+    assert run("footprint", image, "-o", tmp_path / "f.geojson") == 1  # exists
+    assert run("footprint", image, "-o", tmp_path / "f.geojson", "--overwrite") == 0
+
+
+def test_an_rpc_file_has_no_size_and_asks_for_it(tmp_path, capsys):
+    write_rpc(make_rpc(), tmp_path / "a.RPB")
+    assert run("footprint", tmp_path / "a.RPB") == 2
+    assert "--size" in capsys.readouterr().err
+    assert run("footprint", tmp_path / "a.RPB", "--size", 2000, 1900) == 0
+
+
+def test_info_says_where_the_rpc_comes_from_and_what_was_passed_over(image, capsys):
+    write_rpc(make_rpc(), image.with_suffix(".RPB"))
+    assert run("info", image, "--json") == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert report["rpc"].startswith("rpb in ")
+    assert report["notes"] == ["not used: the image's own RPC"]
+    assert report["size_px"] == [600, 400]
+    assert report["err_bias_m"] == 3.1
+    assert 0.9 < report["smallest_denominator"] <= 1.0
+    assert 0 < report["incidence_deg"] < 60
+    assert run("info", image) == 0
+    assert "incidence deg" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["b_RPC.TXT", "b.RPB", "b.geom", "b.XML", "b.json", "b.vrt", "b.tif"])
+def test_convert_by_the_target_s_name(name, image, tmp_path):
+    assert run("convert", image, tmp_path / "out" / name) == 0
+    assert read_rpc(tmp_path / "out" / name) == read_rpc(image)
+    assert run("convert", image, tmp_path / "out" / name) == 1  # exists
+
+
+def test_convert_can_be_told_the_pixel_convention(tmp_path, capsys):
+    (tmp_path / "RPC_S6.XML").write_text(dimap_v2(make_rpc()))
+    for convention, shift in (("auto", 0), ("0", 1), ("0.5", 0.5)):
+        target = tmp_path / f"{convention}.geom"
+        assert run("convert", tmp_path / "RPC_S6.XML", target, "--pixel-convention", convention) == 0
+        np.testing.assert_allclose(read_rpc(target).image_offset, make_rpc().image_offset + shift, atol=1e-9)
+    assert run("convert", tmp_path / "RPC_S6.XML", tmp_path / "c.doc") == 1
+    assert "choose one of" in capsys.readouterr().err
+
+
+def test_crop_by_window_and_by_box(image, tmp_path, capsys):
+    assert run("crop", image, tmp_path / "w.tif", "--window", 50, 60, 100, 80) == 0
+    rpc = read_rpc(image)
+    np.testing.assert_allclose(
+        read_rpc(tmp_path / "w.tif").image_offset, rpc.image_offset - [50, 60], atol=1e-9
+    )
+    corners = rpc.localize([[100.0, 100.0], [200.0, 150.0]], [200.0, 200.0])
+    west, east = sorted(corners[:, 0])
+    south, north = sorted(corners[:, 1])
+    box = ("--bbox", west, south, east, north, "--alt", 200)
+    assert run("crop", image, tmp_path / "b.tif", *box, "--json") == 0
+    window = json.loads(capsys.readouterr().out.splitlines()[-1])["window"]
+    assert window[0] <= 100
+    assert window[0] + window[2] >= 200
+    assert window[1] <= 100
+    assert window[1] + window[3] >= 150
+    assert window[2] < 130
+    with open_raster(tmp_path / "b.tif") as crop:
+        assert (crop.width, crop.height) == (window[2], window[3])
+    assert run("crop", image, tmp_path / "x.tif", "--bbox", 0, 0, 1, 1) == 2
+    assert run("crop", image, tmp_path / "x.tif") == 2
+    assert run("crop", image, tmp_path / "x.tif", "--window", 590, 0, 100, 80) == 1
+    assert not (tmp_path / "x.tif").exists()
+
+
+@pytest.mark.parametrize("carrier", ["vrt", "copy"])
+def test_apply_gives_images_other_rpcs_and_proves_it(carrier, image, tmp_path, capsys):
+    better = read_rpc(image).crop(0.25, -0.5)
+    write_rpc(better, tmp_path / "rpcs" / "scene_RPC.TXT")
+    before = image.read_bytes()
+    args = (
+        "--rpc",
+        tmp_path / "rpcs",
+        "-o",
+        tmp_path / "out",
+        "--images",
+        carrier,
+        "--rpc-format",
+        "txt,geom",
+    )
+    assert run("apply", image, *args, "--json") == 0
+    readings = json.loads(capsys.readouterr().out)
+    assert all(reading["max_px"] <= 1e-9 for reading in readings)
+    assert {Path(reading["path"]).suffix for reading in readings} == {
+        ".vrt" if carrier == "vrt" else ".tif",
+        ".TXT",
+        ".geom",
+    }
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "scene.vrt" if carrier == "vrt" else "scene.tif",
+        "scene_RPC.TXT",
+        "scene.geom",
+    }
+    assert image.read_bytes() == before
+    assert list(image.parent.iterdir()) == [image]
+    assert run("apply", image, *args) == 1  # exists
+
+
+def test_apply_names_what_hides_the_rpc_beside_the_input_and_in_the_new_folder(image, tmp_path, capsys):
+    rpc = read_rpc(image)
+    write_rpc(rpc.crop(5, 5), image.with_suffix(".RPB"))
+    write_rpc(rpc.crop(5, 5), tmp_path / "out" / "scene.RPB")
+    write_rpc(rpc, tmp_path / "new.geom")
+    assert (
+        run("apply", image, "--rpc", tmp_path / "new.geom", "-o", tmp_path / "out", "--images", "copy") == 3
+    )
+    error = capsys.readouterr().err
+    assert "scene.RPB hides an RPC put into the image" in error
+    assert f"{tmp_path / 'out' / 'scene.RPB'} hides the RPC of" in error
+
+
+def test_apply_refuses_the_images_own_folder_and_missing_rpcs(image, tmp_path, capsys):
+    write_rpc(read_rpc(image), tmp_path / "a.geom")
+    assert run("apply", image, "--rpc", tmp_path / "a.geom", "-o", image.parent) == 1
+    assert "choose a new one" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert run("apply", image, "--rpc", tmp_path / "empty", "-o", tmp_path / "out") == 1
+    assert "no RPC of scene.tif there" in capsys.readouterr().err
+    assert (
+        run("apply", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--rpc-format", "doc") == 2
+    )
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("verb", ["info", "project", "localize", "footprint", "angle", "triangulate"])
+def test_a_file_that_is_missing_is_one_line_and_exit_code_1(verb, tmp_path, capsys):
+    extra = ["--points", tmp_path / "p.csv"] if verb in ("project", "localize", "triangulate") else []
+    assert run(verb, tmp_path / "nothing.tif", *extra) == 1
+    error = capsys.readouterr().err
+    assert "nothing.tif: no such file" in error
+    assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "verb", ["info", "project", "localize", "footprint", "angle", "triangulate", "convert", "crop", "apply"]
+)
+def test_every_verb_explains_itself(verb, capsys):
+    assert run(verb, "--help") == 0
+    assert "Example" in capsys.readouterr().out
