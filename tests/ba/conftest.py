@@ -1,0 +1,37 @@
+"""Blocks of simulated views, and how they are adjusted in the tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.simulate import Block, simulate_block
+
+INDEPENDENT = {"noise_floor": 0.0, "sigma_attitude": 10.4, "sigma_position": 1.0, "min_convergence": 0.01}
+"""What simulated blocks are: white noise, 15 urad at 694 km, 1 m."""
+
+
+def centers_of(block: Block) -> np.ndarray:
+    """The camera centres that the block was made with."""
+    return np.array([correction.center for correction in block.truth.corrections])
+
+
+def solve(block: Block, **options: Any) -> Adjustment:
+    """The block adjusted with priors that are true of it."""
+    chosen = AdjustOptions(**{**INDEPENDENT, **options})
+    return adjust_tracks(block.views, block.tracks, chosen, centers=centers_of(block))
+
+
+@pytest.fixture(scope="session")
+def block() -> Block:
+    """Ten views, 2000 tie points, noise of a tenth of a pixel."""
+    return simulate_block(10, 2000, seed=11)
+
+
+@pytest.fixture(scope="session")
+def adjusted(block: Block) -> Adjustment:
+    """`block`, adjusted."""
+    return solve(block)

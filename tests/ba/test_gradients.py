@@ -1,0 +1,156 @@
+"""Every derivative of the adjustment against central differences.
+
+A right derivative proves nothing about the value that it belongs to: `test_recovery` does that.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc.ba.blocks import CameraPrior, JointPrior, PointPrior, flat_heights, ground_control, terrain_heights
+from barpc.ba.cameras import Cameras
+from barpc.ba.loss import LOSSES
+from barpc.ba.unknowns import make_unknowns
+from barpc.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.scene import GroundPoints, View
+from barpc.sensor.corrected import Corrected
+from barpc.simulate import simulate_block
+
+MODELS = [
+    ("rotation+translation", 0),
+    ("rotation", 0),
+    ("translation", 0),
+    ("rotation+translation", 1),
+    ("rotation", 2),
+    ("shift", 0),
+    ("shift-drift", 0),
+    ("affine", 0),
+]
+
+
+@pytest.fixture(scope="module")
+def views() -> tuple[View, ...]:
+    """Two RPCs, and a third sensor that is none."""
+    block = simulate_block(3, 10, seed=5)
+    odd = block.views[2]
+    other = Corrected(odd.sensor, block.truth.corrections[2])
+    return (*block.views[:2], View(odd.name, "", odd.size, other, odd.alt_range))
+
+
+@pytest.fixture(scope="module")
+def ecef(views: tuple[View, ...]) -> np.ndarray:
+    """Points (3, 30), ten a view."""
+    rng = np.random.default_rng(8)
+    image = rng.uniform(2000, 18000, (10, 2))
+    ground = [view.sensor.localize(image, rng.uniform(0, 500, 10)) for view in views]
+    return ecef_from_ground(np.concatenate(ground)).T
+
+
+def _setup(views, model, drift, scale=5.0):
+    cameras = Cameras(views, make_unknowns(views, model, drift))
+    params = np.random.default_rng(3).normal(0, scale, (3, cameras.unknowns.size))
+    return cameras, params, np.array([0, 10, 20, 30])
+
+
+@pytest.mark.parametrize(("model", "drift"), MODELS)
+def test_tie_observations_have_the_derivatives_of_central_differences(views, ecef, model, drift):
+    cameras, params, bounds = _setup(views, model, drift)
+    found = cameras.project(params, ecef, bounds)
+    for j in range(params.shape[1]):
+        step = np.zeros_like(params)
+        step[:, j] = 0.5
+        high, low = (cameras.project(params + s * step, ecef, bounds, "image").image for s in (1, -1))
+        np.testing.assert_allclose(found.by_unknown[:, j], high - low, rtol=0, atol=2e-6)
+    for axis in range(3):
+        step = np.zeros((3, 1))
+        step[axis] = 0.5
+        high, low = (cameras.project(params, ecef + s * step, bounds, "image").image for s in (1, -1))
+        np.testing.assert_allclose(found.by_point[:, axis], high - low, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize(("model", "drift"), MODELS)
+def test_views_together_project_like_each_corrected_sensor_alone(views, ecef, model, drift):
+    cameras, params, bounds = _setup(views, model, drift)
+    image = cameras.project(params, ecef, bounds).image
+    sensors = cameras.unknowns.corrected(params, views)
+    for v, sensor in enumerate(sensors):
+        part = slice(bounds[v], bounds[v + 1])
+        alone = sensor.project(ground_from_ecef(ecef[:, part].T))
+        np.testing.assert_allclose(image[:, part].T, alone, rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("drift", [1, 2])
+def test_a_drifting_correction_is_a_sensor_with_right_derivatives_and_localisation(views, drift):
+    cameras, params, _ = _setup(views, "rotation+translation", drift)
+    sensor = cameras.unknowns.corrected(params, views)[0]
+    image = np.random.default_rng(1).uniform(1000, 19000, (20, 2))
+    ground = sensor.localize(image, np.full(20, 300.0))
+    np.testing.assert_allclose(sensor.project(ground), image, rtol=0, atol=1e-7)
+    _, jacobian = sensor.project_jacobian(ground)
+    for axis, step in enumerate((1e-5, 1e-5, 1.0)):
+        offset = np.eye(3)[axis] * step
+        numeric = (sensor.project(ground + offset) - sensor.project(ground - offset)) / (2 * step)
+        np.testing.assert_allclose(jacobian[..., axis] * step, numeric * step, rtol=0, atol=1e-6)
+
+
+def _point_priors():
+    points = ecef_from_ground([[5.4, 43.2, 200.0], [5.5, 43.3, 250.0], [5.6, 43.4, 300.0]])
+    index = np.array([0, 2])
+    none = np.zeros(0, dtype=int)
+    gcps = GroundPoints(
+        ("a", "b"), ground_from_ecef(points[index]), [[0.2, 0.3, 0.5]] * 2, none, none, np.zeros((0, 2)), np.zeros(0)
+    )
+    return points, {
+        "gcp": ground_control(gcps, index),
+        "terrain": terrain_heights(points, index, lambda lon, lat: 100.0 + 800.0 * (lon - 5.4) + 300.0 * (lat - 43), 3.0),
+        "flat": flat_heights(points, index, 210.0, 20.0),
+    }
+
+
+@pytest.mark.parametrize("name", ["gcp", "terrain", "flat"])
+def test_priors_on_points_have_the_derivatives_of_central_differences(name):
+    points, blocks = _point_priors()
+    block = blocks[name]
+    assert isinstance(block, PointPrior)
+    for axis in range(3):
+        step = np.zeros_like(points)
+        step[:, axis] = 1.0
+        numeric = (block.residual(points + step) - block.residual(points - step)) / 2
+        np.testing.assert_allclose(block.jacobian()[..., axis], numeric, rtol=0, atol=1e-7)
+
+
+def test_a_terrain_prior_measures_the_distance_along_the_vertical():
+    points, blocks = _point_priors()
+    ground = ground_from_ecef(points[[0, 2]])
+    alt = 100.0 + 800.0 * (ground[:, 0] - 5.4) + 300.0 * (ground[:, 1] - 43)
+    np.testing.assert_allclose(blocks["terrain"].residual(points)[:, 0] * 3.0, ground[:, 2] - alt, atol=1e-6)
+
+
+def test_priors_on_cameras_have_the_derivatives_of_central_differences():
+    rng = np.random.default_rng(0)
+    params = rng.normal(size=(3, 6))
+    prior = CameraPrior(rng.normal(size=(3, 6)), rng.uniform(1, 5, (3, 6)))
+    joint = JointPrior(np.array([2, 7, 11]), rng.normal(size=3), np.triu(rng.normal(size=(3, 3))))
+    for n in range(params.size):
+        step = np.zeros(params.size)
+        step[n] = 0.5
+        step = step.reshape(params.shape)
+        numeric = prior.residual(params + step) - prior.residual(params - step)
+        np.testing.assert_allclose(numeric.ravel()[n], prior.jacobian().ravel()[n], atol=1e-12)
+        numeric = joint.residual(params + step) - joint.residual(params - step)
+        column = joint.jacobian()[:, joint.index == n].sum(axis=1)
+        np.testing.assert_allclose(numeric, column, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_loss_has_the_derivative_of_central_differences_and_starts_as_squares(name):
+    loss = LOSSES[name]
+    s = np.geomspace(1e-3, 1e3, 60)
+    s = s[np.abs(s - 1) > 1e-3]
+    step = 1e-5 * s
+    numeric = (loss(s + step)[0] - loss(s - step)[0]) / (2 * step)
+    np.testing.assert_allclose(loss(s)[1], numeric, rtol=1e-6, atol=1e-12)
+    value, slope = loss(np.array([1e-12]))
+    np.testing.assert_allclose(value, 1e-12, rtol=1e-3)
+    np.testing.assert_allclose(slope, 1.0, rtol=1e-3)
