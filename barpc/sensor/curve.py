@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
 
 from barpc.errors import RpcError
 from barpc.geodesy import Array
@@ -44,6 +47,37 @@ class Curve:
         """One polynomial, sum over k of coeffs[k] (t - start)^k, used from `start` to `stop` [s]."""
         return cls(np.array([start, stop]), np.asarray(coeffs, dtype=np.float64)[None])
 
+    @classmethod
+    def through(cls, times: npt.ArrayLike, values: npt.ArrayLike, degree: int = 5) -> Curve:
+        """The spline through samples: smooth to the second but one derivative, not-a-knot at its ends.
+
+        Parameters
+        ----------
+        times : (N,)
+            [s], ascending.
+        values : (N, 3)
+            Positions [m] or rotation vectors [rad].
+        degree : int
+            3 or 5; less where there are too few samples. A quintic through positions every 10 s is true to
+            1e-4 m between them.
+
+        Raises
+        ------
+        RpcError
+            Fewer than two samples, times that do not ascend, numbers that are not finite.
+        """
+        times = np.asarray(times, dtype=np.float64)
+        values = np.asarray(values, dtype=np.float64)
+        if times.ndim != 1 or len(times) < 2 or values.shape != (len(times), 3):
+            raise RpcError(f"curve: {values.shape} values at {times.shape} times; two samples or more needed")
+        if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
+            raise RpcError("curve: sample times must ascend and all numbers must be finite")
+        order = min(degree, len(times) - 1)
+        spline = make_interp_spline(times, values, k=order - (order + 1) % 2)
+        knots = np.unique(spline.t)
+        taylor = [spline(knots[:-1], nu=k) / math.factorial(k) for k in range(spline.k + 1)]
+        return cls(knots, np.stack(taylor, axis=1))
+
     def __call__(self, time: Array) -> tuple[Array, Array]:
         """Values and their derivatives by time.
 
@@ -79,3 +113,36 @@ class Curve:
 
     def __hash__(self) -> int:
         return hash(self.content())
+
+
+def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[Array, Curve]:
+    """Attitude from quaternions: axes at the middle sample, and the rotation vector from there.
+
+    Parameters
+    ----------
+    times : (N,)
+        [s], ascending.
+    quaternions : (N, 4)
+        ecef_from_camera, scalar first; of any sign and length but zero.
+
+    Returns
+    -------
+    mount : (3, 3)
+        ecef_from_camera at the middle sample.
+    attitude : Curve
+        Rotation vector [rad] in the axes of `mount`: a cubic spline.
+
+    Raises
+    ------
+    RpcError
+        A quaternion that is zero or not finite, an attitude that turns by more than 2 rad from the middle.
+    """
+    q = np.asarray(quaternions, dtype=np.float64)
+    if q.ndim != 2 or q.shape[1] != 4 or not (np.isfinite(q).all() and q.any(axis=1).all()):
+        raise RpcError(f"attitude: quaternions {q.shape} must be finite, not zero, four numbers each")
+    rotations = Rotation.from_quat(np.roll(q, -1, axis=1))
+    middle = rotations[len(q) // 2]
+    vectors = (middle.inv() * rotations).as_rotvec()
+    if np.linalg.norm(vectors, axis=1).max() > 2.0:
+        raise RpcError("attitude: it turns by more than 2 rad; cut the samples to the image")
+    return np.asarray(middle.as_matrix()), Curve.through(times, vectors, degree=3)
