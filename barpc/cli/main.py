@@ -32,6 +32,7 @@ COMMANDS = {
     "crop": "Cut a window out of an image with its exact RPC.",
     "apply": "Give images other RPCs in a new folder and prove that tools read them.",
     "simulate": "Make synthetic images with known cameras and truth.",
+    "doctor": "Print versions and check the installation.",
 }
 """Verb -> its line in `barpc --help`; the code is `barpc.cli.<verb>.command`."""
 
