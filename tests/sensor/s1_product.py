@@ -47,6 +47,8 @@ class Product:
     burst_cycle: int = 1342
     states_from: float = -65.0
     num_states: int = 17
+    step: float = 10.0
+    stripmap: bool = False
     noise: float = 0.0
     sr0: float = 800_400.0
 
@@ -62,7 +64,11 @@ class Product:
     @property
     def duration(self) -> float:
         rows = (self.num_bursts - 1) * self.burst_cycle + self.lines_per_burst
-        return (rows - 1) * INTERVAL if self.product_type == "SLC" else (self.lines - 1) * INTERVAL
+        return ((rows if self.bursts else self.lines) - 1) * INTERVAL
+
+    @property
+    def bursts(self) -> bool:
+        return self.product_type == "SLC" and not self.stripmap
 
     def state(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Exact ECEF position and velocity; the satellite is over `lon` 12.5 s after START."""
@@ -99,11 +105,11 @@ class Product:
         """The annotation, its geolocation grid computed from the truth."""
         rough = read_annotation(self._xml(np.zeros((1, 7))), name=self.name)
         model = _quiet(lambda: RangeDoppler.from_annotation(rough))
-        step = self.lines_per_burst if self.product_type == "SLC" else self.lines // 9
+        step = self.lines_per_burst if self.bursts else self.lines // 9
         lines = np.arange(0, self.lines + 1, step) - np.r_[np.zeros(self.lines // step), 1]
         pixel, line = np.meshgrid(np.linspace(0, self.samples - 1, 5).round(), lines)
         row = line.ravel()
-        if self.product_type == "SLC":
+        if self.bursts:
             burst = np.minimum(row // self.lines_per_burst, self.num_bursts - 1)
             row = row - burst * (self.lines_per_burst - self.burst_cycle)
         alt = 100.0 + 300.0 * np.sin(np.arange(row.size)) ** 2
@@ -118,7 +124,7 @@ class Product:
         rng = np.random.default_rng(7)
         states = ""
         for k in range(self.num_states):
-            time = self.states_from + 10.0 * k
+            time = self.states_from + self.step * k
             position, velocity = self.state(time)
             velocity = velocity + self.noise * rng.normal(size=3)
             axes = [
@@ -141,7 +147,7 @@ class Product:
         return f"""<?xml version="1.0" encoding="UTF-8"?>
 <product>
 <adsHeader><missionId>S1A</missionId><productType>{self.product_type}</productType>
-<polarisation>VV</polarisation><mode>IW</mode><swath>{self.swath}</swath></adsHeader>
+<polarisation>VV</polarisation><mode>{self.swath[:2]}</mode><swath>{self.swath}</swath></adsHeader>
 <generalAnnotation><productInformation><rangeSamplingRate>{SAMPLING!r}</rangeSamplingRate></productInformation>
 <downlinkInformationList><downlinkInformation><downlinkValues><pri>5.823e-04</pri><rank>9</rank>
 </downlinkValues></downlinkInformation></downlinkInformationList>
@@ -155,8 +161,8 @@ class Product:
 <numberOfSamples>{self.samples}</numberOfSamples><numberOfLines>{self.lines}</numberOfLines>
 </imageInformation><processingInformation><orbitSource>Auxiliary</orbitSource>
 <bistaticDelayCorrectionApplied>true</bistaticDelayCorrectionApplied></processingInformation></imageAnnotation>
-<swathTiming><linesPerBurst>{self.lines_per_burst if slc else 0}</linesPerBurst>
-{self._bursts() if slc else ""}</swathTiming>
+<swathTiming><linesPerBurst>{self.lines_per_burst if self.bursts else 0}</linesPerBurst>
+{self._bursts() if self.bursts else ""}</swathTiming>
 <geolocationGrid><geolocationGridPointList>{points}</geolocationGridPointList></geolocationGrid>
 <coordinateConversion>{"" if slc else self._conversion()}</coordinateConversion>
 </product>
@@ -215,6 +221,8 @@ IW = {
     "IW3": Product(swath="IW3", first_range_time=5.34e-3 + 45000 / SAMPLING, samples=24300, first_burst=1.7),
 }
 """The three swaths of one product."""
+
+STRIPMAP = Product(swath="S3", stripmap=True, num_bursts=12, states_from=-10.0, step=1.0, num_states=60)
 
 GRD = replace(Product(), swath="IW", product_type="GRD", samples=25000)
 

@@ -14,13 +14,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from barpc.cli.main import cli
-from barpc.errors import BarpcWarning, FitError, InputError, RpcError, RpcFormatError
+from barpc.errors import BarpcError, BarpcWarning, FitError, InputError, RpcError, RpcFormatError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
@@ -37,7 +38,7 @@ from barpc.sensor.sentinel1 import (
     read_annotation,
 )
 from barpc.sensor.sentinel1.annotation import parse_time, seconds
-from tests.sensor.s1_product import GRD, INTERVAL, IW, SAMPLING, START, Product
+from tests.sensor.s1_product import GRD, INTERVAL, IW, SAMPLING, START, STRIPMAP, Product
 
 AUXILIARY = ["20210216t151207", "20220104t170558", "20211223t051122"]
 SLC = ["20160114t054006", "20210216t151207", "20220104t170558", "20210401t052624", "20190803t164007"]
@@ -95,7 +96,8 @@ def safe(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "product", [*IW.values(), GRD, Product(lon=-180.0, argument=0.3), Product(noise=5e-3)]
+    "product",
+    [*IW.values(), GRD, STRIPMAP, Product(lon=-180.0, argument=0.3), Product(swath="EW1", noise=5e-3)],
 )
 def test_times_are_those_of_the_exact_orbit(product: Product) -> None:
     built = product.model()
@@ -366,6 +368,15 @@ def test_a_grd_is_not_taken_for_a_swath(tmp_path: Path) -> None:
         open_product(path, bistatic="full")
 
 
+def test_a_stripmap_image_is_one_frame_without_bursts(tmp_path: Path) -> None:
+    path = tmp_path / STRIPMAP.name
+    path.write_bytes(STRIPMAP.xml())
+    strip = open_product(path, swath="s3", bistatic="full")
+    assert strip.size == (STRIPMAP.samples, STRIPMAP.lines)
+    with pytest.raises(InputError, match="a mosaic takes TOPS SLC swaths, this is a S3 SLC of S3"):
+        mosaic([path])
+
+
 def test_swaths_of_different_products_are_no_mosaic() -> None:
     first, other = (read_annotation(IW[name].xml()) for name in ("IW1", "IW2"))
     with pytest.raises(InputError, match="not of the same product"):
@@ -388,8 +399,8 @@ def broken(xml: bytes) -> Iterator[tuple[str, bytes, str]]:
     yield "no grid", _without(xml, b"geolocationGrid"), "no geolocation grid"
     yield "no spacing", _without(xml, b"azimuthTimeInterval"), "no imageAnnotation/imageInformation/azimuth"
     yield "not a number", xml.replace(b"<rank>9<", b"<rank>nine<"), "not a list of numbers"
-    yield "infinite", xml.replace(b"<pri>5.823e-04<", b"<pri>inf<"), "not finite"
-    yield "negative", xml.replace(b"<pri>5", b"<pri>-5"), "positive number is needed"
+    yield "infinite", xml.replace(b"<pri>5.823e-04<", b"<pri>inf<"), "not finite or absurdly large"
+    yield "negative", xml.replace(b"<pri>5", b"<pri>-5"), "expected above 0"
     yield "no date", xml.replace(b"<productFirstLineUtcTime>2021", b"<productFirstLineUtcTime>x"), "UTC time"
     yield "inertial orbit", xml.replace(b"Earth Fixed", b"Inertial"), "not Earth fixed"
     yield "an odd burst", xml.replace(b"<lastValidSample>-1", b"<lastValidSample>"), "last valid samples"
@@ -406,6 +417,41 @@ def test_a_broken_annotation_is_refused_with_what_and_where(iw1: Product, index:
     _, xml, message = list(broken(iw1.xml()))[index]
     with pytest.raises(RpcError, match=message):
         RangeDoppler.from_annotation(read_annotation(xml, name="s1a.xml"))
+
+
+def test_no_mutation_of_an_annotation_gets_past_the_errors_that_are_meant() -> None:
+    rng = np.random.default_rng(4)
+    small = replace(IW["IW1"], samples=900, num_bursts=3, lines_per_burst=60, burst_cycle=50)
+    sources = [small.xml(), replace(GRD, samples=900, num_bursts=1, lines_per_burst=300).xml()]
+    for k in range(200):
+        xml = mutated(sources[k % 2], rng)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", BarpcWarning)
+                annotation = read_annotation(xml, name="mutated.xml")
+                built = RangeDoppler.from_annotation(annotation, bistatic="annotated" if k % 3 else None)
+            built.project_jacobian(built.localize(np.array([10.0, 10.0]), np.array(0.0)))
+        except BarpcError as error:
+            assert "\n" not in str(error)  # noqa: PT017 - anything else must surface
+
+
+def mutated(xml: bytes, rng: np.random.Generator) -> bytes:
+    """The annotation with one to three elements removed, emptied, garbled or filled with nonsense."""
+    nonsense = ["", "0", "-1", "1e400", "nan", "x", "1 2 3", "1e-300", "9" * 20, "2021-02-16T15:12:07", "GRD"]
+    root = ElementTree.fromstring(xml)
+    parents = {child: parent for parent in root.iter() for child in parent}
+    for _ in range(rng.integers(1, 4)):
+        element = list(parents)[rng.integers(len(parents))]
+        text = list((element.text or "").strip())
+        way = rng.integers(3)
+        if way == 0 and element in parents[element]:
+            parents[element].remove(element)
+        elif way == 1 and text:
+            text[rng.integers(len(text))] = chr(rng.integers(33, 127))
+            element.text = "".join(text)
+        else:
+            element.text = nonsense[rng.integers(len(nonsense))]
+    return ElementTree.tostring(root)
 
 
 def test_too_few_state_vectors_and_extrapolation_are_refused() -> None:
@@ -443,7 +489,7 @@ def test_times_are_exact_to_the_microsecond() -> None:
     assert seconds(parse_time("UTC=2021-02-16T15:12:32.665878", "x"), epoch) == pytest.approx(
         25.141509, abs=1e-12
     )
-    for text in ("yesterday", "NaT", ""):
+    for text in ("yesterday", "NaT", "", "2021-13-01T00:00:00", "2021-02-16T15:12:07+01:00", "none"):
         with pytest.raises(RpcFormatError, match="not a UTC time"):
             parse_time(text, "x")
 

@@ -23,7 +23,7 @@ MARGIN = 70.0
 EXTRAPOLATION = 1.0
 """An orbit is used so far beyond its first and last state vector [s]."""
 MIN_VECTORS = 4
-MAX_DEGREE = 11
+MIN_DEGREE, MAX_DEGREE = 5, 11
 
 _TOLERANCE = 1.0  # m: state vectors that scatter more are not one orbit
 _FLOOR = 2e-5  # m: a residual across the track that no pixel sees
@@ -96,7 +96,7 @@ class Orbit(Record):
 def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float, float]) -> Orbit:
     """The orbit through state vectors, around the time of an image.
 
-    The degree is the lowest that no higher one (to `MAX_DEGREE`) betters by more than half in the
+    The degree is the lowest that no higher one (`MIN_DEGREE` to `MAX_DEGREE`) betters by more than half in the
     residual ACROSS the track: about 5 for downlinked vectors, 6 for auxiliary ones, more for a long span.
     Along the track a high degree would follow the rounding of the times.
 
@@ -132,7 +132,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
             f"orbit: the image lasts from {window[0]:.1f} to {window[1]:.1f} s, the state vectors from "
             f"{time[0]:.1f} to {time[-1]:.1f} s; give a precise orbit file that covers it"
         )
-    degrees = range(3, min(MAX_DEGREE, len(time)) + 1)
+    degrees = range(min(MIN_DEGREE, len(time)), min(MAX_DEGREE, len(time)) + 1)
     fits = [_fit(time, position, velocity, degree) for degree in degrees]
     limit = _GAIN * max(_FLOOR, min(float(fit.sigma[1]) for fit in fits))
     orbit = next(fit for fit in fits if fit.sigma[1] <= limit)
