@@ -11,6 +11,9 @@ import numpy as np
 from barpc.errors import OutputError
 from barpc.fit import RpcFit
 from barpc.geodesy import Array
+from barpc.report import Run
+from barpc.report.page import can_render, report_html
+from barpc.report.tables import TABLES
 from barpc.rpcio import FORMATS, read_rpc, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.scene import View
 from barpc.sensor import SensorModel
@@ -85,9 +88,24 @@ def write_view(
     return written
 
 
-def write_tables(run: Workspace, summary: Mapping[str, Any]) -> None:
-    """summary.json: written last, so that a folder that has it is complete."""
-    run.write_text("summary.json", json.dumps(summary, indent=1) + "\n")
+def write_tables(workspace: Workspace, run: Run, summary: Mapping[str, Any]) -> None:
+    """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete.
+
+    Parameters
+    ----------
+    workspace : Workspace
+        Where to.
+    run : Run
+        What was found.
+    summary : mapping
+        Its summary.
+    """
+    for name, content in TABLES.items():
+        with workspace.output(name) as partial:
+            partial.write_bytes(content(run, summary))
+    if can_render():
+        workspace.write_text("report.html", report_html(summary, workspace.folder))
+    workspace.write_text("summary.json", json.dumps(summary, indent=1) + "\n")
 
 
 def unknown_formats(formats: Sequence[str]) -> list[str]:

@@ -110,7 +110,7 @@ def adjust(
                 run = _fit_and_write(run, options, workspace, progress)
         run = replace(run, stages=workspace.stages, out_dir=str(out_dir))
         summary = summarize(run)
-        write_tables(workspace, summary)
+        write_tables(workspace, run, summary)
         workspace.remove_stale()
     views = tuple(
         replace(view, sensor=sensor) for view, sensor in zip(run.views, run.after or run.before, strict=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from barpc.report.run import Run, summarize
+from barpc.report.run import Run
+from barpc.report.summary import summarize
 
 __all__ = ["Run", "summarize"]

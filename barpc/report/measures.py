@@ -172,16 +172,18 @@ def coverage(xy: Array, size: tuple[int, int], cells: int = 8) -> float:
     return len(np.unique(place[:, 0] * cells + place[:, 1])) / cells**2
 
 
-def shift_in_image(before: Corrected, covariance: Array, ground: Array) -> tuple[Array, Array]:
+def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array]:
     """How far a correction moves a ground point in the image, and the standard deviation of that.
 
     Parameters
     ----------
-    before : Corrected
+    model : Corrected
         P_BA.
     covariance : (q, q)
-        Of its unknowns: rotation (metres: angle x distance) and translation [m], then any drift, which is
-        zero in the middle row.
+        Of its unknowns: rotation (metres: angle x distance), translation [m], then any drift, which is zero
+        in the middle row.
+    unknowns : str
+        Which there are: "rotation", "translation", "rotation+translation".
     ground : (3,)
         A ground point near the middle of the image.
 
@@ -191,12 +193,13 @@ def shift_in_image(before: Corrected, covariance: Array, ground: Array) -> tuple
         col, row [px].
     """
     ecef = ecef_from_ground(ground)
-    image, _, by_rotation, by_translation = before.project_ecef(ecef)
-    distance = np.linalg.norm(ecef - before.correction.center)
-    jacobian = np.hstack([by_rotation / distance, by_translation])
-    part = covariance[:6, :6]
-    variance = np.einsum("ij,jk,ik->i", jacobian, part, jacobian)
-    return image - before.sensor.project(ground), np.sqrt(np.maximum(variance, 0.0))
+    image, _, by_rotation, by_translation = model.project_ecef(ecef)
+    distance = np.linalg.norm(ecef - model.correction.center)
+    parts = {"rotation": by_rotation / distance, "translation": by_translation}
+    jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
+    q = jacobian.shape[1]
+    variance = np.einsum("ij,jk,ik->i", jacobian, covariance[:q, :q], jacobian)
+    return image - model.sensor.project(ground), np.sqrt(np.maximum(variance, 0.0))
 
 
 def triangulate_tracks(

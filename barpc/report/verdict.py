@@ -1,0 +1,166 @@
+"""Verdicts in plain words: of each image, of the block, of what the images cannot tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from barpc.ba.gauge import Mode
+from barpc.geodesy import Array
+from barpc.report.run import Run
+
+GOOD_RMSE = 0.5
+"""A view whose tie points are left with more than this [px] is called doubtful."""
+FEW_OBSERVATIONS = 30
+"""A view with fewer is called weakly tied."""
+MANY_REJECTED = 0.3
+"""A view that lost a larger share of its observations is called doubtful."""
+
+STATUS_WORDS = {
+    "adjusted": "adjusted",
+    "consistent": "consistent",
+    "weak": "weakly tied",
+    "doubtful": "doubtful",
+    "failed": "not adjusted",
+}
+"""Status of a view -> what people read, from good to bad."""
+
+_MODE_WORDS = {
+    "east": "the whole scene may lie {0} farther east or west",
+    "north": "the whole scene may lie {0} farther north or south",
+    "up": "all heights may be {0} too high or too low",
+    "tilt east": "the scene may be tilted: {0} up or down at its eastern and western edges",
+    "tilt north": "the scene may be tilted: {0} up or down at its northern and southern edges",
+    "turn": "the scene may be turned about the vertical: {0} at its edge",
+    "scale": "the scene may be too large or too small: {0} at its edge",
+}
+
+View = Mapping[str, Any]
+
+
+def metres(value: float) -> str:
+    """A length with a unit that keeps it readable.
+
+    Examples
+    --------
+    >>> metres(3.14159), metres(0.0421), metres(0.00012)
+    ('3.1 m', '4.2 cm', '0.1 mm')
+    """
+    for factor, unit in ((1.0, "m"), (1e2, "cm"), (1e3, "mm")):
+        if abs(value) * factor >= 1.0:
+            return f"{value * factor:.1f} {unit}"
+    return f"{value * 1e3:.1f} mm"
+
+
+def mode_in_words(mode: Mode) -> str:
+    """One weak mode of the scene as a sentence without its full stop."""
+    return _MODE_WORDS[mode.meaning].format(metres(mode.sigma))
+
+
+def view_status(view: View, run: Run) -> dict[str, str]:
+    """The verdict on a view: a word of `STATUS_WORDS`, and what to do (empty when all is well)."""
+    for status, advice in (_failure(view, run), _weakness(view), _doubt(view, run)):
+        if advice:
+            return {"status": status, "advice": advice}
+    return {"status": "adjusted" if run.kind == "adjust" else "consistent", "advice": ""}
+
+
+def _failure(view: View, run: Run) -> tuple[str, str]:
+    tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
+    if run.adjustment is not None and view["name"] in run.adjustment.left_out:
+        return "failed", "not tied to the other images: its camera was left as it was"
+    if view["fit"] is not None and not max(view["fit"]["max_px"]) <= tolerance:
+        return (
+            "failed",
+            f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range",
+        )
+    return "failed", ""
+
+
+def _weakness(view: View) -> tuple[str, str]:
+    few = view["num_observations"]
+    return "weak", f"only {few} tie points: check overlap, clouds and dates" if few < FEW_OBSERVATIONS else ""
+
+
+def _doubt(view: View, run: Run) -> tuple[str, str]:
+    error = view["rmse_after"] if run.kind == "adjust" else view["rmse_before"]
+    if not error <= GOOD_RMSE:
+        if run.kind == "check":
+            return "doubtful", f"tie points disagree by {error:.2f} px: adjust the cameras"
+        return (
+            "doubtful",
+            f"tie points are left with {error:.2f} px: try --drift 1, or look for wrong matches",
+        )
+    lost = view["num_rejected"] / max(view["num_rejected"] + view["num_observations"], 1)
+    if lost > MANY_REJECTED:
+        return (
+            "doubtful",
+            f"{100 * lost:.0f} % of its tie points were rejected: look for clouds, water, change",
+        )
+    return "doubtful", ""
+
+
+def block_verdict(run: Run, views: Sequence[View]) -> dict[str, Any]:
+    """The verdict on the whole: `status` ("good", "look" or "bad"), a `headline`, and `lines`, sentences."""
+    bad = [view for view in views if view["status"] == "failed"]
+    look = [view for view in views if view["advice"] and view not in bad]
+    status = "bad" if bad or run.left_out else "look" if look else "good"
+    lines = _adjusted_lines(run, views) if run.kind == "adjust" else _checked_lines(views)
+    lines += [f"{view['name']}: {STATUS_WORDS[view['status']]}: {view['advice']}." for view in bad + look]
+    lines += [f"{path} was left out: {reason}" for path, reason in run.left_out]
+    return {
+        "status": status,
+        "headline": _headline(run, len(views), len(bad) + len(run.left_out), len(look)),
+        "lines": lines,
+    }
+
+
+def _headline(run: Run, num: int, bad: int, look: int) -> str:
+    all_well = (
+        "All {} images are adjusted." if run.kind == "adjust" else "The cameras of all {} images agree."
+    )
+    if not bad and not look:
+        return all_well.format(num)
+    parts = []
+    if bad:
+        word = "not adjusted" if run.kind == "adjust" else "not usable"
+        parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
+    if look:
+        parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
+    return f"{', '.join(parts)[0].upper()}{', '.join(parts)[1:]} (of {num + len(run.left_out)})."
+
+
+def _adjusted_lines(run: Run, views: Sequence[View]) -> list[str]:
+    assert run.adjustment is not None
+    before, after = (_median([view[f"rmse_{when}"] for view in views]) for when in ("before", "after"))
+    gauge = run.adjustment.gauge
+    lines = [
+        f"Tie points of {len(views)} images agree to {after:.3f} px (before: {before:.3f} px).",
+        f"The scene as a whole moved by {_enu(gauge.shift)}.",
+    ]
+    known = ", ".join(metres(s) for s in gauge.sigma)
+    if run.gcps is None:
+        lines.append(
+            f"Without ground control its place is known to {known} (east, north, up; one sigma) only."
+        )
+    else:
+        lines.append(
+            f"With {len(run.gcps.names)} GCPs its place is known to {known} (east, north, up; one sigma)."
+        )
+    return lines
+
+
+def _enu(shift: Array) -> str:
+    return ", ".join(f"{s:+.2f} m {word}" for s, word in zip(shift, ("east", "north", "up"), strict=True))
+
+
+def _checked_lines(views: Sequence[View]) -> list[str]:
+    rmse = _median([view["rmse_before"] for view in views])
+    return [f"Tie points of {len(views)} images agree to {rmse:.3f} px as the cameras are."]
+
+
+def _median(values: Sequence[float]) -> float:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.median(finite)) if finite else float("nan")
