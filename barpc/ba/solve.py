@@ -28,6 +28,9 @@ _LOG = logging.getLogger(__name__)
 SCIPY_UNKNOWNS = 600
 """Up to so many camera unknowns "auto" takes scipy, whose dense decomposition grows as their cube."""
 
+_ROUNDING = 1e-9
+"""A cost does not fall any more where the step promises less than this fraction."""
+
 
 @dataclass(frozen=True)
 class State:
@@ -185,6 +188,8 @@ def _levenberg_marquardt(
         if trial.cost <= state.cost * (1.0 + 1e-12):
             state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
             reduced, damping = trial, damping / 10.0 if damping > 1e-8 else 0.0
+        elif gain <= _ROUNDING * state.cost:
+            return Minimum(state, reduced)
         elif damping > 1e8:
             raise AdjustError(f"no step lowers the cost {state.cost:.6g}: the solution is not usable")
         else:

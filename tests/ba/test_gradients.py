@@ -99,11 +99,19 @@ def _point_priors():
     index = np.array([0, 2])
     none = np.zeros(0, dtype=int)
     gcps = GroundPoints(
-        ("a", "b"), ground_from_ecef(points[index]), [[0.2, 0.3, 0.5]] * 2, none, none, np.zeros((0, 2)), np.zeros(0)
+        ("a", "b"),
+        ground_from_ecef(points[index]),
+        [[0.2, 0.3, 0.5]] * 2,
+        none,
+        none,
+        np.zeros((0, 2)),
+        np.zeros(0),
     )
     return points, {
         "gcp": ground_control(gcps, index),
-        "terrain": terrain_heights(points, index, lambda lon, lat: 100.0 + 800.0 * (lon - 5.4) + 300.0 * (lat - 43), 3.0),
+        "terrain": terrain_heights(
+            points, index, lambda lon, lat: 100.0 + 800.0 * (lon - 5.4) + 300.0 * (lat - 43), 3.0
+        ),
         "flat": flat_heights(points, index, 210.0, 20.0),
     }
 

@@ -1,0 +1,227 @@
+"""Known corrections come back: with noise, outliers, fixed views, GCPs, a DEM, at the ends of the Earth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.scene import Tracks
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.geometry import triangulate
+from barpc.simulate import simulate_block
+from tests.ba.conftest import INDEPENDENT, centers_of, solve
+
+L2 = {"loss": "linear", "estimate_noise": False}
+
+
+def truth_sensors(block):
+    return [Corrected(v.sensor, c) for v, c in zip(block.views, block.truth.corrections, strict=True)]
+
+
+def test_without_noise_the_held_out_points_are_met_to_a_millionth_of_a_pixel():
+    exact = simulate_block(6, 500, seed=2, noise=0.0)
+    found = solve(exact, **L2, sigma_attitude=1e4, sigma_position=1e3)
+    assert exact.held_out_rms([v.sensor for v in exact.views]) > 1.0
+    assert exact.held_out_rms(list(found.sensors)) < 1e-5
+
+
+def test_an_adjusted_block_meets_held_out_points_to_a_fraction_of_the_noise(block, adjusted):
+    assert block.held_out_rms([v.sensor for v in block.views]) > 1.0
+    assert block.held_out_rms(list(adjusted.sensors)) < 0.1 * 0.1  # noise 0.1 px, thousands of points
+    assert adjusted.inlier.mean() > 0.995
+    assert adjusted.noise == pytest.approx(1.0, abs=0.03)
+
+
+def test_reported_residuals_are_those_of_the_corrected_sensors(block, adjusted):
+    for v, sensor in enumerate(adjusted.sensors):
+        rows = block.tracks.view == v
+        ground = ground_from_ecef(adjusted.points[block.tracks.point[rows]])
+        again = sensor.project(ground) - block.tracks.xy[rows]
+        np.testing.assert_allclose(adjusted.residuals[rows], again, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("model", ["rotation", "rotation+translation", "translation"])
+def test_both_solvers_reach_the_same_minimum(block, model):
+    first, second = (solve(block, **L2, model=model, solver=solver) for solver in ("scipy", "sparse"))
+    tight = solve(block, **L2, model=model, solver="sparse", tolerance=1e-14)
+    assert first.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
+    assert second.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
+    np.testing.assert_allclose(first.params, tight.params, atol=2e-3 * np.abs(tight.params).max())
+
+
+PLACES = [(5.4, 43.3), (5.0, 0.0), (0.0, 51.0), (90.0, 30.0), (180.0, 10.0), (30.0, 84.0)]
+
+
+def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies():
+    for lon, lat in PLACES:
+        there = simulate_block(10, 1500, seed=4, lon=lon, lat=lat)
+        costs = [
+            solve(there, **L2, solver="scipy").cost_history[-1],
+            solve(there, **L2, solver="sparse", tolerance=1e-14).cost_history[-1],
+        ]
+        assert costs[0] == pytest.approx(costs[1], rel=1e-6), (lon, lat)
+        freedom = 2 * len(there.tracks) - 3 * 1500
+        assert costs[0] == pytest.approx(freedom, rel=0.1), (lon, lat)
+
+
+@pytest.mark.slow
+def test_outliers_cost_little():
+    bounds = {0.10: 1.15, 0.25: 1.50, 0.40: 2.00}
+    rms = {part: [] for part in (0.0, *bounds)}
+    for seed in (1, 2, 3, 4, 5):
+        for part in rms:
+            dirty = simulate_block(10, 3000, seed=seed, outliers=part)
+            found = solve(dirty)
+            rms[part].append(dirty.held_out_rms(list(found.sensors)))
+            wrong = dirty.truth.outlier
+            assert not wrong.any() or found.inlier[wrong].mean() < 0.03
+    clean = np.sqrt(np.mean(np.square(rms[0.0])))
+    for part, bound in bounds.items():
+        assert np.sqrt(np.mean(np.square(rms[part]))) <= bound * clean, (part, rms)
+
+
+def test_a_fixed_view_keeps_its_camera_and_the_others_come_to_it(block):
+    fixed = block.views[4].name
+    found = solve(block, fixed=(fixed,))
+    assert not found.params[4].any()
+    assert block.held_out_rms(list(found.sensors)) < 0.02
+
+
+def test_drift_is_corrected_as_if_there_were_none():
+    ratio, price = [], []
+    for seed in (1, 2, 3):
+        still, drifting = (simulate_block(10, 3000, seed=seed, drift=d) for d in (0.0, 20e-6))
+        assert drifting.held_out_rms(list(solve(drifting).sensors)) > 1.0
+        with_drift = drifting.held_out_rms(list(solve(drifting, drift=1).sensors))
+        ratio.append(with_drift / still.held_out_rms(list(solve(still, drift=1).sensors)))
+        price.append(with_drift / still.held_out_rms(list(solve(still).sensors)))
+    assert np.mean(ratio) <= 1.1
+    assert np.mean(price) <= 1.4  # three more unknowns a view cost a quarter, drift or not
+
+
+@pytest.mark.parametrize(("model", "bound"), [("affine", 0.1), ("shift-drift", 1.0), ("shift", 2.0)])
+def test_image_models_correct_what_they_can(model, bound):
+    small = simulate_block(3, 1000, seed=6, size=(4000, 4000))
+    found = solve(small, model=model, sigma_shift=30.0)
+    assert small.held_out_rms(list(found.sensors)) < bound
+    assert small.held_out_rms([v.sensor for v in small.views]) > 3 * small.held_out_rms(list(found.sensors))
+
+
+def test_three_gcps_bring_the_scene_to_its_place():
+    errors, sigmas = [], []
+    for seed in range(6):
+        triplet = simulate_block(3, 600, seed=seed, num_gcps=3)
+        gcps = replace(triplet.gcps, sigma=np.full((3, 3), 0.2))
+        rng = np.random.default_rng(seed)
+        enu = enu_basis(gcps.lonlatalt)
+        moved = ecef_from_ground(gcps.lonlatalt) + np.einsum("gij,gi->gj", enu, rng.normal(0, 0.2, (3, 3)))
+        gcps = replace(gcps, lonlatalt=ground_from_ecef(moved))
+        found = adjust_tracks(
+            triplet.views, triplet.tracks, AdjustOptions(**INDEPENDENT), gcps, centers=centers_of(triplet)
+        )
+        check = triplet.truth.check
+        there = triangulate(list(found.sensors), check.view, check.point, check.xy)
+        offset = there.points - ecef_from_ground(triplet.truth.check_ground)
+        errors.append(np.abs(enu[0] @ offset.mean(axis=0)))
+        sigmas.append(found.gauge.sigma)
+        assert (found.gauge.sigma < [1.0, 1.0, 2.0]).all()
+    assert (np.array(errors) < 2 * np.array(sigmas)).mean() > 0.8
+    assert (np.array(errors) < 3.5 * np.array(sigmas)).all()
+
+
+def test_a_single_view_is_refined_by_gcps_alone():
+    one = simulate_block(1, 0, seed=3, num_gcps=12, num_checks=0)
+    found = adjust_tracks(
+        one.views, one.tracks, AdjustOptions(**INDEPENDENT), one.gcps, centers=centers_of(one)
+    )
+    truth = truth_sensors(one)[0]
+    image = np.random.default_rng(0).uniform(0, 19999, (50, 2))
+    ground = truth.localize(image, np.full(50, 300.0))
+    before = np.abs(one.views[0].sensor.project(ground) - image).max()
+    assert np.sqrt(((found.sensors[0].project(ground) - image) ** 2).mean()) < 0.2
+    assert before > 3.0
+    assert np.abs(found.gcp_residuals).max() < 0.5
+
+
+def test_a_dem_holds_the_height_of_the_scene():
+    block = simulate_block(3, 600, seed=8, alt_range=(200.0, 201.0))
+    options = AdjustOptions(**{**INDEPENDENT, "dem_for_all": True, "dem_sigma": 2.0})
+    free = solve(block)
+    held = adjust_tracks(
+        block.views,
+        block.tracks,
+        options,
+        dem=lambda lon, lat: np.full(len(lon), 200.5),
+        centers=centers_of(block),
+    )
+    truth = ecef_from_ground(block.truth.ground)
+    up = enu_basis(block.truth.ground)[0, 2]
+    error = [abs(((found.points - truth) @ up).mean()) for found in (free, held)]
+    assert error[1] < 0.2 < error[0]
+    assert held.gauge.sigma[2] < 0.5 < free.gauge.sigma[2]
+
+
+def test_tracks_under_a_small_angle_are_held_and_said_to_be():
+    block = simulate_block(3, 300, seed=8)
+    with pytest.warns(BarpcWarning, match="held in height"):
+        found = solve(block, min_convergence=90.0)
+    assert found.held.all()
+    assert np.isfinite(found.params).all()
+
+
+def test_groups_without_common_tie_points_are_named(block):
+    tracks = block.tracks
+    split = tracks.select((tracks.view < 5) == (tracks.view[np.searchsorted(tracks.point, tracks.point)] < 5))
+    with pytest.raises(DisconnectedError) as caught:
+        adjust_tracks(block.views, split, centers=centers_of(block))
+    assert sorted(len(group) for group in caught.value.groups) == [5, 5]
+    with pytest.warns(BarpcWarning, match="keep their cameras"):
+        options = AdjustOptions(keep_largest=True, min_convergence=0.01)
+        found = adjust_tracks(block.views, split, options, centers=centers_of(block))
+    assert len(found.left_out) == 5
+    left = [found.names.index(name) for name in found.left_out]
+    assert np.abs(found.params[left]).max() < 1e-9
+
+
+def test_a_view_with_too_few_points_is_named(block):
+    few = block.tracks.select(block.tracks.view != 3)
+    with pytest.raises(TiePointError, match=r"view_0003 \(0\)"):
+        adjust_tracks(block.views, few, centers=centers_of(block))
+
+
+def test_contradictions_are_refused(block):
+    tracks = block.tracks
+    twice = Tracks(
+        np.append(tracks.view, tracks.view[-1]), np.append(tracks.point, tracks.point[-1]),
+        np.vstack([tracks.xy, tracks.xy[-1:]]), np.append(tracks.sigma, 0.1),
+    )  # fmt: skip
+    with pytest.raises(InputError, match="twice"):
+        adjust_tracks(block.views, twice, centers=centers_of(block))
+    with pytest.raises(InputError, match="no view is named"):
+        adjust_tracks(block.views, tracks, AdjustOptions(fixed=("nobody",)), centers=centers_of(block))
+    with pytest.raises(InputError, match="not one of"):
+        AdjustOptions(model="magic")
+    with pytest.raises(InputError, match="needs a model with a rotation"):
+        AdjustOptions(model="shift", drift=1)
+
+
+def test_rows_of_tracks_may_come_in_any_order(block, adjusted):
+    tracks = block.tracks
+    order = np.random.default_rng(0).permutation(len(tracks))
+    mixed = Tracks(tracks.view[order], tracks.point[order], tracks.xy[order], tracks.sigma[order])
+    found = adjust_tracks(block.views, mixed, AdjustOptions(**INDEPENDENT), centers=centers_of(block))
+    np.testing.assert_allclose(found.params, adjusted.params, atol=1e-4)
+    np.testing.assert_allclose(found.residuals, adjusted.residuals[order], atol=1e-4)
+
+
+def test_centers_are_regressed_where_none_are_given(block, adjusted):
+    found = adjust_tracks(block.views, block.tracks, AdjustOptions(**INDEPENDENT))
+    for mine, theirs in zip(found.corrections, block.truth.corrections, strict=True):
+        assert isinstance(mine, Correction)
+        assert np.linalg.norm(mine.center - theirs.center) < 0.03 * 694e3
+    assert block.held_out_rms(list(found.sensors)) < 1.2 * block.held_out_rms(list(adjusted.sensors))

@@ -1,0 +1,149 @@
+"""What the adjustment says it does not know is what it does not know: Monte-Carlo against prediction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks, block_prior, pair_heights
+from barpc.ba.incremental import BlockPrior
+from barpc.errors import InputError
+from barpc.geodesy import ecef_from_ground, enu_basis
+from barpc.scene import Tracks
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.simulate import Block, simulate_block
+from tests.ba.conftest import centers_of, solve
+
+SIGMA_ATTITUDE, SIGMA_POSITION, NOISE = 4.0, 1.0, 0.1
+OPTIONS = AdjustOptions(
+    noise_floor=0.0,
+    sigma_attitude=SIGMA_ATTITUDE,
+    sigma_position=SIGMA_POSITION,
+    loss="linear",
+    estimate_noise=False,
+    min_convergence=0.01,
+)
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Errors of many adjustments of one block, each with corrections and noise of its own, by their sigmas."""
+
+    nees: np.ndarray
+    scene: np.ndarray
+    scene_sigma: np.ndarray
+    unknowns: int
+
+
+def run_trials(block: Block, count: int) -> Trials:
+    """Draw corrections from the prior and noise, adjust, compare."""
+    rng = np.random.default_rng(5)
+    centers = centers_of(block)
+    tracks, n = block.tracks, len(block.views)
+    truth = ecef_from_ground(block.truth.ground)
+    enu = enu_basis(block.truth.ground[0])
+    first = adjust_tracks(block.views, tracks, OPTIONS, centers=centers)
+    distance = first.cameras.unknowns.distance
+    nees, scene = [], []
+    for _ in range(count):
+        params = rng.normal(0, np.repeat([SIGMA_ATTITUDE, SIGMA_POSITION], 3), (n, 6))
+        xy = np.empty_like(tracks.xy)
+        for v, view in enumerate(block.views):
+            rows = tracks.view == v
+            correction = Correction(params[v, :3] / distance[v], params[v, 3:], centers[v])
+            xy[rows] = Corrected(view.sensor, correction).project(block.truth.ground[tracks.point[rows]])
+        xy += rng.normal(0, NOISE, xy.shape)
+        noisy = Tracks(tracks.view, tracks.point, xy, tracks.sigma)
+        found = adjust_tracks(block.views, noisy, OPTIONS, centers=centers)
+        error = (found.params - params).ravel()
+        nees.append(error @ (found.covariance.reduced.matrix @ error))
+        scene.append(enu @ (found.points - truth).mean(axis=0))
+    return Trials(np.array(nees), np.array(scene), first.gauge.sigma, 6 * n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("views", "tracks"), [(3, 150), (10, 300)])
+def test_errors_of_the_corrections_are_as_large_as_predicted(views, tracks):
+    trials = run_trials(simulate_block(views, tracks, seed=1, noise=NOISE), 1000)
+    assert trials.nees.mean() / trials.unknowns == pytest.approx(1.0, abs=0.05)
+    ratio = trials.scene.std(axis=0) / trials.scene_sigma
+    np.testing.assert_allclose(ratio, 1.0, atol=0.1)
+    # chi-square: half of the trials below its median
+    assert np.mean(trials.nees < trials.unknowns - 2 / 3) == pytest.approx(0.5, abs=0.06)
+
+
+def test_a_hundred_trials_agree_with_the_prediction():
+    trials = run_trials(simulate_block(3, 100, seed=2, noise=NOISE), 100)
+    spread = np.sqrt(2 / (trials.unknowns * 100))
+    assert trials.nees.mean() / trials.unknowns == pytest.approx(1.0, abs=4 * spread)
+
+
+def test_points_and_relative_heights_err_as_predicted():
+    block = simulate_block(3, 200, seed=9, noise=NOISE)
+    found = solve(block, loss="linear", estimate_noise=False)
+    index = np.arange(0, 200, 10)
+    covariance = found.covariance.points(index)
+    error = (found.points - ecef_from_ground(block.truth.ground))[index]
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
+    assert np.median(nees) < 12.0
+    up = enu_basis(block.truth.ground[0])[2]
+    heights = pair_heights(found, 0, 1)
+    assert heights.count > 50
+    assert heights.relative < 0.2 * heights.absolute
+    assert heights.absolute == pytest.approx(np.sqrt(up @ covariance.mean(axis=0) @ up), rel=0.3)
+    assert pair_heights(found, 1, 0).relative == pytest.approx(heights.relative, rel=1e-9)
+
+
+def test_covariance_of_single_views_is_the_whole_matrix_cut_up(adjusted):
+    view = adjusted.covariance.view(3)
+    full = adjusted.covariance.full
+    np.testing.assert_allclose(view, full[18:24, 18:24], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(adjusted.covariance.joint(np.array([3])), view, rtol=1e-6, atol=1e-9)
+    product = full @ adjusted.covariance.reduced.matrix
+    np.testing.assert_allclose(product, np.eye(len(full)), atol=1e-5)
+
+
+def test_the_gauge_report_names_the_height_as_the_weakest_mode(adjusted):
+    assert adjusted.gauge.modes[0].meaning == "up"
+    assert adjusted.gauge.modes[0].sigma > adjusted.gauge.modes[-1].sigma
+    assert (adjusted.gauge.sigma > 0).all()
+    assert (np.abs(adjusted.scene_shift) < 5 * np.linalg.norm(adjusted.gauge.sigma)).all()
+
+
+def _divided(block: Block, old: int) -> tuple[Tracks, Tracks, np.ndarray]:
+    """Tracks among the first views, the others, and how old tracks are counted in the whole."""
+    tracks = block.tracks
+    last = np.zeros(tracks.num_points, dtype=int)
+    np.maximum.at(last, tracks.point, tracks.view)
+    is_old = last[tracks.point] < old
+    return tracks.select(is_old), tracks.select(~is_old), is_old
+
+
+def test_views_added_to_an_adjusted_block_end_where_the_joint_adjustment_puts_them(tmp_path):
+    block = simulate_block(12, 2500, seed=3)
+    old, new, _ = _divided(block, 9)
+    centers = centers_of(block)
+    first = adjust_tracks(block.views[:9], old, OPTIONS, centers=centers[:9])
+    block_prior(first).save(tmp_path / "prior.npz")
+    prior = BlockPrior.load(tmp_path / "prior.npz")
+    second = adjust_tracks(block.views, new, OPTIONS, centers=centers, prior=prior)
+    joint = adjust_tracks(block.views, block.tracks, OPTIONS, centers=centers)
+    sigma = np.sqrt(np.diag(joint.covariance.full)).reshape(joint.params.shape)
+    assert (np.abs(second.params - joint.params) / sigma).max() < 0.01
+    again = np.sqrt(np.diag(second.covariance.full)).reshape(joint.params.shape)
+    np.testing.assert_allclose(again, sigma, rtol=0.01)
+    assert (np.abs(first.params - joint.params[:9]) / sigma[:9]).max() > 0.02  # the old views did move
+
+
+def test_a_prior_of_other_unknowns_or_views_is_refused(tmp_path, block, adjusted):
+    prior = block_prior(adjusted)
+    with pytest.raises(InputError, match="use the same"):
+        adjust_tracks(block.views, block.tracks, AdjustOptions(model="rotation"), prior=prior)
+    fewer = block.tracks.select(block.tracks.view < 9)
+    with pytest.raises(InputError, match="missing"):
+        adjust_tracks(block.views[:9], fewer, AdjustOptions(), prior=prior)
+    (tmp_path / "bad.npz").write_bytes(b"not a prior")
+    with pytest.raises(InputError, match=r"bad\.npz"):
+        BlockPrior.load(tmp_path / "bad.npz")
