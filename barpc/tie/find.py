@@ -69,17 +69,16 @@ def detect(
         One a view; none in an image in which nothing varies.
     """
     stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
-    tasks = [
-        (view, box, stretch, options)
-        for view, stretch in zip(views, stretches, strict=True)
-        if stretch is not None
-        for box in tiles(view.size, options)
-    ]
+    owners, tasks = [], []
+    for owner, (view, stretch) in enumerate(zip(views, stretches, strict=True)):
+        boxes = tiles(view.size, options) if stretch is not None else []
+        owners += [owner] * len(boxes)
+        tasks += [(view, box, stretch, options) for box in boxes]
     found = ordered(executor, detect_tile, tasks, "detect", progress)
-    parts: dict[str, list[Keypoints]] = {view.name: [] for view in views}
-    for (view, *_), part in zip(tasks, found, strict=True):
-        parts[view.name].append(part)
-    return [bounded(join(parts[view.name]), options) for view in views]
+    parts: list[list[Keypoints]] = [[] for _ in views]
+    for owner, part in zip(owners, found, strict=True):
+        parts[owner].append(part)
+    return [bounded(join(part), options) for part in parts]
 
 
 def match(

@@ -1,0 +1,104 @@
+"""Real and rendered images for the tests of the tie points."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.raster import open_raster
+from barpc.rpcio import read_rpc
+from barpc.scene import View
+from barpc.sensor.geometry import altitude_range
+from barpc.sensor.rpc import RPC
+from barpc.simulate import ImageOptions, Scene
+from barpc.tie import TieResult, find_tracks
+
+
+def write_image(path: Path, data: np.ndarray, **profile: object) -> Path:
+    """Write (H, W) or (bands, H, W) as a GeoTIFF without georeference."""
+    bands = data if data.ndim == 3 else data[None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        with rasterio.open(
+            path, "w", driver="GTiff", width=bands.shape[2], height=bands.shape[1], count=len(bands),
+            dtype=bands.dtype, **profile,
+        ) as out:  # fmt: skip
+            out.write(bands)
+    return path
+
+
+def view_of(path: Path, rpc: RPC) -> View:
+    with open_raster(path) as dataset:
+        size = (dataset.width, dataset.height)
+    return View(path.stem, str(path), size, rpc, altitude_range(rpc))
+
+
+@pytest.fixture(scope="session")
+def triplet(shared_data: Path) -> list[View]:
+    folder = shared_data / "optical/phr_triplet_north"
+    return [view_of(path, read_rpc(path)) for path in sorted(folder.glob("*.tif"))]
+
+
+@pytest.fixture(scope="session")
+def ventoux(shared_data: Path) -> list[View]:
+    folder = shared_data / "optical/phr_ventoux"
+    views = []
+    for name in ("left_image", "right_image"):
+        with open_raster(folder / f"{name}.tif") as dataset:
+            corner = dataset.transform.c, dataset.transform.f
+        views.append(view_of(folder / f"{name}.tif", read_rpc(folder / f"{name}.geom").crop(*corner)))
+    return views
+
+
+@pytest.fixture(scope="session")
+def triplet_ties(triplet: list[View]) -> TieResult:
+    return find_tracks(triplet)
+
+
+@pytest.fixture(scope="session")
+def ventoux_ties(ventoux: list[View]) -> TieResult:
+    return find_tracks(ventoux)
+
+
+class Rendered:
+    """A rendered scene on disk, and the true place of its tie points."""
+
+    def __init__(self, folder: Path, options: ImageOptions) -> None:
+        self.scene = Scene(options)
+        self.views, self.altitude = [], []
+        for index, shot in enumerate(self.scene.shots):
+            picture = self.scene.picture(index)
+            path = write_image(folder / f"{shot.name}.tif", picture.numbers)
+            self.views.append(View(shot.name, str(path), options.size, shot.delivered, self.scene.alt_range))
+            self.altitude.append(picture.altitude.astype(np.float64))
+
+    def errors(self, first: int, second: int, xy_first: np.ndarray, xy_second: np.ndarray) -> np.ndarray:
+        """True place in the second view minus the measured one (M, 2) [px], where the truth is known."""
+        corner = np.minimum(np.floor(xy_first).astype(int), np.subtract(self.scene.options.size, 2))
+        x, y = (xy_first - corner).T
+        alt, (col, row) = self.altitude[first], corner.T
+        upper = alt[row, col] * (1 - x) + alt[row, col + 1] * x
+        lower = alt[row + 1, col] * (1 - x) + alt[row + 1, col + 1] * x
+        ground = self.scene.shots[first].exact.localize(xy_first, upper * (1 - y) + lower * y)
+        errors = self.scene.shots[second].exact.project(ground) - xy_second
+        return errors[np.isfinite(errors).all(axis=1)]
+
+
+@pytest.fixture(scope="session")
+def render(tmp_path_factory) -> Callable[..., Rendered]:
+    """Render a scene: `render(views=2, clouds=0.5)`; the same options are rendered once."""
+    made: dict[tuple[tuple[str, object], ...], Rendered] = {}
+
+    def make(**options: object) -> Rendered:
+        key = tuple(sorted(options.items()))
+        if key not in made:
+            chosen = ImageOptions(**{"size": (600, 600), "seed": 1, **options})  # type: ignore[arg-type]
+            made[key] = Rendered(tmp_path_factory.mktemp("rendered"), chosen)
+        return made[key]
+
+    return make

@@ -1,0 +1,89 @@
+"""Keypoints: tiles join without a seam, cells hold their quota, empty images hold none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from barpc.scene import View
+from barpc.tie import TieOptions, detect
+from barpc.tie.features import quota, tiles
+
+from .conftest import write_image
+
+
+@pytest.fixture(scope="module")
+def texture() -> np.ndarray:
+    noise = np.random.default_rng(5).uniform(100, 3000, (400, 500)).astype(np.float32)
+    return cv2.GaussianBlur(noise, (0, 0), 2.0).astype(np.uint16)
+
+
+def view(path, size=(500, 400)) -> View:
+    return View("a", str(path), size, None, (0.0, 1.0))  # type: ignore[arg-type]
+
+
+def test_tiles_cover_the_image_once_and_are_cut_at_whole_cells() -> None:
+    options = TieOptions(tile=256, cell=64)
+    count = np.zeros((700, 1000), int)
+    for col, row, width, height in tiles((1000, 700), options):
+        count[row : row + height, col : col + width] += 1
+        assert col % 64 == 0
+        assert row % 64 == 0
+        assert max(width, height) <= 256
+    assert (count == 1).all()
+
+
+def test_an_image_read_in_tiles_has_the_keypoints_of_the_image_read_at_once(tmp_path, texture) -> None:
+    path = write_image(tmp_path / "a.tif", texture)
+    whole = detect([view(path)], TieOptions(keypoints_per_cell=1000))[0]
+    tiled = detect([view(path)], TieOptions(keypoints_per_cell=1000, tile=192))[0]
+    small = whole.scale < 12  # larger neighbourhoods reach beyond the margin
+    seen = {tuple(p) for p in np.round(tiled.xy, 1)}
+    share = np.mean([tuple(p) in seen for p in np.round(whole.xy[small], 1)])
+    assert len(whole) > 1000
+    assert share > 0.97
+
+
+def test_no_cell_holds_more_than_its_quota_and_the_strongest_stay(tmp_path, texture) -> None:
+    path = write_image(tmp_path / "a.tif", texture)
+    found = detect([view(path)], TieOptions(keypoints_per_cell=5))[0]
+    cells = np.floor((found.xy + 0.5) / 64).astype(int)
+    assert np.unique(cells, axis=0, return_counts=True)[1].max() == 5
+    response = np.arange(10.0)
+    assert quota(np.zeros((10, 2)), response, 64, 3).tolist() == [7, 8, 9]
+
+
+def test_the_bound_on_an_image_thins_all_cells_alike(tmp_path, texture) -> None:
+    path = write_image(tmp_path / "a.tif", texture)
+    found = detect([view(path)], TieOptions(keypoints_per_image=300))[0]
+    assert 150 <= len(found) <= 300
+    counts = np.unique(np.floor((found.xy + 0.5) / 64).astype(int), axis=0, return_counts=True)[1]
+    assert counts.max() <= 8
+
+
+def test_keypoints_stay_away_from_nodata(tmp_path, texture) -> None:
+    holed = texture.copy()
+    holed[150:250, 200:300] = 9
+    path = write_image(tmp_path / "a.tif", holed, nodata=9)
+    xy = detect([view(path)])[0].xy
+    inside = (np.abs(xy - [249.5, 199.5]) < 52.5).all(axis=1)
+    assert len(xy) > 500
+    assert not inside.any()
+
+
+@pytest.mark.parametrize("data", [np.zeros((400, 500), np.uint16), np.full((400, 500), np.nan, np.float32)])
+def test_an_image_without_content_has_no_keypoints(tmp_path, data: np.ndarray) -> None:
+    found = detect([view(write_image(tmp_path / "a.tif", data))])[0]
+    assert len(found) == 0
+    assert found.descriptors.shape == (0, 128)
+
+
+def test_views_of_one_name_keep_their_own_keypoints(tmp_path, texture) -> None:
+    one = view(write_image(tmp_path / "a.tif", texture))
+    other = replace(one, path=str(write_image(tmp_path / "b.tif", np.flipud(texture).copy())))
+    alone = [detect([v])[0] for v in (one, other)]
+    for found, expected in zip(detect([one, other]), alone, strict=True):
+        np.testing.assert_array_equal(found.xy, expected.xy)

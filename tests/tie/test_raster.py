@@ -1,0 +1,72 @@
+"""Reading windows: what counts as a valid pixel, and how numbers become an 8-bit picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc.errors import ImageError
+from barpc.tie.raster import grow, read_pixels, sample_stretch
+
+from .conftest import write_image
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "float32", "float64"])
+def test_every_real_type_is_read_and_stretched_over_the_whole_range(tmp_path, dtype: str) -> None:
+    data = RNG.integers(10, 120, (300, 200)).astype(dtype)
+    path = write_image(tmp_path / "a.tif", data)
+    pixels, valid = read_pixels(path, (5, 7, 50, 60))
+    assert valid.all()
+    np.testing.assert_array_equal(pixels, data[7:67, 5:55])
+    stretch = sample_stretch(path)
+    assert stretch is not None
+    picture = stretch.apply(pixels, valid)
+    assert picture.min() < 15
+    assert picture.max() > 240
+
+
+def test_complex_pixels_are_refused_with_advice(tmp_path) -> None:
+    path = write_image(tmp_path / "slc.tif", np.ones((64, 64), np.complex64))
+    with pytest.raises(ImageError, match=r"slc\.tif: band 1 is complex; give its amplitude"):
+        sample_stretch(path)
+
+
+def test_a_band_that_does_not_exist_is_refused(tmp_path) -> None:
+    path = write_image(tmp_path / "a.tif", np.ones((2, 64, 64), np.uint8))
+    with pytest.raises(ImageError, match="no band 3, only 2"):
+        read_pixels(path, (0, 0, 8, 8), band=3)
+
+
+def test_the_band_that_is_asked_for_is_read(tmp_path) -> None:
+    data = RNG.integers(1, 200, (3, 40, 40)).astype(np.uint8)
+    path = write_image(tmp_path / "a.tif", data)
+    np.testing.assert_array_equal(read_pixels(path, (0, 0, 40, 40), band=2)[0], data[1])
+
+
+def test_nodata_nan_saturated_and_zero_borders_are_invalid_but_a_lone_zero_is_not(tmp_path) -> None:
+    data = RNG.uniform(1, 100, (60, 60)).astype(np.float32)
+    data[0, 0], data[1, 1], data[2, 2] = np.nan, np.inf, -9999
+    _, valid = read_pixels(write_image(tmp_path / "float.tif", data, nodata=-9999), (0, 0, 60, 60))
+    assert np.flatnonzero(~valid).tolist() == [0, 61, 122]
+    whole = RNG.integers(1, 60000, (60, 60)).astype(np.uint16)
+    whole[:10], whole[30, 30], whole[40, 40] = 0, 0, 65535
+    _, valid = read_pixels(write_image(tmp_path / "whole.tif", whole), (0, 0, 60, 60))
+    assert not valid[:10].any()
+    assert valid[30, 30]
+    assert not valid[40, 40]
+    assert (~valid).sum() == 601
+
+
+@pytest.mark.parametrize("value", [0, 7, 65535])
+def test_a_constant_image_has_no_stretch(tmp_path, value: int) -> None:
+    assert sample_stretch(write_image(tmp_path / "a.tif", np.full((90, 90), value, np.uint16))) is None
+
+
+def test_an_image_of_one_pixel_has_no_stretch(tmp_path) -> None:
+    assert sample_stretch(write_image(tmp_path / "a.tif", np.ones((1, 1), np.uint8))) is None
+
+
+def test_a_box_grows_up_to_the_border_of_the_image() -> None:
+    assert grow((0, 10, 20, 20), 5, (100, 32)) == (0, 5, 25, 27)
