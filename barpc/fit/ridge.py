@@ -19,6 +19,7 @@ from barpc.sensor.rpc import MONOMIALS
 _DEGREE = np.array([0, *(len(monomial) for monomial in MONOMIALS[1:])])
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
 _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
+_SIGMA_STEPS = 2
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -40,10 +41,20 @@ def penalized(system: Compressed, penalty: Array) -> Compressed:
     return system.stacked(rows)
 
 
-def noise_scaled(system: Compressed, expected: Array) -> Compressed:
-    """The system with each unknown penalised by sigma / its expected size; never quite singular."""
+def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float]:
+    """The system with each unknown penalised by sigma / its expected size, and sigma.
+
+    The free solution lets noisy denominators shrink, and the residual with them; the residual of the
+    penalised one tells the noise better. Never quite singular: there is a floor at the rounding.
+    """
     floor = 16 * _EPS * float(np.abs(system.matrix).max())
-    return penalized(system, np.where(np.isfinite(expected), np.maximum(system.sigma / expected, floor), 0.0))
+    dof = max(system.num_points - len(expected), 1)
+    sigma = system.sigma
+    for _ in range(_SIGMA_STEPS):
+        penalty = np.where(np.isfinite(expected), np.maximum(sigma / expected, floor), 0.0)
+        penalised = penalized(system, penalty)
+        sigma = float(np.sqrt(system.squares(solution(penalised)) / dof))
+    return penalised, sigma
 
 
 def solution(system: Compressed, quantize: Callable[[Array], Array] | None = None) -> Array:

@@ -167,12 +167,12 @@ def _ridge(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solutio
         denominator = None
         for last in [False] * options.weighted + [True]:
             raw = problem.compressed(axis, denominator)
-            system = noise_scaled(raw, expected)
+            system, sigma = noise_scaled(raw, expected)
             x = solution(system, quantize if last else None)
             coeffs[own] = problem.expanded(x)
             denominator = coeffs[2 * axis + 1]
         solved.append(system)
-        h[axis] = raw.sigma / options.tau
+        h[axis] = sigma / options.tau
     return _assembled(problem, coeffs, solved, h, 1 + options.weighted, "ridge")
 
 
@@ -198,7 +198,7 @@ def _vendor_denominators(problem: Problem, options: FitOptions, vendor: RPC | No
         if quantize is not None:
             denominator = quantize(denominator)
         raw = problem.compressed(axis, denominator, free=False)
-        system = noise_scaled(raw, expected_size(problem.active, options.tau)[: len(raw.matrix)])
+        system, _ = noise_scaled(raw, expected_size(problem.active, options.tau)[: len(raw.matrix)])
         x = solution(system, quantize)
         coeffs[2 * axis : 2 * axis + 2] = problem.expanded(x, denominator)
         solved.append(system)

@@ -1,0 +1,116 @@
+"""`barpc fit` on the command line: what it writes, prints and returns."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.cli import main
+from barpc.rpcio import read_rpc, write_rpc
+from tests.fit.cameras import Camera, random_points, synthetic
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    return synthetic()
+
+
+def run(*args: object) -> int:
+    """Exit code of the command."""
+    with pytest.raises(SystemExit) as stop:
+        main([str(arg) for arg in args])
+    return int(stop.value.code or 0)
+
+
+def table(path: Path, camera: Camera, noise: float = 0.0) -> Path:
+    rng = np.random.default_rng(0)
+    ground, image = random_points(camera, 400, rng)
+    np.savez(path, ground=ground, image=image + rng.normal(0, 1, image.shape) * noise)
+    return path
+
+
+def test_points_become_an_rpc_file_that_reads_back(
+    camera: Camera, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "points_RPC.TXT"
+    assert run("fit", table(tmp_path / "p.npz", camera), "-o", out, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["verdict"] == ""
+    assert report["output"] == str(out)
+    assert max(report["max_ckp"]) <= 1e-5
+    ground, image = random_points(camera, 500, np.random.default_rng(1))
+    assert np.abs(read_rpc(out).project(ground) - image).max() <= 1e-5
+    assert np.abs(camera.rpc.project(ground) - image).max() >= 1.0
+    assert run("fit", tmp_path / "p.npz", "-o", out) == 1
+    assert "exists already" in capsys.readouterr().err
+    assert run("fit", tmp_path / "p.npz", "-o", out, "--overwrite") == 0
+
+
+def test_a_miss_exits_3_and_writes_nothing_unless_forced(
+    camera: Camera, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noisy, out = table(tmp_path / "p.npz", camera, noise=0.3), tmp_path / "points_RPC.TXT"
+    assert run("fit", noisy, "-o", out) == 3
+    assert not out.exists()
+    assert "nothing written" in capsys.readouterr().err
+    assert run("fit", noisy, "-o", out, "--force") == 3
+    assert out.exists()
+    assert run("fit", noisy, "-o", out, "--overwrite", "--tolerance", "2") == 0
+
+
+def test_an_rpc_file_is_refitted_over_another_altitude_range(
+    camera: Camera, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_rpc(camera.rpc, tmp_path / "a_RPC.TXT")
+    assert run("fit", tmp_path / "a_RPC.TXT", "-o", tmp_path / "b.RPB") == 1
+    assert "--size" in capsys.readouterr().err
+    size = ("--size", 20000, 19000)
+    assert run("fit", tmp_path / "a_RPC.TXT", *size, "--alt-range", 200, 2200, "-o", tmp_path / "b.RPB") == 0
+    assert "within tolerance" in capsys.readouterr().out
+    refitted = read_rpc(tmp_path / "b.RPB")
+    assert [refitted.ground_offset[2], refitted.ground_scale[2]] == [1200.0, 1000.0]
+    ground, _ = random_points(camera, 500, np.random.default_rng(1))
+    assert np.abs(refitted.project(ground) - camera.rpc.project(ground)).max() <= 1e-7
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("lon,lat,alt,col,row\n5,43,1,2\n", "line 2"),
+        ("lon,lat,alt,col,row\n5,43,1,2,3\n", "determine no image"),
+        ("nothing at all", "no RPC format recognised"),
+    ],
+)
+def test_a_source_that_cannot_be_fitted_is_one_line_and_exit_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str, message: str
+) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text(content)
+    assert run("fit", path) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_real_sources(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = shared_data / "optical" / "phr_triplet_north" / "img_01.tif"
+    assert run("fit", image, "-o", tmp_path / "img.vrt", "--space", "ground", "--nodes", "uniform") == 0
+    assert run("fit", shared_data / "physical" / "GRID_P1BP--2017092838284574CP.tif") == 0
+    radar = sorted((shared_data / "sar").glob("s1a-iw1-slc-vv-20210216*.xml"))[0]
+    assert run("fit", radar, "-o", tmp_path / "iw1_RPC.TXT", "--method", "lcurve") == 0
+    capsys.readouterr()
+    assert run("fit", image, "--alt-range", 100, 400, "--for-format", "nitf", "--json") == 0
+    assert max(json.loads(capsys.readouterr().out)["max_ckp"]) <= 1e-3
+
+
+def test_the_altitudes_may_come_from_a_dem(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dem = ("--dem", shared_data / "dem" / "N44E005.hgt", "--geoid", shared_data / "dem" / "egm96_15.gtx")
+    image = shared_data / "optical" / "phr_ventoux" / "left_image.tif"
+    assert run("fit", image, *dem, "--dem-margin", 200, "-o", tmp_path / "left_RPC.TXT") == 0
+    rpc = read_rpc(tmp_path / "left_RPC.TXT")
+    low, high = rpc.ground_offset[2] - rpc.ground_scale[2], rpc.ground_offset[2] + rpc.ground_scale[2]
+    assert 200.0 < low < 400.0
+    assert 700.0 < high < 1100.0

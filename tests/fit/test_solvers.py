@@ -1,0 +1,105 @@
+"""The pieces of the solvers against their definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc.fit import Normalization
+from barpc.fit.lcurve import corner
+from barpc.fit.precision import PRECISIONS
+from barpc.fit.ridge import expected_size, noise_scaled, penalized, solution
+from barpc.fit.system import ALL, Problem
+from barpc.geodesy import Array
+from tests.fit.cameras import Camera, random_points
+
+
+@pytest.fixture(scope="module")
+def problem(camera: Camera) -> Problem:
+    rng = np.random.default_rng(1)
+    ground, image = random_points(camera, 1300, rng)
+    rpc = camera.rpc
+    norm = Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+    return Problem(ground, image + rng.normal(0, 0.3, image.shape), norm)
+
+
+def dense(problem: Problem, axis: int, denominator: Array | None = None) -> Array:
+    """The whole system (M | y) at once."""
+    return np.concatenate([rows for _, rows in problem.rows(axis, denominator)])
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_compressed_system_is_the_system(camera: Camera, problem: Problem, axis: int) -> None:
+    whole = dense(problem, axis, camera.rpc.coeffs[2 * axis + 1])
+    system = problem.compressed(axis, camera.rpc.coeffs[2 * axis + 1])
+    assert system.triangle.T @ system.triangle == pytest.approx(whole.T @ whole, abs=1e-9)
+    x = np.linspace(-1, 1, 39)
+    assert system.squares(x) == pytest.approx(((whole[:, :-1] @ x - whole[:, -1]) ** 2).sum())
+    free = np.linalg.lstsq(whole[:, :-1], whole[:, -1], rcond=None)
+    assert system.sigma == pytest.approx(np.sqrt(free[1][0] / (1300 - 39)))
+
+
+def test_rows_are_the_papers_equation(camera: Camera, problem: Problem) -> None:
+    """w (m(x), -y m'(x)) (a, b') = w y holds for the coefficients of the RPC that made the points."""
+    exact = Problem(problem.ground, camera.rpc.project(problem.ground), problem.norm)
+    for axis in (0, 1):
+        numerator, denominator = camera.rpc.coeffs[2 * axis : 2 * axis + 2]
+        for weight in (None, denominator):
+            rows = dense(exact, axis, weight)
+            assert rows[:, :-1] @ np.r_[numerator, denominator[1:]] == pytest.approx(rows[:, -1], abs=1e-12)
+
+
+def test_the_penalised_solution_is_that_of_the_normal_equations(problem: Problem) -> None:
+    whole = dense(problem, 0)
+    penalty = np.r_[np.zeros(4), np.linspace(0.1, 3, 35)]
+    matrix = whole[:, :-1]
+    expected = np.linalg.solve(matrix.T @ matrix + np.diag(penalty**2), matrix.T @ whole[:, -1])
+    assert solution(penalized(problem.compressed(0), penalty)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_penalty_follows_the_noise(camera: Camera, problem: Problem) -> None:
+    system = problem.compressed(0, camera.rpc.coeffs[1])
+    expected = expected_size(ALL, 0.003)
+    assert expected[:4].tolist() == [np.inf] * 4
+    added, sigma = noise_scaled(system, expected)
+    assert sigma * 10100 == pytest.approx(0.3, rel=0.05)
+    more = added.triangle.T @ added.triangle - system.triangle.T @ system.triangle
+    assert np.sqrt(np.diag(more)[20:23]) == pytest.approx(sigma / 0.003, rel=0.05)
+
+
+def test_the_corner_of_the_l_curve_has_the_largest_curvature(problem: Problem) -> None:
+    """Against the curvature of the sampled curve (log |M x - y|, log |x|)."""
+    system = problem.compressed(0)
+    h = corner([system])
+    grid = h * np.exp(np.linspace(-0.4, 0.4, 401))
+    curve = []
+    for value in grid:
+        x = np.linalg.lstsq(
+            np.vstack([system.matrix, value * np.eye(39)]), np.r_[system.target, np.zeros(39)], rcond=None
+        )[0]
+        curve.append([0.5 * np.log(system.squares(x)), np.log(np.linalg.norm(x))])
+    rho, eta = np.gradient(np.array(curve), np.log(grid), axis=0).T
+    rho2, eta2 = np.gradient(rho, np.log(grid)), np.gradient(eta, np.log(grid))
+    curvature = (rho * eta2 - rho2 * eta) / (rho**2 + eta**2) ** 1.5
+    assert abs(np.log(grid[5 + np.argmax(curvature[5:-5])] / h)) <= 0.02
+
+
+def test_coefficients_rounded_in_turn_make_up_for_each_other(problem: Problem) -> None:
+    system, _ = noise_scaled(problem.compressed(0), expected_size(ALL, 0.003))
+    exact = solution(system)
+    coarse = lambda x: np.round(x, 4)  # noqa: E731
+    together, in_turn = coarse(exact), solution(system, coarse)
+    assert np.array_equal(coarse(in_turn), in_turn)
+    least = system.squares(exact)
+    assert system.squares(in_turn) - least < 0.8 * (system.squares(together) - least)
+
+
+def test_seven_digits_and_one_of_exponent_are_what_nitf_prints() -> None:
+    value = np.array([1.23456789, -0.0123456789, 3.4567891e-9, 4e-14, 0.0, 9.9999999e-5])
+    rounded = PRECISIONS["nitf"].coeffs(value)
+    assert rounded == pytest.approx([1.234568, -1.234568e-2, 3.456789e-9, 0.0, 0.0, 1e-4], rel=1e-12)
+    norm = Normalization([5.43217, 43.26789, 123.4], [0.12341, -0.09, 400.2], [511.5, 279.5], [512.0, 280.1])
+    held = PRECISIONS["nitf"].normalization(norm)
+    assert held.ground_offset.tolist() == [5.4322, 43.2679, 123.0]
+    assert held.ground_scale.tolist() == [0.1235, -0.09, 401.0]
+    assert held.image_scale.tolist() == [512.0, 281.0]

@@ -1,0 +1,104 @@
+"""Files of correspondences: what is read, and what is refused with the reason."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.errors import InputError
+from barpc.pointio.tables import correspondence_kind, read_correspondences
+
+ROWS = np.array([[5.4, 43.2, 100.0, 10.5, 20.25], [5.5, 43.3, 120.5, 11.0, 21.0]])
+
+
+def check(path: Path) -> None:
+    points = read_correspondences(path)
+    assert np.array_equal(points.ground, ROWS[:, :3])
+    assert np.array_equal(points.image, ROWS[:, 3:])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "lon,lat,alt,col,row\n5.4,43.2,100,10.5,20.25\n5.5,43.3,120.5,11,21\n",
+        "# points\nROW;COL;Latitude;Longitude;Height [m]\n20.25;10.5;43.2;5.4;100\n21;11;43.3;5.5;120.5\n",
+        "5.4 43.2 100 10.5 20.25\n\n5.5 43.3 120.5 11 21  # last\n",
+        "\ufeffid,line,sample,lon,lat,h\n1,20.25,10.5,5.4,43.2,100\n2,21,11,5.5,43.3,120.5\n",
+    ],
+)
+def test_a_text_table_is_read_by_its_header_or_in_the_order_of_the_convention(
+    tmp_path: Path, text: str
+) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text(text, encoding="utf-8")
+    check(path)
+
+
+def test_npz_holds_two_arrays_or_one_a_column(tmp_path: Path) -> None:
+    np.savez(tmp_path / "two.npz", ground=ROWS[:, :3], image=ROWS[:, 3:])
+    np.savez(
+        tmp_path / "five.npz", lon=ROWS[:, 0], lat=ROWS[:, 1], alt=ROWS[:, 2], col=ROWS[:, 3], row=ROWS[:, 4]
+    )
+    check(tmp_path / "two.npz")
+    check(tmp_path / "five.npz")
+
+
+def test_geojson_points_carry_their_image_position(tmp_path: Path) -> None:
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"ji": row[3:].tolist()},
+            "geometry": {"type": "Point", "coordinates": row[:3].tolist()},
+        }
+        for row in ROWS
+    ]
+    path = tmp_path / "points.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    check(path)
+
+
+def test_a_localisation_grid_counts_from_the_corner_of_the_first_pixel(tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    path = tmp_path / "grid.tif"
+    bands = np.arange(4 * 3 * 2, dtype=np.float64).reshape(4, 3, 2)
+    profile = {"driver": "GTiff", "width": 2, "height": 3, "count": 4, "dtype": "float64"}
+    with rasterio.open(path, "w", transform=rasterio.Affine(10, 0, 5, 0, 20, 7), **profile) as file:
+        file.write(bands)
+    assert correspondence_kind(path) is None
+    points = read_correspondences(path, altitudes=[0.0, 500.0])
+    assert points.image[:3].tolist() == [[4.5, 6.5], [14.5, 6.5], [4.5, 26.5]]
+    assert points.ground[0].tolist() == [0.0, 6.0, 0.0]
+    assert points.ground[-1].tolist() == [17.0, 23.0, 500.0]
+    with pytest.raises(InputError, match="one altitude a layer"):
+        read_correspondences(path, altitudes=[0.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", b"lon,lat,alt,col\n1,2,3,4\n", "no column row"),
+        ("a.csv", b"lon,lat,alt,col,row\n1,2,3,4,x\n", "line 2"),
+        ("a.csv", b"lon,lat,alt,col,row\n1,2,3\n", "line 2"),
+        ("a.csv", b"lon,lat,alt,col,row\n", "no points"),
+        ("a.npz", b"PK\x03\x04 nothing", "not an npz"),
+        ("a.json", b'{"type": "FeatureCollection", "features": [{}]}', "not a GeoJSON"),
+        ("a.txt", b"LINE_OFF: 5\n", "neither a table"),
+        ("a.bin", bytes(range(256)), "neither a table"),
+        ("a.csv", b"", "neither a table"),
+    ],
+)
+def test_what_is_no_table_is_refused_with_the_reason(
+    tmp_path: Path, name: str, content: bytes, message: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_correspondences(path)
+
+
+def test_a_file_that_does_not_exist_is_said_so(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_correspondences(tmp_path / "none.csv")
