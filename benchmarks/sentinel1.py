@@ -92,10 +92,9 @@ def line(name: str, ours: float, peer: float | None) -> None:
 
 def measure(path: Path, eos: str | None, rpcfit: str | None) -> None:
     """All figures of one product."""
-    from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
-    from barpc.fit.grid import check_points, control_points
-    from barpc.sensor.sentinel1 import RangeDoppler, grid_residuals, read_annotation
-    from barpc.sensor.sentinel1.annotation import seconds
+    from barpc.fit import FitOptions
+    from barpc.fit.grid import control_points
+    from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 
     annotation = read_annotation(path)
     model = RangeDoppler.from_annotation(annotation)
@@ -108,22 +107,7 @@ def measure(path: Path, eos: str | None, rpcfit: str | None) -> None:
     peer = ask(eos, "eos", path, data) if eos else None
     print(f"{path.name[:32]}, {annotation.states.source} orbit, {model.size[0]} x {model.size[1]} px")
     print(f"  {'':44s}{'barpc':>12s}{'eos-sar' if eos else '':>12s}")
-    interval, rate = annotation.azimuth_time_interval, annotation.range_sampling_rate
-    ours = grid_residuals(annotation, model)
-    theirs = None
-    if peer:
-        unix = seconds(annotation.grid.time, np.datetime64(0, "ns"))
-        theirs = (
-            (peer["grid"][:, 1] - annotation.grid.range_time) * rate,
-            (peer["grid"][:, 0] - unix) / interval,
-        )
-    for name, index, figure in (
-        ("range against the grid, max [px]", 0, lambda x: np.abs(x).max()),
-        ("azimuth against the grid, |mean| [line]", 1, lambda x: abs(x.mean())),
-        ("azimuth against the grid, std [line]", 1, np.std),
-        ("azimuth, farthest from its median [line]", 1, lambda x: np.abs(x - np.median(x)).max()),
-    ):
-        line(name, figure(ours[:, index]), figure(theirs[index]) if theirs else None)
+    measure_grid(annotation, model, peer)
     line(
         "CPU, 25,000 points projected [s]",
         cpu(lambda: model.project(ground)),
@@ -134,26 +118,64 @@ def measure(path: Path, eos: str | None, rpcfit: str | None) -> None:
         cpu(lambda: model.localize(image, alt)),
         peer and float(peer["localize"]),
     )
-    loop = np.abs(model.project(ground) - image).max()
-    line("round trip, max [px]", float(loop), None)
-    if annotation.product_type == "GRD":
-        return
-    floor = fit_rpc_points(
-        control.reshape(-1, 3), control_image.reshape(-1, 2), options=options, strict=False
-    )
-    coarse = None
+    line("round trip, max [px]", float(np.abs(model.project(ground) - image).max()), None)
+    if annotation.product_type == "SLC":
+        measure_floor(control, control_image, options, peer)
+        other = None
+        if rpcfit:
+            points = {"target": control_image.reshape(-1, 2), "locs": control.reshape(-1, 3)}
+            other = ask(rpcfit, "rpcfit", path, {**points, **check_data(model, control)})
+        measure_rpc(model, ground, image, options, other)
+
+
+def measure_grid(annotation, model, peer) -> None:
+    """The model against the product's own grid."""
+    from barpc.sensor.sentinel1 import grid_residuals
+    from barpc.sensor.sentinel1.annotation import seconds
+
+    ours, theirs = grid_residuals(annotation, model).T, None
     if peer:
-        coarse = fit_rpc_points(control.reshape(-1, 3), peer["control"], options=options, strict=False)
-    line("RPC, rows: residual floor [px]", floor.rmse_cnp[1], coarse and coarse.rmse_cnp[1])
+        unix = seconds(annotation.grid.time, np.datetime64(0, "ns"))
+        theirs = (
+            (peer["grid"][:, 1] - annotation.grid.range_time) * annotation.range_sampling_rate,
+            (peer["grid"][:, 0] - unix) / annotation.azimuth_time_interval,
+        )
+    for name, index, figure in (
+        ("range against the grid, max [px]", 0, lambda x: np.abs(x).max()),
+        ("azimuth against the grid, |mean| [line]", 1, lambda x: abs(x.mean())),
+        ("azimuth against the grid, std [line]", 1, np.std),
+        ("azimuth, farthest from its median [line]", 1, lambda x: np.abs(x - np.median(x)).max()),
+    ):
+        line(name, figure(ours[index]), figure(theirs[index]) if theirs else None)
+
+
+def measure_floor(control, control_image, options, peer) -> None:
+    """What the rounding of a model's rows leaves of an RPC fit."""
+    from barpc.fit import fit_rpc_points
+
+    def residual(image: np.ndarray) -> float:
+        fit = fit_rpc_points(control.reshape(-1, 3), image.reshape(-1, 2), options=options, strict=False)
+        return fit.rmse_cnp[1]
+
+    line("RPC, rows: residual floor [px]", residual(control_image), peer and residual(peer["control"]))
+
+
+def check_data(model, control) -> dict[str, np.ndarray]:
+    """Check points between the control points."""
+    from barpc.fit.grid import check_points
+
+    check = np.concatenate(list(check_points(control)))
+    return {"check": check, "check_image": model.project(check)}
+
+
+def measure_rpc(model, ground, image, options, other) -> None:
+    """RPCs on points that they have not seen."""
+    from barpc.fit import FitOptions, fit_rpc
+
     box = fit_rpc(model, model.size, model.alt_range, options=options)
     inner = fit_rpc(model, model.size, model.alt_range, options=FitOptions(nodes="uniform")).rpc
     error = inner.project(ground) - image
-    other = None
-    if rpcfit:
-        check = np.concatenate(list(check_points(control)))
-        points = {"target": control_image.reshape(-1, 2), "locs": control.reshape(-1, 3)}
-        other = ask(rpcfit, "rpcfit", path, {**points, "check": check, "check_image": model.project(check)})
-    print(f"  {'':44s}{'barpc':>12s}{'rpcfit' if rpcfit else '':>12s}")
+    print(f"  {'':44s}{'barpc':>12s}{'rpcfit' if other else '':>12s}")
     line(
         "RPC, 50x50x10 box, columns, check RMSE [px]", box.rmse_ckp[0], other and float(other["rmse_True"][0])
     )
