@@ -15,6 +15,7 @@ __version__ = "0.1.0"
 _PUBLIC = {
     "RPC": "barpc.sensor.rpc",
     "Pushbroom": "barpc.sensor.pushbroom",
+    "RangeDoppler": "barpc.sensor.sentinel1",
     "SensorModel": "barpc.sensor",
     "Correction": "barpc.sensor.corrected",
     "Corrected": "barpc.sensor.corrected",
