@@ -25,10 +25,13 @@ _CHUNK = 256  # patches worked on at a time: they stay in cache
 _STEPS = 12
 _SETTLED = 0.003  # px; a step below it is the last
 _SMALLER = 0.7  # side of the second try
+_FINE = 4  # samples a pixel and axis
+_GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
 _REACH = 1.5  # px; a patch that moves farther has left its point
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _MIN_DETAIL = 1e-12  # relative variance below which a patch is flat
-_TAPS = 6  # samples on either side in the half-pixel interpolation
+_LEAST_SIGMA = 1e-3  # px
+_TAPS = 6  # samples on either side in the interpolation
 _RIDGE = 1e-6
 
 
@@ -152,7 +155,7 @@ def register(
     registration : Registration
         In the coordinates of `images`.
     """
-    doubled = _double(images[1])
+    fine = _upsampled(images[1])
     best = Registration(
         np.array(start), np.zeros(len(start)), np.full(len(start), np.inf), np.zeros(len(start), dtype=bool)
     )
@@ -162,7 +165,7 @@ def register(
         possible = np.flatnonzero(~best.ok & _at(usable[0], reference) & _at(usable[1], start))
         for first in range(0, len(possible), _CHUNK):
             rows = possible[first : first + _CHUNK]
-            found = template.find(doubled, reference[rows].astype(np.int64), start[rows], linear[rows])
+            found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.xy[rows], best.correlation[rows], best.sigma[rows] = found.xy, found.correlation, found.sigma
             best.ok[rows] = found.ok & _at(usable[1], found.xy)
     return best
@@ -175,28 +178,29 @@ def _at(mask: BoolArray, xy: Array) -> BoolArray:
     return out
 
 
-def _double(image: FloatImage) -> FloatImage:
-    """Twice the samples a side, by a windowed sinc; the sample (2 row, 2 col) is the pixel (row, col).
+def _upsampled(image: FloatImage) -> FloatImage:
+    """More samples a side, by a windowed sinc; the sample `_FINE` (row, col) is the pixel (row, col).
 
-    On this grid a bicubic sample, taken to 1/32 of its step, is as good as a long kernel on the image.
+    Between these a linear sample moves no phase; OpenCV's bicubic one would, by up to a twentieth of the step.
     """
-    offset = np.arange(-_TAPS, _TAPS) + 0.5
-    kernel = np.sinc(offset) * np.cos(0.5 * np.pi * offset / _TAPS) ** 2
-    kernel = (kernel / kernel.sum()).astype(np.float32)
-    one = np.ones(1, np.float32)
-    border = cv2.BORDER_REFLECT_101
-
-    def between(samples: FloatArray, along_columns: bool) -> FloatArray:
-        across, down = (kernel, one) if along_columns else (one, kernel)
-        anchor = (_TAPS - 1, 0) if along_columns else (0, _TAPS - 1)
-        return np.asarray(cv2.sepFilter2D(samples, -1, across, down, None, anchor, 0.0, border), np.float32)
-
-    out = np.empty((2 * image.shape[0], 2 * image.shape[1]), np.float32)
-    out[::2, ::2] = image
-    out[::2, 1::2] = between(image, True)
-    out[1::2, ::2] = between(image, False)
-    out[1::2, 1::2] = between(out[::2, 1::2].copy(), False)
+    wide = np.empty((image.shape[0], _FINE * image.shape[1]), np.float32)
+    out = np.empty((_FINE * image.shape[0], wide.shape[1]), np.float32)
+    one, border = np.ones(1, np.float32), cv2.BORDER_REFLECT_101
+    for phase, kernel in enumerate(_kernels()):
+        wide[:, phase::_FINE] = cv2.sepFilter2D(image, -1, kernel, one, None, (_TAPS - 1, 0), 0.0, border)
+    for phase, kernel in enumerate(_kernels()):
+        out[phase::_FINE] = cv2.sepFilter2D(wide, -1, one, kernel, None, (0, _TAPS - 1), 0.0, border)
     return out
+
+
+def _kernels() -> list[FloatArray]:
+    """Weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel."""
+    kernels = []
+    for phase in range(_FINE):
+        offset = np.arange(1 - _TAPS, _TAPS + 1) - phase / _FINE
+        kernel = np.sinc(offset) * np.cos(0.5 * np.pi * offset / (_TAPS + 1)) ** 2
+        kernels.append((kernel / kernel.sum()).astype(np.float32))
+    return kernels
 
 
 class _Template:
@@ -225,7 +229,7 @@ class _Template:
         deviation = np.where(flat, np.float32(np.inf), deviation)
         return centred / deviation, deviation
 
-    def find(self, doubled: FloatImage, reference: IntArray, start: Array, linear: Array) -> Registration:
+    def find(self, fine: FloatImage, reference: IntArray, start: Array, linear: Array) -> Registration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
         cols, rows = reference[:, :1] + self._col, reference[:, 1:] + self._row
         values, deviation = self._normalized(self._image[rows, cols])
@@ -247,40 +251,42 @@ class _Template:
         normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.linalg.inv(normal)
         solver = inverse.astype(np.float32) @ weighted
-        xy, step = self._iterate(doubled, solver, start.copy(), linear.copy())
-        sampled = self._normalized(self._sample(doubled, *xy))[0]
+        xy, step = self._iterate(fine, solver, start.copy(), linear.copy())
+        sampled = self._normalized(self._sample(fine, *xy))[0]
         correlation = ((sampled * values) @ self._weight).astype(np.float64)
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
-        sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise)
+        sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_LEAST_SIGMA)
         moved = np.hypot(*(xy[0] - start).T)
-        ok = (step <= 10 * _SETTLED) & (moved <= _REACH) & np.isfinite(sigma) & (sigma > 0)
+        ok = (step <= 10 * _SETTLED) & (moved <= _REACH) & np.isfinite(sigma)
         return Registration(xy[0], correlation, sigma, ok)
 
     def _iterate(
-        self, doubled: FloatImage, solver: FloatArray, centre: Array, linear: Array
+        self, fine: FloatImage, solver: FloatArray, centre: Array, linear: Array
     ) -> tuple[tuple[Array, Array], Array]:
         """Centres and distortions after the iterations, and the length of each one's last step [px]."""
         length = np.full(len(centre), np.inf)
         active = np.arange(len(centre))
         for _ in range(_STEPS):
-            patches = self._normalized(self._sample(doubled, centre[active], linear[active]))[0]
+            sampled = np.rint(centre[active] / _GRID) * _GRID  # else the sampler would round, and we not know
+            patches = self._normalized(self._sample(fine, sampled, linear[active]))[0]
             solution = (solver[active] @ patches[:, :, None])[:, :, 0].astype(np.float64)
             change = solution[:, :6] / np.maximum(solution[:, 6:7], 0.2)  # gain: how like the patches are
             shift = np.clip(change[:, :2], -1.0, 1.0)
             distortion = np.clip(change[:, 2:].reshape(-1, 2, 2) / self._half, -0.2, 0.2)
             linear[active] = linear[active] @ np.linalg.inv(np.eye(2) + distortion)
-            centre[active] -= (linear[active] @ shift[:, :, None])[:, :, 0]
-            length[active] = np.hypot(*shift.T)
+            moved = sampled - (linear[active] @ shift[:, :, None])[:, :, 0]
+            length[active] = np.hypot(*(moved - centre[active]).T)
+            centre[active] = moved
             active = active[length[active] > _SETTLED]
             if not len(active):
                 break
         return (centre, linear), length
 
-    def _sample(self, doubled: FloatImage, centre: Array, linear: Array) -> FloatArray:
+    def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatArray:
         """Patches (N, P) of the other image about centres (N, 2) under distortions (N, 2, 2)."""
         offsets = np.stack([self._col, self._row]).astype(np.float32)
-        where = 2.0 * (linear.astype(np.float32) @ offsets + centre.astype(np.float32)[:, :, None])
+        where = _FINE * (linear.astype(np.float32) @ offsets + centre.astype(np.float32)[:, :, None])
         return np.asarray(
-            cv2.remap(doubled, where[:, 0], where[:, 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101),
+            cv2.remap(fine, where[:, 0], where[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101),
             np.float32,
         )

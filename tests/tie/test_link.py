@@ -1,0 +1,100 @@
+"""Matches become tracks: joined, free of contradictions, evenly thinned, independent of their order."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc.scene import Tracks
+from barpc.tie import Matches, common_tracks, link, thin
+
+PLACES = np.random.default_rng(0).uniform(0, 100, (4, 10, 2))
+
+
+def matches(i: int, j: int, *index: tuple[int, int], sigma: float = 0.2) -> Matches:
+    rows = np.array(index, dtype=np.int64).reshape(-1, 2)
+    xy = np.stack([PLACES[i][rows[:, 0]], PLACES[j][rows[:, 1]]], axis=1)
+    return Matches((i, j), rows, xy, np.full(len(rows), sigma))
+
+
+def as_sets(tracks: Tracks) -> set[frozenset[tuple[int, float, float]]]:
+    return {
+        frozenset((int(v), x, y) for v, (x, y) in zip(tracks.view[p], tracks.xy[p], strict=True))
+        for p in (tracks.point == k for k in range(tracks.num_points))
+    }
+
+
+def test_matches_that_share_a_keypoint_become_one_track() -> None:
+    tracks = link([10] * 4, [matches(0, 1, (3, 4)), matches(1, 2, (4, 5)), matches(2, 3, (5, 6), (1, 1))])
+    assert tracks.num_points == 2
+    assert sorted(np.bincount(tracks.point)) == [2, 4]
+    np.testing.assert_array_equal(tracks.xy[tracks.view == 0], [PLACES[0, 3]])
+
+
+def test_a_track_that_meets_a_view_twice_is_thrown_away() -> None:
+    tracks = link([10] * 4, [matches(0, 1, (3, 4), (1, 1)), matches(1, 2, (4, 5)), matches(0, 2, (9, 5))])
+    assert as_sets(tracks) == {frozenset([(0, *PLACES[0, 1]), (1, *PLACES[1, 1])])}
+
+
+def test_the_order_of_the_pairs_does_not_matter() -> None:
+    pairs = [
+        matches(0, 1, *((k, k) for k in range(8))),
+        matches(1, 2, *((k, k) for k in range(3, 9)), sigma=0.1),
+        matches(0, 2, (9, 9)),
+    ]
+    first, second = link([10] * 4, pairs), link([10] * 4, pairs[::-1])
+    for name in ("view", "point", "xy", "sigma"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_rows_of_a_track_stand_together_with_views_ascending() -> None:
+    tracks = link([10] * 4, [matches(2, 3, (1, 1), (2, 2)), matches(0, 3, (5, 2)), matches(0, 1, (5, 5))])
+    assert (np.diff(tracks.point) >= 0).all()
+    assert (np.diff(tracks.view)[np.diff(tracks.point) == 0] > 0).all()
+
+
+def test_no_matches_make_no_tracks() -> None:
+    assert link([10, 10], []).num_points == 0
+    assert link([10, 10], [matches(0, 1)]).num_points == 0
+
+
+def many(count: int, views: int = 2, crowd: float = 1.0) -> Tracks:
+    rng = np.random.default_rng(1)
+    xy = 1000 * rng.uniform(0, 1, (count, 1, 2)) ** crowd + rng.uniform(0, 1, (1, views, 2))
+    point, view = np.repeat(np.arange(count), views), np.tile(np.arange(views), count)
+    return Tracks(view, point, xy.reshape(-1, 2), np.full(count * views, 0.1))
+
+
+@pytest.mark.parametrize("crowd", [1.0, 3.0])
+def test_thinned_tracks_are_about_as_many_as_asked_for_and_cover_the_image_evenly(crowd: float) -> None:
+    tracks = thin(many(20_000, crowd=crowd), [(1001, 1001)] * 2, 1000)
+    assert 700 <= np.bincount(tracks.view)[0] <= 1000
+    cells = np.floor(tracks.xy[tracks.view == 0] / 125).astype(int).clip(0, 7)
+    counts = np.zeros((8, 8), int)
+    np.add.at(counts, tuple(cells.T), 1)
+    assert counts.min() >= 2
+    assert counts.max() <= 70
+
+
+def test_long_and_accurate_tracks_are_kept_first() -> None:
+    short, long = many(3000), many(300, 3)
+    joined = Tracks(
+        np.concatenate([short.view, long.view]),
+        np.concatenate([short.point, long.point + 3000]),
+        np.concatenate([short.xy, long.xy]),
+        np.concatenate([short.sigma, long.sigma]),
+    )
+    tracks = thin(joined, [(1001, 1001)] * 3, 600)
+    assert (np.bincount(tracks.point) == 3).sum() > 250
+
+
+def test_few_tracks_are_not_thinned() -> None:
+    tracks = many(50)
+    assert thin(tracks, [(1001, 1001)] * 2, 50) is tracks
+
+
+def test_common_tracks_come_in_the_same_order() -> None:
+    tracks = many(20, 3)
+    first, third = common_tracks(tracks, 0, 2)
+    np.testing.assert_array_equal(first, tracks.xy[tracks.view == 0])
+    np.testing.assert_array_equal(third, tracks.xy[tracks.view == 2])

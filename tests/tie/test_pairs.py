@@ -1,0 +1,88 @@
+"""Which views are matched: overlap, angle, a connected graph without all pairs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.errors import DisconnectedError, TiePointError
+from barpc.scene import View
+from barpc.sensor.rpc import RPC
+from barpc.tie import TieOptions, select_pairs
+
+
+def camera(lon: float, lat: float = 0.0, lean: float = 0.1) -> RPC:
+    """A linear camera of 1000 x 1000 half-metre pixels about a point; `lean` px a metre of altitude."""
+    coeffs = np.zeros((4, 20))
+    coeffs[1::2, 0] = 1.0
+    coeffs[0, 1], coeffs[2, 2], coeffs[0, 3] = 1.0, -1.0, 100.0 * lean / 500.0
+    degrees = 250.0 / 111_000.0
+    half = np.full(2, 499.5)
+    return RPC(coeffs, np.array([lon, lat, 100.0]), np.array([degrees, degrees, 100.0]), half, half)
+
+
+def views(*cameras: RPC) -> list[View]:
+    return [View(f"v{i}", "", (1000, 1000), rpc, (0.0, 200.0)) for i, rpc in enumerate(cameras)]
+
+
+METRE = 1 / 111_000.0
+
+
+def test_the_overlap_is_the_common_part_of_the_smaller_footprint() -> None:
+    (pair,) = select_pairs(views(camera(0.0, lean=0.0), camera(250 * METRE, lean=0.0)), TieOptions())
+    assert pair.views == (0, 1)
+    assert pair.overlap == pytest.approx(0.5, abs=0.01)
+    assert pair.angle == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_angle_is_that_between_the_lines_of_sight() -> None:
+    (pair,) = select_pairs(views(camera(0.0, lean=0.0), camera(0.0, lean=0.2)), TieOptions())
+    assert pair.angle == pytest.approx(np.degrees(np.arctan(0.1)), abs=0.05)
+
+
+@pytest.mark.parametrize("lon", [0.0, 180.0, -180.0, 359.9999])
+def test_pairs_do_not_depend_on_where_longitudes_wrap(lon: float) -> None:
+    other = (lon + 100 * METRE + 180.0) % 360.0 - 180.0
+    (pair,) = select_pairs(views(camera(lon, lean=0.0), camera(other, lean=0.0)), TieOptions())
+    assert pair.overlap == pytest.approx(0.8, abs=0.01)
+
+
+def test_a_thousand_views_get_their_best_partners_and_not_all_pairs() -> None:
+    grid = [camera(400 * METRE * (k % 40), 400 * METRE * (k // 40)) for k in range(1000)]
+    pairs = select_pairs(views(*grid), TieOptions(neighbours=3))
+    assert 999 <= len(pairs) < 4000
+    assert all(p.views[0] < p.views[1] for p in pairs)
+
+
+def test_views_that_share_no_ground_are_named_group_by_group() -> None:
+    far = views(camera(0.0), camera(100 * METRE), camera(1.0), camera(2.0))
+    with pytest.raises(DisconnectedError, match=r"3 groups \(v0, v1; v2; v3\): no overlap") as caught:
+        select_pairs(far, TieOptions())
+    assert caught.value.groups == (("v0", "v1"), ("v2",), ("v3",))
+
+
+def test_views_are_tried_whose_cameras_may_be_wrong_by_more_than_the_overlap() -> None:
+    (pair,) = select_pairs(views(camera(0.0), camera(600 * METRE)), TieOptions(search=500))
+    assert pair.views == (0, 1)
+    with pytest.raises(DisconnectedError):
+        select_pairs(views(camera(0.0), camera(600 * METRE)), TieOptions(search=50))
+
+
+def test_one_image_is_refused() -> None:
+    with pytest.raises(TiePointError, match="1 image given"):
+        select_pairs(views(camera(0.0)), TieOptions())
+
+
+def test_the_listed_pairs_only_are_chosen_where_a_list_is_given() -> None:
+    three = views(camera(0.0), camera(50 * METRE), camera(100 * METRE))
+    pairs = select_pairs(three, TieOptions(), only=[(1, 0), (2, 1)])
+    assert [p.views for p in pairs] == [(0, 1), (1, 2)]
+
+
+def test_too_small_an_angle_and_too_small_an_overlap_are_left_out() -> None:
+    two = views(camera(0.0, lean=0.0), camera(250 * METRE, lean=0.05))
+    for options in (TieOptions(min_angle=5.0), TieOptions(min_overlap=0.9), TieOptions(max_angle=0.5)):
+        with pytest.raises(DisconnectedError):
+            select_pairs(two, replace(options, search=1.0))

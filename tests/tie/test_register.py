@@ -1,0 +1,125 @@
+"""Registration of patches: exact on what is known, and sure to say when it failed."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from barpc.tie.register import _upsampled, register
+
+SIZE = 400
+
+
+@pytest.fixture(scope="module")
+def texture() -> np.ndarray:
+    noise = np.random.default_rng(2).normal(0, 1, (SIZE, SIZE))
+    return (1000 + 800 * ndimage.gaussian_filter(noise, 1.5)).astype(np.float32)
+
+
+def warped(image: np.ndarray, linear: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """other(linear @ (x - c) + c + shift) = image(x), by a quintic spline."""
+    c = np.full(2, SIZE / 2)
+    inverse = np.linalg.inv(linear)
+    grid = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE)), axis=-1).reshape(-1, 2)
+    source = (grid - c - shift) @ inverse.T + c
+    return (
+        ndimage.map_coordinates(image.astype(np.float64), source[:, ::-1].T, order=5)
+        .reshape(SIZE, SIZE)
+        .astype(np.float32)
+    )
+
+
+def run(first, second, reference, start, linear, patch: int = 21, valid=None):
+    valid = valid if valid is not None else np.ones((SIZE, SIZE), bool)
+    many = np.broadcast_to(linear, (len(reference), 2, 2)).copy()
+    return register((first, second), (valid, valid), reference, start, many, patch)
+
+
+@pytest.fixture(scope="module")
+def reference() -> np.ndarray:
+    return np.random.default_rng(3).integers(80, SIZE - 80, (300, 2)).astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    "linear",
+    [np.eye(2), np.array([[1.04, 0.02], [-0.03, 0.97]]), np.array([[0.9, 0.15], [0.0, 1.0]])],
+    ids=["shift", "small", "shear"],
+)
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, -0.25), (-0.9, 0.7)])
+def test_a_known_affine_map_is_found_to_a_hundredth_of_a_pixel(texture, reference, linear, shift) -> None:
+    other = warped(texture, linear, np.array(shift))
+    centre = np.full(2, SIZE / 2)
+    truth = (reference - centre) @ linear.T + centre + shift
+    start = truth + np.random.default_rng(4).uniform(-0.5, 0.5, truth.shape)
+    found = run(texture, other, reference, start, np.eye(2) if shift == (0.0, 0.0) else linear)
+    error = (found.xy - truth)[found.ok]
+    assert found.ok.mean() > 0.95
+    assert np.sqrt((error**2).mean()) < 0.01
+    assert np.abs(error.mean(axis=0)).max() < 0.001
+
+
+def test_gain_and_offset_between_the_images_do_not_matter(texture, reference) -> None:
+    found = run(texture, 0.37 * texture + 210, reference, reference + 0.4, np.eye(2))
+    assert found.ok.all()
+    assert np.abs(found.xy - reference).max() < 0.005
+    assert found.correlation.min() > 0.999
+
+
+def test_swapping_the_images_gives_the_inverse(texture, reference) -> None:
+    other = warped(texture, np.eye(2), np.array([0.3, 0.2]))
+    forth = run(texture, other, reference, reference, np.eye(2)).xy - reference
+    back = run(other, texture, reference, reference, np.eye(2)).xy - reference
+    assert np.abs(forth.mean(axis=0) + back.mean(axis=0)).max() < 0.001
+
+
+def test_the_stated_sigma_is_the_true_one_in_noise(texture, reference) -> None:
+    rng = np.random.default_rng(6)
+    noise = 0.05 * texture.std()
+    first, second = (texture + rng.normal(0, noise, texture.shape).astype(np.float32) for _ in range(2))
+    found = run(first, second, reference, reference + 0.3, np.eye(2))
+    error = (found.xy - reference)[found.ok] / found.sigma[found.ok, None]
+    assert found.ok.mean() > 0.98
+    assert 0.7 < np.sqrt((error**2).mean()) < 1.6
+
+
+def test_different_ground_does_not_correlate(texture, reference) -> None:
+    found = run(texture, np.flipud(texture).copy(), reference, reference, np.eye(2))
+    assert (found.ok & (found.correlation >= 0.8)).mean() < 0.02
+
+
+def test_flat_patches_fail_without_a_warning(texture, reference) -> None:
+    for flat in (np.zeros_like(texture), np.full_like(texture, 4e4)):
+        for first, second in ((texture, flat), (flat, texture), (flat, flat)):
+            assert not (run(first, second, reference, reference, np.eye(2)).correlation > 0.5).any()
+
+
+def test_patches_beyond_the_image_or_on_invalid_pixels_are_not_used(texture) -> None:
+    valid = np.ones((SIZE, SIZE), bool)
+    valid[200, 200] = False
+    points = np.array([[3.0, 200.0], [200.0, SIZE - 3.0], [195.0, 204.0], [-50.0, 20.0], [100.0, 100.0]])
+    found = run(texture, texture, points, points, np.eye(2), valid=valid)
+    assert found.ok.tolist() == [False, False, False, False, True]
+
+
+def test_no_patches_at_all_is_no_error(texture) -> None:
+    assert len(run(texture, texture, np.empty((0, 2)), np.empty((0, 2)), np.eye(2)).ok) == 0
+
+
+def test_upsampling_keeps_the_pixels_and_a_wave_between_them() -> None:
+    wave = np.tile(np.cos(2 * np.pi * np.arange(200.0) / 5.0), (50, 1)).astype(np.float32)
+    fine = _upsampled(wave)
+    np.testing.assert_allclose(fine[::4, ::4], wave, atol=1e-6)
+    expected = np.cos(2 * np.pi * np.arange(800) / 20.0)
+    np.testing.assert_allclose(fine[80, 80:-80], expected[80:-80], atol=0.01)
+
+
+def test_the_result_does_not_depend_on_opencv_threads(texture, reference) -> None:
+    before = cv2.getNumThreads()
+    results = []
+    for threads in (1, 2):
+        cv2.setNumThreads(threads)
+        results.append(run(texture, texture, reference, reference + 0.3, np.eye(2)).xy)
+    cv2.setNumThreads(before)
+    np.testing.assert_array_equal(*results)
