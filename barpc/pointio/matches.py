@@ -1,0 +1,214 @@
+"""Tables of tie points: CSV and npz (image, col, row, track), and the text matches of ASP.
+
+(0, 0) is the centre of the top-left pixel. CSV: a header with the columns `image, col, row, track` and, where it is
+known, `sigma` [px], in any order. npz: arrays `names`, `view`, `track`, `xy` (K, 2) and `sigma`. ASP: files
+`[prefix-]LEFT__RIGHT.txt` or a folder of them, as `--matches-as-txt` writes them.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from barpc.errors import InputError
+from barpc.geodesy import Array
+from barpc.pointio.names import ViewNames
+from barpc.scene import IntArray, Tracks
+
+SIGMA = 0.5
+"""Standard deviation of each coordinate [px] where the file states none."""
+
+_COLUMNS = ("image", "col", "row", "track")
+
+
+def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA) -> Tracks:
+    """Tie points of a file.
+
+    Parameters
+    ----------
+    path : path
+        CSV, npz, an ASP text match file, or a folder of these.
+    names : sequence of str
+        The views, in order; observations in other images are left out.
+    sigma : float
+        Standard deviation of each coordinate [px] where the file states none.
+
+    Returns
+    -------
+    Tracks
+        Tracks with fewer than two views, or with two observations in one view, are left out.
+
+    Raises
+    ------
+    InputError
+        The file does not parse, or holds no track of these views.
+    """
+    path = Path(path)
+    views = ViewNames(names, str(path))
+    try:
+        if path.is_dir():
+            view, point, xy, spread = _read_asp(sorted(path.glob("*__*.txt")), views, sigma)
+        elif path.suffix.lower() == ".npz":
+            view, point, xy, spread = _read_npz(path, views, sigma)
+        elif "__" in path.name and path.suffix.lower() in (".txt", ".match"):
+            view, point, xy, spread = _read_asp([path], views, sigma)
+        else:
+            view, point, xy, spread = _read_csv(path, views, sigma)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as tie points ({error})") from error
+    return _tracks(path, view, point, xy, spread)
+
+
+def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> None:
+    """Write tie points as CSV or npz, by the ending; `read_matches` reads them back to the bit.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.csv` or `.npz`.
+    tracks : Tracks
+        Tie points.
+    names : sequence of str
+        The views.
+
+    Raises
+    ------
+    InputError
+        Another ending.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".npz":
+        with path.open("wb") as file:
+            np.savez_compressed(
+                file,
+                names=np.array(names),
+                view=tracks.view,
+                track=tracks.point,
+                xy=tracks.xy,
+                sigma=tracks.sigma,
+            )
+        return
+    if path.suffix.lower() != ".csv":
+        raise InputError(f"{path}: tie points are written as .csv or .npz")
+    with path.open("w", encoding="utf-8", newline="") as text:
+        writer = csv.writer(text)
+        writer.writerow([*_COLUMNS, "sigma"])
+        columns = (tracks.view.tolist(), tracks.point.tolist(), tracks.xy.tolist(), tracks.sigma.tolist())
+        for view, point, (col, row), sigma in zip(*columns, strict=True):
+            writer.writerow([names[view], repr(col), repr(row), point, repr(sigma)])
+
+
+Columns = tuple[IntArray, IntArray, Array, Array]
+
+
+def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
+    with path.open(encoding="utf-8-sig", newline="") as text:
+        lines = csv.reader(line for line in text if line.strip() and not line.startswith("#"))
+        header = [word.strip().lower() for word in next(lines, [])]
+        missing = [name for name in _COLUMNS if name not in header]
+        if missing:
+            raise InputError(
+                f"{path}: no column {', '.join(missing)}; found {', '.join(header) or 'nothing'}"
+            )
+        image, *numbers = (header.index(name) for name in _COLUMNS)
+        spread = header.index("sigma") if "sigma" in header else None
+        rows, tracks = [], []
+        for line in lines:
+            try:
+                view = views.find(line[image])
+                col, row = (float(line[i]) for i in numbers[:2])
+                own = sigma if spread is None else float(line[spread])
+                track = line[numbers[2]].strip()
+            except (ValueError, IndexError) as error:
+                raise InputError(
+                    f"{path}: {', '.join(line)!r} does not hold image, col, row, track"
+                ) from error
+            if view is not None:
+                rows.append((view, col, row, own))
+                tracks.append(track)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    _, first, inverse = np.unique(np.array(tracks, dtype=str), return_index=True, return_inverse=True)
+    point = np.argsort(np.argsort(first))[inverse.ravel()] if len(rows) else np.zeros(0, dtype=np.int64)
+    return table[:, 0].astype(np.int64), point, table[:, 1:3], table[:, 3]
+
+
+def _read_npz(path: Path, views: ViewNames, sigma: float) -> Columns:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
+            view, point = own[file["view"].astype(np.int64)], file["track"].astype(np.int64)
+            xy = np.asarray(file["xy"], dtype=np.float64).reshape(len(view), 2)
+            spread = (
+                np.asarray(file["sigma"], dtype=np.float64) if "sigma" in file else np.full(len(view), sigma)
+            )
+    except (KeyError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({error})") from error
+    keep = view >= 0
+    return view[keep], point[keep], xy[keep], spread[keep]
+
+
+def _read_asp(paths: Sequence[Path], views: ViewNames, sigma: float) -> Columns:
+    """Pairs that share a keypoint are one track."""
+    view, xy, pairs = [], [], []
+    count = 0
+    for path in paths:
+        left, right = (views.find(name) for name in _asp_images(path, views))
+        if left is None or right is None:
+            continue
+        first, second = _asp_points(path)
+        n = len(first)
+        view += [np.full(n, left), np.full(n, right)]
+        xy += [first, second]
+        pairs.append(count + np.column_stack([np.arange(n), n + np.arange(n)]))
+        count += 2 * n
+    if not count:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0)
+    keypoints = np.column_stack([np.concatenate(view), np.concatenate(xy)])
+    unique, index = np.unique(keypoints, axis=0, return_inverse=True)
+    i, j = index.ravel()[np.concatenate(pairs)].T
+    graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(unique), len(unique)))
+    _, point = connected_components(graph, directed=False)
+    return unique[:, 0].astype(np.int64), point.astype(np.int64), unique[:, 1:], np.full(len(unique), sigma)
+
+
+def _asp_images(path: Path, views: ViewNames) -> tuple[str, str]:
+    """The two images that a match file's name means, a run's prefix before the first one left out."""
+    stem = path.name.removesuffix(".txt").removesuffix(".match")
+    left, right = stem.split("__", 1)
+    while views.find(left) is None and "-" in left:
+        left = left.split("-", 1)[1]
+    return left, right
+
+
+def _asp_points(path: Path) -> tuple[Array, Array]:
+    """Points (M, 2) of both images: counts on the first line, then one keypoint a line, col and row first."""
+    try:
+        lines = path.read_text(encoding="utf-8").split("\n")
+        left, right = (int(word) for word in lines[0].split()[:2])
+        rows = [line.split()[:2] for line in lines[1:] if line.strip()]
+        points = np.array(rows, dtype=np.float64).reshape(-1, 2)
+    except ValueError as error:
+        raise InputError(f"{path}: not an ASP text match file ({error})") from error
+    if left != right or len(points) != left + right:
+        raise InputError(f"{path}: says {left} and {right} keypoints but holds {len(points)}")
+    return points[:left], points[left:]
+
+
+def _tracks(path: Path, view: IntArray, point: IntArray, xy: Array, sigma: Array) -> Tracks:
+    """Tracks sorted by point and view, without those that are seen once, or twice in one view."""
+    order = np.lexsort((view, point))
+    view, point, xy, sigma = view[order], point[order], xy[order], sigma[order]
+    twice = np.zeros(len(view), dtype=bool)
+    twice[1:] = (point[1:] == point[:-1]) & (view[1:] == view[:-1])
+    good = ~np.isin(point, point[twice])
+    _, index, count = np.unique(point, return_inverse=True, return_counts=True)
+    keep = good & (count[index] >= 2)
+    if not keep.any():
+        raise InputError(f"{path}: no track is seen in two of the views")
+    _, closed = np.unique(point[keep], return_inverse=True)
+    return Tracks(view[keep], closed, xy[keep], sigma[keep])

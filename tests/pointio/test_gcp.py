@@ -1,0 +1,120 @@
+"""GCP files: what each syntax holds arrives, and what is wrong is said with its place."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.control import GroundControlPoint
+
+from barpc.errors import InputError
+from barpc.pointio.gcp import GROUND_SIGMA, IMAGE_SIGMA, read_gcps
+
+NAMES = ["left", "right"]
+
+ASP = """# WKT: GEOGCS[...]
+1 43.25 5.44 120.5 0.1 0.2 0.3 /data/left.tif 100.5 200.25 0.5 0.4 right.tif 110 210 1 1
+2 43.26 5.45 130 1 1 1 left.tif 300 400 1 1 other.tif 5 6 1 1
+"""
+
+
+def test_an_asp_file_gives_points_sigmas_and_observations(tmp_path):
+    path = tmp_path / "a.gcp"
+    path.write_text(ASP)
+    found = read_gcps(path, NAMES)
+    assert found.names == ("1", "2")
+    np.testing.assert_array_equal(found.lonlatalt, [[5.44, 43.25, 120.5], [5.45, 43.26, 130.0]])
+    np.testing.assert_array_equal(found.sigma, [[0.1, 0.2, 0.3], [1, 1, 1]])
+    np.testing.assert_array_equal(found.point, [0, 0, 1])
+    np.testing.assert_array_equal(found.view, [0, 1, 0])
+    np.testing.assert_array_equal(found.xy, [[100.5, 200.25], [110, 210], [300, 400]])
+    np.testing.assert_array_equal(found.xy_sigma, [0.5, 1, 1])
+
+
+def test_sigmas_can_be_given_instead_of_the_files(tmp_path):
+    path = tmp_path / "a.gcp"
+    path.write_text(ASP)
+    found = read_gcps(path, NAMES, sigma=0.2, image_sigma=0.7)
+    assert (found.sigma == 0.2).all()
+    assert (found.xy_sigma == 0.7).all()
+
+
+def _feature(**properties):
+    base = {"ji": [10.5, 20.5], "filename": "left.tif", "id": "a", "info": "x"}
+    return {
+        "type": "Feature",
+        "properties": {**base, **properties},
+        "geometry": {"type": "Point", "coordinates": [5.4, 43.2, 100.0]},
+    }
+
+
+def test_a_point_of_geojson_seen_in_two_images_is_one_point(tmp_path):
+    path = tmp_path / "g.geojson"
+    features = [_feature(), _feature(filename="right.tif", ji=[1, 2]), _feature(filename="far.tif")]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    found = read_gcps(path, NAMES)
+    assert found.names == ("a",)
+    np.testing.assert_array_equal(found.view, [0, 1])
+    np.testing.assert_array_equal(found.xy, [[10.5, 20.5], [1, 2]])
+    assert (found.sigma == GROUND_SIGMA).all()
+    assert (found.xy_sigma == IMAGE_SIGMA).all()
+
+
+def test_tags_of_an_image_belong_to_that_image(tmp_path):
+    path = tmp_path / "right.tif"
+    gcps = [GroundControlPoint(row=20.5, col=10.25, x=5.4, y=43.2, z=100.0, id="p")]
+    with rasterio.open(
+        path, "w", driver="GTiff", width=4, height=4, count=1, dtype="uint8", gcps=gcps, crs="EPSG:4326"
+    ):
+        pass
+    found = read_gcps(path, NAMES)
+    np.testing.assert_array_equal(found.view, [1])
+    np.testing.assert_array_equal(found.xy, [[10.25, 20.5]])
+    np.testing.assert_array_equal(found.lonlatalt, [[5.4, 43.2, 100.0]])
+
+
+def test_tags_in_a_map_projection_are_refused(tmp_path):
+    path = tmp_path / "left.tif"
+    gcps = [GroundControlPoint(row=2, col=1, x=5e5, y=4.7e6, z=100.0, id="p")]
+    with rasterio.open(
+        path, "w", driver="GTiff", width=4, height=4, count=1, dtype="uint8", gcps=gcps, crs="EPSG:32631"
+    ):
+        pass
+    with pytest.raises(InputError, match="longitude and latitude"):
+        read_gcps(path, NAMES)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("1 43 5 120 1 1 1 left.tif 1 2 1\n", "line 1"),
+        ("1 43 5 120 1 1\n", "line 1"),
+        ("1 93 5 120 1 1 1 left.tif 1 2 1 1\n", "beyond 90"),
+        ("1 43 5 120 1 1 1 far.tif 1 2 1 1\n", "no GCP of left, right"),
+        ("# nothing\n", "no GCP"),
+        ('{"features": [{"properties": {}}]}', "not a GeoJSON"),
+        ("{broken", "not a GeoJSON"),
+        ("1 43 5 120 0 1 1 left.tif 1 2 1 1\n", "sigmas positive"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said(tmp_path, text, says):
+    path = tmp_path / "bad.gcp"
+    path.write_text(text)
+    with pytest.raises(InputError, match=says):
+        read_gcps(path, NAMES)
+
+
+def test_a_missing_file_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_gcps(tmp_path / "none.gcp", NAMES)
+
+
+def test_the_quickbird_points_read_alike_from_geojson_and_from_tags(shared_data):
+    folder = shared_data / "optical" / "qb2_single"
+    text = read_gcps(folder / "gcps.geojson", ["qb2_basic1b"])
+    tags = read_gcps(folder / "qb2_basic1b.tif", ["qb2_basic1b"])
+    assert len(text.names) == 5
+    np.testing.assert_allclose(text.xy, tags.xy)
+    np.testing.assert_allclose(text.lonlatalt, tags.lonlatalt)
