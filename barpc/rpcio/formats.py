@@ -55,6 +55,7 @@ FORMATS: dict[str, Format] = {
         Format("enmap", (), xml.sniff_enmap, xml.read_enmap),
         Format("gdal", (), xml.sniff_gdal, xml.read_gdal),
         Format("yaml", (), structured.sniff_yaml, structured.read_yaml),
+        Format("envi", (), text.sniff_envi, text.read_envi),
         Format("alos", (), fixed.sniff_alos, fixed.read_alos),
     )
 }

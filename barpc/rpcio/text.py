@@ -1,4 +1,4 @@
-"""RPC files made of lines of text: ``_RPC.TXT``, ``.RPB`` and OSSIM's ``.geom``."""
+"""RPC files made of lines of text: ``_RPC.TXT``, ``.RPB``, OSSIM's ``.geom``, ENVI's header."""
 
 from __future__ import annotations
 
@@ -154,3 +154,24 @@ def write_geom(rpc: RPC) -> str:
         else:
             lines.append(f"{key}:  {format_number(values[0])}")
     return "\n".join(lines) + "\n"
+
+
+# --- ENVI -------------------------------------------------------------------------------------------------
+
+_ENVI = re.compile(r"^\s*rpc info\s*=\s*\{([^{}]*)\}", re.MULTILINE | re.IGNORECASE)
+
+
+def sniff_envi(text: str) -> bool:
+    """``rpc info = {`` in a header."""
+    return re.search(r"^\s*rpc info\s*=\s*\{", text, re.MULTILINE | re.IGNORECASE) is not None
+
+
+def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
+    """ENVI's header: offsets, scales, four times twenty coefficients; three more numbers may follow."""
+    match = _ENVI.search(text)
+    values = numbers(match.group(1), name, "rpc info") if match else []
+    if len(values) not in (90, 93):
+        raise RpcFormatError(f"{name}: rpc info has {len(values)} numbers, expected 90 or 93")
+    fields: Fields = {key: [value] for key, value in zip(OFFSETS + SCALES, values, strict=False)}
+    fields |= {key: values[10 + 20 * i : 30 + 20 * i] for i, key in enumerate(COEFFICIENTS)}
+    return rpc_from_fields(fields, name, options.first_pixel or 0.0)

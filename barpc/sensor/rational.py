@@ -119,7 +119,7 @@ class Rational:
     def value(self, x: Array, work: Array | None = None) -> Array:
         """Values (2, N) at points (3, N); `work` (20, N) is overwritten."""
         poly = self.coeffs @ monomials(x, work)
-        return np.divide(poly[::2], poly[1::2])
+        return np.divide(poly[::2], poly[1::2], out=poly[::2])
 
     def value_and_gradient(self, x: Array, axes: int = 3, work: Array | None = None) -> tuple[Array, Array]:
         """Values (2, N) and derivatives (axes, 2, N) by the first `axes` variables at points (3, N)."""

@@ -106,7 +106,7 @@ class RPC:
         """
         out = np.empty((3, len(ground)))
         np.subtract(ground.T, self.ground_offset[:, None], out=out)
-        if not np.abs(out[0]).max(initial=0.0) <= 180.0:
+        if not (out[0].max(initial=0.0) <= 180.0 and out[0].min(initial=0.0) >= -180.0):
             out[0] = wrap_longitude(ground[:, 0], self.ground_offset[0]) - self.ground_offset[0]
         out /= self.ground_scale[:, None]
         return out

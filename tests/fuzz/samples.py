@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 from barpc.rpcio import FORMATS, write_rpc_copy
-from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, make_rpc, write_image, yaml
+from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 
 
 def _tiff() -> bytes:
@@ -30,6 +30,7 @@ SAMPLES: dict[str, bytes] = {
     "dimap v3": dimap_v3(make_rpc()).encode(),
     "enmap": enmap(make_rpc()).encode(),
     "yaml": yaml(make_rpc()).encode(),
+    "envi": envi(make_rpc()).encode(),
     "alos": _alos(),
     "tiff": _tiff(),
 }

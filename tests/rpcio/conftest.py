@@ -137,3 +137,11 @@ def yaml(rpc: RPC) -> str:
             first, rest = ", ".join(map(repr, values[:9])), ", ".join(map(repr, values[9:]))
             lines.append(f"        {key}: [{first},\n            {rest}]")
     return "\n".join(lines) + "\n"
+
+
+def envi(rpc: RPC) -> str:
+    """A header as GDAL and ENVI write it."""
+    fields = fields_from_rpc(rpc)
+    values = [v for key in (*OFFSETS, *SCALES, *COEFFICIENTS) for v in fields[key]] + [0, 0, 1]
+    lines = [", ".join(map(repr, values[i : i + 4])) for i in range(0, 93, 4)]
+    return "ENVI\nsamples = 60\nlines = 40\nrpc info = {\n  " + ",\n  ".join(lines) + "}\nbyte order = 0\n"

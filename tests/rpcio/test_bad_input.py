@@ -16,7 +16,7 @@ from barpc.errors import BarpcError, ImageError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.formats import MAX_BYTES, parse
 from barpc.rpcio.tiff import RPC_TAG, read_directory, tag_values
-from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, make_rpc, write_image, yaml
+from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 
 RPC = make_rpc()
 SAMPLES = {row.name: row.write(RPC) for row in FORMATS.values() if row.write is not None} | {
@@ -25,6 +25,7 @@ SAMPLES = {row.name: row.write(RPC) for row in FORMATS.values() if row.write is 
     "dimap v3": dimap_v3(RPC),
     "enmap": enmap(RPC),
     "yaml": yaml(RPC),
+    "envi": envi(RPC),
 }
 each_sample = pytest.mark.parametrize("sample", SAMPLES)
 
@@ -45,7 +46,8 @@ def outcome(data: bytes) -> str:
 def test_a_file_that_is_cut_off_anywhere_in_its_numbers_is_refused(sample):
     data = SAMPLES[sample].encode()
     last = max(
-        m.end() for m in re.finditer(rb"SAMP_DEN|samp_den|sampDen|col_den|COL_DEN|SAMPDEN|</F_ROW", data)
+        m.end()
+        for m in re.finditer(rb"SAMP_DEN|samp_den|sampDen|col_den|COL_DEN|SAMPDEN|</F_ROW|,\n  1(?=})", data)
     )
     for size in np.linspace(1, last, 60).astype(int):
         assert outcome(data[:size]) != "read", size

@@ -14,7 +14,7 @@ from barpc.rpcio.fields import number
 from barpc.rpcio.fixed import nitf_record
 from barpc.rpcio.formats import parse
 from barpc.rpcio.text import write_rpb, write_txt
-from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, grid, make_rpc, yaml
+from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
 
 WRITABLE = [row for row in FORMATS.values() if row.write is not None]
 NAMES = [f"scene{suffix}" for row in WRITABLE for suffix in row.suffixes]
@@ -64,6 +64,7 @@ DIALECTS = {
     "DIMAP v2": (dimap_v2, "dimap"),
     "DIMAP v3": (dimap_v3, "dimap"),
     "orthority's YAML": (yaml, "yaml"),
+    "ENVI's header": (envi, "envi"),
 }
 
 
