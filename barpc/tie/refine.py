@@ -18,7 +18,7 @@ from barpc.tie.register import Registration, Task, register_task
 from barpc.tie.work import Progress, ordered
 
 _FLOOR = 0.1  # px across the epipolar line that are always tolerated
-_DISTORTED = 2.2  # times the median sigma: the patch lies across a step of the ground
+_DISTORTED = 2.0  # times the median sigma: the patch lies across a step of the ground
 _LEAST_SIGMA = 0.02  # px
 _LEAST_REACH = 5.0  # px of half a segment, below which altitudes are not compared
 _FEW = 20  # observations of a pair of views below which their sigmas are not scaled by their errors
@@ -159,7 +159,7 @@ class _Links:
         for group in _grouped(
             views[self.reference[first]], views[self.other[first]], views[self.other[second]]
         ):
-            agree = agreeing(self.origin[first[group]], apart[group], 3 * _FLOOR)[0]
+            agree = agreeing(self.origin[first[group]], apart[group], 2 * _FLOOR)[0]
             for end in (first[group], second[group]):
                 compared[end] = True
                 agreed[end[agree]] = True

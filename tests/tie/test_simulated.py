@@ -1,0 +1,158 @@
+"""Tie points on rendered scenes, whose truth is known; hard light, clouds, and what cannot work."""
+
+from __future__ import annotations
+
+import re
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.errors import DisconnectedError, ImageError, TiePointError
+from barpc.raster import open_raster
+from barpc.scene import Tracks, View
+from barpc.sensor.corrected import Corrected
+from barpc.tie import TieOptions, common_tracks, find_tracks
+
+from .conftest import write_image
+
+
+def rms(scene, tracks: Tracks, i: int, j: int) -> np.ndarray:
+    """True error of the tie points of two views (col, row) [px]: seen from i in j, and from j in i."""
+    first, second = common_tracks(tracks, i, j)
+    errors = [scene.errors(i, j, first, second), scene.errors(j, i, second, first)]
+    return np.array([np.sqrt((e**2).mean(axis=0)) for e in errors])
+
+
+def typical(scene, tracks: Tracks, i: int, j: int) -> np.ndarray:
+    """Robust standard deviation of the true error [px]."""
+    errors = scene.errors(i, j, *common_tracks(tracks, i, j))
+    return 1.4826 * np.median(np.abs(errors), axis=0)
+
+
+def test_the_true_error_is_below_a_twelfth_of_a_pixel_in_both_directions(render) -> None:
+    scene = render(views=3)
+    tracks = find_tracks(scene.views).tracks
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        errors = rms(scene, tracks, i, j)
+        first, second = common_tracks(tracks, i, j)
+        assert len(first) > 1000
+        assert errors.max() <= 0.08
+        assert typical(scene, tracks, i, j).max() <= 0.06
+        bias = np.median(scene.errors(i, j, first, second), axis=0)
+        assert np.abs(bias).max() <= 0.005
+
+
+@pytest.mark.parametrize(
+    "conditions",
+    [
+        {"sun_azimuth": (150.0, 210.0), "clouds": 0.5},
+        {"sun_azimuth": (150.0, 210.0)},
+        {"saturation": 1200},
+    ],
+    ids=["clouds and another sun", "another sun", "saturated"],
+)
+def test_tie_points_hold_under_other_light_and_half_the_sky_in_clouds(render, conditions) -> None:
+    scene = render(views=2, size=(700, 700), **conditions)
+    result = find_tracks(scene.views)
+    assert result.tracks.num_points >= 100
+    assert typical(scene, result.tracks, 0, 1).max() <= 0.1
+    errors = scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))
+    assert (np.abs(errors).max(axis=1) > 1.0).mean() <= 0.02
+
+
+def test_the_corrected_cameras_of_a_second_pass_find_the_same_ground(render) -> None:
+    scene = render(views=3)
+    exact = [Corrected(v.sensor, s.correction) for v, s in zip(scene.views, scene.scene.shots, strict=True)]
+    first, second = find_tracks(scene.views), find_tracks(scene.views, sensors=exact)
+    assert second.tracks.num_points >= 0.98 * first.tracks.num_points
+    for report in second.pairs:
+        assert abs(report.offset[1]) < 0.1
+    assert any(abs(report.offset[1]) > 1.0 for report in first.pairs)
+
+
+def test_the_result_is_the_same_to_the_byte_for_any_workers(render) -> None:
+    views = render(views=3).views
+    options = TieOptions(tile=256)
+    expected = find_tracks(views, options)
+    seen: list[tuple[str, int, int]] = []
+    with ThreadPoolExecutor(2) as threads, ProcessPoolExecutor(2) as processes:
+        for executor in (threads, processes):
+            result = find_tracks(views, options, executor=executor, progress=lambda *step: seen.append(step))
+            for name in ("view", "point", "xy", "sigma"):
+                assert getattr(result.tracks, name).tobytes() == getattr(expected.tracks, name).tobytes()
+            assert result.pairs == expected.pairs
+    assert {stage for stage, _, _ in seen} == {"read", "detect", "match", "refine"}
+    assert all(1 <= done <= total for _, done, total in seen)
+
+
+@pytest.fixture
+def pair(render) -> list[View]:
+    return list(render(views=2).views)
+
+
+def altered(view: View, folder, change) -> View:
+    """The view with other pixels."""
+    with open_raster(view.path) as dataset:
+        data = change(dataset.read(1))
+    return replace(view, path=str(write_image(folder / f"{view.name}.tif", data)))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: d.astype(np.float32),
+        lambda d: (d // 16).astype(np.uint8),
+        lambda d: d.astype(np.int16),
+        lambda d: np.where(np.arange(d.shape[1]) < 100, np.nan, d.astype(np.float64)),
+        lambda d: np.stack([d, d[::-1]]),
+    ],
+    ids=["float", "uint8", "int16", "nan border", "two bands"],
+)
+def test_any_real_pixel_type_works(pair, tmp_path, change) -> None:
+    views = [pair[0], altered(pair[1], tmp_path, change)]
+    assert find_tracks(views).tracks.num_points > 400
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: np.zeros_like(d), "too few keypoints ([0-9]+ and 0 keypoints"),
+        (lambda d: np.full_like(d, 800), "too few keypoints"),
+        (lambda d: np.full(d.shape, np.nan, np.float32), "too few keypoints"),
+        (lambda d: np.random.default_rng(0).integers(1, 4000, d.shape).astype(np.uint16), "no common offset"),
+        (lambda d: np.rot90(d, 2).copy(), "no common offset"),
+    ],
+    ids=["nodata", "constant", "nan", "noise", "turned"],
+)
+def test_what_does_not_match_is_refused_by_name_with_counts_and_advice(
+    pair, tmp_path, change, message
+) -> None:
+    views = [pair[0], altered(pair[1], tmp_path, change)]
+    with pytest.raises(TiePointError, match=message.replace("(", r"\(", 1)) as caught:
+        find_tracks(views)
+    text = str(caught.value)
+    assert re.search(r"view_00 - view_01", text)
+    assert "loosen" in text
+    assert "\n" not in text
+
+
+def test_a_view_that_matches_no_other_is_named(render, tmp_path) -> None:
+    views = list(render(views=3).views)
+    views[2] = altered(views[2], tmp_path, np.zeros_like)
+    with pytest.raises(DisconnectedError, match=r"2 groups \(view_00, view_01; view_02\)") as caught:
+        find_tracks(views)
+    assert caught.value.groups == (("view_00", "view_01"), ("view_02",))
+
+
+def test_a_file_that_vanished_is_named(pair, tmp_path) -> None:
+    views = [pair[0], replace(pair[1], path=str(tmp_path / "gone.tif"))]
+    with pytest.raises(ImageError, match=r"gone\.tif: no such file"):
+        find_tracks(views)
+
+
+def test_one_pixel_is_too_few(pair, tmp_path) -> None:
+    tiny = replace(pair[1], size=(1, 1), path=str(write_image(tmp_path / "t.tif", np.ones((1, 1), np.uint8))))
+    with pytest.raises(TiePointError):
+        find_tracks([pair[0], tiny])
