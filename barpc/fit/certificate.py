@@ -91,7 +91,7 @@ class Errors:
         if len(residual):
             self.count += len(residual)
             self.squares = self.squares + np.einsum("ij,ij->j", residual, residual)
-            self.largest = np.maximum(self.largest, np.abs(residual).max(axis=0))
+            self.largest = np.maximum(self.largest, np.abs(residual.T).max(axis=1))
 
     @property
     def rmse(self) -> Array:
@@ -128,22 +128,22 @@ def roundtrip(rpc: RPC, ground: Array) -> float:
     return float(distance.max(initial=0.0)) if np.isfinite(distance).all() else float("inf")
 
 
-def coverage(image: Array, corner: Array, extent: Array) -> float:
-    """Share of an image inside the convex hull of image points.
+def coverage(image: Array, low: Array, high: Array) -> float:
+    """Share of a rectangle of the image inside the convex hull of image points.
 
     Parameters
     ----------
     image : (N, 2)
         col, row [px].
-    corner, extent : (2,)
-        Top-left corner, width and height of the image [px].
+    low, high : (2,)
+        Top-left and bottom-right corner of the rectangle [px].
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
-    direction = np.stack([np.cos(angle), np.sin(angle)])  # a point is inside if no direction sees it beyond
+    direction = np.column_stack([np.cos(angle), np.sin(angle)])  # outside is beyond all in one direction
     reach = np.full(len(angle), -np.inf)
     for start in range(0, len(image), 1024):
-        part = (image[start : start + 1024] - corner) / extent
-        reach = np.maximum(reach, (part @ direction).max(axis=0))
+        part = (image[start : start + 1024] - low) / (high - low)
+        reach = np.maximum(reach, (direction @ part.T).max(axis=1))
     t = (np.arange(20) + 0.5) / 20
     cells = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
-    return float((cells @ direction <= reach + 1e-9).all(axis=1).mean())
+    return float((cells @ direction.T <= reach + 1e-9).all(axis=1).mean())

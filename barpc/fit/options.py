@@ -71,7 +71,8 @@ class FitOptions:
     tolerance : float
         [px]; a fit whose check points miss by more in one coordinate is refused.
     weighted : int
-        Passes of ``ridge`` with the residuals weighted by 1 / denominator.
+        Further passes of ``ridge`` with the residuals weighted by 1 / denominator, made where that varies
+        by more than 5 %.
     tau : float
         Standard deviation that ``ridge`` expects of a denominator coefficient (no unit).
     joint : bool

@@ -10,6 +10,13 @@ from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 
 _RANGES = (("longitude", -360.0, 720.0), ("latitude", -90.0, 90.0), ("altitude", -12e3, 100e3))
 _ONE_ALTITUDE = 1e-3  # metres
+_CHUNK = 8192
+
+
+def extent(points: Array) -> tuple[Array, Array]:
+    """Smallest and largest value of each column of (N, k); columns one by one are faster than rows."""
+    columns = points.T
+    return np.array([c.min() for c in columns]), np.array([c.max() for c in columns])
 
 
 def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) -> tuple[Array, Array]:
@@ -27,8 +34,20 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
     Raises
     ------
     FitError
-        A wrong shape, numbers that are not finite or out of range, columns that look swapped, points on
-        a line or in a plane.
+        As for `numbers`; or columns that look swapped, points on a line or in a plane.
+    """
+    ground, image = numbers(ground, image)
+    _check_geometry(ground, image, allow_mirrored)
+    return ground, image
+
+
+def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
+    """Points (N, 3) and (N, 2) as finite arrays, longitudes made continuous.
+
+    Raises
+    ------
+    FitError
+        No points, a wrong shape, numbers that are not finite or out of range.
     """
     ground = np.asarray(ground, dtype=np.float64)
     image = np.asarray(image, dtype=np.float64)
@@ -36,7 +55,7 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
         raise FitError(f"points: expected (N, 3) and (N, 2), found {ground.shape} and {image.shape}")
     if not len(ground):
         raise FitError("points: none at all, an RPC takes forty or more")
-    bad = np.flatnonzero(~(np.isfinite(ground).all(axis=1) & np.isfinite(image).all(axis=1)))
+    bad = np.flatnonzero(~np.isfinite(ground.sum(axis=1) + image.sum(axis=1)))
     if len(bad):
         raise FitError(f"points: {len(bad)} of {len(ground)} are not finite (the first is point {bad[0]})")
     for axis, (name, low, high) in enumerate(_RANGES):
@@ -49,39 +68,57 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
     if np.ptp(ground[:, 0]) > 180.0:
         ground = ground.copy()
         ground[:, 0] = wrap_longitude(ground[:, 0], ground[0, 0])
-    _check_geometry(ground, image, allow_mirrored)
     return ground, image
 
 
 def _check_geometry(ground: Array, image: Array, allow_mirrored: bool) -> None:
-    for name, value in zip(("lon", "lat", "col", "row"), (*ground[:, :2].T, *image.T), strict=True):
-        if np.ptp(value) <= 1e-12 * np.abs(value).max():
-            raise FitError(f"points: all have {name} {value[0]:g}: they determine no image")
-    metres = (ground - ground.mean(axis=0)) * metres_per_unit(ground.mean(axis=0))
-    used = metres if np.ptp(ground[:, 2]) >= _ONE_ALTITUDE else metres[:, :2]
-    for points, where in ((used, "on the ground"), (image - image.mean(axis=0), "in the image")):
-        spread = np.linalg.svd(points / np.ptp(points, axis=0), compute_uv=False)
-        if spread[-1] < 1e-5 * spread[0]:
+    (low, left), (high, right) = zip(extent(ground), extent(image), strict=True)
+    low, high = np.concatenate([low, left]), np.concatenate([high, right])
+    span = high - low
+    for i, name in ((0, "lon"), (1, "lat"), (3, "col"), (4, "row")):
+        if span[i] <= 1e-12 * max(abs(low[i]), abs(high[i])):
+            raise FitError(f"points: all have {name} {low[i]:g}: they determine no image")
+    used = [0, 1, 2] if span[2] >= _ONE_ALTITUDE else [0, 1]
+    covariance = _covariance(ground, image, 0.5 * (low + high), np.where(span > 0, span, 1.0))
+    for axes, where in ((used, "on the ground"), ([3, 4], "in the image")):
+        spread = np.linalg.eigvalsh(covariance[np.ix_(axes, axes)])
+        if spread[0] < 1e-10 * spread[-1]:
             raise FitError(
-                f"points: {where} they lie {'in a plane' if points.shape[1] == 3 else 'on a line'}; an RPC "
-                "needs points at several altitudes everywhere"
+                f"points: {where} they lie {'in a plane' if len(axes) == 3 else 'on a line'}; an RPC needs "
+                "points at several altitudes everywhere"
             )
     if not allow_mirrored:
-        _check_order(used, image)
+        slope = np.linalg.solve(covariance[np.ix_(used, used)], covariance[np.ix_(used, [3, 4])])
+        metres = span[:2] * metres_per_unit(0.5 * (low[:3] + high[:3]))[:2]
+        _check_order(slope[:2].T * span[3:, None] / metres)
 
 
-def _check_order(used: Array, image: Array) -> None:
-    """Refuse an image that is mirrored as given, and square and upright with two columns swapped."""
-    jacobian = np.linalg.lstsq(used, image - image.mean(axis=0), rcond=None)[0].T[:, :2]
-    if np.linalg.det(jacobian) < 0 or not _square(jacobian):  # rows run down: a view from above is < 0
+def _covariance(ground: Array, image: Array, center: Array, span: Array) -> Array:
+    """Covariance (5, 5) of lon, lat, alt, col, row, each in units of its span."""
+    total, squares = np.zeros(5), np.zeros((5, 5))
+    for start in range(0, len(ground), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        z = np.concatenate([ground[part].T, image[part].T])
+        z -= center[:, None]
+        z /= span[:, None]
+        total += z.sum(axis=1)
+        squares += z @ z.T
+    return np.asarray(squares / len(ground) - np.outer(total, total) / len(ground) ** 2)
+
+
+def _check_order(jacobian: Array) -> None:
+    """Refuse an image that is mirrored as given, and square and upright with two columns swapped.
+
+    Parameters
+    ----------
+    jacobian : (2, 2)
+        d(col, row) / d(east, north) [px/m].
+    """
+    a, b = np.linalg.norm(jacobian, axis=1)
+    square = 0.5 < a / b < 2.0 and abs(jacobian[0] @ jacobian[1]) < 0.5 * a * b
+    if np.linalg.det(jacobian) < 0 or not square:  # rows run down: a view from above is < 0
         return
     raise FitError(
         "points: they show the ground mirrored, as if col and row or lon and lat were swapped; give "
         "lon, lat, alt and col, row (and allow_mirrored for a radar image that is mirrored)"
     )
-
-
-def _square(jacobian: Array) -> bool:
-    """Whether a (2, 2) derivative has nearly square pixels with nearly right angles."""
-    a, b = np.linalg.norm(jacobian, axis=1)
-    return bool(0.5 < a / b < 2.0 and abs(jacobian[0] @ jacobian[1]) < 0.5 * a * b)

@@ -11,13 +11,14 @@ from barpc.errors import FitError
 from barpc.fit.certificate import Errors, RpcFit, coverage, roundtrip, smallest_denominator
 from barpc.fit.grid import check_points, control_points, widened
 from barpc.fit.options import FitOptions
-from barpc.fit.points import screened
+from barpc.fit.points import extent, numbers, screened
 from barpc.fit.solve import Solution, solve
 from barpc.geodesy import Array
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 
 _CHUNK = 8192
+_LOOPS = 4096  # round trips that a table of points is tried on, about
 
 
 def fit_rpc(
@@ -129,18 +130,17 @@ def fit_rpc_points(
     distinct = len(np.unique(cnp, axis=0)) if len(cnp) < 400 else len(cnp)
     if distinct < min(len(cnp), 40):
         raise FitError(f"points: only {distinct} of {len(cnp)} are distinct, too few for an RPC")
-    held_out = None if check is None else screened(*check, allow_mirrored=True)
+    held_out = None if check is None else numbers(*check)
 
     def attempt(method: str) -> RpcFit:
         solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
-        on_ckp, loop = Errors(), 0.0
+        on_ckp = Errors()
         if held_out is None:
             for residual in solution.leave_one_out():
                 on_ckp.add(residual)
         else:
             on_ckp.add(solution.rpc.project(held_out[0]) - held_out[1])
-        for start in range(0, len(cnp), _CHUNK):
-            loop = max(loop, roundtrip(solution.rpc, cnp[start : start + _CHUNK]))
+        loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // _LOOPS)])
         return _certified(solution, on_ckp, loop, size)
 
     return _first_accepted(attempt, options, vendor, strict)
@@ -170,16 +170,18 @@ def _certified(solution: Solution, on_ckp: Errors, loop: float, size: tuple[int,
     for start in range(0, len(ground), _CHUNK):
         part = slice(start, start + _CHUNK)
         on_cnp.add(rpc.project(ground[part]) - image[part])
-    low, high = (-0.5, -0.5) if size else image.min(axis=0), size if size else np.ptp(image, axis=0)
+    (low, high), (left, right) = extent(ground), extent(image)
+    if size is not None:
+        left, right = np.full(2, -0.5), np.asarray(size) - 0.5
     return RpcFit(
         rpc=rpc,
         rmse_cnp=on_cnp.rmse,
         max_cnp=on_cnp.largest,
         rmse_ckp=on_ckp.rmse,
         max_ckp=on_ckp.largest,
-        min_denominator=smallest_denominator(rpc, ground.min(axis=0), ground.max(axis=0)),
+        min_denominator=smallest_denominator(rpc, low, high),
         roundtrip=loop,
-        coverage=coverage(image, np.asarray(low), np.asarray(high, dtype=np.float64)),
+        coverage=coverage(image, left, right),
         h=solution.h,
         iterations=solution.iterations,
         num_cnp=on_cnp.count,

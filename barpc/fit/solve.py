@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from barpc.errors import FitError
 from barpc.fit.lcurve import solve_lcurve
 from barpc.fit.options import ALTITUDE_FLOOR, FitOptions, Normalization
+from barpc.fit.points import extent
 from barpc.fit.precision import PRECISIONS
 from barpc.fit.ridge import expected_size, noise_scaled, solution
 from barpc.fit.system import Compressed, Problem
 from barpc.geodesy import Array
 from barpc.sensor.rpc import RPC
+
+_EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +89,7 @@ def normalization(
     """
     if options.normalization is not None:
         return options.normalization
-    low, high = ground.min(axis=0), ground.max(axis=0)
-    left, right = image.min(axis=0), image.max(axis=0)
+    (low, high), (left, right) = extent(ground), extent(image)
     offset, scale = 0.5 * (low + high), 0.5 * (high - low)
     if vendor is not None:
         offset, scale = vendor.ground_offset, vendor.ground_scale
@@ -135,8 +137,7 @@ def solve(
             "vendor-denominators: the model is not built on an RPC whose denominators could be kept"
         )
     norm = normalization(ground, image, options, vendor if keeps else None)
-    everything = Problem(ground, image, norm, weight=weight)
-    problem = replace(everything, active=everything.independent())
+    problem = Problem(ground, image, norm, weight=weight).screened()
     unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)
     if len(ground) <= unknowns:
         raise FitError(
@@ -161,19 +162,22 @@ def _assembled(
 def _ridge(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
     expected = expected_size(problem.active, options.tau)
     quantize = _quantize(options)
-    coeffs, solved, h = np.zeros((4, 20)), [], np.zeros(2)
+    coeffs, solved, h, passes = np.zeros((4, 20)), [], np.zeros(2), 1
     for axis in range(2):
-        own = slice(2 * axis, 2 * axis + 2)
         denominator = None
-        for last in [False] * options.weighted + [True]:
-            raw = problem.compressed(axis, denominator)
-            system, sigma = noise_scaled(raw, expected)
-            x = solution(system, quantize if last else None)
-            coeffs[own] = problem.expanded(x)
-            denominator = coeffs[2 * axis + 1]
+        for done in range(1 + options.weighted):
+            system, sigma = noise_scaled(problem.compressed(axis, denominator), expected)
+            pair = problem.expanded(solution(system))
+            denominator = pair[1]
+            passes = max(passes, 1 + done)
+            if np.abs(denominator[1:]).sum() < _EVEN:
+                break
+        coeffs[2 * axis : 2 * axis + 2] = (
+            pair if quantize is None else problem.expanded(solution(system, quantize))
+        )
         solved.append(system)
         h[axis] = sigma / options.tau
-    return _assembled(problem, coeffs, solved, h, 1 + options.weighted, "ridge")
+    return _assembled(problem, coeffs, solved, h, passes, "ridge")
 
 
 def _lcurve(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:

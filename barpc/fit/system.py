@@ -11,7 +11,7 @@ triangular factor of (M | y), which is made chunk by chunk: a squared condition 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,7 @@ from barpc.sensor.rpc import monomials
 
 IntArray = npt.NDArray[np.int64]
 
-CHUNK = 512
+CHUNK = 1024
 """Rows taken into the triangle at a time: what is worked on stays in cache."""
 _BLOCK = 8  # columns of a Householder block
 
@@ -96,6 +96,8 @@ class Problem:
         Monomials in use, the constant one first.
     weight : (N,), optional
         Weights of the points.
+    first : Compressed, optional
+        The compressed system of col without a denominator, where it is known already.
     """
 
     ground: Array
@@ -103,14 +105,21 @@ class Problem:
     norm: Normalization
     active: IntArray = field(default_factory=lambda: ALL)
     weight: Array | None = None
+    first: Compressed | None = None
 
-    def independent(self) -> IntArray:
+    def screened(self) -> Problem:
+        """The same problem without the monomials that its points cannot tell apart."""
+        first = self.compressed(0)
+        active = self._independent(first)
+        return replace(self, first=first) if len(active) == len(self.active) else replace(self, active=active)
+
+    def _independent(self, system: Compressed) -> IntArray:
         """The monomials that these points tell from those before them, which are of lower degree.
 
         All twenty where altitudes abound; of points at one altitude those without H, of two altitudes
         those of degree one in H. A dependent one would make a = b = 0 a solution.
         """
-        diagonal = np.diag(self.compressed(0, free=False).matrix)
+        diagonal = np.diag(system.matrix)[: len(self.active)]
         return np.asarray(self.active[np.abs(diagonal) > _DEPENDENT * np.sqrt(len(self.image))])
 
     def rows(
@@ -153,6 +162,8 @@ class Problem:
 
     def compressed(self, axis: int, denominator: Array | None = None, free: bool = True) -> Compressed:
         """The compressed system of col (0) or row (1); parameters as of `rows`."""
+        if self.first is not None and axis == 0 and denominator is None and free:
+            return self.first
         size = 2 * len(self.active) if free else len(self.active) + 1
         triangle: Array = np.zeros((size, size), order="F")
         for _, rows in self.rows(axis, denominator, free):
