@@ -31,6 +31,8 @@ COMMANDS = {
     "convert": "Write an RPC in another format.",
     "crop": "Cut a window out of an image with its exact RPC.",
     "apply": "Give images other RPCs in a new folder and prove that tools read them.",
+    "report": "Make report.html of a finished run again.",
+    "compare": "Compare two finished runs of the same images.",
     "simulate": "Make synthetic images with known cameras and truth.",
     "doctor": "Print versions and check the installation.",
 }

@@ -55,6 +55,8 @@ class Run:
         Where results are.
     gcps : GroundPoints or None
         Ground control of the adjustment.
+    check_points : GroundPoints or None
+        Ground points that stayed out of it.
     """
 
     kind: str
@@ -71,6 +73,7 @@ class Run:
     stages: Sequence[Mapping[str, Any]] = field(default_factory=list)
     out_dir: str = ""
     gcps: GroundPoints | None = None
+    check_points: GroundPoints | None = None
 
     @property
     def before(self) -> tuple[SensorModel, ...]:

@@ -1,0 +1,189 @@
+"""Charts of the report: errors before and after, pairs, geometry, corrections. Each is one SVG text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from barpc.geodesy import Array
+from barpc.report.svg import (
+    MAX_ROWS,
+    ROW,
+    WIDTH,
+    Scale,
+    label,
+    line,
+    log_scale,
+    path,
+    sheet,
+    short_names,
+    tag,
+    titled,
+    x_axis,
+)
+
+Record = Mapping[str, Any]
+
+_NAMES = 118.0  # units kept free for names on the left
+_RIGHT = WIDTH - 12.0
+_BINS = 48
+
+
+def histogram(before: Array, after: Array) -> str:
+    """Shares of observations by reprojection error (n,) [px], before and after, on a logarithmic axis."""
+    series = [(name, norm[norm > 0]) for name, norm in (("before", before), ("after", after))]
+    series = [(name, norm) for name, norm in series if len(norm)]
+    everything = np.concatenate([norm for _, norm in series])
+    low, high = np.quantile(everything, [0.002, 0.9995])
+    scale = Scale(max(low, high * 1e-4) / 1.2, high * 1.2, 34.0, _RIGHT, log=True)
+    edges = np.geomspace(scale.low, scale.high, _BINS + 1)
+    shares = [np.histogram(norm.clip(scale.low, scale.high), edges)[0] / len(norm) for _, norm in series]
+    top, bottom = 26.0, 190.0
+    up = Scale(0.0, max(float(share.max()) for share in shares) * 1.08, bottom, top)
+    parts = x_axis(scale, top, bottom, "reprojection error [px], logarithmic")
+    for value in up.ticks:
+        parts += [
+            line(34, up(value), _RIGHT, up(value), "grid"),
+            label(30, up(value) + 4, f"{100 * value:g}", "end"),
+        ]
+    parts.append(label(4, 14, "share of the observations [%]", class_="axis"))
+    words = []
+    for (name, norm), share in zip(series, shares, strict=True):
+        steps = [(scale(edges[0]), bottom)]
+        for k, value in enumerate(share.tolist()):
+            steps += [(scale(edges[k]), up(value)), (scale(edges[k + 1]), up(value))]
+        parts.append(path([*steps, (scale(edges[-1]), bottom)], f"area {name}"))
+        words.append(f"median {name} {np.median(norm):.3g} px")
+    parts += legend([name for name, _ in series], _RIGHT, 14)
+    return sheet("errors", "Histogram of reprojection errors", "; ".join(words) + ".", 222, parts)
+
+
+def legend(names: Sequence[str], right: float, y: float) -> list[str]:
+    """Coloured dots with the names of the series, ending at `right`."""
+    parts = []
+    for name in reversed(names):
+        parts.append(label(right, y, name, "end"))
+        right -= 6.6 * len(name) + 9
+        parts.append(tag("circle", cx=right, cy=y - 4, r=4.5, class_=f"dot {name}"))
+        right -= 14
+    return parts
+
+
+def dumbbells(key: str, title: str, axis: str, rows: Sequence[tuple[str, float | None, float | None]]) -> str:
+    """A row a name with a value before and one after, on a logarithmic axis; the largest at the end first.
+
+    Parameters
+    ----------
+    key, title, axis : str
+        Identity; what it is; the axis' title with its unit.
+    rows : sequence of (name, before, after)
+        None where there is none.
+    """
+    shown = most_telling(rows, lambda row: -max(row[2] or 0.0, 0.0 if row[2] else row[1] or 0.0))
+    values = [value for _, *both in shown for value in both if value]
+    scale = log_scale(values, _NAMES, _RIGHT)
+    bottom = 24 + ROW * len(shown)
+    parts = x_axis(scale, 24, bottom, axis)
+    for k, ((name, *both), short) in enumerate(
+        zip(shown, short_names([row[0] for row in shown]), strict=True)
+    ):
+        y = 24 + ROW * (k + 0.5)
+        parts.append(titled(label(_NAMES - 8, y + 4, short, "end"), name))
+        places = [None if not value else scale(value) for value in both]
+        if None not in places:
+            parts.append(line(places[0], y, places[1], y, "link"))  # type: ignore[arg-type]
+        for when, x, value in zip(("before", "after"), places, both, strict=True):
+            if x is not None:
+                dot = tag("circle", cx=x, cy=y, r=4.5, class_=f"dot {when}")
+                parts.append(titled(dot, f"{name}: {when} {value:.3g}"))
+    parts += legend(["before", "after"] if any(row[2] for row in shown) else ["before"], _RIGHT, 13)
+    described = f"{len(shown)} of {len(rows)} rows; the figures are in the table."
+    return sheet(key, title, described, bottom + 34, parts)
+
+
+def most_telling(rows: Sequence[Any], order: Any) -> list[Any]:
+    """All rows as they come, or the first `MAX_ROWS` by an order where there are more."""
+    return list(rows) if len(rows) <= MAX_ROWS else sorted(rows, key=order)[:MAX_ROWS]
+
+
+def connections(views: Sequence[Record], pairs: Sequence[Record]) -> str:
+    """The images on a circle, numbered as in the table; a line for each pair, thicker with more matches."""
+    num, middle, radius = len(views), WIDTH / 2, 150.0
+    angle = [2 * math.pi * k / num - math.pi / 2 for k in range(num)]
+    place = [(middle + radius * math.cos(a), 175 + radius * math.sin(a)) for a in angle]
+    index = {view["name"]: k for k, view in enumerate(views)}
+    most = max([pair["num_matches"] for pair in pairs], default=1)
+    parts = []
+    for pair in sorted(pairs, key=lambda p: p["num_matches"])[-1500:]:
+        (x1, y1), (x2, y2) = place[index[pair["a"]]], place[index[pair["b"]]]
+        share = math.sqrt(pair["num_matches"] / most)
+        link = tag(
+            "line", x1=x1, y1=y1, x2=x2, y2=y2, class_="tie", stroke_width=0.5 + 5.5 * share / max(num / 8, 1),
+            stroke_opacity=0.15 + 0.65 * share,
+        )  # fmt: skip
+        parts.append(titled(link, f"{pair['a']} - {pair['b']}: {pair['num_matches']} matches"))
+    size = 12.0 if num <= 24 else max(3.0, 290.0 / num)
+    for k, view in enumerate(views):
+        x, y = place[k]
+        node = tag("circle", cx=x, cy=y, r=size, class_=f"node {view['status']}")
+        text = label(x, y + 4, str(k + 1), "middle", "nodename") if num <= 40 else ""
+        parts.append(titled(node + text, f"{k + 1} {view['name']}: {view['num_observations']} tie points"))
+    described = f"{num} images, {len(pairs)} pairs with tie points in common; up to {most} matches a pair."
+    return sheet("graph", "Graph of the images and their pairs", described, 350, parts)
+
+
+def convergence(pairs: Sequence[Record]) -> str:
+    """Matches of each pair over its convergence angle; heights are weak on the left, matching on the right."""
+    shown = [pair for pair in pairs if pair["convergence_deg"] is not None]
+    high = max([pair["convergence_deg"] for pair in shown], default=1.0)
+    x = Scale(0.0, max(high * 1.08, 8.0), 44.0, _RIGHT)
+    y = log_scale([pair["num_matches"] for pair in shown], 190.0, 44.0)
+    parts = []
+    for low, up, words in ((0.0, 5.0, "weak heights"), (5.0, 35.0, "good"), (35.0, 180.0, "hard to match")):
+        if low < x.high:
+            left, right = x(low), x(min(up, x.high))
+            parts.append(tag("rect", x=left, y=30, width=right - left, height=160, class_=f"zone {words[0]}"))
+            if right - left > 6.6 * len(words):
+                parts.append(label((left + right) / 2, 26, words, "middle"))
+    parts += x_axis(x, 30, 190, "convergence angle [deg]")
+    for value in y.ticks:
+        parts += [line(44, y(value), _RIGHT, y(value), "grid"), label(40, y(value) + 4, f"{value:g}", "end")]
+    parts.append(label(4, 12, "matches", class_="axis"))
+    for pair in shown:
+        dot = tag(
+            "circle", cx=x(pair["convergence_deg"]), cy=y(pair["num_matches"]), r=4.5, class_="dot after see"
+        )
+        words = f"{pair['a']} - {pair['b']}: {pair['convergence_deg']:.1f} deg, {pair['num_matches']} matches"
+        parts.append(titled(dot, words))
+    described = f"{len(shown)} pairs, up to {high:.1f} degrees."
+    return sheet("angles", "Matches of each pair over its convergence angle", described, 222, parts)
+
+
+def corrections(views: Sequence[Record]) -> str:
+    """How far each camera was moved in its image, col and row, with one sigma."""
+    rows = [
+        (v["name"], v["correction"]["center_shift_px"], v["correction"]["center_sigma_px"]) for v in views
+    ]
+    shown = most_telling(rows, lambda row: -max(abs(shift) for shift in row[1]))
+    reach = max([abs(s) + e for _, shift, sigma in shown for s, e in zip(shift, sigma, strict=True)])
+    scale = Scale(-reach * 1.05, reach * 1.05, _NAMES, _RIGHT)
+    bottom = 24 + ROW * len(shown)
+    parts = [*x_axis(scale, 24, bottom, "shift in the middle of the image, with one sigma [px]")]
+    parts.append(line(scale(0), 24, scale(0), bottom, "zero"))
+    for k, ((name, shift, sigma), short) in enumerate(
+        zip(shown, short_names([r[0] for r in shown]), strict=True)
+    ):
+        middle = 24 + ROW * (k + 0.5)
+        parts.append(titled(label(_NAMES - 8, middle + 4, short, "end"), name))
+        for axis, value, error, y in zip(("col", "row"), shift, sigma, (middle - 4, middle + 4), strict=True):
+            bar = line(scale(value - error), y, scale(value + error), y, f"bar {axis}")
+            dot = tag("circle", cx=scale(value), cy=y, r=3.5, class_=f"dot {axis}")
+            parts.append(titled(bar + dot, f"{name}, {axis}: {value:+.2f} ± {error:.2f} px"))
+    parts += legend(["col", "row"], _RIGHT, 13)
+    described = (
+        f"{len(shown)} of {len(rows)} images; the largest shift with its sigma reaches {reach:.2g} px."
+    )
+    return sheet("moves", "Shift of each camera in its image", described, bottom + 34, parts)

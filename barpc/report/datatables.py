@@ -1,0 +1,175 @@
+"""The tables of the report: what each shows, ready for the template."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from barpc.report.compare import flat_options
+from barpc.report.verdict import STATUS_WORDS
+
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell.
+
+    Parameters
+    ----------
+    text : str
+        As shown.
+    key : float or str
+        What it is sorted by.
+    kind : str
+        CSS class: a status, or "number", "name".
+    """
+
+    text: str
+    key: float | str
+    kind: str = "number"
+
+
+@dataclass(frozen=True)
+class DataTable:
+    """A table with its caption and the heads of its columns, units in them."""
+
+    key: str
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+
+
+def figure(value: float | None, form: str = ".3f") -> Cell:
+    """A number; nothing is a dash that sorts last."""
+    return Cell("-", 1e300) if value is None else Cell(format(value, form), float(f"{value:.6g}"))
+
+
+def name(text: str) -> Cell:
+    """A name."""
+    return Cell(text, text, "name")
+
+
+def views_table(summary: Record) -> DataTable:
+    """One row an image."""
+    adjusted = summary["kind"] == "adjust"
+    columns = ["#", "image", "verdict", "tie points", "rejected [%]", "covered [%]", "before [px]"]
+    columns += ["after [px]", "shift col, row [px]"] if adjusted else []
+    columns += ["GSD [m]", "incidence [deg]", "RPC read from"]
+    rows = []
+    for k, view in enumerate(summary["views"]):
+        every = view["num_observations"] + view["num_rejected"]
+        row = [
+            figure(k + 1, "d"),
+            name(view["name"]),
+            Cell(
+                STATUS_WORDS[view["status"]],
+                list(STATUS_WORDS).index(view["status"]),
+                f"status {view['status']}",
+            ),
+            figure(view["num_observations"], "d"),
+            figure(100 * view["num_rejected"] / every if every else None, ".1f"),
+            figure(100 * view["tie_coverage"], ".0f"),
+            figure(view["rmse_before"]),
+        ]
+        if adjusted:
+            row += [figure(view["rmse_after"]), _shift(view)]
+        source = "-" if view["rpc_source"] is None else view["rpc_source"]["format"]
+        rows.append([*row, figure(view["gsd_m"], ".2f"), figure(view["incidence_deg"], ".1f"), name(source)])
+    return DataTable("images", "Images: reprojection error (RMS) of the tie points that count", columns, rows)
+
+
+def _shift(view: Record) -> Cell:
+    shift = None if view["correction"] is None else view["correction"]["center_shift_px"]
+    if shift is None:
+        return figure(None)
+    return Cell(f"{shift[0]:+.2f}, {shift[1]:+.2f}", float(f"{max(map(abs, shift)):.6g}"))
+
+
+def pairs_table(summary: Record) -> DataTable:
+    """One row a pair."""
+    adjusted = summary["kind"] == "adjust"
+    columns = ["pair", "matches", "angle [deg]", "B/H", "height per px [m]", "before [px]"]
+    columns += ["after [px]"] if adjusted else []
+    rows = []
+    for pair in summary["pairs"]:
+        row = [
+            name(f"{pair['a']} - {pair['b']}"),
+            figure(pair["num_matches"], "d"),
+            figure(pair["convergence_deg"], ".1f"),
+            figure(pair["base_to_height"], ".2f"),
+            figure(pair["height_m_per_px"], ".3g"),
+        ]
+        rows.append(
+            [*row, *(_offset(pair[f"epipolar_{when}"]) for when in ("before", "after")[: 1 + adjusted])]
+        )
+    caption = "Pairs: distance of matches from the epipolar line, median ± spread (1.4826 MAD)"
+    return DataTable("pairs", caption, columns, rows)
+
+
+def _offset(offset: Record | None) -> Cell:
+    if offset is None:
+        return figure(None)
+    return Cell(f"{offset['median']:+.3f} ± {offset['spread']:.3f}", float(f"{abs(offset['median']):.6g}"))
+
+
+def fits_table(summary: Record) -> DataTable:
+    """The certificate of every refitted RPC."""
+    columns = ["image", "RMSE col, row [px]", "largest [px]", "smallest denominator", "round trip [px]"]
+    columns += ["covered [%]", "check points", "solver"]
+    rows = []
+    for view in summary["views"]:
+        fit = view["fit"]
+        rmse = Cell(", ".join(f"{value:.1e}" for value in fit["rmse_px"]), max(fit["rmse_px"]))
+        rows.append(
+            [
+                name(view["name"]),
+                rmse,
+                figure(max(fit["max_px"]), ".1e"),
+                figure(fit["min_denominator"]),
+                figure(fit["roundtrip_px"], ".1e"),
+                figure(100 * fit["coverage"], ".0f"),
+                figure(fit["num_check_points"], "d"),
+                name(fit["method"]),
+            ]
+        )
+    return DataTable("fits", "Refitted RPCs against P_BA, on points that the fit has not seen", columns, rows)
+
+
+def files_table(summary: Record) -> DataTable:
+    """Every file with a new RPC, and what each consumer that reopened it read."""
+    rows = []
+    for view in summary["views"]:
+        for file, found in view["outputs"].items():
+            readings = found if isinstance(found, Mapping) else {"barpc": found}
+            rows += [[name(file), name(who), figure(error, ".1e")] for who, error in readings.items()]
+    return DataTable("files", "Files reopened", ["file", "read by", "largest difference to P_BA [px]"], rows)
+
+
+def gcps_table(summary: Record) -> DataTable:
+    """Adjusted GCPs minus their given place."""
+    columns = ["GCP", "east [m]", "north [m]", "up [m]", "sigma east, north, up [m]"]
+    rows = []
+    for gcp in summary["gcps"]:
+        sigma = Cell(", ".join(f"{s:.2g}" for s in gcp["sigma_m"]), max(gcp["sigma_m"]))
+        rows.append([name(gcp["name"]), *(figure(r, "+.3f") for r in gcp["residual_enu_m"]), sigma])
+    return DataTable("gcps", "Ground control: adjusted minus given place", columns, rows)
+
+
+def stages_table(summary: Record) -> DataTable:
+    """Seconds and memory of the stages."""
+    columns = ["stage", "seconds", "CPU seconds", "peak memory [MB]"]
+    forms = {"seconds": ".2f", "cpu_seconds": ".2f", "peak_memory_mb": ".0f"}
+    rows = [
+        [name(stage["stage"]), *(figure(stage[key], form) for key, form in forms.items())]
+        for stage in summary["stages"]
+    ]
+    return DataTable("stages", "Stages of the run", columns, rows)
+
+
+def options_table(summary: Record) -> DataTable:
+    """Every option of the run."""
+    flat = flat_options(summary["options"] or {})
+    rows = [[name(key), name(str(value))] for key, value in flat.items()]
+    return DataTable("options", "Options of the run", ["option", "value"], rows)

@@ -1,0 +1,283 @@
+"""The sections of the report: a question that a user has, the answer in words, the charts that show it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from barpc.report import charts, datatables
+from barpc.report.datatables import DataTable
+from barpc.report.load import RunFiles
+from barpc.report.maps import ground_map
+from barpc.report.panels import arrow_key, residual_panels
+from barpc.report.svg import MAX_ROWS
+from barpc.report.verdict import metres
+from barpc.scene import connected_groups
+
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A question and its answer.
+
+    Parameters
+    ----------
+    key : str
+        Anchor on the page.
+    question : str
+        The heading.
+    answer : str
+        A sentence or two.
+    charts : sequence of (str, str)
+        SVG texts with their captions.
+    panels : sequence of {"svg", "name", "note"}
+        Small maps.
+    bars : sequence of (str, str, float)
+        Words, a value as text, and the length of a bar in percent.
+    tables : sequence of DataTable
+        Tables.
+    """
+
+    key: str
+    question: str
+    answer: str
+    charts: Sequence[tuple[str, str]] = ()
+    panels: Sequence[Mapping[str, str]] = ()
+    bars: Sequence[tuple[str, str, float]] = ()
+    tables: Sequence[DataTable] = field(default_factory=list)
+
+
+def _images(files: RunFiles) -> Section:
+    summary = files.summary
+    good = sum(view["status"] in ("adjusted", "consistent") for view in summary["views"])
+    answer = f"{good} of {len(summary['views'])} without reservation."
+    todo = [view for view in summary["views"] if view["advice"]]
+    bars: list[tuple[str, str, float]] = []
+    answer += " What to do about the others stands in the verdict above." if todo else ""
+    table = datatables.views_table(summary)
+    return Section("images", "Which images can I use?", answer, bars=bars, tables=[table])
+
+
+def _map(files: RunFiles) -> Section | None:
+    if not any(files.outlines):
+        return None
+    caption = (
+        "Outlines at the altitude of the scene, numbered as in the table of images; dots are tie points; lines join "
+        "the images of a pair, stronger with more matches; triangles are GCPs."
+    )
+    answer = f"The scene lies at about {files.summary['altitude_m']:.0f} m above the ellipsoid."
+    return Section("map", "Where are the images?", answer, [(ground_map(files), caption)])
+
+
+def _graph(files: RunFiles) -> Section | None:
+    views, pairs = files.summary["views"], files.summary["pairs"]
+    if not pairs:
+        return None
+    index = {view["name"]: k for k, view in enumerate(views)}
+    links = [(index[pair["a"]], index[pair["b"]]) for pair in pairs]
+    groups = connected_groups(len(views), links)
+    partners = np.bincount(np.array(links).ravel(), minlength=len(views))
+    lonely = [view["name"] for view, n in zip(views, partners, strict=True) if n == 1]
+    answer = "All images hang together." if len(groups) == 1 else f"They fall into {len(groups)} groups."
+    if lonely and len(views) > 2:
+        answer += f" Tied to one other image only: {_some(lonely)}."
+    caption = "Numbers as in the table of images; a thicker line is a pair with more matches."
+    return Section(
+        "graph", "Which images hold together?", answer, [(charts.connections(views, pairs), caption)]
+    )
+
+
+def _some(names: Sequence[str], most: int = 6) -> str:
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _errors(files: RunFiles) -> Section | None:
+    table = files.observations
+    if not len(table.view):
+        return None
+    norms = [np.hypot(*r[table.used & np.isfinite(r).all(axis=1)].T) for r in (table.before, table.after)]
+    views = files.summary["views"]
+    rows = [(view["name"], view["rmse_before"], view["rmse_after"]) for view in views]
+    adjusted = files.summary["kind"] == "adjust"
+    shown = [(charts.histogram(*norms), "All observations that count.")]
+    axis = "root mean square reprojection error [px], logarithmic"
+    shown.append(
+        (charts.dumbbells("rmse", "Error of each image", axis, rows), _which(rows, "images", "error"))
+    )
+    if not adjusted:
+        answer = f"Half of the observations lie within {np.median(norms[0]):.3f} px of where their cameras put them."
+        return Section("errors", "How large are the errors?", answer, shown)
+    medians = [float(np.median(norm)) for norm in norms]
+    answer = (
+        f"The median reprojection error went from {medians[0]:.3f} px to {medians[1]:.3f} px."
+        " These are the points the adjustment was made of: it shows agreement, not accuracy on the ground."
+    )
+    return Section("errors", "Did the adjustment help?", answer, shown)
+
+
+def _which(rows: Sequence[Any], what: str, by: str) -> str:
+    most = MAX_ROWS
+    return f"All {len(rows)} {what}." if len(rows) <= most else f"The {most} {what} with the largest {by}."
+
+
+def _randomness(files: RunFiles) -> Section | None:
+    if not len(files.observations.view):
+        return None
+    views = files.summary["views"]
+    panels, shares = residual_panels(views, files.observations)
+    marked = [view["name"] for view, share in zip(views, shares, strict=True) if share > 0.5]
+    when = "left after the adjustment" if files.summary["kind"] == "adjust" else "as the cameras are"
+    if marked:
+        answer = f"Not in {_some(marked)}: in most of their cells the residuals {when} point the same way."
+        answer += " Small systematic residuals are usual (attitude jitter, relief); where they matter, try --drift 1."
+    else:
+        answer = (
+            f"Mostly: in no image do the residuals {when} point the same way in more than half of the cells."
+        )
+    answer += (
+        " A cell is darker where its error is larger; thin lines are single residuals; a bold arrow is the mean of a"
+        f" cell that is larger than chance allows. {arrow_key(files.observations)}"
+    )
+    return Section("random", "Are the residuals random?", answer, panels=panels)
+
+
+def _pairs(files: RunFiles) -> Section | None:
+    pairs = files.summary["pairs"]
+    if not pairs:
+        return None
+    rows = []
+    for pair in pairs:
+        both = (pair["epipolar_before"], pair["epipolar_after"])
+        rms = [None if offset is None else offset["rms"] for offset in both]
+        rows.append((f"{pair['a']} - {pair['b']}", rms[0], rms[1]))
+    last = [row[2] if row[2] is not None else row[1] for row in rows]
+    largest = max((value for value in last if value is not None), default=float("nan"))
+    answer = (
+        f"The epipolar offset, which no height explains, is {largest:.3f} px (RMS) in the worst pair."
+        " Stereo matching along epipolar lines wants it well below 0.5 px."
+    )
+    axis = "RMS distance from the epipolar line [px], logarithmic"
+    chart = charts.dumbbells("epipolar", "Epipolar offset of each pair", axis, rows)
+    shown = [(chart, _which(rows, "pairs", "offset"))]
+    table = datatables.pairs_table(files.summary)
+    return Section("pairs", "Do the pairs fit for stereo?", answer, shown, tables=[table])
+
+
+def _heights(files: RunFiles) -> Section | None:
+    pairs = [pair for pair in files.summary["pairs"] if pair["convergence_deg"] is not None]
+    if not pairs:
+        return None
+    best = min(pairs, key=lambda pair: pair["height_m_per_px"] or np.inf)
+    answer = (
+        f"Best from {best['a']} - {best['b']}: the rays meet under {best['convergence_deg']:.1f} degrees "
+        f"(B/H {best['base_to_height']:.2f}), so one pixel of parallax is {metres(best['height_m_per_px'])} of height."
+    )
+    weak = sum(pair["convergence_deg"] < 1.0 for pair in pairs)
+    if weak:
+        answer += (
+            f" {weak} of {len(pairs)} pairs meet under less than one degree and say nothing about heights."
+        )
+    caption = (
+        "One dot a pair. Small angles give weak heights; beyond about 35 degrees images look too different."
+    )
+    return Section("heights", "Can heights be measured?", answer, [(charts.convergence(pairs), caption)])
+
+
+def _corrections(files: RunFiles) -> Section | None:
+    views = [v for v in files.summary["views"] if v["correction"] and v["correction"]["center_shift_px"]]
+    if not views:
+        return None
+    largest = max(float(np.hypot(*view["correction"]["center_shift_px"])) for view in views)
+    answer = (
+        f"Up to {largest:.2f} px in the middle of an image. The bars are what the adjustment itself predicts for its"
+        " error (one sigma); without control most of it is common to all images: the scene's own place."
+    )
+    caption = _which(views, "images", "shift") + " Rotations and translations stand in summary.json."
+    return Section(
+        "moves", "What was changed in each camera?", answer, [(charts.corrections(views), caption)]
+    )
+
+
+def _gauge(files: RunFiles) -> Section | None:
+    scene = files.summary["scene"]
+    if scene is None:
+        return None
+    modes = scene["weakest_modes"]
+    most = max([mode["sigma_m"] for mode in modes if mode["sigma_m"]], default=1.0)
+    bars = [
+        (_sentence(m["words"]), metres(m["sigma_m"]), 100 * m["sigma_m"] / most)
+        for m in modes
+        if m["sigma_m"]
+    ]
+    answer = "Images fix each other, not their place on the Earth. What is left open, one sigma, the weakest first."
+    if scene["num_held_in_height"]:
+        answer += (
+            f" {scene['num_held_in_height']} tie points seen under too small an angle were held in height."
+        )
+    tables = [datatables.gcps_table(files.summary)] if files.summary["gcps"] else []
+    if not tables:
+        answer += " Ground control points (--gcp) are what helps where it matters."
+    return Section("gauge", "What can the images not tell?", answer, bars=bars, tables=tables)
+
+
+def _sentence(words: str) -> str:
+    return f"{words[0].upper()}{words[1:]}"
+
+
+def _files(files: RunFiles) -> Section | None:
+    summary = files.summary
+    tables = [datatables.fits_table(summary)] if all(view["fit"] for view in summary["views"]) else []
+    if any(view["outputs"] for view in summary["views"]):
+        tables.append(datatables.files_table(summary))
+    if not tables:
+        return None
+    worst = max(max(view["fit"]["max_px"]) for view in summary["views"])
+    answer = (
+        f"Yes, to {worst:.1e} px at worst, on check points over each image and its altitudes. Every file was reopened"
+        " and compared before it counted as written. Give other tools these files, never the old image alone."
+    )
+    return Section("files", "Do the new RPC files hold the corrected cameras?", answer, tables=tables)
+
+
+def _run(files: RunFiles) -> Section:
+    summary = files.summary
+    seconds = sum(stage["seconds"] for stage in summary["stages"])
+    tracks = summary["tracks"]
+    answer = (
+        f"{seconds:.1f} s for {len(summary['views'])} images and {tracks['num_tracks']} tie points"
+        f" ({tracks['num_observations']} observations)."
+    )
+    if not summary["tables"]["complete"]:
+        answer += (
+            f" Tables and charts hold {summary['tables']['num_written_tracks']} tie points, evenly taken."
+        )
+    longest = max([stage["seconds"] for stage in summary["stages"]], default=1.0) or 1.0
+    bars = [(s["stage"], f"{s['seconds']:.2f} s", 100 * s["seconds"] / longest) for s in summary["stages"]]
+    tables = [datatables.stages_table(summary), datatables.options_table(summary)]
+    return Section("run", "How was this made, and how long did it take?", answer, bars=bars, tables=tables)
+
+
+SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
+    _images,
+    _map,
+    _graph,
+    _errors,
+    _randomness,
+    _pairs,
+    _heights,
+    _corrections,
+    _gauge,
+    _files,
+    _run,
+)
+"""In the order of the page; a section that has nothing to show is None."""
+
+
+def sections(files: RunFiles) -> list[Section]:
+    """All sections of a run."""
+    return [section for make in SECTIONS if (section := make(files)) is not None]
