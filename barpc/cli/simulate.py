@@ -34,6 +34,7 @@ from barpc.cli.progress import progress_bars
 @click.option("--gsd", default=0.5, show_default=True, help="Ground sampling at nadir, metres.")
 @click.option("--relief", default=60.0, show_default=True, help="Highest minus lowest ground, metres.")
 @click.option("--buildings", default=8.0, show_default=True, help="Buildings a hectare.")
+@click.option("--turn", default=0.0, show_default=True, help="Another set of viewpoints, 0 to 1.")
 @click.option("--attitude", default=15.0, show_default=True, help="Attitude error, microradians a component.")
 @click.option("--position", default=1.0, show_default=True, help="Position error, metres a component.")
 @click.option("--drift", default=0.0, show_default=True, help="Attitude drift over an image, microradians.")

@@ -28,7 +28,7 @@ from barpc.simulate.texture import Date, Surface, make_surfaces
 
 ALTITUDES = (694e3, 617e3, 770e3)
 """Satellites of the first, second and third date [m above the ellipsoid]; then again from the first."""
-_OPEN = 100.0  # m below and above the ground for which a delivered RPC is fitted
+_OPEN = 250.0  # m below and above the ground for which a delivered RPC is fitted: its error moves heights
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class ImageOptions:
         Difference between the highest and the lowest ground [m].
     buildings : float
         Buildings a hectare.
+    turn : float
+        Where the views stand across the flight, 0 to 1: the start of a sequence (see `looks`).
     attitude : float
         Standard deviation of each component of the attitude error [rad].
     position : float
@@ -86,6 +88,7 @@ class ImageOptions:
     gsd: float = 0.5
     relief: float = 60.0
     buildings: float = 8.0
+    turn: float = 0.0
     attitude: float = 15e-6
     position: float = 1.0
     drift: float = 0.0
@@ -268,7 +271,8 @@ class Scene:
         dates = len(options.sun_azimuth)
         date, within = index % dates, index // dates
         count = len(range(date, options.views, dates))
-        look = looks(count, 0.31 * date, ALTITUDES[date % len(ALTITUDES)])[within]
+        turn = options.turn + 0.31 * date
+        look = looks(count, turn, ALTITUDES[date % len(ALTITUDES)])[within]
         exact = fly(self.target, look, options.size, options.gsd)
         center = exact.position(0.5 * (options.size[1] - 1))
         correction = Correction(

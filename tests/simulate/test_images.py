@@ -194,3 +194,10 @@ def test_a_scene_across_the_antimeridian_is_like_any_other():
     assert np.isfinite(picture.altitude).mean() > 0.8
     assert visible.sum() > 15
     assert np.isfinite(image).all()
+
+
+def test_another_turn_is_another_set_of_viewpoints(scene):
+    other = Scene(ImageOptions(size=(200, 160), seed=3, turn=0.5))
+    for a, b in zip(scene.shots, other.shots, strict=True):
+        apart = np.degrees(np.arccos(np.cos(np.radians(a.look.azimuth - b.look.azimuth))))
+        assert apart > 5.0 or abs(a.look.incidence - b.look.incidence) > 1.0
