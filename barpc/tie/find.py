@@ -15,7 +15,7 @@ from barpc.tie.features import Keypoints, bounded, detect_tile, join, tiles
 from barpc.tie.link import link, thin
 from barpc.tie.matching import Matches, PairReport, match_pair
 from barpc.tie.options import TieOptions
-from barpc.tie.pairs import Pair, require_connected, select_pairs
+from barpc.tie.pairs import Pair, require_connected, select_pairs, shared_boxes
 from barpc.tie.raster import sample_stretch
 from barpc.tie.refine import refine
 from barpc.tie.work import Progress, ordered
@@ -47,6 +47,8 @@ def detect(
     views: Sequence[View],
     options: TieOptions = _DEFAULTS,
     *,
+    pairs: Sequence[Pair] | None = None,
+    sensors: Sequence[SensorModel] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Keypoints]:
@@ -58,6 +60,10 @@ def detect(
         The images.
     options : TieOptions
         Band, detector, tiles, quotas.
+    pairs : sequence of Pair, optional
+        As `select_pairs` gave them: tiles that no partner may see are not read. None: all are.
+    sensors : sequence of SensorModel, optional
+        Corrected cameras to use instead of the views' own.
     executor : Executor, optional
         Works on the tiles; without one they are worked on here, one after the other.
     progress : callable, optional
@@ -69,11 +75,17 @@ def detect(
         One a view; none in an image in which nothing varies.
     """
     stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
+    boxes = [tiles(view.size, options) for view in views]
+    if pairs is not None:
+        wanted = shared_boxes(views, pairs, boxes, options, sensors=sensors)
+        boxes = [
+            [box for box, keep in zip(*both, strict=True) if keep] for both in zip(boxes, wanted, strict=True)
+        ]
     owners, tasks = [], []
     for owner, (view, stretch) in enumerate(zip(views, stretches, strict=True)):
-        boxes = tiles(view.size, options) if stretch is not None else []
-        owners += [owner] * len(boxes)
-        tasks += [(view, box, stretch, options) for box in boxes]
+        of_view = boxes[owner] if stretch is not None else []
+        owners += [owner] * len(of_view)
+        tasks += [(view, box, stretch, options) for box in of_view]
     found = ordered(executor, detect_tile, tasks, "detect", progress)
     parts: list[list[Keypoints]] = [[] for _ in views]
     for owner, part in zip(owners, found, strict=True):
@@ -140,7 +152,7 @@ def find_tracks(
         An image cannot be read.
     """
     pairs = select_pairs(views, options, sensors=sensors)
-    keypoints = detect(views, options, executor=executor, progress=progress)
+    keypoints = detect(views, options, pairs=pairs, sensors=sensors, executor=executor, progress=progress)
     matched = match(views, keypoints, pairs, options, sensors=sensors, executor=executor, progress=progress)
     reports = tuple(report for _, report in matched)
     require_matches(views, pairs, reports)

@@ -10,10 +10,11 @@ import shapely
 
 from barpc.errors import DisconnectedError, TiePointError
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
-from barpc.scene import View, connected_groups
+from barpc.scene import BoolArray, View, connected_groups
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import convergence_angle, footprint
 from barpc.tie.options import TieOptions
+from barpc.tie.raster import Box
 
 _BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined
 _ANGLE_DECAY = 15.0  # deg
@@ -103,6 +104,13 @@ def footprints(
     return Footprints(first, alt, tuple(outlines))
 
 
+def _levels(views: Sequence[View]) -> tuple[float, float, float]:
+    """Middle, lowest and highest altitude [m] of what the views' ranges have in common."""
+    ranges = np.array([view.alt_range for view in views])
+    low, high = np.sort([ranges[:, 0].max(), ranges[:, 1].min()]).tolist()
+    return 0.5 * (low + high), low, high
+
+
 def overlapping_pairs(
     views: Sequence[View], sensors: Sequence[SensorModel], options: TieOptions, reach: float = 0.0
 ) -> list[Pair]:
@@ -117,11 +125,9 @@ def overlapping_pairs(
     reach : float
         How far the cameras may be wrong [px].
     """
-    ranges = np.array([view.alt_range for view in views])
-    low, high = np.sort([ranges[:, 0].max(), ranges[:, 1].min()])
     best: dict[tuple[int, int], Pair] = {}
-    for alt in (0.5 * (low + high), low, high):
-        for pair in _overlapping_at(footprints(views, sensors, float(alt), reach), sensors, options):
+    for alt in _levels(views):
+        for pair in _overlapping_at(footprints(views, sensors, alt, reach), sensors, options):
             if pair.views not in best or pair.overlap > best[pair.views].overlap:
                 best[pair.views] = pair
     return [best[views] for views in sorted(best)]
@@ -243,3 +249,51 @@ def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], w
         for group in names[:6]
     )
     raise DisconnectedError(f"the images fall into {len(groups)} groups ({listed}): {why}", names)
+
+
+def shared_boxes(
+    views: Sequence[View],
+    pairs: Sequence[Pair],
+    boxes: Sequence[Sequence[Box]],
+    options: TieOptions,
+    *,
+    sensors: Sequence[SensorModel] | None = None,
+) -> list[BoolArray]:
+    """Which windows of the views a partner may see at some altitude: only those are worth reading.
+
+    Parameters
+    ----------
+    views : sequence of View
+        The images.
+    pairs : sequence of Pair
+        Who is whose partner.
+    boxes : sequence of sequence of Box
+        Windows of every view.
+    options : TieOptions
+        `search`: how far the cameras may be wrong.
+    sensors : sequence of SensorModel, optional
+        Corrected cameras to use instead of the views' own.
+
+    Returns
+    -------
+    masks : list of (B,)
+        One a view.
+    """
+    cameras = [view.sensor for view in views] if sensors is None else sensors
+    partners: list[list[int]] = [[] for _ in views]
+    for pair in pairs:
+        i, j = pair.views
+        partners[i].append(j)
+        partners[j].append(i)
+    masks = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
+    for alt in _levels(views):
+        prints = footprints(views, cameras, alt, options.search)
+        for i, of_view in enumerate(boxes):
+            seen = shapely.union_all([prints.outlines[j] for j in partners[i]])
+            corners = np.array([[(c, r), (c + w, r), (c + w, r + h), (c, r + h)] for c, r, w, h in of_view])
+            ground = cameras[i].localize(corners.reshape(-1, 4, 2) - 0.5, np.array(alt))
+            unknown = ~np.isfinite(ground).all(axis=(1, 2))
+            ground[unknown] = 0.0
+            windows = shapely.polygons(prints.plane(ground[..., :2]))
+            masks[i] |= unknown | np.asarray(shapely.intersects(windows, seen))
+    return masks

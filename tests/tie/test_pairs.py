@@ -11,6 +11,8 @@ from barpc.errors import DisconnectedError, TiePointError
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
 from barpc.tie import TieOptions, select_pairs
+from barpc.tie.features import tiles
+from barpc.tie.pairs import shared_boxes
 
 
 def camera(lon: float, lat: float = 0.0, lean: float = 0.1) -> RPC:
@@ -86,3 +88,13 @@ def test_too_small_an_angle_and_too_small_an_overlap_are_left_out() -> None:
     for options in (TieOptions(min_angle=5.0), TieOptions(min_overlap=0.9), TieOptions(max_angle=0.5)):
         with pytest.raises(DisconnectedError):
             select_pairs(two, replace(options, search=1.0))
+
+
+def test_only_windows_that_a_partner_may_see_are_read() -> None:
+    two = views(camera(0.0, lean=0.0), camera(250 * METRE, lean=0.0))
+    options = TieOptions(search=50, tile=250, cell=50)
+    pairs = select_pairs(two, options)
+    boxes = [tiles((1000, 1000), options)] * 2
+    left, right = (mask.reshape(4, 4) for mask in shared_boxes(two, pairs, boxes, options))
+    assert left.tolist() == [[False, True, True, True]] * 4  # the second one within the search
+    assert right.tolist() == [[True, True, True, False]] * 4
