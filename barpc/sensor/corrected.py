@@ -229,7 +229,7 @@ class Corrected:
 
 
 def refine_localization(
-    sensor: SensorModel, ground: Array, image: Array, steps: int = 12, tolerance: float = 1e-8
+    sensor: SensorModel, ground: Array, image: Array, steps: int = 12, tolerance: float = 1e-7
 ) -> Array:
     """Newton steps on (lon, lat) until `ground` projects to `image`.
 
