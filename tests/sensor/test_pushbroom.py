@@ -7,12 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from barpc.errors import RpcError
 from barpc.geodesy import ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve, attitude_through
+from barpc.sensor.geometry import view_angles
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.simulate.orbit import EARTH_RATE, GM, Look, fly
 
@@ -240,3 +243,28 @@ def test_beyond_the_ephemeris_points_are_nan_after_a_second(sensor):
     row = (times[-1] + np.array([0.5, 1.5]) - sensor.first_line) / sensor.line_period
     image = np.stack([np.full(2, 1e4), row], axis=1)
     assert np.array_equal(np.isnan(cut.localize(image, np.array(0.0)))[:, 0], [False, True])
+
+
+@given(
+    lon=st.floats(-180, 180),
+    lat=st.floats(-80, 80),
+    incidence=st.floats(0, 35),
+    azimuth=st.floats(0, 360),
+    altitude=st.floats(450e3, 850e3),
+    heading=st.floats(0, 360),
+)
+@settings(max_examples=60, deadline=None)
+def test_any_satellite_anywhere_sees_its_target_in_the_middle(
+    lon, lat, incidence, azimuth, altitude, heading
+):
+    look = Look(incidence, azimuth, altitude, heading)
+    target = np.array([lon, lat, 150.0])
+    sensor = fly(target, look, (2000, 1500), 0.5)
+    assert np.abs(sensor.project(target) - (999.5, 749.5)).max() < 1e-6
+    seen_incidence, seen_azimuth = view_angles(sensor, target)
+    assert seen_incidence == pytest.approx(incidence, abs=1e-3)
+    assert incidence < 0.1 or abs((seen_azimuth - azimuth + 180) % 360 - 180) < 0.1 / np.sin(
+        np.radians(incidence)
+    )
+    image = np.array([[0.0, 0.0], [1999.0, 1499.0], [0.0, 1499.0]])
+    assert np.abs(sensor.project(sensor.localize(image, np.array(2000.0))) - image).max() < 2e-8

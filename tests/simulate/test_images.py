@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from barpc.cli.main import cli
 from barpc.errors import InputError, OutputError
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import convergence_angle, triangulate
+from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
 from barpc.sensor.rpc import RPC
 from barpc.simulate import ImageOptions, Scene, write_scene
 from barpc.simulate.images import inverse
@@ -201,3 +202,17 @@ def test_another_turn_is_another_set_of_viewpoints(scene):
     for a, b in zip(scene.shots, other.shots, strict=True):
         apart = np.degrees(np.arccos(np.cos(np.radians(a.look.azimuth - b.look.azimuth))))
         assert apart > 5.0 or abs(a.look.incidence - b.look.incidence) > 1.0
+
+
+@pytest.mark.parametrize("side", [600, 1000])
+def test_the_line_method_finds_the_camera_centre_of_small_images_within_two_percent(side):
+    for shot in Scene(ImageOptions(size=(side, side))).shots:
+        found = camera_center(shot.delivered, (side, side), (130.0, 400.0))
+        assert found.altitude == pytest.approx(shot.look.altitude, rel=0.02)
+
+
+@pytest.mark.slow
+def test_three_views_of_600_pixels_take_less_than_three_seconds(tmp_path):
+    start = time.process_time()
+    write_scene(tmp_path / "scene", ImageOptions(size=(600, 600)))
+    assert time.process_time() - start < 3.0
