@@ -61,7 +61,8 @@ class Solution:
             part = both[0][0]
             residual = self.rpc.project(self.problem.ground[part]) - self.problem.image[part]
             for axis, (_, block) in enumerate(both):
-                leverage = ((block[:, :-1] @ inverses[axis]) ** 2).sum(axis=1)
+                spread = block[:, :-1] @ inverses[axis]
+                leverage = np.einsum("ij,ij->i", spread, spread)
                 residual[:, axis] /= np.maximum(1.0 - leverage, 1e-6)
             yield residual
 
