@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
@@ -149,7 +151,7 @@ def write_rpc_copy(
     source, driver = identify(image_path)
     target = Path(copy_path).absolute()
     _refuse_same(source, target)
-    with open_raster(source) as dataset:
+    with _copying(source) as dataset:
         drop = () if dataset.crs is not None else GEOREFERENCE_TAGS
         with replacing(target, overwrite=overwrite) as partial:
             if driver == "GTiff":
@@ -157,6 +159,13 @@ def write_rpc_copy(
             else:
                 _convert(dataset, partial)
             put_tag(partial, printable(rpc), drop)
+
+
+@contextmanager
+def _copying(source: Path) -> Iterator[Any]:
+    """An open raster whose copies leave no ``.aux.xml`` behind under a temporary name."""
+    with open_raster(source) as dataset, rasterio.Env(GDAL_PAM_ENABLED="NO"):
+        yield dataset
 
 
 def _convert(dataset: Any, target: Path) -> None:
@@ -172,7 +181,7 @@ def write_rpc_nitf(
     target = Path(nitf_path).absolute()
     _refuse_same(source, target)
     record = nitf_record(rpc)
-    with open_raster(source) as dataset, replacing(target, overwrite=overwrite) as partial:
+    with _copying(source) as dataset, replacing(target, overwrite=overwrite) as partial:
         raster_copy(dataset, str(partial), driver="NITF", TRE=f"RPC00B={record}")
 
 

@@ -185,7 +185,8 @@ class Rational:
         dy = (a * value[1] - c * value[0]) * det
         x[0] += dx
         x[1] += dy
-        return np.maximum(np.abs(dx, out=dx), np.abs(dy, out=dy))
+        length: Array = np.maximum(np.abs(dx, out=dx), np.abs(dy, out=dy))
+        return length
 
     @cached_property
     def _inverse(self) -> _Inverse | None:
@@ -200,7 +201,7 @@ class Rational:
             center = (arguments.max(axis=1) + arguments.min(axis=1))[:, None] / 2
             scale = np.maximum(np.ptp(arguments, axis=1)[:, None] / 2, 1e-300)
             basis = monomials((arguments - center) / scale)
-            coeffs = np.linalg.lstsq(basis.T, x[:2].T, rcond=None)[0].T
+            coeffs = np.asarray(np.linalg.lstsq(basis.T, x[:2].T, rcond=None)[0].T, dtype=np.float64)
             # what one step leaves of an error of 1e-3: quadratic, so it scales with the step's square
             start = x + np.array([[1e-3], [1e-3], [0.0]])
             length = self._step(value, start)

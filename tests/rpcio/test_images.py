@@ -196,6 +196,16 @@ def test_a_nitf_copy_holds_what_its_record_can_hold(image, tmp_path):
     np.testing.assert_array_equal(pixels(tmp_path / "a.ntf"), pixels(image))
     with open_raster(tmp_path / "a.ntf") as dataset:
         assert dataset.rpcs.line_off == 950.0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ntf", "in"]
+
+
+def test_a_raster_that_is_no_tiff_is_converted_and_leaves_nothing_beside(rpc, tmp_path):
+    image = write_image(tmp_path / "in.png", shape=(1, 30, 30), driver="PNG", dtype="uint8")
+    (tmp_path / "in.png.aux.xml").unlink(missing_ok=True)
+    write_rpc_copy(rpc, image, tmp_path / "copy.tif")
+    assert read_rpc(tmp_path / "copy.tif") == rpc
+    np.testing.assert_array_equal(pixels(tmp_path / "copy.tif"), pixels(image))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["copy.tif", "in.png"]
 
 
 def test_the_tag_of_a_tiff_that_is_cut_off_is_an_error_in_one_line(rpc, image, tmp_path):
