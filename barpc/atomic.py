@@ -18,7 +18,7 @@ _MARK = ".barpc-partial-"
 
 
 @contextmanager
-def replacing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
+def replacing(path: Path | str, *, overwrite: bool = False, durable: bool = True) -> Iterator[Path]:
     """A temporary path beside `path`, renamed to it when the block ends without an error.
 
     The temporary name ends with the target's own, so that what a writer takes from a suffix stays right.
@@ -29,6 +29,8 @@ def replacing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
         The file to be written; its folder is made where it is missing.
     overwrite : bool
         Replace an existing file.
+    durable : bool
+        Wait until the file is on the disk; not needed for what can be made again.
 
     Yields
     ------
@@ -47,9 +49,11 @@ def replacing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
-        _sync(partial)
+        if durable:
+            _sync(partial)
         partial.replace(path)
-        _sync(path.parent)
+        if durable:
+            _sync(path.parent)
     except OSError as error:
         if isinstance(error, OutputError) or error.errno is None:
             raise

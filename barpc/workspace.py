@@ -5,7 +5,7 @@
     OUT/                     what the user asked for
     OUT/.barpc/state.json    status, stages with seconds and peak memory, the files this run wrote
     OUT/.barpc/lock          held while a run is at work
-    OUT/.barpc/cache/<stage>/<key>.npz
+    OUT/.barpc/cache/<stage>/<key>.npz   results of tasks; a damaged one is made again
 
 The key of a stage is a hash of its inputs, its options and the code; resuming is running the same
 command again. Nothing is ever pickled.
@@ -23,7 +23,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import TracebackType
@@ -36,11 +36,9 @@ import numpy.typing as npt
 from barpc import __version__
 from barpc.atomic import remove_leftovers, replacing, write_text
 from barpc.errors import BarpcError, OutputError
+from barpc.record import Record
 
 logger = logging.getLogger(__name__)
-
-Record = dict[str, npt.NDArray[Any]]
-"""What a stage leaves behind: named plain arrays."""
 
 STATE = ".barpc"
 KEEP_AFTER = 30.0
@@ -97,7 +95,8 @@ def key_of(*parts: object) -> str:
 
 def _plain(value: object) -> object:
     if is_dataclass(value) and not isinstance(value, type):
-        return {"type": type(value).__name__, **{k: v for k, v in vars(value).items() if k[0] != "_"}}
+        kept = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
+        return {"type": type(value).__name__, **kept}
     if isinstance(value, np.ndarray):
         return [str(value.dtype), list(value.shape), hashlib.sha256(value.tobytes()).hexdigest()]
     if isinstance(value, np.generic):
@@ -233,7 +232,7 @@ class Workspace:
     def store(self, stage: str, key: str, record: Mapping[str, npt.NDArray[Any]]) -> None:
         """Keep a result, under a temporary name until it is whole."""
         path = self._cache_path(stage, key)
-        with replacing(path, overwrite=True) as partial, partial.open("wb") as file:
+        with replacing(path, overwrite=True, durable=False) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in record.items()})
 
     def _cache_path(self, stage: str, key: str) -> Path:

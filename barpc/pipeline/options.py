@@ -48,6 +48,10 @@ class RunOptions:
         A tie-point table to use instead of matching.
     gcp : tuple of str
         Files of ground control points.
+    check_points : tuple of str
+        Files of ground points that stay out of the adjustment and are measured after it.
+    fixed_run : str or None
+        Folder of an earlier run whose views are among these: what it knows about them is carried over.
     dem : str or None
         A raster of terrain heights.
     geoid : str or None
@@ -66,6 +70,8 @@ class RunOptions:
     overwrite: bool = False
     matches: str | None = None
     gcp: tuple[str, ...] = ()
+    check_points: tuple[str, ...] = ()
+    fixed_run: str | None = None
     dem: str | None = None
     geoid: str | None = None
 

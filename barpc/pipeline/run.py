@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -11,17 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from barpc.ba import Adjustment, adjust_tracks
+from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import InputError
 from barpc.fit import RpcFit, fit_rpc
+from barpc.pipeline.crew import Crew
+from barpc.pipeline.inputs import PRIOR, input_files, load_dem, load_gcps, load_prior
 from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import SUFFIXES, write_tables, write_view
 from barpc.pipeline.views import LoadedViews, load_views
+from barpc.pointio.matches import read_matches
 from barpc.report import Run, summarize
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
-from barpc.tie import TieResult, find_tracks
-from barpc.workspace import Workspace
+from barpc.tie import find_tracks
+from barpc.workspace import Workspace, fingerprint
 
 logger = logging.getLogger(__name__)
 
@@ -99,14 +103,18 @@ def adjust(
     unknown = [name for name in options.rpc_formats if name not in SUFFIXES]
     if unknown:
         raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(SUFFIXES)}")
-    loaded = load_views(images, keep_going=options.keep_going, band=options.tie.band)
-    keep = frozenset(
-        Path(p) for v, s in zip(loaded.views, loaded.sources, strict=True) for p in (v.path, s.path)
-    )
-    with Workspace(out_dir, overwrite=options.overwrite, keep=keep) as workspace:
-        run = _solve(loaded, options, workspace, executor, progress)
+    loaded = _load(images, options)
+    keep = {
+        Path(path)
+        for view, source in zip(loaded.views, loaded.sources, strict=True)
+        for path in (view.path, source.path)
+    }
+    keep |= set(input_files(options))
+    with Workspace(out_dir, overwrite=options.overwrite, keep=frozenset(keep)) as workspace:
+        crew = _crew(loaded, workspace, executor)
+        run = _solve(loaded, options, workspace, crew, progress)
         if run.adjustment is not None and options.stop_after == "all":
-            with workspace.stage("fit"):
+            with workspace.stage("fit and write"):
                 run = _fit_and_write(run, options, workspace, progress)
         run = replace(run, stages=workspace.stages, out_dir=str(out_dir))
         summary = summarize(run)
@@ -127,54 +135,73 @@ def check(
 ) -> AdjustResult:
     """Measure how well the cameras of overlapping images agree; nothing is adjusted or written."""
     options = options or RunOptions()
-    loaded = load_views(images, keep_going=options.keep_going, band=options.tie.band)
-    ties = find_tracks(loaded.views, options.tie, executor=executor, progress=progress)
-    run = Run(
-        "check",
-        loaded.views,
-        loaded.sources,
-        ties.tracks,
-        ties.pairs,
-        left_out=loaded.left_out,
-        options=options,
-    )
+    loaded = _load(images, options)
+    run = _empty_run("check", loaded, options)
+    run = _with_ties(run, options, executor, progress, None)
     return AdjustResult(loaded.views, run, summarize(run))
 
 
+def _load(images: Sequence[str | Path], options: RunOptions) -> LoadedViews:
+    least = 1 if options.gcp else 2  # one image and control points are enough
+    return load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
+
+
+def _crew(loaded: LoadedViews, workspace: Workspace, executor: Executor | None) -> Crew:
+    with workspace.stage("fingerprints"):
+        fingerprints = {view.path: fingerprint(view.path) for view in loaded.views}
+    return Crew(
+        workspace, fingerprints, executor, getattr(executor, "_max_workers", None) or os.cpu_count() or 1
+    )
+
+
+def _empty_run(kind: str, loaded: LoadedViews, options: RunOptions) -> Run:
+    none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
+    return Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options)
+
+
 def _solve(
-    loaded: LoadedViews,
-    options: RunOptions,
-    workspace: Workspace,
-    executor: Executor | None,
-    progress: Progress | None,
+    loaded: LoadedViews, options: RunOptions, workspace: Workspace, crew: Crew, progress: Progress | None
 ) -> Run:
     """Tie points and the adjustment, as often as there are passes."""
-    views = loaded.views
-    run = Run(
-        "adjust",
-        views,
-        loaded.sources,
-        Tracks([], [], np.empty((0, 2)), []),
-        left_out=loaded.left_out,
-        options=options,
-    )
-    centers = tuple(_center(view, options) for view in views)
+    run = _empty_run("adjust", loaded, options)
+    names = [view.name for view in run.views]
+    gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
+    dem, prior = load_dem(options), load_prior(options)
+    centers = tuple(_center(view, options) for view in run.views)
     adjustment: Adjustment | None = None
-    for number in range(options.num_passes):
+    passes = 1 if options.matches is not None else options.num_passes
+    for number in range(passes):
         again = f" (pass {number + 1})" if number else ""
         with workspace.stage("tie points" + again):
-            sensors = None if adjustment is None else adjustment.sensors
-            ties: TieResult = find_tracks(
-                views, options.tie, executor=executor, progress=progress, sensors=sensors
-            )
-        run = replace(run, tracks=ties.tracks, matched=ties.pairs)
+            run = _with_ties(run, options, crew, progress, adjustment)
         if options.stop_after == "matching":
             return replace(run, kind="check")
         with workspace.stage("adjustment" + again):
+            ecef = np.array([center.ecef for center in centers])
             adjustment = adjust_tracks(
-                views, ties.tracks, options.adjust, centers=np.array([center.ecef for center in centers])
+                run.views, run.tracks, options.adjust, gcps, dem, centers=ecef, prior=prior
             )
-    return replace(run, adjustment=adjustment, centers=centers)
+    assert adjustment is not None
+    with workspace.output(PRIOR) as partial:
+        block_prior(adjustment).save(partial)
+    return replace(run, adjustment=adjustment, centers=centers, gcps=gcps, check_points=checks)
+
+
+def _with_ties(
+    run: Run,
+    options: RunOptions,
+    executor: Executor | None,
+    progress: Progress | None,
+    adjustment: Adjustment | None,
+) -> Run:
+    """The run with tie points: from a file, or matched, with the corrected cameras in a later pass."""
+    if options.matches is not None:
+        return replace(run, tracks=read_matches(options.matches, [view.name for view in run.views]))
+    if len(run.views) < 2:
+        return run
+    sensors = None if adjustment is None else adjustment.sensors
+    ties = find_tracks(run.views, options.tie, executor=executor, progress=progress, sensors=sensors)
+    return replace(run, tracks=ties.tracks, matched=ties.pairs)
 
 
 def _center(view: View, options: RunOptions) -> CameraCenter:

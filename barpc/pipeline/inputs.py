@@ -1,0 +1,50 @@
+"""What a run is given besides images: control points, terrain, tie points, an earlier block."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from barpc.ba import BlockPrior
+from barpc.dem import Dem
+from barpc.pipeline.options import RunOptions
+from barpc.pointio.gcp import read_gcps
+from barpc.scene import GroundPoints
+
+PRIOR = "block.npz"
+"""The file in a run folder that a later run starts from."""
+
+
+def load_gcps(paths: Sequence[str], names: Sequence[str]) -> GroundPoints | None:
+    """Control points of several files, one after the other; None without files."""
+    parts = [read_gcps(path, names) for path in paths]
+    if not parts:
+        return None
+    starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
+    return GroundPoints(
+        names=tuple(name for part in parts for name in part.names),
+        lonlatalt=np.concatenate([part.lonlatalt for part in parts]),
+        sigma=np.concatenate([part.sigma for part in parts]),
+        point=np.concatenate([part.point + start for part, start in zip(parts, starts, strict=True)]),
+        view=np.concatenate([part.view for part in parts]),
+        xy=np.concatenate([part.xy for part in parts]),
+        xy_sigma=np.concatenate([part.xy_sigma for part in parts]),
+    )
+
+
+def load_dem(options: RunOptions) -> Dem | None:
+    """The terrain, with its geoid; None where none was given."""
+    return None if options.dem is None else Dem.open(options.dem, options.geoid)
+
+
+def load_prior(options: RunOptions) -> BlockPrior | None:
+    """What an earlier run knows about its views; None where none was given."""
+    return None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
+
+
+def input_files(options: RunOptions) -> list[Path]:
+    """Every file that the options name; none of them is ever written."""
+    named = [*options.gcp, *options.check_points, options.dem, options.geoid, options.matches]
+    return [Path(path) for path in named if path is not None]
