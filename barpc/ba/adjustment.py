@@ -75,7 +75,7 @@ def adjust_tracks(
     options = AdjustOptions() if options is None else options
     views = tuple(views)
     block = join(views, tracks, gcps, options)
-    problem = _problem(block, options, centers, prior)
+    problem = make_problem(block, options, centers, prior)
     state, heights = _start(problem, block, options, gcps, dem)
     heights.warn()
     before = problem.residuals(state.params, state.points)
@@ -113,7 +113,7 @@ def adjust_tracks(
     )
 
 
-def _problem(
+def make_problem(
     block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior | None
 ) -> Problem:
     """Observations, cameras and priors, before anything is known about points."""
