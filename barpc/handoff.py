@@ -84,6 +84,16 @@ def control_grid(
     return ground, model.project(ground)
 
 
+def difference(
+    model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
+) -> float:
+    """Largest distance [px] between two cameras of one image over the image and its altitudes; NaN if blind."""
+    ground, image = control_grid(model, size, alt_range)
+    if not len(ground):
+        return float("nan")
+    return float(np.linalg.norm(other.project(ground) - image, axis=1).max())
+
+
 def verify(
     paths: Sequence[Path | str],
     model: SensorModel,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import OutputError
-from barpc.handoff import CONSUMERS, TOLERANCE, control_grid, verify
+from barpc.handoff import CONSUMERS, TOLERANCE, control_grid, difference, verify
 from barpc.rpcio import write_rpc, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
 from barpc.sensor.rpc import RPC
 from tests.rpcio.conftest import make_rpc, write_image
@@ -85,6 +85,13 @@ def test_the_grid_covers_the_image_and_its_altitudes():
     np.testing.assert_allclose(image.min(axis=0), [0, 0], atol=1e-6)
     np.testing.assert_allclose(image.max(axis=0), [SIZE[0] - 1, SIZE[1] - 1], atol=1e-6)
     assert (ground[:, 2].min(), ground[:, 2].max()) == ALTITUDES
+
+
+def test_two_cameras_differ_by_what_one_was_moved():
+    rpc = make_rpc()
+    assert difference(rpc, rpc, SIZE, ALTITUDES) == 0.0
+    assert difference(rpc, rpc.crop(3, 4), SIZE, ALTITUDES) == pytest.approx(5.0, abs=1e-9)
+    assert np.isnan(difference(rpc.crop(1e12, 0), rpc, SIZE, ALTITUDES))
 
 
 def test_a_model_that_sees_nothing_is_an_error():

@@ -69,7 +69,12 @@ def command(
                 click.echo(f"barpc: {sidecar.path} hides the RPC of {written[0]}: remove it", err=True)
     if as_json:
         rows = [
-            {"path": str(r.path), "consumer": r.consumer, "max_px": r.max_error, "note": r.note}
+            {
+                "path": str(r.path),
+                "consumer": r.consumer,
+                "max_px": None if r.note else r.max_error,
+                "note": r.note,
+            }
             for r in readings
         ]
         click.echo(json.dumps(rows))

@@ -52,6 +52,7 @@ def describe(camera: Camera) -> dict[str, Any]:
     report: dict[str, Any] = {
         "rpc": f"{camera.source.format} in {camera.source.path}",
         "notes": list(camera.source.notes),
+        "first_pixel": "its centre is (0, 0)",
         "altitude_range_m": [low, high],
         "domain": _domain(rpc),
         "err_bias_m": rpc.err_bias,

@@ -266,6 +266,21 @@ def test_apply_names_what_hides_the_rpc_beside_the_input_and_in_the_new_folder(i
     assert f"{tmp_path / 'out' / 'scene.RPB'} hides the RPC of" in error
 
 
+def test_apply_reports_a_file_that_a_tool_cannot_read_as_valid_json(image, tmp_path, capsys, monkeypatch):
+    from barpc import handoff
+
+    def broken(path):
+        raise RuntimeError("no such\nfield")
+
+    monkeypatch.setitem(handoff.CONSUMERS, "gdal", handoff.Consumer((".vrt",), "rasterio", broken))
+    write_rpc(read_rpc(image), tmp_path / "a.geom")
+    assert run("apply", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--json") == 3
+    rows = {row["consumer"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["gdal"]["max_px"] is None
+    assert rows["gdal"]["note"] == "RuntimeError: no such field"
+    assert rows["barpc"]["max_px"] == 0.0
+
+
 def test_apply_refuses_the_images_own_folder_and_missing_rpcs(image, tmp_path, capsys):
     write_rpc(read_rpc(image), tmp_path / "a.geom")
     assert run("apply", image, "--rpc", tmp_path / "a.geom", "-o", image.parent) == 1
