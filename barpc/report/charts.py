@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from barpc.report.svg import (
     log_scale,
     path,
     sheet,
-    short_names,
     tag,
     titled,
     x_axis,
@@ -72,34 +72,45 @@ def legend(names: Sequence[str], right: float, y: float) -> list[str]:
     return parts
 
 
-def dumbbells(key: str, title: str, axis: str, rows: Sequence[tuple[str, float | None, float | None]]) -> str:
-    """A row a name with a value before and one after, on a logarithmic axis; the largest at the end first.
+@dataclass(frozen=True)
+class Row:
+    """A row of a list chart: its short label, its full name, its value before and after (None: there is none)."""
+
+    label: str
+    name: str
+    before: float | None
+    after: float | None
+
+    @property
+    def last(self) -> float:
+        """The value that counts."""
+        return (self.before if self.after is None else self.after) or 0.0
+
+
+def dumbbells(key: str, title: str, axis: str, rows: Sequence[Row]) -> str:
+    """A row a name with a value before and one after, on a logarithmic axis.
 
     Parameters
     ----------
     key, title, axis : str
         Identity; what it is; the axis' title with its unit.
-    rows : sequence of (name, before, after)
-        None where there is none.
+    rows : sequence of Row
+        Of more than `MAX_ROWS` the largest are shown.
     """
-    shown = most_telling(rows, lambda row: -max(row[2] or 0.0, 0.0 if row[2] else row[1] or 0.0))
-    values = [value for _, *both in shown for value in both if value]
-    scale = log_scale(values, _NAMES, _RIGHT)
+    shown = most_telling(rows, lambda row: -row.last)
+    scale = log_scale([value for row in shown for value in (row.before, row.after) if value], _NAMES, _RIGHT)
     bottom = 24 + ROW * len(shown)
     parts = x_axis(scale, 24, bottom, axis)
-    for k, ((name, *both), short) in enumerate(
-        zip(shown, short_names([row[0] for row in shown]), strict=True)
-    ):
+    for k, row in enumerate(shown):
         y = 24 + ROW * (k + 0.5)
-        parts.append(titled(label(_NAMES - 8, y + 4, short, "end"), name))
-        places = [None if not value else scale(value) for value in both]
-        if None not in places:
-            parts.append(line(places[0], y, places[1], y, "link"))  # type: ignore[arg-type]
-        for when, x, value in zip(("before", "after"), places, both, strict=True):
-            if x is not None:
-                dot = tag("circle", cx=x, cy=y, r=4.5, class_=f"dot {when}")
-                parts.append(titled(dot, f"{name}: {when} {value:.3g}"))
-    parts += legend(["before", "after"] if any(row[2] for row in shown) else ["before"], _RIGHT, 13)
+        parts.append(titled(label(_NAMES - 8, y + 4, row.label, "end"), row.name))
+        if row.before and row.after:
+            parts.append(line(scale(row.before), y, scale(row.after), y, "link"))
+        for when, value in (("before", row.before), ("after", row.after)):
+            if value:
+                dot = tag("circle", cx=scale(value), cy=y, r=4.5, class_=f"dot {when}")
+                parts.append(titled(dot, f"{row.name}: {when} {value:.3g}"))
+    parts += legend(["before", "after"] if any(row.after for row in shown) else ["before"], _RIGHT, 13)
     described = f"{len(shown)} of {len(rows)} rows; the figures are in the table."
     return sheet(key, title, described, bottom + 34, parts)
 
@@ -145,7 +156,9 @@ def convergence(pairs: Sequence[Record]) -> str:
     for low, up, words in ((0.0, 5.0, "weak heights"), (5.0, 35.0, "good"), (35.0, 180.0, "hard to match")):
         if low < x.high:
             left, right = x(low), x(min(up, x.high))
-            parts.append(tag("rect", x=left, y=30, width=right - left, height=160, class_=f"zone {words[0]}"))
+            parts.append(
+                tag("rect", x=left, y=30, width=right - left, height=160, class_=f"zone {words.split()[0]}")
+            )
             if right - left > 6.6 * len(words):
                 parts.append(label((left + right) / 2, 26, words, "middle"))
     parts += x_axis(x, 30, 190, "convergence angle [deg]")
@@ -162,28 +175,31 @@ def convergence(pairs: Sequence[Record]) -> str:
     return sheet("angles", "Matches of each pair over its convergence angle", described, 222, parts)
 
 
-def corrections(views: Sequence[Record]) -> str:
-    """How far each camera was moved in its image, col and row, with one sigma."""
+def corrections(views: Sequence[Record], labels: Sequence[str]) -> str:
+    """How far each camera was moved in its image, col and row; with one sigma where that fits on the chart."""
     rows = [
-        (v["name"], v["correction"]["center_shift_px"], v["correction"]["center_sigma_px"]) for v in views
+        (text, v["name"], v["correction"]["center_shift_px"], v["correction"]["center_sigma_px"])
+        for text, v in zip(labels, views, strict=True)
     ]
-    shown = most_telling(rows, lambda row: -max(abs(shift) for shift in row[1]))
-    reach = max([abs(s) + e for _, shift, sigma in shown for s, e in zip(shift, sigma, strict=True)])
-    scale = Scale(-reach * 1.05, reach * 1.05, _NAMES, _RIGHT)
+    shown = most_telling(rows, lambda row: -max(map(abs, row[2])))
+    largest = max(abs(value) for row in shown for value in row[2]) or 1e-3
+    spread = max(sigma for row in shown for sigma in row[3])
+    bars = spread <= 2 * largest
+    reach = 1.1 * (largest + spread * bars)
+    scale = Scale(-reach, reach, _NAMES, _RIGHT)
     bottom = 24 + ROW * len(shown)
-    parts = [*x_axis(scale, 24, bottom, "shift in the middle of the image, with one sigma [px]")]
-    parts.append(line(scale(0), 24, scale(0), bottom, "zero"))
-    for k, ((name, shift, sigma), short) in enumerate(
-        zip(shown, short_names([r[0] for r in shown]), strict=True)
-    ):
-        middle = 24 + ROW * (k + 0.5)
-        parts.append(titled(label(_NAMES - 8, middle + 4, short, "end"), name))
-        for axis, value, error, y in zip(("col", "row"), shift, sigma, (middle - 4, middle + 4), strict=True):
-            bar = line(scale(value - error), y, scale(value + error), y, f"bar {axis}")
-            dot = tag("circle", cx=scale(value), cy=y, r=3.5, class_=f"dot {axis}")
-            parts.append(titled(bar + dot, f"{name}, {axis}: {value:+.2f} ± {error:.2f} px"))
-    parts += legend(["col", "row"], _RIGHT, 13)
-    described = (
-        f"{len(shown)} of {len(rows)} images; the largest shift with its sigma reaches {reach:.2g} px."
+    parts = x_axis(
+        scale, 24, bottom, f"shift in the middle of the image{', with one sigma' if bars else ''} [px]"
     )
-    return sheet("moves", "Shift of each camera in its image", described, bottom + 34, parts)
+    parts.append(line(scale(0), 24, scale(0), bottom, "zero"))
+    for k, (text, name, shift, sigma) in enumerate(shown):
+        middle = 24 + ROW * (k + 0.5)
+        parts.append(titled(label(_NAMES - 8, middle + 4, text, "end"), name))
+        for axis, value, error, y in zip(("col", "row"), shift, sigma, (middle - 4, middle + 4), strict=True):
+            left, right = (value - error, value + error) if bars else (min(value, 0.0), max(value, 0.0))
+            dot = tag("circle", cx=scale(value), cy=y, r=3.5, class_=f"dot {axis}")
+            words = f"{name}, {axis}: {value:+.2f} ± {error:.2f} px"
+            parts.append(titled(line(scale(left), y, scale(right), y, f"bar {axis}") + dot, words))
+    parts += legend(["col", "row"], _RIGHT, 13)
+    described = f"{len(shown)} of {len(rows)} images; the largest shift is {largest:.2g} px."
+    return sheet("moves-chart", "Shift of each camera in its image", described, bottom + 34, parts)

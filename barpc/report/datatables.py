@@ -33,12 +33,20 @@ class Cell:
 
 @dataclass(frozen=True)
 class DataTable:
-    """A table with its caption and the heads of its columns, units in them."""
+    """A table with its caption and the heads of its columns, units in them; `folded` ones open on demand."""
 
     key: str
     caption: str
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
+    folded: bool = False
+
+    @property
+    def kinds(self) -> list[str]:
+        """How each column is set: "text" on the left, "number" on the right."""
+        first = self.rows[0] if self.rows else []
+        kinds = ["number" if cell.kind == "number" else "text" for cell in first]
+        return kinds or ["text"] * len(self.columns)
 
 
 def figure(value: float | None, form: str = ".3f") -> Cell:
@@ -87,14 +95,46 @@ def _shift(view: Record) -> Cell:
     return Cell(f"{shift[0]:+.2f}, {shift[1]:+.2f}", float(f"{max(map(abs, shift)):.6g}"))
 
 
+def corrections_table(summary: Record) -> DataTable:
+    """What was changed in each camera, with what the adjustment predicts for its error."""
+    columns = [
+        "image",
+        "col [px]",
+        "row [px]",
+        "rotation [urad]",
+        "translation [m]",
+        "camera centre [km]",
+        "found by",
+    ]
+    rows = []
+    for view in summary["views"]:
+        correction, center = view["correction"], view["camera_center"]
+        moves = zip(correction["center_shift_px"], correction["center_sigma_px"], strict=True)
+        rows.append(
+            [
+                name(view["name"]),
+                *(Cell(f"{shift:+.3f} ± {sigma:.2f}", shift) for shift, sigma in moves),
+                figure(correction["angle_urad"], ".2f"),
+                figure(correction["translation_norm_m"], ".2f"),
+                figure(None if center is None else center["altitude_m"] / 1e3, ".0f"),
+                name("-" if center is None else center["method"]),
+            ]
+        )
+    caption = "Corrections: shift in the middle of the image ± one sigma, size of rotation and translation"
+    return DataTable("corrections", caption, columns, rows, folded=True)
+
+
 def pairs_table(summary: Record) -> DataTable:
     """One row a pair."""
     adjusted = summary["kind"] == "adjust"
-    columns = ["pair", "matches", "angle [deg]", "B/H", "height per px [m]", "before [px]"]
+    columns = ["#", "pair", "matches", "angle [deg]", "B/H", "height per px [m]", "before [px]"]
     columns += ["after [px]"] if adjusted else []
     rows = []
+    number = {view["name"]: k + 1 for k, view in enumerate(summary["views"])}
     for pair in summary["pairs"]:
+        first, second = number[pair["a"]], number[pair["b"]]
         row = [
+            Cell(f"{first}-{second}", first + second / 1e6),
             name(f"{pair['a']} - {pair['b']}"),
             figure(pair["num_matches"], "d"),
             figure(pair["convergence_deg"], ".1f"),
@@ -165,11 +205,11 @@ def stages_table(summary: Record) -> DataTable:
         [name(stage["stage"]), *(figure(stage[key], form) for key, form in forms.items())]
         for stage in summary["stages"]
     ]
-    return DataTable("stages", "Stages of the run", columns, rows)
+    return DataTable("stages", "Stages of the run", columns, rows, folded=True)
 
 
 def options_table(summary: Record) -> DataTable:
     """Every option of the run."""
     flat = flat_options(summary["options"] or {})
     rows = [[name(key), name(str(value))] for key, value in flat.items()]
-    return DataTable("options", "Options of the run", ["option", "value"], rows)
+    return DataTable("options", "Options of the run", ["option", "value"], rows, folded=True)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from barpc.report.svg import WIDTH, label, line, path, round_ticks, sheet, tag, 
 
 _MARGIN = 34.0
 _DOTS = 1500
+_APART = 26.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,74 +62,108 @@ def plane_of(lonlat: Array) -> Plane:
 
 
 def ground_map(files: RunFiles) -> str:
-    """Footprints, pairs coloured by their matches, tie points, GCPs, on a graticule with a scale bar."""
+    """Footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
     summary = files.summary
     rings = [ring for outline in files.outlines for ring in outline]
     gcps = np.array([[gcp["lon"], gcp["lat"]] for gcp in summary["gcps"]]).reshape(-1, 2)
     plane = plane_of(np.concatenate([*rings, files.points[:, :2], gcps]))
-    parts = _graticule(plane)
+    grid, degrees = _graticule(plane)
     points = plane(files.points[:: max(1, -(-len(files.points) // _DOTS)), :2])
-    parts += [tag("circle", cx=x, cy=y, r=1.1, class_="point") for x, y in points]
+    parts = [*grid, *(tag("circle", cx=x, cy=y, r=1.1, class_="point") for x, y in points)]
     for view, outline in zip(summary["views"], files.outlines, strict=True):
         shape = "".join(path(plane(ring[:-1]), f"outline {view['status']}", closed=True) for ring in outline)
         parts.append(titled(shape, f"{view['name']}: {view['num_observations']} tie points"))
-    parts += _pair_lines(plane, files)
-    for k, outline in enumerate(files.outlines):
-        parts += _number(plane, k, len(files.outlines), outline)
+    stacks = _stacks(plane, files.outlines)
+    parts += _pair_lines(stacks, summary)
+    if len(stacks) <= 100:
+        parts += [
+            label(stack.place[0], stack.place[1] + 4, stack.text, "middle", "stack") for stack in stacks
+        ]
     for gcp, (x, y) in zip(summary["gcps"], plane(gcps), strict=True):
         parts.append(
             titled(path([(x, y - 6), (x + 5, y + 4), (x - 5, y + 4)], "gcp", closed=True), gcp["name"])
         )
     described = f"{len(summary['views'])} outlines, {len(summary['pairs'])} pairs, {len(gcps)} GCPs."
-    return sheet("map", "Map of the images", described, plane.height, parts)
+    return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees])
 
 
-def _pair_lines(plane: Plane, files: RunFiles) -> list[str]:
-    """From middle to middle of the images of each pair."""
-    middle = {}
-    for view, outline in zip(files.summary["views"], files.outlines, strict=True):
-        if outline:
-            middle[view["name"]] = plane(np.concatenate([ring[:-1] for ring in outline])).mean(axis=0)
-    pairs = [pair for pair in files.summary["pairs"] if pair["a"] in middle and pair["b"] in middle]
-    most = max([pair["num_matches"] for pair in pairs], default=1)
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Images that lie over each other on the map: their indices, and the place (2,) of their middle."""
+
+    views: list[int]
+    place: Array
+
+    @property
+    def text(self) -> str:
+        """Their numbers, runs of them as 1-3."""
+        runs: list[list[int]] = []
+        for k in self.views:
+            if runs and k == runs[-1][-1] + 1:
+                runs[-1].append(k)
+            else:
+                runs.append([k])
+        words = [f"{run[0] + 1}" if len(run) == 1 else f"{run[0] + 1}-{run[-1] + 1}" for run in runs]
+        return ", ".join(words) if len(words) <= 4 else f"{', '.join(words[:3])} …"
+
+
+def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
+    """Images whose middles stand nearer than their numbers are wide."""
+    stacks: list[Stack] = []
+    for k, outline in enumerate(outlines):
+        if not outline:
+            continue
+        place = plane(np.concatenate([ring[:-1] for ring in outline])).mean(axis=0)
+        near = next((stack for stack in stacks if np.hypot(*(stack.place - place)) < _APART), None)
+        if near is None:
+            stacks.append(Stack([k], place))
+        else:
+            near.views.append(k)
+    return stacks
+
+
+def _pair_lines(stacks: Sequence[Stack], summary: Mapping[str, Any]) -> list[str]:
+    """From stack to stack, stronger with more matches between them."""
+    index = {view["name"]: k for k, view in enumerate(summary["views"])}
+    stack_of = {k: number for number, stack in enumerate(stacks) for k in stack.views}
+    matches: Counter[tuple[int, int]] = Counter()
+    for pair in summary["pairs"]:
+        ends = sorted({stack_of[k] for k in (index[pair["a"]], index[pair["b"]]) if k in stack_of})
+        if len(ends) == 2:
+            matches[ends[0], ends[1]] += pair["num_matches"]
+    most = max(matches.values(), default=1)
     parts = []
-    for pair in sorted(pairs, key=lambda p: p["num_matches"])[-1500:]:
-        (x1, y1), (x2, y2) = middle[pair["a"]], middle[pair["b"]]
-        opacity = 0.15 + 0.75 * math.sqrt(pair["num_matches"] / most)
-        link = tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_="tie", stroke_opacity=opacity, stroke_width=1.6)
-        parts.append(titled(link, f"{pair['a']} - {pair['b']}: {pair['num_matches']} matches"))
+    for (i, j), count in sorted(matches.items(), key=lambda item: item[1])[-1500:]:
+        (x1, y1), (x2, y2) = stacks[i].place, stacks[j].place
+        share = math.sqrt(count / most)
+        style = {"stroke_width": 0.6 + 2.4 * share, "stroke_opacity": 0.2 + 0.7 * share}
+        link = tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_="tie", **style)
+        parts.append(titled(link, f"{stacks[i].text} - {stacks[j].text}: {count} matches"))
     return parts
 
 
-def _number(plane: Plane, k: int, num: int, outline: Sequence[Array]) -> list[str]:
-    """The image's number on its outline, at another place for each so that stacks of images stay readable."""
-    if not outline or num > 100:
-        return []
-    ring = plane(outline[0][:-1])
-    x, y = ring[(k * len(ring)) // num]
-    circle = tag("circle", cx=x, cy=y, r=8, class_="badge")
-    return [circle, label(x, y + 4, str(k + 1), "middle", "badgename")]
-
-
-def _graticule(plane: Plane) -> list[str]:
-    """Lines of longitude and latitude with their degrees, the frame and the scale bar."""
+def _graticule(plane: Plane) -> tuple[list[str], list[str]]:
+    """Lines of longitude and latitude; their degrees and the scale bar, which go on top."""
     right, bottom = WIDTH - 4, plane.height - 24
     reach = np.array([WIDTH / 2, plane.height / 2]) / plane.unit
-    parts = []
+    lines, texts = [], []
     for lon in round_ticks(plane.lon - reach[0], plane.lon + reach[0], 4):
         x, _ = plane(np.array([lon, plane.lat]))
-        shown = (lon + 180.0) % 360.0 - 180.0
-        if 40 < x < right - 30:
-            parts += [line(x, 4, x, bottom, "grid"), label(x, bottom - 4, _degrees(shown, "EW"), "middle")]
+        if 50 < x < right - 40:
+            lines.append(line(x, 4, x, bottom, "grid"))
+            texts.append(
+                label(x, bottom - 4, _degrees((lon + 180.0) % 360.0 - 180.0, "EW"), "middle", "degrees")
+            )
     for lat in round_ticks(plane.lat - reach[1], plane.lat + reach[1], 4):
         _, y = plane(np.array([plane.lon, lat]))
         if 16 < y < bottom - 20:
-            parts += [line(4, y, right, y, "grid"), label(8, y - 3, _degrees(lat, "NS"))]
+            lines.append(line(4, y, right, y, "grid"))
+            texts.append(label(4, y - 3, _degrees(lat, "NS"), class_="degrees"))
     length = max(round_ticks(0.0, 110.0 / plane.scale, 3))
-    text = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
+    words = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     x = right - length * plane.scale
-    parts += [tag("rect", x=x, y=bottom + 9, width=right - x, height=4, class_="scalebar")]
-    return [*parts, label(x - 6, bottom + 15, text, "end"), label(4, bottom + 15, "north is up")]
+    texts.append(tag("rect", x=x, y=bottom + 9, width=right - x, height=4, class_="scalebar"))
+    return lines, [*texts, label(x - 6, bottom + 15, words, "end"), label(4, bottom + 15, "north is up")]
 
 
 def _degrees(value: float, letters: str) -> str:

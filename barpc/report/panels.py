@@ -11,7 +11,6 @@ import numpy as np
 from barpc.geodesy import Array
 from barpc.report.load import Observations
 from barpc.report.svg import path, sheet, tag
-from barpc.scene import BoolArray
 
 Record = Mapping[str, Any]
 
@@ -61,30 +60,58 @@ def cells_of(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
     return Cells(np.sqrt(square).reshape(shape), mean.reshape(*shape, 2), systematic.reshape(shape))
 
 
-def residual_panels(
-    views: Sequence[Record], observations: Observations
-) -> tuple[list[dict[str, str]], list[float]]:
-    """A small map of every image's residuals, and the part of its cells that are systematic.
+@dataclass(frozen=True, eq=False)
+class Panels:
+    """The small maps of all images.
+
+    Parameters
+    ----------
+    charts : list of (str, str)
+        SVG texts and captions.
+    shares : list of float
+        Part of each image's cells that are systematic.
+    key : str
+        What the lengths stand for.
+    """
+
+    charts: list[tuple[str, str]]
+    shares: list[float]
+    key: str
+
+
+def residual_panels(views: Sequence[Record], observations: Observations, when: str) -> Panels:
+    """A small map of every image's residuals.
 
     Cells are darker where the error is larger; thin lines are single residuals; a bold arrow is the mean of
     a cell where it is larger than chance allows.
 
-    Returns
-    -------
-    panels : list of {"svg", "name", "note"}
-    shares : list of float
+    Parameters
+    ----------
+    views : sequence of mapping
+        Of the summary.
+    observations : Observations
+        Of the tables.
+    when : {"before", "after"}
+        Whose residuals.
     """
-    residuals, use, longest = _left(observations)
-    each = max(_VECTORS // max(len(views), 1), 40)
-    panels, shares = [], []
+    residuals: Array = getattr(observations, when)
+    use = observations.used & np.isfinite(residuals).all(axis=1)
+    norm = np.hypot(*residuals[use].T)
+    longest = (float(np.quantile(norm, 0.95)) if len(norm) else 0.0) or 1.0
+    most = min(max(_VECTORS // max(len(views), 1), 40), 300)
+    charts, shares = [], []
     for k, view in enumerate(views):
         rows = np.flatnonzero(use & (observations.view == k))
         cells = cells_of(observations.xy[rows], residuals[rows], view["size"])
-        rows = rows[:: max(1, -(-len(rows) // min(each, 300)))]
-        svg = _panel(k, view, cells, observations.xy[rows], residuals[rows], longest)
-        panels.append({"svg": svg, "name": f"{k + 1} {view['name']}", "note": _note(cells)})
+        rows = rows[:: max(1, -(-len(rows) // most))]
+        svg = _panel(f"{when}{k}", view, cells, observations.xy[rows], residuals[rows], longest)
+        charts.append((svg, f"{k + 1} {view['name']}: {_note(cells)}"))
         shares.append(cells.share)
-    return panels, shares
+    key = (
+        f"A thin line of a {_PANEL / _REACH:.0f}th of a panel's width is {longest:.2g} px;"
+        " bold arrows are drawn twice as long."
+    )
+    return Panels(charts, shares, key)
 
 
 def _note(cells: Cells) -> str:
@@ -93,7 +120,7 @@ def _note(cells: Cells) -> str:
     return f"{100 * cells.share:.0f} % systematic"
 
 
-def _panel(k: int, view: Record, cells: Cells, xy: Array, residuals: Array, longest: float) -> str:
+def _panel(key: str, view: Record, cells: Cells, xy: Array, residuals: Array, longest: float) -> str:
     width, height = view["size"]
     tall = _PANEL * min(max(height / width, 0.4), 2.5)
     stretch = np.array([_PANEL / width, tall / height])
@@ -117,7 +144,7 @@ def _panel(k: int, view: Record, cells: Cells, xy: Array, residuals: Array, long
         parts.append(_arrow(middle, cells.mean[i, j] * (2 * _REACH / longest)))
     described = f"{len(residuals)} residuals are drawn; {_note(cells)}."
     title = f"Residuals over {view['name']}"
-    return sheet(f"panel{k}", title, described, tall, parts, width=_PANEL, class_="panel")
+    return sheet(f"panel-{key}", title, described, tall, parts, width=_PANEL, class_="panel")
 
 
 def _arrow(middle: Array, vector: Array) -> str:
@@ -130,21 +157,3 @@ def _arrow(middle: Array, vector: Array) -> str:
     across = np.array([-along[1], along[0]]) * 0.6
     barbs = [tip - along + across, tip, tip - along - across]
     return path(np.array([tail, tip]).tolist(), "mean") + path(np.array(barbs).tolist(), "mean")
-
-
-def arrow_key(observations: Observations) -> str:
-    """What the lengths in the small maps stand for, in words."""
-    _, _, longest = _left(observations)
-    return (
-        f"A thin line of a {_PANEL / _REACH:.0f}th of a panel's width is {longest:.2g} px;"
-        " bold arrows are drawn twice as long."
-    )
-
-
-def _left(observations: Observations) -> tuple[Array, BoolArray, float]:
-    """Residuals as they are now (K, 2), which count (K,), and a length that few exceed [px]."""
-    residuals = np.where(np.isfinite(observations.after), observations.after, observations.before)
-    use = observations.used & np.isfinite(residuals).all(axis=1)
-    norm = np.hypot(*residuals[use].T)
-    longest = float(np.quantile(norm, 0.95)) if len(norm) else 0.0
-    return residuals, use, longest or 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,8 @@ from barpc.report import charts, datatables
 from barpc.report.datatables import DataTable
 from barpc.report.load import RunFiles
 from barpc.report.maps import ground_map
-from barpc.report.panels import arrow_key, residual_panels
-from barpc.report.svg import MAX_ROWS
+from barpc.report.panels import residual_panels
+from barpc.report.svg import MAX_ROWS, numbered
 from barpc.report.verdict import metres
 from barpc.scene import connected_groups
 
@@ -34,21 +34,27 @@ class Section:
         A sentence or two.
     charts : sequence of (str, str)
         SVG texts with their captions.
-    panels : sequence of {"svg", "name", "note"}
-        Small maps.
+    panels : sequence of (str, str)
+        Small maps with their captions.
+    folds : sequence of (str, panels)
+        Words, and more small maps that open on demand.
     bars : sequence of (str, str, float)
         Words, a value as text, and the length of a bar in percent.
     tables : sequence of DataTable
         Tables.
+    half : bool
+        Whether half the width of a desk's screen is enough.
     """
 
     key: str
     question: str
     answer: str
     charts: Sequence[tuple[str, str]] = ()
-    panels: Sequence[Mapping[str, str]] = ()
+    panels: Sequence[tuple[str, str]] = ()
+    folds: Sequence[tuple[str, Sequence[tuple[str, str]]]] = ()
     bars: Sequence[tuple[str, str, float]] = ()
-    tables: Sequence[DataTable] = field(default_factory=list)
+    tables: Sequence[DataTable] = ()
+    half: bool = False
 
 
 def _images(files: RunFiles) -> Section:
@@ -56,39 +62,36 @@ def _images(files: RunFiles) -> Section:
     good = sum(view["status"] in ("adjusted", "consistent") for view in summary["views"])
     answer = f"{good} of {len(summary['views'])} without reservation."
     todo = [view for view in summary["views"] if view["advice"]]
-    bars: list[tuple[str, str, float]] = []
     answer += " What to do about the others stands in the verdict above." if todo else ""
     table = datatables.views_table(summary)
-    return Section("images", "Which images can I use?", answer, bars=bars, tables=[table])
+    return Section("images", "Which images can I use?", answer, tables=[table])
 
 
 def _map(files: RunFiles) -> Section | None:
-    if not any(files.outlines):
-        return None
-    caption = (
-        "Outlines at the altitude of the scene, numbered as in the table of images; dots are tie points; lines join "
-        "the images of a pair, stronger with more matches; triangles are GCPs."
-    )
-    answer = f"The scene lies at about {files.summary['altitude_m']:.0f} m above the ellipsoid."
-    return Section("map", "Where are the images?", answer, [(ground_map(files), caption)])
-
-
-def _graph(files: RunFiles) -> Section | None:
     views, pairs = files.summary["views"], files.summary["pairs"]
-    if not pairs:
-        return None
+    shown = []
+    if any(files.outlines):
+        caption = (
+            "Outlines at the altitude of the scene with their numbers in the table of images; dots are tie points;"
+            " a stronger line stands for more matches; triangles are GCPs."
+        )
+        shown.append((ground_map(files), caption))
+    if pairs:
+        caption = "Numbers as in the table of images; a thicker line is a pair with more matches."
+        shown.append((charts.connections(views, pairs), caption))
+    return Section("map", "Where are the images, and which hold together?", _bonds(views, pairs), shown)
+
+
+def _bonds(views: Sequence[Record], pairs: Sequence[Record]) -> str:
     index = {view["name"]: k for k, view in enumerate(views)}
     links = [(index[pair["a"]], index[pair["b"]]) for pair in pairs]
     groups = connected_groups(len(views), links)
-    partners = np.bincount(np.array(links).ravel(), minlength=len(views))
+    partners = np.bincount(np.array(links, dtype=np.int64).ravel(), minlength=len(views))
     lonely = [view["name"] for view, n in zip(views, partners, strict=True) if n == 1]
     answer = "All images hang together." if len(groups) == 1 else f"They fall into {len(groups)} groups."
     if lonely and len(views) > 2:
         answer += f" Tied to one other image only: {_some(lonely)}."
-    caption = "Numbers as in the table of images; a thicker line is a pair with more matches."
-    return Section(
-        "graph", "Which images hold together?", answer, [(charts.connections(views, pairs), caption)]
-    )
+    return answer
 
 
 def _some(names: Sequence[str], most: int = 6) -> str:
@@ -102,7 +105,11 @@ def _errors(files: RunFiles) -> Section | None:
         return None
     norms = [np.hypot(*r[table.used & np.isfinite(r).all(axis=1)].T) for r in (table.before, table.after)]
     views = files.summary["views"]
-    rows = [(view["name"], view["rmse_before"], view["rmse_after"]) for view in views]
+    labels = numbered([view["name"] for view in views])
+    rows = [
+        charts.Row(text, view["name"], view["rmse_before"], view["rmse_after"])
+        for text, view in zip(labels, views, strict=True)
+    ]
     adjusted = files.summary["kind"] == "adjust"
     shown = [(charts.histogram(*norms), "All observations that count.")]
     axis = "root mean square reprojection error [px], logarithmic"
@@ -128,79 +135,86 @@ def _which(rows: Sequence[Any], what: str, by: str) -> str:
 def _randomness(files: RunFiles) -> Section | None:
     if not len(files.observations.view):
         return None
-    views = files.summary["views"]
-    panels, shares = residual_panels(views, files.observations)
-    marked = [view["name"] for view, share in zip(views, shares, strict=True) if share > 0.5]
-    when = "left after the adjustment" if files.summary["kind"] == "adjust" else "as the cameras are"
+    views, adjusted = files.summary["views"], files.summary["kind"] == "adjust"
+    panels = residual_panels(views, files.observations, "after" if adjusted else "before")
+    marked = [view["name"] for view, share in zip(views, panels.shares, strict=True) if share > 0.5]
     if marked:
-        answer = f"Not in {_some(marked)}: in most of their cells the residuals {when} point the same way."
-        answer += " Small systematic residuals are usual (attitude jitter, relief); where they matter, try --drift 1."
-    else:
-        answer = (
-            f"Mostly: in no image do the residuals {when} point the same way in more than half of the cells."
+        answer = f"Not in {_some(marked)}: in most of their cells the residuals point the same way."
+        answer += (
+            " Small ones are usual (attitude jitter, relief); where they matter, try --drift 1." * adjusted
         )
+    else:
+        answer = "Mostly: in no image do residuals point the same way in more than half of the cells."
     answer += (
         " A cell is darker where its error is larger; thin lines are single residuals; a bold arrow is the mean of a"
-        f" cell that is larger than chance allows. {arrow_key(files.observations)}"
+        f" cell that is larger than chance allows. {panels.key}"
     )
-    return Section("random", "Are the residuals random?", answer, panels=panels)
+    folds = []
+    if adjusted:
+        before = residual_panels(views, files.observations, "before")
+        folds.append((f"Before the adjustment. {before.key}", before.charts))
+    return Section("random", "Are the residuals random?", answer, panels=panels.charts, folds=folds)
 
 
 def _pairs(files: RunFiles) -> Section | None:
     pairs = files.summary["pairs"]
     if not pairs:
         return None
+    number = {view["name"]: k + 1 for k, view in enumerate(files.summary["views"])}
     rows = []
     for pair in pairs:
         both = (pair["epipolar_before"], pair["epipolar_after"])
         rms = [None if offset is None else offset["rms"] for offset in both]
-        rows.append((f"{pair['a']} - {pair['b']}", rms[0], rms[1]))
-    last = [row[2] if row[2] is not None else row[1] for row in rows]
-    largest = max((value for value in last if value is not None), default=float("nan"))
+        numbers = f"{number[pair['a']]} - {number[pair['b']]}"
+        rows.append(charts.Row(numbers, f"{pair['a']} - {pair['b']}", rms[0], rms[1]))
     answer = (
-        f"The epipolar offset, which no height explains, is {largest:.3f} px (RMS) in the worst pair."
-        " Stereo matching along epipolar lines wants it well below 0.5 px."
+        f"The epipolar offset, which no height explains, is {max(row.last for row in rows):.3f} px (RMS) in the worst"
+        " pair; stereo matching along epipolar lines wants it well below 0.5 px."
     )
     axis = "RMS distance from the epipolar line [px], logarithmic"
     chart = charts.dumbbells("epipolar", "Epipolar offset of each pair", axis, rows)
-    shown = [(chart, _which(rows, "pairs", "offset"))]
+    shown = [(chart, _which(rows, "pairs, by the numbers of their images", "offset"))]
+    seen = [pair for pair in pairs if pair["convergence_deg"] is not None]
+    if seen:
+        caption = "One dot a pair. Small angles give weak heights; beyond about 35 degrees images look too different."
+        shown.append((charts.convergence(seen), caption))
+        answer += _heights(seen)
     table = datatables.pairs_table(files.summary)
-    return Section("pairs", "Do the pairs fit for stereo?", answer, shown, tables=[table])
+    return Section(
+        "pairs", "Do the pairs fit for stereo, and can heights be measured?", answer, shown, tables=[table]
+    )
 
 
-def _heights(files: RunFiles) -> Section | None:
-    pairs = [pair for pair in files.summary["pairs"] if pair["convergence_deg"] is not None]
-    if not pairs:
-        return None
+def _heights(pairs: Sequence[Record]) -> str:
     best = min(pairs, key=lambda pair: pair["height_m_per_px"] or np.inf)
-    answer = (
-        f"Best from {best['a']} - {best['b']}: the rays meet under {best['convergence_deg']:.1f} degrees "
-        f"(B/H {best['base_to_height']:.2f}), so one pixel of parallax is {metres(best['height_m_per_px'])} of height."
+    if not best["height_m_per_px"]:
+        return " No pair says anything about heights: all rays are parallel."
+    words = (
+        f" Heights come best from {best['a']} - {best['b']}: the rays meet under {best['convergence_deg']:.1f} degrees"
+        f" (B/H {best['base_to_height']:.2f}), so one pixel of parallax is {metres(best['height_m_per_px'])} of height."
     )
     weak = sum(pair["convergence_deg"] < 1.0 for pair in pairs)
     if weak:
-        answer += (
-            f" {weak} of {len(pairs)} pairs meet under less than one degree and say nothing about heights."
-        )
-    caption = (
-        "One dot a pair. Small angles give weak heights; beyond about 35 degrees images look too different."
-    )
-    return Section("heights", "Can heights be measured?", answer, [(charts.convergence(pairs), caption)])
+        words += f" {weak} of {len(pairs)} pairs meet under less than one degree and say next to nothing about heights."
+    return words
 
 
 def _corrections(files: RunFiles) -> Section | None:
-    views = [v for v in files.summary["views"] if v["correction"] and v["correction"]["center_shift_px"]]
-    if not views:
+    views = files.summary["views"]
+    if not all(view["correction"] and view["correction"]["center_shift_px"] for view in views):
         return None
-    largest = max(float(np.hypot(*view["correction"]["center_shift_px"])) for view in views)
+    moves = [view["correction"] for view in views]
+    largest = max(float(np.hypot(*move["center_shift_px"])) for move in moves)
+    sigma = max(float(np.hypot(*move["center_sigma_px"])) for move in moves)
     answer = (
-        f"Up to {largest:.2f} px in the middle of an image. The bars are what the adjustment itself predicts for its"
-        " error (one sigma); without control most of it is common to all images: the scene's own place."
+        f"Up to {largest:.2f} px in the middle of an image. The adjustment itself predicts this to be known to"
+        f" {sigma:.2g} px (one sigma, the worst image); without control most of that is common to all images: the"
+        " scene's own place, which no tie point can tell."
     )
-    caption = _which(views, "images", "shift") + " Rotations and translations stand in summary.json."
-    return Section(
-        "moves", "What was changed in each camera?", answer, [(charts.corrections(views), caption)]
-    )
+    labels = numbered([view["name"] for view in views])
+    chart = (charts.corrections(views, labels), _which(views, "images", "shift"))
+    table = datatables.corrections_table(files.summary)
+    return Section("moves", "What was changed in each camera?", answer, [chart], tables=[table], half=True)
 
 
 def _gauge(files: RunFiles) -> Section | None:
@@ -222,7 +236,7 @@ def _gauge(files: RunFiles) -> Section | None:
     tables = [datatables.gcps_table(files.summary)] if files.summary["gcps"] else []
     if not tables:
         answer += " Ground control points (--gcp) are what helps where it matters."
-    return Section("gauge", "What can the images not tell?", answer, bars=bars, tables=tables)
+    return Section("gauge", "What can the images not tell?", answer, bars=bars, tables=tables, half=True)
 
 
 def _sentence(words: str) -> str:
@@ -265,11 +279,9 @@ def _run(files: RunFiles) -> Section:
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
     _images,
     _map,
-    _graph,
     _errors,
     _randomness,
     _pairs,
-    _heights,
     _corrections,
     _gauge,
     _files,

@@ -13,9 +13,9 @@ from html import escape
 
 WIDTH = 420.0
 """Units of a chart from left to right."""
-ROW = 18.0
+ROW = 17.0
 """Units from one row of a list chart to the next."""
-MAX_ROWS = 40
+MAX_ROWS = 24
 """A list chart shows so many rows, the most telling ones."""
 
 
@@ -162,18 +162,21 @@ def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
     for value in scale.ticks:
         x = scale(value)
         parts += [line(x, top, x, bottom, "grid"), label(x, bottom + 13, f"{value:g}", "middle")]
-    middle = (scale.start + scale.stop) / 2
-    return [*parts, label(middle, bottom + 29, title, "middle", "axis")]
+    return [*parts, label(scale.stop, bottom + 29, title, "end", "axis")]
 
 
-def short_names(names: Sequence[str], most: int = 16) -> list[str]:
-    """Names cut to `most` characters, in their middle, where they tell least apart.
+def numbered(names: Sequence[str], most: int = 17) -> list[str]:
+    """Names behind their number in the table of images, cut in their middle, where they tell least apart.
 
     Examples
     --------
-    >>> short_names(["IMG_PHR1A_P_201304171032_SEN_001", "a"])
-    ['IMG_PHR…_SEN_001', 'a']
+    >>> numbered(["IMG_PHR1A_P_201304171032_SEN_001", "a"])
+    ['1 IMG_PHR…SEN_001', '2 a']
     """
-    head = (most - 1) // 2
-    tail = most - 1 - head
-    return [name if len(name) <= most else f"{name[:head]}…{name[-tail:]}" for name in names]
+    out = []
+    for k, name in enumerate(names):
+        room = most - len(str(k + 1)) - 1
+        tail = (room - 1) // 2
+        short = name if len(name) <= room else f"{name[: room - 1 - tail]}…{name[-tail:]}"
+        out.append(f"{k + 1} {short}")
+    return out
