@@ -20,6 +20,7 @@ EXIT_INTERRUPTED = 130
 
 COMMANDS = {
     "adjust": "Correct the cameras of overlapping images and write fresh RPCs.",
+    "match": "Match tie points and stop.",
     "check": "Measure how well cameras agree, without adjusting.",
     "fit": "Fit an RPC to any camera or to points, and certify it.",
     "info": "Say where an image's RPC comes from and how it looks at the ground.",

@@ -124,6 +124,8 @@ RUN_FLAGS = (
     Flag("--force", "force", "Write RPCs that miss the tolerance; exit 3.", is_flag=True),
     Flag("--keep-going", "keep_going", "Leave bad files out; exit 3 at the end.", is_flag=True),
 )
+MATCH_FLAGS = tuple(flag for flag in RUN_FLAGS if flag.target in ("overwrite", "keep_going"))
+MATCH_FLAGS += tuple(flag for flag in ADJUSTMENT_FLAGS if flag.target == "adjust.keep_largest")
 _BY_PARAMETER = {flag.parameter: flag for flag in (*TIE_FLAGS, *ADJUSTMENT_FLAGS, *RUN_FLAGS)}
 
 

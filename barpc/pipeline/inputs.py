@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +35,35 @@ def load_gcps(paths: Sequence[str], names: Sequence[str]) -> GroundPoints | None
     )
 
 
-def load_dem(options: RunOptions) -> Dem | None:
-    """The terrain, with its geoid; None where none was given."""
-    return None if options.dem is None else Dem.open(options.dem, options.geoid)
+@dataclass(frozen=True, eq=False)
+class Given:
+    """Side inputs, read before any work starts.
 
+    Parameters
+    ----------
+    dem : Dem or None
+        The terrain, with its geoid.
+    prior : BlockPrior or None
+        What an earlier run knows about its views.
+    """
 
-def load_prior(options: RunOptions) -> BlockPrior | None:
-    """What an earlier run knows about its views; None where none was given."""
-    return None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
+    dem: Dem | None
+    prior: BlockPrior | None
+
+    @classmethod
+    def read(cls, options: RunOptions, names: Sequence[str]) -> Given:
+        """Read them all; a file that cannot be used stops the run here, and not after an hour.
+
+        Raises
+        ------
+        InputError
+            A file is missing or does not parse.
+        """
+        load_gcps(options.gcp, names)
+        load_gcps(options.check_points, names)
+        dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
+        prior = None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
+        return cls(dem, prior)
 
 
 def input_files(options: RunOptions) -> list[Path]:

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment, adjust_tracks, block_prior
-from barpc.errors import InputError
+from barpc.errors import DisconnectedError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.pipeline.crew import Crew
-from barpc.pipeline.inputs import PRIOR, input_files, load_dem, load_gcps, load_prior
+from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps
 from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import SUFFIXES, write_tables, write_view
 from barpc.pipeline.views import LoadedViews, load_views
-from barpc.pointio.matches import read_matches
+from barpc.pointio.matches import read_matches, write_matches
 from barpc.report import Run, summarize
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
@@ -164,10 +164,7 @@ def _solve(
 ) -> Run:
     """Tie points and the adjustment, as often as there are passes."""
     run = _empty_run("adjust", loaded, options)
-    names = [view.name for view in run.views]
-    gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
-    dem, prior = load_dem(options), load_prior(options)
-    centers = tuple(_center(view, options) for view in run.views)
+    given = Given.read(options, [view.name for view in run.views])
     adjustment: Adjustment | None = None
     passes = 1 if options.matches is not None else options.num_passes
     for number in range(passes):
@@ -175,16 +172,26 @@ def _solve(
         with workspace.stage("tie points" + again):
             run = _with_ties(run, options, crew, progress, adjustment)
         if options.stop_after == "matching":
+            _write_matches(run, workspace)
             return replace(run, kind="check")
         with workspace.stage("adjustment" + again):
-            ecef = np.array([center.ecef for center in centers])
-            adjustment = adjust_tracks(
-                run.views, run.tracks, options.adjust, gcps, dem, centers=ecef, prior=prior
-            )
+            run, adjustment = _adjusted(run, options, given)
     assert adjustment is not None
     with workspace.output(PRIOR) as partial:
         block_prior(adjustment).save(partial)
-    return replace(run, adjustment=adjustment, centers=centers, gcps=gcps, check_points=checks)
+    return replace(run, adjustment=adjustment)
+
+
+def _adjusted(run: Run, options: RunOptions, given: Given) -> tuple[Run, Adjustment]:
+    """One adjustment, and the run with what went into it."""
+    names = [view.name for view in run.views]
+    gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
+    centers = tuple(_center(view, options) for view in run.views)
+    ecef = np.array([center.ecef for center in centers])
+    adjustment = adjust_tracks(
+        run.views, run.tracks, options.adjust, gcps, given.dem, centers=ecef, prior=given.prior
+    )
+    return replace(run, centers=centers, gcps=gcps, check_points=checks), adjustment
 
 
 def _with_ties(
@@ -200,8 +207,35 @@ def _with_ties(
     if len(run.views) < 2:
         return run
     sensors = None if adjustment is None else adjustment.sensors
-    ties = find_tracks(run.views, options.tie, executor=executor, progress=progress, sensors=sensors)
+    try:
+        ties = find_tracks(run.views, options.tie, executor=executor, progress=progress, sensors=sensors)
+    except DisconnectedError as error:
+        if not options.adjust.keep_largest or len(error.groups[0]) < 2:
+            raise
+        kept = _only(run, frozenset(error.groups[0]))
+        logger.warning("%d of %d images are tied together and kept", len(kept.views), len(run.views))
+        return _with_ties(kept, options, executor, progress, None)
     return replace(run, tracks=ties.tracks, matched=ties.pairs)
+
+
+def _write_matches(run: Run, workspace: Workspace) -> None:
+    names = [view.name for view in run.views]
+    for name in ("matches.csv", "matches.npz"):
+        with workspace.output(name) as partial:
+            write_matches(partial, run.tracks, names)
+
+
+def _only(run: Run, names: frozenset[str]) -> Run:
+    """The run without the views that the others are not tied to."""
+    kept = [i for i, view in enumerate(run.views) if view.name in names]
+    why = "it shares no tie points with the largest group of images"
+    dropped = tuple((view.path, why) for view in run.views if view.name not in names)
+    return replace(
+        run,
+        views=tuple(run.views[i] for i in kept),
+        sources=tuple(run.sources[i] for i in kept),
+        left_out=(*run.left_out, *dropped),
+    )
 
 
 def _center(view: View, options: RunOptions) -> CameraCenter:
