@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
 
-from barpc.errors import FitError
+from barpc.errors import BarpcWarning, FitError
 from barpc.fit.certificate import Errors, RpcFit, coverage, roundtrip, smallest_denominator
 from barpc.fit.grid import check_points, control_points, widened
 from barpc.fit.options import FitOptions
@@ -55,8 +56,15 @@ def fit_rpc(
     ------
     FitError
         The model cannot be localised over the image, or the RPC does not reach the tolerance.
+
+    Warns
+    -----
+    BarpcWarning
+        A few control points have no ground point.
     """
     options = options or FitOptions()
+    if min(size) < 1:
+        raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
     ground, image = control_points(model, size, widened(alt_range), options)
     cnp, cnp_image = ground.reshape(-1, 3), image.reshape(-1, 2)
     ok = np.isfinite(cnp).all(axis=1) & np.isfinite(cnp_image).all(axis=1)
@@ -66,6 +74,12 @@ def fit_rpc(
             f"{alt_range[0]:g} to {alt_range[1]:g} m: give an altitude range that it is made for"
         )
     if not ok.all():
+        warnings.warn(
+            f"{np.count_nonzero(~ok)} of {ok.size} control points have no ground point and are left out: the "
+            "RPC extrapolates there",
+            BarpcWarning,
+            stacklevel=2,
+        )
         cnp, cnp_image = cnp[ok], cnp_image[ok]
     vendor = underlying_rpc(model)
 

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.errors import FitError
+from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, Normalization, fit_rpc, fit_rpc_points
 from barpc.fit.grid import check_points, control_points
 from barpc.fit.precision import PRECISIONS
+from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.rpc import RPC
 from barpc.simulate.orbit import Look, fly
@@ -171,6 +172,31 @@ def test_a_model_without_ground_under_its_image_is_refused(camera: Camera) -> No
         fit_rpc(camera.model, camera.size, (1e7, 2e7))
     with pytest.raises(FitError, match="not an interval"):
         fit_rpc(camera.model, camera.size, (500.0, 0.0))
+
+
+class Holed:
+    """A camera that has no ground point in a corner of its image."""
+
+    def __init__(self, camera: Camera, share: float) -> None:
+        self.camera, self.share = camera, share
+        self.project, self.project_jacobian = camera.model.project, camera.model.project_jacobian
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        ground = self.camera.model.localize(image, alt)
+        hole = (image < self.share * np.array(self.camera.size)).all(axis=-1)
+        return np.where(hole[..., None], np.nan, ground)
+
+
+def test_a_small_hole_is_said_and_a_large_one_refused(camera: Camera) -> None:
+    with pytest.warns(BarpcWarning, match="control points have no ground point"):
+        fit = fit_rpc(Holed(camera, 0.05), camera.size, camera.alt_range)
+    assert fit.max_ckp.max() <= 1e-7
+    assert fit.num_cnp < 12 * 12 * 7
+    assert fit.coverage < 1.0
+    with pytest.raises(FitError, match="no ground point for"):
+        fit_rpc(Holed(camera, 0.6), camera.size, camera.alt_range)
+    with pytest.raises(FitError, match="nothing to fit over"):
+        fit_rpc(camera.model, (0, 5), camera.alt_range)
 
 
 def test_check_points_lie_strictly_between_control_points(camera: Camera) -> None:
