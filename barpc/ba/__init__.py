@@ -1,10 +1,12 @@
 """Tracks to corrections: the bundle adjustment.
 
 `adjust_tracks` is the entry; `AdjustOptions` says how it runs, `Adjustment` what it found. `block_prior` keeps
-what a block knows for a later run with more views; `pair_heights` says how well a stereo pair knows heights.
+what a block knows for a later run with more views; `pair_heights` says how well a stereo pair knows heights;
+`split_points` and `check_residuals` keep known points out of the solve and measure it by them.
 """
 
 from barpc.ba.adjustment import adjust_tracks
+from barpc.ba.control import CheckResiduals, check_residuals, split_points
 from barpc.ba.incremental import BlockPrior, block_prior
 from barpc.ba.options import AdjustOptions
 from barpc.ba.result import Adjustment
@@ -14,8 +16,11 @@ __all__ = [
     "AdjustOptions",
     "Adjustment",
     "BlockPrior",
+    "CheckResiduals",
     "PairHeights",
     "adjust_tracks",
     "block_prior",
+    "check_residuals",
     "pair_heights",
+    "split_points",
 ]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba import AdjustOptions, adjust_tracks, check_residuals, split_points
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import Tracks
@@ -104,7 +104,7 @@ def test_drift_is_corrected_as_if_there_were_none():
     assert np.mean(price) <= 1.4  # three more unknowns a view cost a quarter, drift or not
 
 
-@pytest.mark.parametrize(("model", "bound"), [("affine", 0.1), ("shift-drift", 1.0), ("shift", 2.0)])
+@pytest.mark.parametrize(("model", "bound"), [("affine", 0.02), ("shift-drift", 0.03), ("shift", 0.04)])
 def test_image_models_correct_what_they_can(model, bound):
     small = simulate_block(3, 1000, seed=6, size=(4000, 4000))
     found = solve(small, model=model, sigma_shift=30.0)
@@ -132,6 +132,35 @@ def test_three_gcps_bring_the_scene_to_its_place():
         assert (found.gauge.sigma < [1.0, 1.0, 2.0]).all()
     assert (np.array(errors) < 2 * np.array(sigmas)).mean() > 0.8
     assert (np.array(errors) < 3.5 * np.array(sigmas)).all()
+
+
+def test_check_points_stay_out_of_the_solve_and_measure_it():
+    triplet = simulate_block(3, 600, seed=2, num_gcps=12)
+    control, check = split_points(triplet.gcps, triplet.gcps.names[6:])
+    assert set(control.names).isdisjoint(check.names)
+    assert len(control.names) == len(check.names) == 6
+    assert len(control.view) + len(check.view) == len(triplet.gcps.view)
+    centers = centers_of(triplet)
+    found = adjust_tracks(
+        triplet.views, triplet.tracks, AdjustOptions(**INDEPENDENT), control, centers=centers
+    )
+    before = check_residuals([view.sensor for view in triplet.views], check).rms()
+    after = check_residuals(found.sensors, check).rms()
+    assert (before[0] > 1.0).all()
+    assert (after[0] < 0.4).all()
+    assert (after[1] < 1.0).all()
+    exact = check_residuals(truth_sensors(triplet), triplet.gcps).rms()
+    assert (exact[0] < 0.15).all()
+    with pytest.raises(InputError, match="named nobody"):
+        split_points(triplet.gcps, ["nobody"])
+
+
+def test_a_check_point_in_one_view_has_no_place_on_the_ground():
+    one = simulate_block(1, 0, seed=3, num_gcps=3, num_checks=0)
+    found = check_residuals(truth_sensors(one), one.gcps)
+    assert np.isnan(found.ground).all()
+    assert np.isnan(found.rms()[1]).all()
+    assert (found.rms()[0] < 0.3).all()
 
 
 def test_a_single_view_is_refined_by_gcps_alone():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from barpc.geodesy import ecef_from_ground
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.imagespace import ImageAffine, ImageCorrected
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.simulate.orbit import Look, fly
@@ -74,6 +75,19 @@ MODELS: dict[str, Callable[[], Case]] = {
     "corrected rpc": lambda: Case(Corrected(make_rpc(), _correction()), (20000, 19000), (0.0, 1000.0)),
     "corrected rpc across the antimeridian": lambda: Case(
         Corrected(make_rpc(lon=-179.98), _correction(lon=-179.98)), (20000, 19000), (0.0, 1000.0)
+    ),
+    "corrected rpc with drift": lambda: Case(
+        Corrected(
+            make_rpc(),
+            replace(_correction(), drift=[[5e-6, 1e-5, -1e-5]], row_offset=9500.0, row_scale=9500.0),
+        ),
+        (20000, 19000),
+        (0.0, 1000.0),
+    ),
+    "rpc corrected in the image": lambda: Case(
+        ImageCorrected(make_rpc(), ImageAffine([3.0, -4.0], [[1e-4, 2e-4], [-1e-4, 3e-4]])),
+        (20000, 19000),
+        (0.0, 1000.0),
     ),
     "pushbroom": lambda: Case(_pushbroom(5.4), (20000, 19000), (0.0, 1000.0)),
     "pushbroom across the antimeridian": lambda: Case(_pushbroom(180.0), (20000, 19000), (0.0, 1000.0)),
