@@ -116,9 +116,9 @@ class Rational:
         # d/dL, d/dP, d/dH of the four polynomials on the first ten monomials, by axis: (12, 10)
         self.gradients = np.einsum("pi,aij->apj", coeffs, DERIVATIVE).reshape(12, 10)
 
-    def value(self, x: Array, work: Array | None = None) -> Array:
-        """Values (2, N) at points (3, N); `work` (20, N) is overwritten."""
-        poly = self.coeffs @ monomials(x, work)
+    def value(self, x: Array, work: Array | None = None, poly: Array | None = None) -> Array:
+        """Values (2, N) at points (3, N); `work` (20, N) and `poly` (4, N) are overwritten."""
+        poly = np.matmul(self.coeffs, monomials(x, work), out=poly)
         return np.divide(poly[::2], poly[1::2], out=poly[::2])
 
     def value_and_gradient(self, x: Array, axes: int = 3, work: Array | None = None) -> tuple[Array, Array]:
@@ -133,7 +133,7 @@ class Rational:
         out *= inverse
         return value, out
 
-    def solve(self, target: Array, z: Array) -> tuple[Array, BoolArray]:
+    def solve(self, target: Array, z: Array, work: Array | None = None) -> tuple[Array, BoolArray]:
         """Points whose third variable is `z` and whose values are `target`: the inverse.
 
         The cubic inverse and one Newton step; where the step is too long to prove that it was enough, one
@@ -146,6 +146,8 @@ class Rational:
             Values.
         z : (N,)
             Third variable.
+        work : (20, N), optional
+            Overwritten.
 
         Returns
         -------
@@ -162,11 +164,11 @@ class Rational:
         x[:2], x[2] = target, z
         x -= inverse.center
         x /= inverse.scale
-        x[:2] = inverse.coeffs @ monomials(x)
+        x[:2] = inverse.coeffs @ monomials(x, work)
         x[2] = z
-        long = self._step(target, x) > inverse.safe_step
+        long = self._step(target, x, work) > inverse.safe_step
         if long.any():
-            long = ~(self._step(target, x) <= inverse.safe_step)
+            long = ~(self._step(target, x, work) <= inverse.safe_step)
         out = np.abs(x).max(axis=0)
         bad = np.flatnonzero(long | ~(out <= REACH))
         ok = np.ones(len(z), dtype=bool)
@@ -174,9 +176,9 @@ class Rational:
             ok[bad] = self._solve_with_care(target[:, bad], x, bad)
         return x, ok
 
-    def _step(self, target: Array, x: Array) -> Array:
+    def _step(self, target: Array, x: Array, work: Array | None = None) -> Array:
         """One Newton step on `x[:2]`, in place; its length (N,)."""
-        value, ((a, c), (b, d)) = self.value_and_gradient(x, axes=2)
+        value, ((a, c), (b, d)) = self.value_and_gradient(x, axes=2, work=work)
         np.subtract(target, value, out=value)
         det = a * d
         det -= b * c

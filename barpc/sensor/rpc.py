@@ -91,20 +91,23 @@ class RPC:
         """Derivatives of the four polynomials by (lon, lat, alt), normalised, on ten monomials: (12, 10)."""
         return np.asarray(self._map.gradients.reshape(3, 4, 10).swapaxes(0, 1).reshape(12, 10))
 
-    def normalize(self, ground: Array) -> Array:
+    def normalize(self, ground: Array, out: Array | None = None) -> Array:
         """Normalised longitude, latitude, altitude, one row each.
 
         Parameters
         ----------
         ground : (N, 3)
             lon, lat [deg], alt [m].
+        out : (3, N), optional
+            Where to put them.
 
         Returns
         -------
         normalized : (3, N)
             Without unit; -1 to 1 in the RPC's box.
         """
-        out = np.empty((3, len(ground)))
+        if out is None:
+            out = np.empty((3, len(ground)))
         np.subtract(ground.T, self.ground_offset[:, None], out=out)
         if not (out[0].max(initial=0.0) <= 180.0 and out[0].min(initial=0.0) >= -180.0):
             out[0] = wrap_longitude(ground[:, 0], self.ground_offset[0]) - self.ground_offset[0]
@@ -127,11 +130,14 @@ class RPC:
         ground = np.asarray(ground, dtype=np.float64)
         flat = ground.reshape(-1, 3)
         out = np.empty((len(flat), 2))
-        work = np.empty((20, min(len(flat), CHUNK)))
+        buffer = np.empty(
+            (27, min(len(flat), CHUNK))
+        )  # kept for all pieces: fresh memory costs more than sums
         with np.errstate(all="ignore"):
             for start in range(0, len(flat), CHUNK):
                 piece = flat[start : start + CHUNK]
-                value = self._map.value(self.normalize(piece), work[:, : len(piece)])
+                work = buffer[:, : len(piece)]
+                value = self._map.value(self.normalize(piece, work[20:23]), work[:20], work[23:])
                 value *= self.image_scale[:, None]
                 value += self.image_offset[:, None]
                 if not np.isfinite(value.sum()):
@@ -201,17 +207,18 @@ class RPC:
         flat = np.broadcast_to(image, (*shape, 2)).reshape(-1, 2)
         height = np.broadcast_to(alt, shape).reshape(-1)
         out = np.empty((len(flat), 3))
+        work = np.empty((20, min(len(flat), CHUNK)))
         with np.errstate(all="ignore"):
             for start in range(0, len(flat), CHUNK):
                 part = slice(start, start + CHUNK)
-                out[part] = self._localize(flat[part], height[part])
+                out[part] = self._localize(flat[part], height[part], work)
         return out.reshape(*shape, 3)
 
-    def _localize(self, image: Array, alt: Array) -> Array:
+    def _localize(self, image: Array, alt: Array, work: Array) -> Array:
         target = np.subtract(image.T, self.image_offset[:, None])
         target /= self.image_scale[:, None]
         z = (alt - self.ground_offset[2]) / self.ground_scale[2]
-        x, ok = self._map.solve(target, z)
+        x, ok = self._map.solve(target, z, work[:, : len(alt)])
         reach = max(x.max(initial=0.0), -x.min(initial=0.0))
         x *= self.ground_scale[:, None]
         x += self.ground_offset[:, None]
