@@ -40,6 +40,11 @@ COMMANDS = {
 """Verb -> its line in `barpc --help`; the code is `barpc.cli.<verb>.command`."""
 
 
+def _kept_lines(text: str | None) -> str | None:
+    r"""Turn the written ``\b`` of a raw docstring into the character by which click keeps lines apart."""
+    return text and text.replace("\\b\n", "\b\n")
+
+
 class Verbs(click.Group):
     """A group that imports a verb's module when the verb is used."""
 
@@ -52,6 +57,7 @@ class Verbs(click.Group):
         if cmd_name not in COMMANDS:
             return None
         command: click.Command = import_module(f"barpc.cli.{cmd_name}").command
+        command.help = _kept_lines(command.help)
         return command
 
     def resolve_command(
@@ -90,6 +96,9 @@ def cli(ctx: click.Context, verbose: int, quiet: bool, debug: bool) -> None:
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     logging.basicConfig(level=level, format="%(levelname).1s %(name)s: %(message)s", stream=sys.stderr)
     logging.captureWarnings(True)
+
+
+cli.help = _kept_lines(cli.help)
 
 
 def main(args: list[str] | None = None) -> None:

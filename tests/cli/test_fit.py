@@ -32,6 +32,12 @@ def table(path: Path, camera: Camera, noise: float = 0.0) -> Path:
     return path
 
 
+def test_examples_in_the_help_stand_on_lines_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("fit", "--help") == 0
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert "barpc fit points.csv -o points.RPB --tolerance 1" in lines
+
+
 def test_points_become_an_rpc_file_that_reads_back(
     camera: Camera, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
