@@ -175,7 +175,7 @@ def _transformer(rpcs: Any) -> Projection:
 
 
 def _gdal_raster(path: Path) -> Projection:
-    with open_raster(path) as dataset:
+    with open_raster(path, sidecars=True) as dataset:
         if dataset.rpcs is None:
             raise OutputError("no RPC")
         return _transformer(dataset.rpcs)

@@ -1,8 +1,8 @@
 """Opening a raster: one regular local file, one driver, nothing fetched.
 
 GDAL decides by content what a file is, and some contents (a VRT, a web service description) make it
-read other files or the network. So the first bytes choose the one driver that may open a file, and only
-a VRT that points at plain local rasters is let through.
+read other files or the network. So the first bytes choose the one driver that may open a file, only a VRT
+that points at plain local rasters is let through, and GDAL does not look at the files beside an image.
 """
 
 from __future__ import annotations
@@ -38,12 +38,15 @@ DRIVERS: dict[bytes, str] = {
 """First bytes of a file -> the driver that may open it."""
 
 GDAL_OPTIONS: dict[str, Any] = {
-    "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{noext}",  # no sidecar or overview is fetched
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "none",  # nothing is fetched
+    "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{noext}",
     "GDAL_HTTP_MAX_RETRY": 0,
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     "GDAL_CACHEMAX": 64,  # MB
 }
 """Settings under which every raster is read."""
+_ALONE: dict[str, Any] = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
+# An .ovr, .msk or .aux.xml beside an image may be, or name, a web service: GDAL is told that there is none.
 
 _VRT_TAGS = frozenset(
     [
@@ -82,13 +85,15 @@ _WARNINGS = threading.Lock()  # catch_warnings is process-wide
 
 
 @contextmanager
-def open_raster(path: str | os.PathLike[str]) -> Iterator[Any]:
+def open_raster(path: str | os.PathLike[str], *, sidecars: bool = False) -> Iterator[Any]:
     """Open a raster read-only; an error while it is open names the file, too.
 
     Parameters
     ----------
     path : path
         An existing regular file.
+    sidecars : bool
+        Let GDAL look at the files beside it: for files that barpc itself has written, never for inputs.
 
     Yields
     ------
@@ -104,7 +109,7 @@ def open_raster(path: str | os.PathLike[str]) -> Iterator[Any]:
     name = os.fspath(path)
     file, driver = identify(name)
     try:
-        with rasterio.Env(**GDAL_OPTIONS):
+        with rasterio.Env(**GDAL_OPTIONS, **({} if sidecars else _ALONE)):
             with _WARNINGS, warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
                 dataset = rasterio.open(file, driver=driver)

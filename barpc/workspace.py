@@ -155,7 +155,7 @@ class Workspace:
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         self._clean()
-        self._earlier: list[str] = list(self._read_state().get("outputs", []))
+        self._earlier = self._earlier_outputs()
         self.outputs: list[str] = []
         self.stages: list[dict[str, Any]] = []
         self._save_state("running")
@@ -300,6 +300,13 @@ class Workspace:
             return {}
         return state if isinstance(state, dict) else {}
 
+    def _earlier_outputs(self) -> list[str]:
+        """What an earlier run says it wrote; never a place outside the folder, whatever the file says."""
+        named = self._read_state().get("outputs", [])
+        names = [name for name in named if isinstance(name, str)] if isinstance(named, list) else []
+        below = self.folder.resolve()
+        return [name for name in names if (self.folder / name).resolve().parent.is_relative_to(below)]
+
     def _save_state(self, status: str) -> None:
         outputs = sorted({*self.outputs, *(self._earlier if status != "done" else ())})
         state = {"barpc": __version__, "status": status, "stages": self.stages, "outputs": outputs}
@@ -307,5 +314,6 @@ class Workspace:
 
     def _clean(self) -> None:
         """Leftovers of a run that was killed."""
-        for folder in [self.folder, *(p for p in self.folder.rglob("*") if p.is_dir())]:
+        below = (p for p in self.folder.rglob("*") if p.is_dir() and not p.is_symlink())
+        for folder in [self.folder, *below]:
             remove_leftovers(folder)

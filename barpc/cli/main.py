@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import difflib
 import logging
+import os
+import signal
 import sys
+import threading
 import traceback
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
+from typing import Any
 
 import click
 
 from barpc import __version__
-from barpc.errors import BarpcError
+from barpc.errors import BarpcError, BarpcWarning
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_GATE = 3
 EXIT_INTERRUPTED = 130
+
+_NO_ARGUMENTS: Any = getattr(click.exceptions, "NoArgsIsHelpError", click.exceptions.Exit)  # not in click 8.1
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 COMMANDS = {
     "adjust": "Correct the cameras of overlapping images and write fresh RPCs.",
@@ -95,28 +105,87 @@ def cli(ctx: click.Context, verbose: int, quiet: bool, debug: bool) -> None:
     ctx.obj = {"quiet": quiet, "verbose": verbose}
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     logging.basicConfig(level=level, format="%(levelname).1s %(name)s: %(message)s", stream=sys.stderr)
-    logging.captureWarnings(True)
+    warnings.showwarning = _log_warning
 
 
 cli.help = _kept_lines(cli.help)
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the console script: runs a verb and turns errors into exit codes."""
+    """Entry point of the console script: runs a verb and turns errors into one line and an exit code."""
     argv = sys.argv[1:] if args is None else args
-    try:
-        code = cli.main(args=argv, prog_name="barpc", standalone_mode=False)
-    except click.exceptions.Exit as stop:
-        code = stop.exit_code
-    except click.Abort:
-        click.echo("barpc: interrupted; run the same command again to go on", err=True)
-        code = EXIT_INTERRUPTED
-    except click.ClickException as error:
-        error.show()
-        code = error.exit_code
-    except BarpcError as error:
-        if "--debug" in argv:
-            traceback.print_exc()
-        click.echo(f"barpc: {' '.join(str(error).split())}", err=True)
-        code = EXIT_FAILED
+    for name in _THREADS:  # sums keep their order whatever the machine; -j spreads the work
+        os.environ.setdefault(name, "1")
+    with _interruptible(), warnings.catch_warnings():
+        try:
+            code = cli.main(args=argv, prog_name="barpc", standalone_mode=False)
+            sys.stdout.flush()
+        except click.exceptions.Exit as stop:
+            code = stop.exit_code
+        except _NO_ARGUMENTS as error:
+            error.show()
+            code = error.exit_code
+        except BrokenPipeError:  # whoever read the results has gone
+            sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115  (flushed at exit)
+            code = EXIT_FAILED
+        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001  (nobody wants a traceback)
+            code, message = _told(error)
+            if "--debug" in argv:
+                traceback.print_exc()
+            click.echo(f"barpc: {' '.join(message.split())}", err=True)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _told(error: BaseException) -> tuple[int, str]:
+    """The exit code of an error, and what to say."""
+    if isinstance(error, (click.Abort, KeyboardInterrupt)):
+        return EXIT_INTERRUPTED, "interrupted; run the same command again to go on"
+    if isinstance(error, click.ClickException):
+        context = getattr(error, "ctx", None)
+        where = context.command_path if context is not None else "barpc"
+        return error.exit_code, f"{error.format_message()} (see '{where} --help')"
+    if isinstance(error, BarpcError):
+        return EXIT_FAILED, str(error)
+    if isinstance(error, MemoryError):
+        return EXIT_FAILED, (
+            "out of memory; what was finished is kept: run the same command again, with a smaller -j or [tie] tile"
+        )
+    if isinstance(error, OSError) and error.strerror:
+        return EXIT_FAILED, f"{error.filename or 'the system'}: {error.strerror}"
+    return EXIT_FAILED, (
+        f"unexpected {type(error).__name__}: {error}; this is a bug: please report what --debug shows"
+    )
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """End at a SIGTERM, as batch systems send it, in the same way as at a Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _log_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: object = None,
+    line: str | None = None,
+) -> None:
+    """A warning as one line of the log: barpc's own always, those of libraries with -v."""
+    own = issubclass(category, BarpcWarning)
+    text = " ".join(str(message).split())
+    if own:
+        logging.getLogger("barpc").warning(text)
+    else:
+        logging.getLogger("py.warnings").info("%s:%d: %s: %s", filename, lineno, category.__name__, text)
