@@ -12,7 +12,7 @@ from barpc.ba import BlockPrior
 from barpc.dem import Dem
 from barpc.pipeline.options import RunOptions
 from barpc.pointio.gcp import read_gcps
-from barpc.scene import GroundPoints
+from barpc.scene import BoolArray, GroundPoints, Tracks
 
 PRIOR = "block.npz"
 """The file in a run folder that a later run starts from."""
@@ -70,3 +70,26 @@ def input_files(options: RunOptions) -> list[Path]:
     """Every file that the options name; none of them is ever written."""
     named = [*options.gcp, *options.check_points, options.dem, options.geoid, options.matches]
     return [Path(path) for path in named if path is not None]
+
+
+def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
+    """Tracks that tell something an earlier block did not know.
+
+    Tracks without a new view are left out. Of those seen in several old views one old observation is kept: how
+    these views lie to each other is in the earlier block's normal matrix already.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Tie points of old and new views.
+    old : (N,)
+        Views of the earlier block.
+    """
+    is_old = old[tracks.view]
+    has_new = np.bincount(tracks.point, ~is_old, minlength=tracks.num_points) > 0
+    order = np.lexsort((tracks.sigma, tracks.point))  # the surest old observation of a track comes first
+    order = order[is_old[order]]
+    _, first = np.unique(tracks.point[order], return_index=True)
+    keep = ~is_old
+    keep[order[first]] = True
+    return tracks.select(keep & has_new[tracks.point])

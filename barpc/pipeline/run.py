@@ -16,7 +16,7 @@ from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import DisconnectedError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.pipeline.crew import Crew
-from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps
+from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new
 from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import SUFFIXES, write_tables, write_view
 from barpc.pipeline.views import LoadedViews, load_views
@@ -185,6 +185,8 @@ def _solve(
 def _adjusted(run: Run, options: RunOptions, given: Given) -> tuple[Run, Adjustment]:
     """One adjustment, and the run with what went into it."""
     names = [view.name for view in run.views]
+    if given.prior is not None:
+        run = replace(run, tracks=only_new(run.tracks, np.isin(names, given.prior.names)))
     gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
     centers = tuple(_center(view, options) for view in run.views)
     ecef = np.array([center.ecef for center in centers])

@@ -1,0 +1,160 @@
+"""Control points, terrain, tie points from files, earlier blocks, stray images."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.errors import DisconnectedError, InputError
+from barpc.pipeline import RunOptions, adjust
+from barpc.pipeline.inputs import only_new
+from barpc.rpcio import read_rpc
+from barpc.scene import Tracks
+
+from .test_synthetic import SAMPLES, errors_at_check_points
+
+IMAGES = sorted(SAMPLES.glob("*.tif"))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return json.loads((SAMPLES / "truth.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def matched(tmp_path_factory):
+    out = tmp_path_factory.mktemp("matched") / "ties"
+    return adjust(IMAGES, out, RunOptions(stop_after="matching")), out
+
+
+def test_tie_points_from_a_file_give_the_same_answer(matched, tmp_path):
+    result, out = matched
+    runs = []
+    for name in ("matches.csv", "matches.npz"):
+        again = adjust(IMAGES, tmp_path / name, RunOptions(matches=str(out / name)))
+        np.testing.assert_array_equal(again.tracks.xy, result.tracks.xy)
+        np.testing.assert_array_equal(again.tracks.sigma, result.tracks.sigma)
+        runs.append(again.adjustment.params)
+    np.testing.assert_array_equal(*runs)
+
+
+def test_control_points_put_the_scene_in_its_place(matched, truth, tmp_path):
+    options = RunOptions(matches=str(matched[1] / "matches.npz"), gcp=(str(SAMPLES / "gcps.geojson"),))
+    result = adjust(IMAGES, tmp_path / "out", options)
+    rms, offset = errors_at_check_points(
+        [read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], truth
+    )
+    sigma = np.array(result.summary["scene"]["sigma_enu_m"])
+    assert rms <= 0.02
+    assert (sigma < 1.0).all()
+    assert (np.abs(offset) <= 2 * sigma).all()
+    assert len(result.summary["gcps"]) == 5
+
+
+def test_one_image_and_control_points_are_enough(shared_data, tmp_path):
+    image = shared_data / "optical/qb2_single/qb2_basic1b.tif"
+    gcps = shared_data / "optical/qb2_single/gcps.geojson"
+    result = adjust([image], tmp_path / "out", RunOptions(gcp=(str(gcps),)))
+    before, after = result.run.views[0].sensor, read_rpc(tmp_path / "out/qb2_basic1b.vrt")
+    points = result.run.gcps
+
+    def error(rpc):
+        return np.sqrt(((rpc.project(points.lonlatalt[points.point]) - points.xy) ** 2).sum(axis=1).mean())
+
+    assert error(before) > 3
+    assert error(after) < 0.4 * error(before)
+    assert result.summary["passed"]
+    assert "nan" not in " ".join(result.summary["verdict"])
+
+
+def test_control_points_of_other_images_are_refused_before_any_work(tmp_path):
+    text = (SAMPLES / "gcps.geojson").read_text().replace("view_0", "photo_")
+    (tmp_path / "gcps.geojson").write_text(text)
+    with pytest.raises(InputError, match=r"gcps\.geojson"):
+        adjust(IMAGES, tmp_path / "out", RunOptions(gcp=(str(tmp_path / "gcps.geojson"),)))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_stray_image_is_named_and_left_out_when_asked(shared_data, tmp_path):
+    stray = shared_data / "optical/phr_triplet_north/img_01.tif"
+    with pytest.raises(DisconnectedError) as caught:
+        adjust([*IMAGES, stray], tmp_path / "out")
+    assert caught.value.groups[1] == ("img_01",)
+    options = RunOptions(matches=None)
+    options = replace(options, adjust=replace(options.adjust, keep_largest=True))
+    result = adjust([*IMAGES, stray], tmp_path / "out", options)
+    assert [view.name for view in result.views] == ["view_00", "view_01", "view_02"]
+    assert not result.passed
+    assert result.summary["left_out"][0]["path"] == str(stray)
+    assert not (tmp_path / "out/img_01.vrt").exists()
+
+
+def test_a_later_run_goes_on_from_an_earlier_block(matched, truth, tmp_path):
+    adjust(IMAGES[:2], tmp_path / "two")
+    joint = adjust(IMAGES, tmp_path / "joint", RunOptions(matches=str(matched[1] / "matches.npz")))
+    result = adjust(IMAGES, tmp_path / "three", RunOptions(fixed_run=str(tmp_path / "two")))
+    rms, _ = errors_at_check_points([read_rpc(tmp_path / f"three/{v.name}.vrt") for v in result.views], truth)
+    assert rms <= 0.03
+    sigma = [np.sqrt(np.diag(run.adjustment.covariance.view(2))) for run in (joint, result)]
+    np.testing.assert_allclose(sigma[1], sigma[0], rtol=0.2)
+    with pytest.raises(InputError, match="prior of an adjusted block"):
+        adjust(IMAGES, tmp_path / "none", RunOptions(fixed_run=str(tmp_path)))
+
+
+def test_what_the_earlier_block_knew_does_not_count_twice():
+    # track 0: old views only; 1: both old views and the new one; 2: one old and the new one
+    tracks = Tracks(
+        [0, 1, 0, 1, 2, 1, 2],
+        [0, 0, 1, 1, 1, 2, 2],
+        np.arange(14.0).reshape(7, 2),
+        [1, 1, 0.3, 0.2, 0.1, 1, 1],
+    )
+    new = only_new(tracks, np.array([True, True, False]))
+    assert new.view.tolist() == [1, 2, 1, 2]
+    assert new.point.tolist() == [0, 0, 1, 1]
+    assert new.sigma.tolist() == [0.2, 0.1, 1, 1]
+
+
+def test_a_second_pass_matches_with_the_adjusted_cameras(truth, tmp_path):
+    result = adjust(IMAGES, tmp_path / "out", RunOptions(num_passes=2))
+    rms, _ = errors_at_check_points([read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], truth)
+    assert rms <= 0.02
+    assert "tie points (pass 2)" in [stage["stage"] for stage in result.summary["stages"]]
+
+
+def test_a_dem_holds_heights_and_says_what_it_took(shared_data, tmp_path):
+    source = shared_data / "optical/phr_ventoux"
+    for path in source.glob("*_image.*"):
+        shutil.copy(path, tmp_path / path.name)
+    images = [tmp_path / "left_image.tif", tmp_path / "right_image.tif"]
+    base = RunOptions()
+    options = replace(
+        base,
+        dem=str(shared_data / "dem/N44E005.hgt"),
+        geoid=str(shared_data / "dem/egm96_15.gtx"),
+        adjust=replace(base.adjust, dem_for_all=True),
+    )
+    free, held = adjust(images, tmp_path / "free"), adjust(images, tmp_path / "held", options)
+    sigma = [run.summary["scene"]["sigma_enu_m"][2] for run in (free, held)]
+    assert sigma[0] > 20
+    assert sigma[1] < 10
+    # the crops' terrain stands 0-30 m above the radar DEM's (trees, 90 m cells)
+    assert abs(held.adjustment.scene_shift[2] - free.adjustment.scene_shift[2]) < 60
+    assert abs(held.summary["pairs"][0]["epipolar_after"]["median"]) < 0.1
+
+
+def test_paths_with_spaces_and_accents_and_equal_stems(tmp_path):
+    folders = [tmp_path / "été 1", tmp_path / "été 2"]
+    for folder, path in zip(folders, IMAGES, strict=False):
+        folder.mkdir()
+        shutil.copy(path, folder / "scène.tif")
+    result = adjust([folder / "scène.tif" for folder in folders], tmp_path / "out à moi")
+    names = [view.name for view in result.views]
+    assert names == ["été 1_scène", "été 2_scène"]
+    for name in names:
+        assert read_rpc(Path(tmp_path / "out à moi" / f"{name}.vrt")) is not None
