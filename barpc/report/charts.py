@@ -27,38 +27,34 @@ from barpc.report.svg import (
 
 Record = Mapping[str, Any]
 
-_NAMES = 118.0  # units kept free for names on the left
+_NAMES = 128.0  # units kept free for names on the left
 _RIGHT = WIDTH - 12.0
 _BINS = 48
 
 
 def histogram(before: Array, after: Array) -> str:
-    """Shares of observations by reprojection error (n,) [px], before and after, on a logarithmic axis."""
+    """Distributions of reprojection errors (n,) [px], before and after, each to its own peak, on a logarithmic axis."""
     series = [(name, norm[norm > 0]) for name, norm in (("before", before), ("after", after))]
     series = [(name, norm) for name, norm in series if len(norm)]
-    everything = np.concatenate([norm for _, norm in series])
-    low, high = np.quantile(everything, [0.002, 0.9995])
-    scale = Scale(max(low, high * 1e-4) / 1.2, high * 1.2, 34.0, _RIGHT, log=True)
+    low, high = np.quantile(np.concatenate([np.ones(0), *(norm for _, norm in series)]), [0.002, 0.9995])
+    scale = Scale(max(low, high * 1e-4) / 1.2, high * 1.2, 12.0, _RIGHT, log=True)
     edges = np.geomspace(scale.low, scale.high, _BINS + 1)
-    shares = [np.histogram(norm.clip(scale.low, scale.high), edges)[0] / len(norm) for _, norm in series]
-    top, bottom = 26.0, 190.0
-    up = Scale(0.0, max(float(share.max()) for share in shares) * 1.08, bottom, top)
+    top, bottom = 26.0, 170.0
     parts = x_axis(scale, top, bottom, "reprojection error [px], logarithmic")
-    for value in up.ticks:
-        parts += [
-            line(34, up(value), _RIGHT, up(value), "grid"),
-            label(30, up(value) + 4, f"{100 * value:g}", "end"),
-        ]
-    parts.append(label(4, 14, "share of the observations [%]", class_="axis"))
     words = []
-    for (name, norm), share in zip(series, shares, strict=True):
+    for name, norm in series:
+        share = np.histogram(norm.clip(scale.low, scale.high), edges)[0] / len(norm)
+        up = Scale(0.0, float(share.max()), bottom, top)
         steps = [(scale(edges[0]), bottom)]
         for k, value in enumerate(share.tolist()):
             steps += [(scale(edges[k]), up(value)), (scale(edges[k + 1]), up(value))]
-        parts.append(path([*steps, (scale(edges[-1]), bottom)], f"area {name}"))
+        area = path([*steps, (scale(edges[-1]), bottom)], f"area {name}")
         words.append(f"median {name} {np.median(norm):.3g} px")
+        parts.append(titled(area, words[-1]))
     parts += legend([name for name, _ in series], _RIGHT, 14)
-    return sheet("errors", "Histogram of reprojection errors", "; ".join(words) + ".", 222, parts)
+    return sheet(
+        "errors-chart", "Histogram of reprojection errors", f"{'; '.join(words)}.", bottom + 32, parts
+    )
 
 
 def legend(names: Sequence[str], right: float, y: float) -> list[str]:
@@ -66,7 +62,7 @@ def legend(names: Sequence[str], right: float, y: float) -> list[str]:
     parts = []
     for name in reversed(names):
         parts.append(label(right, y, name, "end"))
-        right -= 6.6 * len(name) + 9
+        right -= 6.6 * len(name) + 12
         parts.append(tag("circle", cx=right, cy=y - 4, r=4.5, class_=f"dot {name}"))
         right -= 14
     return parts
@@ -143,7 +139,7 @@ def connections(views: Sequence[Record], pairs: Sequence[Record]) -> str:
         text = label(x, y + 4, str(k + 1), "middle", "nodename") if num <= 40 else ""
         parts.append(titled(node + text, f"{k + 1} {view['name']}: {view['num_observations']} tie points"))
     described = f"{num} images, {len(pairs)} pairs with tie points in common; up to {most} matches a pair."
-    return sheet("graph", "Graph of the images and their pairs", described, 350, parts)
+    return sheet("graph-chart", "Graph of the images and their pairs", described, 350, parts)
 
 
 def convergence(pairs: Sequence[Record]) -> str:
@@ -172,7 +168,7 @@ def convergence(pairs: Sequence[Record]) -> str:
         words = f"{pair['a']} - {pair['b']}: {pair['convergence_deg']:.1f} deg, {pair['num_matches']} matches"
         parts.append(titled(dot, words))
     described = f"{len(shown)} pairs, up to {high:.1f} degrees."
-    return sheet("angles", "Matches of each pair over its convergence angle", described, 222, parts)
+    return sheet("angles-chart", "Matches of each pair over its convergence angle", described, 222, parts)
 
 
 def corrections(views: Sequence[Record], labels: Sequence[str]) -> str:

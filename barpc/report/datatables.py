@@ -51,7 +51,9 @@ class DataTable:
 
 def figure(value: float | None, form: str = ".3f") -> Cell:
     """A number; nothing is a dash that sorts last."""
-    return Cell("-", 1e300) if value is None else Cell(format(value, form), float(f"{value:.6g}"))
+    if value is None:
+        return Cell("-", 1e300)
+    return Cell(format(value, form) if value else "0", float(f"{value:.6g}"))
 
 
 def name(text: str) -> Cell:

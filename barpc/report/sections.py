@@ -76,7 +76,7 @@ def _map(files: RunFiles) -> Section | None:
             " a stronger line stands for more matches; triangles are GCPs."
         )
         shown.append((ground_map(files), caption))
-    if pairs:
+    if pairs and len(views) > 2:
         caption = "Numbers as in the table of images; a thicker line is a pair with more matches."
         shown.append((charts.connections(views, pairs), caption))
     return Section("map", "Where are the images, and which hold together?", _bonds(views, pairs), shown)
@@ -104,6 +104,8 @@ def _errors(files: RunFiles) -> Section | None:
     if not len(table.view):
         return None
     norms = [np.hypot(*r[table.used & np.isfinite(r).all(axis=1)].T) for r in (table.before, table.after)]
+    if not any((norm > 0).any() for norm in norms):
+        return None
     views = files.summary["views"]
     labels = numbered([view["name"] for view in views])
     rows = [
@@ -111,7 +113,7 @@ def _errors(files: RunFiles) -> Section | None:
         for text, view in zip(labels, views, strict=True)
     ]
     adjusted = files.summary["kind"] == "adjust"
-    shown = [(charts.histogram(*norms), "All observations that count.")]
+    shown = [(charts.histogram(*norms), "All observations that count; each curve is drawn to its own peak.")]
     axis = "root mean square reprojection error [px], logarithmic"
     shown.append(
         (charts.dumbbells("rmse", "Error of each image", axis, rows), _which(rows, "images", "error"))
@@ -173,7 +175,7 @@ def _pairs(files: RunFiles) -> Section | None:
     )
     axis = "RMS distance from the epipolar line [px], logarithmic"
     chart = charts.dumbbells("epipolar", "Epipolar offset of each pair", axis, rows)
-    shown = [(chart, _which(rows, "pairs, by the numbers of their images", "offset"))]
+    shown = [(chart, f"{_which(rows, 'pairs', 'offset')} Numbers are those of the images.")]
     seen = [pair for pair in pairs if pair["convergence_deg"] is not None]
     if seen:
         caption = "One dot a pair. Small angles give weak heights; beyond about 35 degrees images look too different."

@@ -165,13 +165,13 @@ def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
     return [*parts, label(scale.stop, bottom + 29, title, "end", "axis")]
 
 
-def numbered(names: Sequence[str], most: int = 17) -> list[str]:
+def numbered(names: Sequence[str], most: int = 15) -> list[str]:
     """Names behind their number in the table of images, cut in their middle, where they tell least apart.
 
     Examples
     --------
     >>> numbered(["IMG_PHR1A_P_201304171032_SEN_001", "a"])
-    ['1 IMG_PHR…SEN_001', '2 a']
+    ['1 IMG_PH…EN_001', '2 a']
     """
     out = []
     for k, name in enumerate(names):

@@ -1,0 +1,148 @@
+"""report.html: one file, the same for the same run, safe, and complete."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from xml.etree import ElementTree
+
+import pytest
+from click.testing import CliRunner
+
+from barpc.cli.main import cli
+from barpc.errors import BarpcError, InputError
+from barpc.report import page
+
+pytest.importorskip("jinja2")
+
+RUNS = pytest.mark.parametrize("fixture", ["block_run", "check_run", "antimeridian_run"])
+
+
+def html_of(finished):
+    return (finished.folder / "report.html").read_text(encoding="utf-8")
+
+
+@RUNS
+def test_the_report_made_again_from_the_files_is_the_same_to_the_byte(fixture, request, tmp_path):
+    finished = request.getfixturevalue(fixture)
+    shutil.copytree(finished.folder, tmp_path / "copy")
+    (tmp_path / "copy/report.html").unlink()
+    page.remake_report(tmp_path / "copy")
+    assert (tmp_path / "copy/report.html").read_bytes() == (finished.folder / "report.html").read_bytes()
+
+
+@RUNS
+def test_it_loads_nothing_from_elsewhere(fixture, request):
+    html = html_of(request.getfixturevalue(fixture))
+    assert not re.search(r'(src|href)="(?!#|data:)', html)
+    assert "url(" not in html
+    assert "@import" not in html
+    assert "default-src 'none'" in html
+
+
+@RUNS
+def test_every_chart_is_well_formed_with_a_title_and_a_description(fixture, request):
+    html = html_of(request.getfixturevalue(fixture))
+    charts = re.findall(r"<svg.*?</svg>", html, flags=re.DOTALL)
+    assert len(charts) > 5
+    for chart in charts:
+        root = ElementTree.fromstring(chart)
+        assert root.get("role") == "img"
+        named = root.get("aria-labelledby").split()
+        assert [root[0].get("id"), root[1].get("id")] == named
+        assert all(element.text for element in root[:2])
+        assert "nan" not in chart.replace("nanometre", "").lower()
+    ids = re.findall(r'\bid="([^"]+)"', html)
+    assert len(ids) == len(set(ids))
+
+
+def test_names_cannot_carry_markup_into_the_page(antimeridian_run):
+    html = html_of(antimeridian_run)
+    assert "<b>bold</b>" not in html
+    assert "&lt;b&gt;bold&lt;/b&gt;" in html
+
+
+def test_every_question_is_asked_of_a_full_run(block_run):
+    html = html_of(block_run)
+    questions = re.findall(r"<h2[^>]*>([^<]+)</h2>", html)
+    assert questions == [
+        "Which images can I use?",
+        "Where are the images, and which hold together?",
+        "Did the adjustment help?",
+        "Are the residuals random?",
+        "Do the pairs fit for stereo, and can heights be measured?",
+        "What was changed in each camera?",
+        "What can the images not tell?",
+        "Do the new RPC files hold the corrected cameras?",
+        "How was this made, and how long did it take?",
+    ]
+    for view in block_run.summary["views"]:
+        assert f"{view['rmse_after']:.3f}" in html
+    for gcp in block_run.summary["gcps"]:
+        assert gcp["name"] in html
+
+
+def test_a_check_asks_only_what_it_can_answer(check_run):
+    html = html_of(check_run)
+    assert "How large are the errors?" in html
+    assert "What was changed" not in html
+    assert "new RPC files" not in html
+
+
+def test_a_run_without_a_single_tie_point_still_has_a_page(block_run, tmp_path):
+    import numpy as np
+
+    from barpc.report import Run
+    from barpc.scene import Tracks
+    from tests.report.conftest import written
+
+    none = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+    written(Run("check", block_run.run.views, (), none), tmp_path / "run")
+    html = (tmp_path / "run/report.html").read_text()
+    assert "Which images can I use?" in html
+    assert "weakly tied" in html
+
+
+def test_barpc_report_makes_the_page_and_says_where(block_run, tmp_path):
+    shutil.copytree(block_run.folder, tmp_path / "run")
+    (tmp_path / "run/report.html").unlink()
+    result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")], standalone_mode=False)
+    assert result.exception is None
+    assert result.output.strip() == str(tmp_path / "run/report.html")
+    assert (tmp_path / "run/report.html").is_file()
+
+
+def test_a_folder_without_a_finished_run_is_refused_with_a_reason(block_run, tmp_path):
+    with pytest.raises(InputError, match="no finished run"):
+        page.remake_report(tmp_path)
+    (tmp_path / "summary.json").write_text("{")
+    with pytest.raises(InputError, match="cannot be read"):
+        page.remake_report(tmp_path)
+    (tmp_path / "summary.json").write_text(json.dumps({"schema": 1}))
+    with pytest.raises(InputError, match="schema 1"):
+        page.remake_report(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["residuals.csv", "observations.csv", "footprints.geojson"])
+@pytest.mark.parametrize("damage", [None, "nonsense\n1,2,3\n"])
+def test_a_table_that_is_missing_or_damaged_is_named(block_run, tmp_path, name, damage):
+    shutil.copytree(block_run.folder, tmp_path / "run")
+    (tmp_path / "run" / name).unlink()
+    if damage is not None:
+        (tmp_path / "run" / name).write_text(damage)
+    with pytest.raises(InputError, match=re.escape(name)):
+        page.remake_report(tmp_path / "run")
+
+
+def test_without_jinja2_the_run_is_whole_and_the_verb_says_what_to_install(block_run, tmp_path, monkeypatch):
+    from barpc.pipeline import outputs
+    from tests.report.conftest import written
+
+    monkeypatch.setattr(outputs, "can_render", lambda: False)
+    written(block_run.run, tmp_path / "run")
+    assert (tmp_path / "run/summary.json").is_file()
+    assert not (tmp_path / "run/report.html").exists()
+    monkeypatch.setattr(page, "can_render", lambda: False)
+    with pytest.raises(BarpcError, match=r"pip install 'barpc\[report\]'"):
+        page.remake_report(tmp_path / "run")

@@ -1,0 +1,154 @@
+"""summary.json follows its published schema, and its figures are what they say."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.report import Run, summarize
+from barpc.report.measures import shift_in_image, triangulate_tracks
+from barpc.sensor.corrected import Corrected
+from barpc.sensor.geometry import view_angles
+
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs/summary.schema.json").read_text())
+TYPES = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None)}
+
+
+def is_of(value, kind):
+    if kind in ("number", "integer"):
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        return whole or (kind == "number" and isinstance(value, float))
+    return isinstance(value, TYPES[kind])
+
+
+def faults(value, schema, where="$"):
+    """Where a value breaks a schema, for the words of JSON Schema that ours uses."""
+    kinds = schema.get("type")
+    kinds = [kinds] if isinstance(kinds, str) else kinds
+    if kinds and not any(is_of(value, kind) for kind in kinds):
+        return [f"{where}: {value!r} is no {kinds}"]
+    found = []
+    if "const" in schema and value != schema["const"]:
+        found.append(f"{where}: {value!r}")
+    if "enum" in schema and value not in schema["enum"]:
+        found.append(f"{where}: {value!r}")
+    if isinstance(value, dict):
+        known, more = schema.get("properties", {}), schema.get("additionalProperties", True)
+        found += [f"{where}: no {key}" for key in schema.get("required", ()) if key not in value]
+        for key, item in value.items():
+            if key in known or isinstance(more, dict):
+                found += faults(item, known.get(key, more), f"{where}.{key}")
+            elif not more:
+                found.append(f"{where}: unknown {key}")
+    if isinstance(value, list):
+        if not schema.get("minItems", 0) <= len(value) <= schema.get("maxItems", np.inf):
+            found.append(f"{where}: {len(value)} items")
+        for k, item in enumerate(value):
+            found += faults(item, schema.get("items", {}), f"{where}[{k}]")
+    return found
+
+
+@pytest.mark.parametrize("fixture", ["block_run", "check_run", "antimeridian_run"])
+def test_summaries_follow_the_published_schema(fixture, request):
+    folder = request.getfixturevalue(fixture).folder
+    summary = json.loads((folder / "summary.json").read_text())
+    assert faults(summary, SCHEMA) == []
+
+
+def test_the_schema_refuses_what_is_missing_unknown_or_of_another_kind(block_run):
+    for change in ({"kind": "adjusted"}, {"views": None}, {"surprise": 1}, {"passed": 1}):
+        assert faults({**block_run.summary, **change}, SCHEMA)
+    assert faults({key: value for key, value in block_run.summary.items() if key != "pairs"}, SCHEMA)
+
+
+def test_the_schema_is_valid_json_schema_and_takes_the_summary(block_run):
+    jsonschema = pytest.importorskip("jsonschema")
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    jsonschema.Draft202012Validator(SCHEMA).validate(json.loads(json.dumps(block_run.summary)))
+
+
+def test_every_field_of_the_schema_says_what_it_is():
+    def undescribed(schema, where):
+        for key, part in schema.get("properties", {}).items():
+            if "description" not in part:
+                yield f"{where}.{key}"
+            yield from undescribed(part, f"{where}.{key}")
+            yield from undescribed(part.get("items", {}), f"{where}.{key}[]")
+
+    assert list(undescribed(SCHEMA, "$")) == []
+
+
+def test_outliers_do_not_bend_the_points_that_errors_are_measured_at(block_run):
+    run = block_run.run
+    clean = run.tracks.select(run.keep)
+    alone = triangulate_tracks(clean, run.after, run.start_altitude, np.ones(len(clean), dtype=bool))
+    kept = run.keep & np.isin(run.tracks.point, np.flatnonzero(np.bincount(run.tracks.point[run.keep]) >= 2))
+    assert np.abs(run.ties_after.residuals[kept] - alone.residuals).max() < 1e-6
+
+
+def test_the_shift_of_a_camera_is_how_far_its_image_points_move(block_run):
+    run = block_run.run
+    for i, view in enumerate(block_run.summary["views"]):
+        middle = run.before[i].localize((np.array(view["size"]) - 1) / 2, np.array(run.altitude))
+        moved = run.adjustment.sensors[i].project(middle) - run.before[i].project(middle)
+        assert np.abs(moved - view["correction"]["center_shift_px"]).max() < 1e-6
+        assert np.abs(moved).max() > 0.05
+
+
+@pytest.mark.parametrize("model", ["rotation+translation", "rotation", "translation"])
+def test_its_sigma_is_the_covariance_carried_over_by_the_derivative(block_run, model):
+    run = block_run.run
+    adjustment = adjust_tracks(run.views, run.tracks, AdjustOptions(model=model))
+    sensor = adjustment.sensors[2]
+    middle = sensor.sensor.localize((np.array(run.views[2].size) - 1) / 2, np.array(run.altitude))
+    covariance = adjustment.covariance.view(2)
+    _, sigma = shift_in_image(sensor, covariance, model, middle)
+    from barpc.geodesy import ecef_from_ground
+
+    distance = np.linalg.norm(ecef_from_ground(middle) - sensor.correction.center)
+    columns = []
+    for name, step in (("rotation", 1.0 / distance), ("translation", 1.0)):
+        if name in model:
+            for axis in np.eye(3):
+                ends = []
+                for sign in (-1.0, 1.0):
+                    value = getattr(sensor.correction, name) + sign * step * axis
+                    ends.append(
+                        Corrected(sensor.sensor, replace(sensor.correction, **{name: value})).project(middle)
+                    )
+                columns.append((ends[1] - ends[0]) / 2)
+    jacobian = np.array(columns).T
+    expected = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
+    assert sigma == pytest.approx(expected, rel=1e-4)
+
+
+def test_base_to_height_is_the_distance_of_two_cameras_one_unit_up(block_run):
+    run = block_run.run
+    names = [view.name for view in run.views]
+    for pair in block_run.summary["pairs"][:5]:
+        place = run.ground[np.isfinite(run.ground).all(axis=1)].mean(axis=0)
+        ends = []
+        for name in (pair["a"], pair["b"]):
+            incidence, azimuth = np.radians(view_angles(run.before[names.index(name)], place))
+            ends.append(np.tan(incidence) * np.array([np.sin(azimuth), np.cos(azimuth)]))
+        assert pair["base_to_height"] == pytest.approx(np.hypot(*(ends[0] - ends[1])), rel=0.1)
+        assert pair["height_m_per_px"] == pytest.approx(0.5 / pair["base_to_height"], rel=0.1)
+
+
+def test_the_simulated_camera_sees_half_a_metre(block_run):
+    for view in block_run.summary["views"]:
+        assert view["gsd_m"] == pytest.approx(0.5, rel=0.05)
+        assert 0 < view["incidence_deg"] < 30
+
+
+def test_an_adjustment_in_the_image_has_no_shift_of_a_camera_in_space(block_run):
+    run = block_run.run
+    adjustment = adjust_tracks(run.views, run.tracks, AdjustOptions(model="shift"))
+    summary = summarize(Run("adjust", run.views, (), run.tracks, adjustment=adjustment))
+    assert faults(json.loads(json.dumps(summary)), SCHEMA) == []
+    assert summary["views"][0]["correction"]["center_shift_px"] is None
