@@ -24,7 +24,8 @@ FloatArray = npt.NDArray[np.float32]
 _CHUNK = 256  # patches worked on at a time: they stay in cache
 _STEPS = 12
 _SETTLED = 0.003  # px; a step below it is the last
-_SMALLER = 0.7  # side of the second try
+_SMALLER = 0.7  # side of the patch of the second try and of the check
+_TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
 _GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
 _REACH = 1.5  # px; a patch that moves farther has left its point
@@ -133,7 +134,8 @@ def register(
 ) -> Registration:
     """Register patches of the second image to patches of the first.
 
-    What fails (at a border, on a steep slope) is tried again with a smaller patch.
+    What fails (at a border, on a steep slope) is tried again with a smaller patch; what succeeds must be
+    confirmed by it.
 
     Parameters
     ----------
@@ -159,16 +161,24 @@ def register(
     best = Registration(
         np.array(start), np.zeros(len(start)), np.full(len(start), np.inf), np.zeros(len(start), dtype=bool)
     )
-    for side in (patch, int(_SMALLER * patch) | 1):
+    smaller = int(_SMALLER * patch) | 1
+    for side in (patch, smaller):
         template = _Template(images[0], side)
         usable = [_usable(mask, side) for mask in valid]
         possible = np.flatnonzero(~best.ok & _at(usable[0], reference) & _at(usable[1], start))
-        for first in range(0, len(possible), _CHUNK):
-            rows = possible[first : first + _CHUNK]
+        for rows in _chunks(possible):
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.xy[rows], best.correlation[rows], best.sigma[rows] = found.xy, found.correlation, found.sigma
             best.ok[rows] = found.ok & _at(usable[1], found.xy)
+    for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows])
+        apart = np.hypot(*(inner.xy - best.xy[rows]).T)
+        best.ok[rows] = apart <= np.maximum(_TORN, 5.0 * inner.sigma)
     return best
+
+
+def _chunks(rows: IntArray) -> list[IntArray]:
+    return [rows[first : first + _CHUNK] for first in range(0, len(rows), _CHUNK)]
 
 
 def _at(mask: BoolArray, xy: Array) -> BoolArray:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from scipy import ndimage
 
 from barpc.raster import open_raster
 from barpc.rpcio import read_rpc
@@ -75,10 +76,16 @@ class Rendered:
             picture = self.scene.picture(index)
             path = write_image(folder / f"{shot.name}.tif", picture.numbers)
             self.views.append(View(shot.name, str(path), options.size, shot.delivered, self.scene.alt_range))
-            self.altitude.append(picture.altitude.astype(np.float64))
+            altitude = picture.altitude.astype(np.float64)
+            filled = np.where(np.isfinite(altitude), altitude, 1e6)
+            step = ndimage.maximum_filter(filled, 7) - ndimage.minimum_filter(filled, 7) > 3.0
+            self.altitude.append(np.where(step, np.nan, altitude))
 
     def errors(self, first: int, second: int, xy_first: np.ndarray, xy_second: np.ndarray) -> np.ndarray:
-        """True place in the second view minus the measured one (M, 2) [px], where the truth is known."""
+        """True place in the second view minus the measured one (M, 2) [px], where the truth is known.
+
+        Within 3 px of a step of the ground it is not: the patch may show the one side or the other.
+        """
         corner = np.minimum(np.floor(xy_first).astype(int), np.subtract(self.scene.options.size, 2))
         x, y = (xy_first - corner).T
         alt, (col, row) = self.altitude[first], corner.T
