@@ -235,8 +235,13 @@ class Workspace:
         with replacing(path, overwrite=True, durable=False) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in record.items()})
 
+    @property
+    def cache(self) -> Path:
+        """Where results are kept."""
+        return self.folder / STATE / "cache"
+
     def _cache_path(self, stage: str, key: str) -> Path:
-        return self.folder / STATE / "cache" / stage / f"{key}.npz"
+        return self.cache / stage / f"{key}.npz"
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

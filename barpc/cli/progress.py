@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
 import sys
+import threading
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -51,32 +55,64 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 def executor_for(jobs: int, dask: str | None) -> Iterator[Executor | None]:
     """The executor of a run: None works in this process."""
     if dask is not None:
-        from barpc.errors import InputError
-
-        try:
-            from distributed import Client
-        except ImportError as error:
-            raise InputError("--dask needs the extra: pip install 'barpc[cluster]'") from error
-        try:
-            client = Client(dask, timeout=20)  # type: ignore[no-untyped-call]
-        except (OSError, ValueError) as error:
-            raise InputError(f"--dask {dask}: no scheduler answers there ({error})") from error
-        with client:
-            yield client.get_executor()  # type: ignore[no-untyped-call]
+        with _cluster(dask) as executor:
+            yield executor
     elif jobs > 1:
-        import multiprocessing
-
-        before = {name: os.environ.get(name) for name in _THREADS}
-        os.environ.update(dict.fromkeys(_THREADS, "1"))
-        try:  # one BLAS thread a worker: the work is spread by processes, and sums keep their order
-            context = multiprocessing.get_context("spawn")
-            with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-                yield pool
-        finally:
-            for name, value in before.items():
-                if value is None:
-                    os.environ.pop(name, None)
-                else:
-                    os.environ[name] = value
+        with _processes(jobs) as executor:
+            yield executor
     else:
         yield None
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    from barpc.errors import InputError
+
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError("--dask needs the extra: pip install 'barpc[cluster]'") from error
+    try:
+        client = Client(address, timeout=20)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise InputError(f"--dask {address}: no scheduler answers there ({error})") from error
+    with client:
+        yield client.get_executor()  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def _processes(jobs: int) -> Iterator[Executor]:
+    """Worker processes with one BLAS thread each: the work is spread by processes, and sums keep their order."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_enter_worker)
+    try:
+        yield pool
+    except BaseException:  # an error or Ctrl-C: nobody waits for what is in flight
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.kill()
+        raise
+    else:
+        pool.shutdown()
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _enter_worker() -> None:
+    """Leave Ctrl-C to the parent, and end when the parent is gone, however it went."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    warnings.simplefilter("ignore")
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+
+
+def _leave_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

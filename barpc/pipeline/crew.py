@@ -2,31 +2,54 @@
 
 The stages hand their tasks (per tile, per pair) to any `concurrent.futures.Executor`. `Crew` is one: it
 looks each task up among the kept results first, gives the rest to the executor behind it (or works on them
-itself, when asked for the result), and keeps what comes back. So a run that was interrupted goes on where it
-was, and a thousand pairs do not stand pickled in a queue.
+itself, when asked for the result), and keeps what comes back as soon as it comes back. So a run that was
+interrupted goes on where it was, and a thousand pairs do not stand pickled in a queue. Tasks that are quick
+travel together: what a task costs on the way (0.2 ms to a process, 10 ms over dask) is paid once for half a
+second of work.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import threading
+import time
+import traceback
 from collections import deque
-from collections.abc import Callable, Mapping
-from concurrent.futures import CancelledError, Executor, Future
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import fields, is_dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from barpc.errors import AdjustError
+from barpc.errors import AdjustError, BarpcError
+from barpc.pipeline.parcel import Parcel, Shelf
 from barpc.record import from_record, to_record
+from barpc.tie.work import one_thread
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
 
-_PER_WORKER = 3  # tasks in flight for each worker: enough that none waits
+BATCH_SECONDS = 0.5
+"""Work that is handed in at a time [s], as far as there are tasks for all workers."""
+_PER_WORKER = 3  # batches in flight for each worker: enough that none waits
+_CLUSTER = 32  # workers of a cluster, at least: it may grow when there is work
+_LOST = ("KilledWorker", "FutureCancelledError")  # of distributed, which may not be installed
+
+Function = Callable[..., Any]
+Outcome = tuple[float, Any, BaseException | None]
+"""Seconds, result, error of one task."""
+
+
+def worker_count(executor: Executor | None) -> int:
+    """How many tasks an executor works on at a time; of a dask cluster at least what it may grow to."""
+    client = getattr(executor, "_client", None)
+    if client is not None:
+        return max(_CLUSTER, sum(int(n) for n in client.nthreads().values()))
+    return int(getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
 
 
 class Crew(Executor):
@@ -41,8 +64,8 @@ class Crew(Executor):
     executor : Executor, optional
         Works on the tasks; None: they are worked on in this process, one after the other, when their result
         is asked for.
-    workers : int
-        How many workers the executor has.
+    workers : int, optional
+        How many workers the executor has; by default it is asked.
     """
 
     def __init__(
@@ -50,30 +73,40 @@ class Crew(Executor):
         workspace: Workspace,
         fingerprints: Mapping[str, str],
         executor: Executor | None = None,
-        workers: int = 1,
+        workers: int | None = None,
     ) -> None:
-        self._workspace, self._fingerprints = workspace, dict(fingerprints)
-        self._executor, self._limit = executor, _PER_WORKER * max(workers, 1)
+        self.workspace, self._fingerprints = workspace, dict(fingerprints)
+        self.executor = executor
+        self._limit = _PER_WORKER * max(worker_count(executor) if workers is None else workers, 1)
         self._lock = threading.Lock()
+        self._landing = threading.RLock()  # held while results are kept: `shutdown` waits for it
         self._waiting: deque[_Task] = deque()
         self._in_flight = 0
+        self._open = True
+        self._seconds: dict[Function, float] = {}
         self._digests: dict[int, tuple[object, str]] = {}
+        self._shelf = Shelf(workspace)
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, fn: Function, /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Hand in `fn(*args)`; its result is looked up, or made when its turn comes."""
         if kwargs:
             raise TypeError("tasks take positional arguments only")
         task = _Task(self, fn, args)
-        with self._lock:
-            self._waiting.append(task)
-        self._pump()
+        if self.executor is not None:
+            with self._lock:
+                self._waiting.append(task)
+            self._pump()
         return task
 
-    def forget(self) -> None:
-        """Drop the digests of arrays that were seen (and the arrays with them)."""
-        self._digests.clear()
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Nothing is handed out or kept from now on; the executor behind is left as it is."""
+        with self._landing:
+            self._open = False
+            self._waiting.clear()
+            self._digests.clear()
+            self._shelf.clear()
 
-    def key(self, fn: Callable[..., Any], args: tuple[Any, ...]) -> str:
+    def key(self, fn: Function, args: tuple[Any, ...]) -> str:
         """The key under which the result of a task is kept."""
         return key_of(fn.__module__, fn.__qualname__, [self._canonical(arg) for arg in args])
 
@@ -81,11 +114,7 @@ class Crew(Executor):
         if isinstance(value, str):
             return self._fingerprints.get(value, value)
         if isinstance(value, np.ndarray):
-            known = self._digests.get(id(value))
-            if known is None:  # the array is held with its digest, so that its id stays its own
-                digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-                known = self._digests[id(value)] = (value, f"{value.dtype} {value.shape} {digest}")
-            return known[1]
+            return self._digest(value)
         if is_dataclass(value) and not isinstance(value, type):
             given = [getattr(value, field.name) for field in fields(value) if field.init]
             return [type(value).__qualname__, *(self._canonical(part) for part in given)]
@@ -93,96 +122,165 @@ class Crew(Executor):
             return [self._canonical(v) for v in value]
         return value
 
+    def _digest(self, value: np.ndarray[Any, Any]) -> str:
+        known = self._digests.get(id(value))
+        if known is None:  # the array is held with its digest, so that its id stays its own
+            digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+            known = self._digests[id(value)] = (value, f"{value.dtype} {value.shape} {digest}")
+        return known[1]
+
+    # -- handing out -------------------------------------------------------------------------------
+
     def _pump(self) -> None:
         """Give waiting tasks to the executor while few are in flight."""
-        if self._executor is None:
-            return
-        while True:
-            with self._lock:
-                if not self._waiting or self._in_flight >= self._limit:
-                    return
-                task = self._waiting.popleft()
-                self._in_flight += 1
-            if task.cancelled() or not task.start(self._executor):
-                self._landed(None)
+        while batch := self._next_batch():
+            try:
+                tasks = [self._shelf.packed(task.args, self._digest) for task in batch]
+                future = self._executor().submit(work_off, batch[0].fn, tasks)
+            except (RuntimeError, OSError) as error:  # the pool is broken or shut down; no room on the shelf
+                self._settle(batch, [(0.0, None, _explained(error))] * len(batch))
+            else:
+                future.add_done_callback(partial(self._landed, batch))
 
-    def _landed(self, _: Future[Any] | None) -> None:
+    def _executor(self) -> Executor:
+        assert self.executor is not None
+        return self.executor
+
+    def _next_batch(self) -> list[_Task]:
+        """Waiting tasks of one function that have no kept result; they count as in flight, empty does not."""
+        with self._lock:
+            if not self._open or self._in_flight >= self._limit:
+                return []
+            self._in_flight += 1
+        batch: list[_Task] = []
+        while (task := self._next_task(batch)) is not None:
+            if task.begin():
+                batch.append(task)
+        if not batch:
+            with self._lock:
+                self._in_flight -= 1
+        return batch
+
+    def _next_task(self, batch: Sequence[_Task]) -> _Task | None:
+        with self._lock:
+            if not self._waiting:
+                return None
+            fn = self._waiting[0].fn
+            if batch and (fn is not batch[0].fn or len(batch) >= self._batch_size(fn)):
+                return None
+            return self._waiting.popleft()
+
+    def _batch_size(self, fn: Function) -> int:
+        """As many tasks as take BATCH_SECONDS, as far as the other workers get as many; 1 until it is known."""
+        seconds = self._seconds.get(fn)
+        if seconds is None:
+            return 1
+        share = -(-len(self._waiting) // self._limit)
+        return max(1, min(int(BATCH_SECONDS / max(seconds, 1e-6)), share))
+
+    # -- taking back -------------------------------------------------------------------------------
+
+    def _landed(self, batch: Sequence[_Task], future: Future[Any]) -> None:
+        try:
+            outcomes: list[Outcome] = future.result()
+        except BaseException as error:  # noqa: BLE001  (goes to whoever asks for the result)
+            outcomes = [(0.0, None, _explained(error))] * len(batch)
+        else:
+            seconds = sum(outcome[0] for outcome in outcomes) / len(outcomes)
+            self._seconds[batch[0].fn] = 0.5 * (self._seconds.get(batch[0].fn, seconds) + seconds)
+        self._settle(batch, outcomes)
+        self._pump()
+
+    def _settle(self, batch: Sequence[_Task], outcomes: Sequence[Outcome]) -> None:
         with self._lock:
             self._in_flight -= 1
-        self._pump()
+        with self._landing:
+            for task, (_, value, error) in zip(batch, outcomes, strict=True):
+                task.land(value, error, keep=self._open)
 
 
 class _Task(Future[Any]):
     """One task of a crew: found, in flight, or to be done when asked for."""
 
-    def __init__(self, crew: Crew, fn: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    def __init__(self, crew: Crew, fn: Function, args: tuple[Any, ...]) -> None:
         super().__init__()
-        self._crew, self._fn, self._args = crew, fn, args
-        self._inner: Future[Any] | None = None
-        self._kept: Any = None
-        self._is_kept = False
+        self._crew, self.fn, self.args = crew, fn, args
+        self._key = ""
 
-    def start(self, executor: Executor) -> bool:
-        """Look the result up, or hand the task to the executor; whether it is in flight now."""
-        if self._look_up():
+    def begin(self) -> bool:
+        """Whether there is work to do: it was not cancelled, and no result is kept."""
+        if not self.set_running_or_notify_cancel():
             return False
         try:
-            self._inner = executor.submit(self._fn, *self._args)
-        except RuntimeError as error:  # the pool is broken or was shut down
+            found, value = self._look_up()
+        except Exception as error:  # noqa: BLE001  (goes to whoever asks for the result)
             self.set_exception(error)
             return False
-        self._inner.add_done_callback(self._crew._landed)
-        return True
+        if found:
+            self.set_result(value)
+        return not found
+
+    def land(self, value: Any, error: BaseException | None, *, keep: bool = True) -> None:
+        """Take the outcome, and keep a result for the next time."""
+        self.args = ()
+        try:
+            if error is None and keep:
+                self._crew.workspace.store(self._stage, self._key, to_record(value))
+        except Exception as failed:  # noqa: BLE001  (a full disk: goes to whoever asks for the result)
+            error = failed
+        if error is None:
+            self.set_result(value)
+        else:
+            self.set_exception(error)
 
     def result(self, timeout: float | None = None) -> Any:
-        """The result, kept for the next time."""
-        if self.cancelled():
-            raise CancelledError
-        if not self.done() and not self._is_kept:
-            self._work(timeout)
-        if self._is_kept:
-            return self._kept
-        try:
-            return super().result(timeout)
-        except BrokenProcessPool as error:
-            raise _worker_died() from error
-
-    def _work(self, timeout: float | None) -> None:
-        crew = self._crew
-        if self._inner is None and not self._look_up():
-            value = self._fn(*self._args)
-        elif self._inner is not None:
-            try:
-                value = self._inner.result(timeout)
-            except BrokenProcessPool as error:
-                raise _worker_died() from error
-        else:
-            return
-        crew._workspace.store(self._stage, self._key, to_record(value))
-        self._keep(value)
+        """The result, worked out here where there is no executor."""
+        if self._crew.executor is None and not self.done() and self.begin():
+            self.land(self.fn(*self.args), None)
+        return super().result(timeout)
 
     @property
     def _stage(self) -> str:
-        return self._fn.__name__.strip("_")
+        return self.fn.__name__.strip("_")
 
-    def _look_up(self) -> bool:
-        self._key = self._crew.key(self._fn, self._args)
-        record = self._crew._workspace.load(self._stage, self._key)
+    def _look_up(self) -> tuple[bool, Any]:
+        self._key = self._crew.key(self.fn, self.args)
+        record = self._crew.workspace.load(self._stage, self._key)
         if record is None:
-            return False
+            return False, None
         try:
-            self._keep(from_record(record))
+            return True, from_record(record)
         except ValueError as error:
             logger.warning("a kept result is made again: %s", error)
-            return False
-        return True
-
-    def _keep(self, value: Any) -> None:
-        self._kept, self._is_kept, self._args, self._inner = value, True, (), None
+            return False, None
 
 
-def _worker_died() -> AdjustError:
-    return AdjustError(
+def work_off(fn: Function, tasks: Sequence[tuple[Any, ...] | Parcel]) -> list[Outcome]:
+    """Work on a batch, in a worker: one task's error leaves the others their results."""
+    one_thread()
+    outcomes: list[Outcome] = []
+    for task in tasks:
+        start = time.perf_counter()
+        value: Any = None
+        error: Exception | None = None
+        try:
+            value = fn(*(task.unpacked() if isinstance(task, Parcel) else task))
+        except Exception as caught:  # noqa: BLE001  (raised again where the result is asked for)
+            error = caught
+            if not isinstance(caught, BarpcError):
+                caught.add_note("in a worker:\n" + traceback.format_exc())
+        outcomes.append((time.perf_counter() - start, value, error))
+    return outcomes
+
+
+def _explained(error: BaseException) -> BaseException:
+    """A worker that is lost, in words; any other error as it is."""
+    lost = isinstance(error, (BrokenExecutor, CancelledError)) or type(error).__name__ in _LOST
+    if not lost:
+        return error
+    told = AdjustError(
         "a worker process died (out of memory?): what was finished is kept, so run the same command again, "
         "perhaps with a smaller -j"
     )
+    told.__cause__ = error
+    return told

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -111,8 +110,8 @@ def adjust(
     }
     keep |= set(input_files(options))
     with Workspace(out_dir, overwrite=options.overwrite, keep=frozenset(keep)) as workspace:
-        crew = _crew(loaded, workspace, executor)
-        run = _solve(loaded, options, workspace, crew, progress)
+        with _crew(loaded, workspace, executor) as crew:
+            run = _solve(loaded, options, workspace, crew, progress)
         if run.adjustment is not None and options.stop_after == "all":
             with workspace.stage("fit and write"):
                 run = _fit_and_write(run, options, workspace, progress)
@@ -149,9 +148,7 @@ def _load(images: Sequence[str | Path], options: RunOptions) -> LoadedViews:
 def _crew(loaded: LoadedViews, workspace: Workspace, executor: Executor | None) -> Crew:
     with workspace.stage("fingerprints"):
         fingerprints = {view.path: fingerprint(view.path) for view in loaded.views}
-    return Crew(
-        workspace, fingerprints, executor, getattr(executor, "_max_workers", None) or os.cpu_count() or 1
-    )
+    return Crew(workspace, fingerprints, executor)
 
 
 def _empty_run(kind: str, loaded: LoadedViews, options: RunOptions) -> Run:

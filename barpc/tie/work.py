@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
+import cv2
+
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how much is done, of how much."""
 
@@ -43,3 +45,9 @@ def ordered(
         for future in futures:
             future.cancel()
     return results
+
+
+def one_thread() -> None:
+    """Keep OpenCV to one thread: in a worker, where the work is spread by processes."""
+    if cv2.getNumThreads() != 1:
+        cv2.setNumThreads(1)
