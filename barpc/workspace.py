@@ -155,7 +155,7 @@ class Workspace:
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         self._clean()
-        self._earlier = self._earlier_outputs()
+        self.earlier_outputs = self.earlier_outputs_outputs()
         self.outputs: list[str] = []
         self.stages: list[dict[str, Any]] = []
         self._save_state("running")
@@ -183,7 +183,7 @@ class Workspace:
 
     def _discard(self) -> None:
         """Take the folder away again, for a run that was refused before it made anything worth keeping."""
-        if self.outputs or self._earlier:
+        if self.outputs or self.earlier_outputs:
             return
         shutil.rmtree(self.folder / STATE, ignore_errors=True)
         for made in self._made:  # innermost first; only what this run made, and only when empty
@@ -291,7 +291,7 @@ class Workspace:
 
     def remove_stale(self) -> None:
         """Take away what an earlier run wrote here and this one did not."""
-        for name in self._earlier:
+        for name in self.earlier_outputs:
             path = self.folder / name
             if name not in self.outputs and path.is_file() and path.resolve() not in self._keep:
                 path.unlink()
@@ -313,7 +313,7 @@ class Workspace:
         return [name for name in names if (self.folder / name).resolve().parent.is_relative_to(below)]
 
     def _save_state(self, status: str) -> None:
-        outputs = sorted({*self.outputs, *(self._earlier if status != "done" else ())})
+        outputs = sorted({*self.outputs, *(self.earlier_outputs if status != "done" else ())})
         state = {"barpc": __version__, "status": status, "stages": self.stages, "outputs": outputs}
         write_text(self.folder / STATE / "state.json", json.dumps(state, indent=1) + "\n", overwrite=True)
 

@@ -14,7 +14,7 @@ from barpc.handoff import verify
 from barpc.report import Run
 from barpc.report.page import can_render, report_html
 from barpc.report.tables import TABLES
-from barpc.rpcio import FORMATS, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio import FORMATS, sidecars, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.workspace import Workspace
@@ -57,8 +57,7 @@ def write_view(
     OutputError
         A file cannot be written, or barpc and GDAL do not read it back.
     """
-    names = {"vrt": [f"{view.name}.vrt"], "copy": [f"{view.name}.tif"], "none": []}[images]
-    names += [view.name + SUFFIXES[key] for key in formats]
+    names = file_names(view, images, formats)
     for name in names:
         with run.output(name) as partial:
             if name.endswith(".vrt"):
@@ -78,6 +77,37 @@ def write_view(
             )
         written[reading.path.name][reading.consumer] = reading.note or reading.max_error
     return written
+
+
+def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
+    """The files that `write_view` writes for a view."""
+    names = {"vrt": [f"{view.name}.vrt"], "copy": [f"{view.name}.tif"], "none": []}[images]
+    return names + [view.name + SUFFIXES[key] for key in formats]
+
+
+def refuse_shadows(run: Workspace, names: Sequence[str]) -> None:
+    """Raise if a foreign RPC file would be read in place of one that is about to be written.
+
+    Parameters
+    ----------
+    run : Workspace
+        Where to.
+    names : sequence of str
+        The files to be written for one image.
+
+    Raises
+    ------
+    OutputError
+        Names the file that is in the way.
+    """
+    for name in names:
+        for sidecar in sidecars(run.folder / name) if name.endswith((".vrt", ".tif")) else []:
+            read_first = sidecar.kind == "geom" or (sidecar.before_tag and not name.endswith(".vrt"))
+            if read_first and sidecar.path.name not in {*names, *run.earlier_outputs}:
+                raise OutputError(
+                    f"{sidecar.path}: lies beside {name} and would be read in place of the new RPC; "
+                    "move it away, or give another -o"
+                )
 
 
 def write_tables(workspace: Workspace, run: Run, summary: Mapping[str, Any]) -> None:

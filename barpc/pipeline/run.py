@@ -17,12 +17,13 @@ from barpc.fit import RpcFit, fit_rpc
 from barpc.pipeline.crew import Crew
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new
 from barpc.pipeline.options import RunOptions
-from barpc.pipeline.outputs import SUFFIXES, write_tables, write_view
+from barpc.pipeline.outputs import SUFFIXES, file_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import LoadedViews, load_views
 from barpc.pointio.matches import read_matches, write_matches
 from barpc.report import Run, summarize
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
+from barpc.sensor.rpc import RPC
 from barpc.tie import find_tracks
 from barpc.workspace import Workspace, fingerprint
 
@@ -250,12 +251,16 @@ def _center(view: View, options: RunOptions) -> CameraCenter:
 def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress: Progress | None) -> Run:
     """Refit every P_BA first, and write only when all can be written."""
     assert run.adjustment is not None
+    for view in run.views:
+        refuse_shadows(workspace, file_names(view, options.images, options.rpc_formats))
     fits: list[RpcFit] = []
-    tolerance = np.inf if options.force else options.fit.tolerance
+    # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
+    bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
     for i, (view, model) in enumerate(zip(run.views, run.adjustment.sensors, strict=True)):
-        fits.append(
-            fit_rpc(model, view.size, view.alt_range, options=replace(options.fit, tolerance=tolerance))
-        )
+        fit = fit_rpc(model, view.size, view.alt_range, options=options.fit, strict=not options.force)
+        rand = view.sensor.err_rand if isinstance(view.sensor, RPC) else None
+        known = bias if np.isfinite(bias) and bias > 0 else None
+        fits.append(replace(fit, rpc=replace(fit.rpc, err_bias=known, err_rand=rand)))
         if progress is not None:
             progress("fit", i + 1, len(run.views))
     written = []

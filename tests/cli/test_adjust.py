@@ -270,3 +270,24 @@ def test_warnings_are_not_shown_as_python_sees_them(crops, tmp_path):
     assert issubclass(NotGeoreferencedWarning, UserWarning)
     _, _, err = barpc("adjust", *crops, "-o", tmp_path / "o")
     assert "Warning" not in err
+
+
+def test_a_foreign_rpc_file_that_would_shadow_the_new_one_is_refused(crops, tmp_path):
+    (tmp_path / "o").mkdir()
+    shadow = tmp_path / "o/view_00.RPB"
+    barpc("convert", crops[0], shadow)
+    content = shadow.read_bytes()
+    code, _, err = barpc("adjust", *crops, "-o", tmp_path / "o", "--overwrite", "--images", "copy")
+    assert code == 1
+    assert "view_00.RPB" in err
+    assert [path.name for path in (tmp_path / "o").iterdir() if path.suffix in (".tif", ".TXT")] == []
+    assert shadow.read_bytes() == content
+
+
+def test_the_accuracy_stated_in_a_new_rpc_is_what_is_known_now(crops, tmp_path):
+    code, out, _ = barpc("adjust", *crops, "-o", tmp_path / "o", "--json")
+    assert code == 0
+    sigma = json.loads(out)["scene"]["sigma_enu_m"][:2]
+    with rasterio.open(tmp_path / "o/view_00.vrt") as image:
+        assert image.rpcs.err_bias == pytest.approx(np.sqrt(np.mean(np.square(sigma))), rel=1e-6)
+        assert image.rpcs.err_rand == pytest.approx(0.1)
