@@ -155,7 +155,7 @@ class Workspace:
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         self._clean()
-        self.earlier_outputs = self.earlier_outputs_outputs()
+        self.earlier_outputs = self.earlier_outputs()
         self.outputs: list[str] = []
         self.stages: list[dict[str, Any]] = []
         self._save_state("running")
