@@ -155,7 +155,7 @@ class Workspace:
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         self._clean()
-        self.earlier_outputs = self.earlier_outputs()
+        self.earlier_outputs = self._read_outputs()
         self.outputs: list[str] = []
         self.stages: list[dict[str, Any]] = []
         self._save_state("running")
@@ -305,7 +305,7 @@ class Workspace:
             return {}
         return state if isinstance(state, dict) else {}
 
-    def _earlier_outputs(self) -> list[str]:
+    def _read_outputs(self) -> list[str]:
         """What an earlier run says it wrote; never a place outside the folder, whatever the file says."""
         named = self._read_state().get("outputs", [])
         names = [name for name in named if isinstance(name, str)] if isinstance(named, list) else []
