@@ -34,13 +34,20 @@ _PUBLIC = {
 if TYPE_CHECKING:
     from barpc.errors import BarpcError as BarpcError
     from barpc.errors import BarpcWarning as BarpcWarning
+    from barpc.fit import fit_rpc as fit_rpc
+    from barpc.fit import fit_rpc_points as fit_rpc_points
+    from barpc.pipeline import adjust as adjust
+    from barpc.rpcio import read_rpc as read_rpc
+    from barpc.rpcio import write_rpc as write_rpc
     from barpc.scene import GroundPoints as GroundPoints
     from barpc.scene import Tracks as Tracks
     from barpc.scene import View as View
     from barpc.sensor import SensorModel as SensorModel
     from barpc.sensor.corrected import Corrected as Corrected
     from barpc.sensor.corrected import Correction as Correction
+    from barpc.sensor.pushbroom import Pushbroom as Pushbroom
     from barpc.sensor.rpc import RPC as RPC
+    from barpc.sensor.sentinel1 import RangeDoppler as RangeDoppler
 
 __all__ = ["__version__", *sorted(_PUBLIC)]
 

@@ -1,0 +1,157 @@
+"""Write docs/options.md from the option records and the verbs' flags.
+
+    python docs/generate_options.py            # writes it
+    python docs/generate_options.py --print    # prints it
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+from dataclasses import MISSING, Field, fields
+from pathlib import Path
+from typing import Any
+
+import click
+
+from barpc.ba import AdjustOptions
+from barpc.ba.loss import LOSSES
+from barpc.ba.options import MODELS
+from barpc.cli.main import COMMANDS, cli
+from barpc.cli.options import ADJUSTMENT_FLAGS, RUN_FLAGS, TIE_FLAGS
+from barpc.fit import FitOptions
+from barpc.pipeline import RunOptions
+from barpc.tie import TieOptions
+from barpc.tie.features import DETECTORS
+from barpc.tie.guided import MATCHERS
+
+PAGE = Path(__file__).with_name("options.md")
+TABLES = {"": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions}
+"""Table of an options file -> the record it fills; "" is the file's top level."""
+
+CHOICES = {"model": MODELS, "loss": LOSSES, "detector": DETECTORS, "matcher": MATCHERS}
+"""Options whose values are rows of a table of the code."""
+
+HEAD = """# Options
+
+<!-- Written by docs/generate_options.py. Edit the docstrings and help texts there, then run it again. -->
+
+Every option has a default. Later ones win: the defaults, then the file given with `--options`, then the flags.
+An unknown name, a wrong type or a value out of range is refused before anything is computed.
+
+```toml
+# run.toml: barpc adjust scene/*.tif --options run.toml -o adjusted
+rpc_formats = ["txt", "geom"]
+
+[tie]
+points_per_image = 8000
+
+[adjust]
+sigma_attitude = 3.0
+```
+
+The same from Python, with the records named in the headings below:
+
+```python
+import barpc
+from barpc.ba import AdjustOptions
+from barpc.ba.loss import LOSSES
+from barpc.ba.options import MODELS
+from barpc.pipeline import RunOptions
+
+options = RunOptions(adjust=AdjustOptions(sigma_attitude=3.0))
+result = barpc.adjust(["a.tif", "b.tif"], "adjusted", options)
+```
+"""
+
+
+def described(record: type) -> dict[str, tuple[str, str]]:
+    """Field -> (type, meaning), from the numpydoc section Parameters."""
+    section = inspect.getdoc(record).split("Parameters\n----------\n")[1].split("\n\n")[0]
+    found = {}
+    for names, kind, body in re.findall(r"^(\S[^:\n]*) : (.*)\n((?:    .*\n?)+)", section, re.MULTILINE):
+        for name in names.split(","):
+            found[name.strip()] = (kind, " ".join(body.split()))
+    return found
+
+
+def default(field: Field[Any]) -> str:
+    """A field's default as an options file would spell it."""
+    value = field.default if field.default_factory is MISSING else field.default_factory()
+    if value is None or value == {}:
+        return "-"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
+    if isinstance(value, tuple):
+        return "`[" + ", ".join(f'"{v}"' if isinstance(v, str) else str(v) for v in value) + "]`"
+    return f'`"{value}"`' if isinstance(value, str) else f"`{value}`"
+
+
+def row(*cells: str) -> str:
+    """One row of a table."""
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def option_table(name: str, record: type, flags: dict[str, str]) -> list[str]:
+    """The options of one table of the file, with the flags that set them."""
+    texts = described(record)
+    title = f"[{name}]: `{record.__name__}`" if name else f"Top level: `{record.__name__}`"
+    lines = ["", f"### {title}", "", row("option", "type", "default", "flag", "meaning"), row(*["---"] * 5)]
+    for field in fields(record):
+        if field.name in TABLES:
+            continue
+        kind, meaning = texts[field.name]
+        if field.name in CHOICES:
+            meaning += " Values: " + ", ".join(f"`{value}`" for value in CHOICES[field.name]) + "."
+        flag = flags.get(f"{name}.{field.name}" if name else field.name, "")
+        lines.append(row(f"`{field.name}`", kind, default(field), flag and f"`{flag}`", meaning))
+    return lines
+
+
+def verb_section(name: str) -> list[str]:
+    """A verb: its usage, its first words and its flags."""
+    command = cli.get_command(click.Context(cli), name)
+    context = click.Context(command, info_name=f"barpc {name}", terminal_width=100)
+    usage = " ".join(command.collect_usage_pieces(context))
+    first = command.help.replace("\b", "\\b").split("\\b")[0]
+    lines = ["", f"### barpc {name}", "", f"`barpc {name} {usage}`", "", " ".join(first.split())]
+    examples = command.help.replace("\b", "\\b").split("\\b")[1:]
+    if examples:
+        text = inspect.cleandoc("\n".join(examples[0].strip("\n").splitlines()[1:])).strip()
+        lines += ["", "```", text, "```"]
+    records = [p.get_help_record(context) for p in command.params if isinstance(p, click.Option)]
+    shown = [record for record in records if record is not None]
+    if shown:
+        lines += ["", row("flag", "meaning"), row("---", "---")]
+        lines += [row(f"`{names}`", re.sub(r"\s+", " ", text)) for names, text in shown]
+    return lines
+
+
+def page() -> str:
+    """The whole page."""
+    flags = {}
+    for flag in (*TIE_FLAGS, *ADJUSTMENT_FLAGS, *RUN_FLAGS):
+        option = flag.decorate(lambda: None).__click_params__[0]
+        flags[flag.target] = option.opts[0]
+    lines = [HEAD, "## Options of a run"]
+    for name, record in TABLES.items():
+        lines += option_table(name, record, flags)
+    lines += ["", "## Verbs"]
+    for name in COMMANDS:
+        lines += verb_section(name)
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Write or print the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--print", action="store_true", dest="show", help="print instead of writing")
+    if parser.parse_args().show:
+        print(page(), end="")
+    else:
+        PAGE.write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

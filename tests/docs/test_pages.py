@@ -1,0 +1,93 @@
+"""What a reader may rely on: links lead somewhere, generated pages are what the code says, the site builds."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import barpc
+from tests.docs.pages import DOCS, PAGES, ROOT, anchors, links
+
+
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_of_a_page_leads_to_a_file_and_a_heading_that_exist(page):
+    for target in links(page):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        goal = (page.parent / name).resolve() if name else page
+        assert goal.exists(), f"{target}: no such file"
+        if anchor:
+            assert anchor in anchors(goal), f"{target}: no such heading"
+
+
+def test_pages_of_the_site_link_to_pages_of_the_site_only():
+    for page in DOCS.rglob("*.md"):
+        for target in links(page):
+            if not re.match(r"[a-z]+:", target) and not target.startswith("#"):
+                assert (page.parent / target.partition("#")[0]).resolve().is_relative_to(DOCS), (page, target)
+
+
+def test_the_page_of_options_is_what_the_code_says():
+    generator = script("generate_options")
+    assert (DOCS / "options.md").read_text(encoding="utf-8") == generator.page()
+
+
+def test_every_option_has_a_meaning():
+    generator = script("generate_options")
+    for record in generator.TABLES.values():
+        texts = generator.described(record)
+        missing = [f.name for f in fields(record) if f.name not in texts]
+        assert not missing, f"{record.__name__}: {missing} are not in its docstring"
+
+
+def test_every_page_of_the_navigation_exists_and_every_page_is_in_it():
+    configuration = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = re.findall(r": ([\w/]+\.md)$", configuration, re.MULTILINE)
+    assert sorted(listed) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
+
+
+def test_type_checkers_know_every_public_name():
+    text = (ROOT / "barpc" / "__init__.py").read_text(encoding="utf-8")
+    typed = set(re.findall(r"^    from \S+ import \w+ as (\w+)$", text, re.MULTILINE))
+    assert typed == set(barpc.__all__) - {"__version__"}
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path):
+    for module in ("mkdocs", "material", "mkdocstrings", "latex2mathml"):
+        pytest.importorskip(module)
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for page in (tmp_path / "site").rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        loaded = re.findall(r"<(?:script|img|iframe)[^>]* src=\"([^\"]+)\"", text)
+        loaded += re.findall(r"<link[^>]* rel=\"(?:stylesheet|preconnect|preload)\"[^>]*>", text)
+        assert not [item for item in loaded if "//" in item], page
+        assert 'class="arithmatex"' not in text, f"{page}: an equation that is not MathML"
+
+
+@pytest.mark.parametrize("name", sorted(p.name for p in Path(ROOT / "benchmarks").glob("*.py")))
+@pytest.mark.slow
+def test_every_benchmark_says_what_it_does(name):
+    command = [sys.executable, str(ROOT / "benchmarks" / name), "--help"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "usage:" in done.stdout
