@@ -184,8 +184,9 @@ def files_table(summary: Record) -> DataTable:
     rows = []
     for view in summary["views"]:
         for file, found in view["outputs"].items():
-            readings = found if isinstance(found, Mapping) else {"barpc": found}
-            rows += [[name(file), name(who), figure(error, ".1e")] for who, error in readings.items()]
+            for consumer, reading in found.items():
+                last = Cell(reading, 1e301) if isinstance(reading, str) else figure(reading, ".1e")
+                rows.append([name(file), name(consumer), last])
     return DataTable("files", "Files reopened", ["file", "read by", "largest difference to P_BA [px]"], rows)
 
 

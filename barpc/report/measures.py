@@ -13,7 +13,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import Triangulation, convergence_angle, epipolar_offset, sight_enu, triangulate
 
-MAX_PER_PAIR = 2000
+MAX_PER_PAIR = 1000
 """Matches of a pair that its epipolar offset is measured on, evenly taken."""
 
 
@@ -113,11 +113,27 @@ def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
     ]
 
 
-def pair_offset(ties: PairTies, tracks: Tracks, sensors: Sequence[SensorModel], alt: float) -> PairOffset:
-    """The epipolar offset of a pair's matches through given cameras, started at an altitude [m]."""
+def pair_offset(ties: PairTies, tracks: Tracks, sensors: Sequence[SensorModel], alt: Array) -> PairOffset:
+    """The epipolar offset of a pair's matches.
+
+    Parameters
+    ----------
+    ties : PairTies
+        The pair.
+    tracks : Tracks
+        Tie points.
+    sensors : sequence of SensorModel
+        The cameras of all views.
+    alt : (P,)
+        Altitudes of the tracks through these cameras [m]: so near to where the pair's own rays pass each other
+        that two steps arrive.
+    """
     pick = np.linspace(0, len(ties.a) - 1, min(len(ties.a), MAX_PER_PAIR)).astype(np.int64)
+    start = alt[tracks.point[ties.a[pick]]]
+    pick, start = pick[np.isfinite(start)], start[np.isfinite(start)]
     i, j = ties.views
-    offset, _ = epipolar_offset(sensors[i], sensors[j], tracks.xy[ties.a[pick]], tracks.xy[ties.b[pick]], alt)
+    image_a, image_b = tracks.xy[ties.a[pick]], tracks.xy[ties.b[pick]]
+    offset, _ = epipolar_offset(sensors[i], sensors[j], image_a, image_b, start, steps=2)
     offset = offset[np.isfinite(offset)]
     if not len(offset):
         return PairOffset(float("nan"), float("nan"), float("nan"), 0)

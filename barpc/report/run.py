@@ -43,8 +43,8 @@ class Run:
     fits : tuple of RpcFit
         Refitted RPCs, for an adjustment that went so far.
     written : tuple of mapping
-        Per view: output name to the largest difference to P_BA [px] when reopened; a mapping of consumers
-        to such differences where several read it.
+        Per view: output name to what each consumer that reopened it found: the largest difference to P_BA
+        [px], or why it does not read the file.
     left_out : tuple of (str, str)
         Files that were left out, and why.
     options : object
@@ -67,7 +67,7 @@ class Run:
     adjustment: Adjustment | None = None
     centers: tuple[CameraCenter, ...] = ()
     fits: tuple[RpcFit, ...] = ()
-    written: tuple[Mapping[str, Any], ...] = ()
+    written: tuple[Mapping[str, Mapping[str, float | str]], ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
     options: object = None
     stages: Sequence[Mapping[str, Any]] = field(default_factory=list)
@@ -101,6 +101,11 @@ class Run:
     def ties_before(self) -> Triangulation:
         """The tie points through the delivered cameras."""
         return triangulate_tracks(self.tracks, self.before, self.start_altitude, self.keep)
+
+    @cached_property
+    def altitudes_before(self) -> Array:
+        """Altitudes of the tie points (P,) through the delivered cameras [m]."""
+        return ground_from_ecef(self.ties_before.points)[:, 2]
 
     @cached_property
     def ties_after(self) -> Triangulation | None:

@@ -119,10 +119,15 @@ def _pair(run: Run, ties: PairTies, reports: Mapping[tuple[str, str], PairReport
     i, j = ties.views
     names = (run.views[i].name, run.views[j].name)
     report = reports.get(names)
-    alt = run.start_altitude
     some = ties.a[:: max(1, len(ties.a) // 100)]
     convergence, base_to_height, height = pair_geometry(ties, run.before, run.ground[run.tracks.point[some]])
-    after = None if run.after is None else _offset(pair_offset(ties, run.tracks, run.after, alt))
+    offsets = {}
+    for when, sensors, alt in (
+        ("before", run.before, run.altitudes_before),
+        ("after", run.after, run.ground[:, 2]),
+    ):
+        found = None if sensors is None else pair_offset(ties, run.tracks, sensors, alt)
+        offsets[f"epipolar_{when}"] = None if found is None else _offset(found)
     return {
         "a": names[0],
         "b": names[1],
@@ -130,8 +135,7 @@ def _pair(run: Run, ties: PairTies, reports: Mapping[tuple[str, str], PairReport
         "convergence_deg": convergence,
         "base_to_height": base_to_height,
         "height_m_per_px": height,
-        "epipolar_before": _offset(pair_offset(ties, run.tracks, run.before, alt)),
-        "epipolar_after": after,
+        **offsets,
         "matching": None if report is None else plain(report),
     }
 

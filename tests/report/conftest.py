@@ -48,7 +48,7 @@ def run_of_block(
         adjustment=adjustment,
         centers=centers,
         fits=fits,
-        written=tuple({f"{view.name}_RPC.TXT": 1e-9} for view in views),
+        written=tuple({f"{view.name}_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}} for view in views),
         options=options,
         stages=[STAGE],
         gcps=control,

@@ -79,6 +79,7 @@ def test_every_question_is_asked_of_a_full_run(block_run):
     ]
     for view in block_run.summary["views"]:
         assert f"{view['rmse_after']:.3f}" in html
+    assert "cannot read it" in html
     for gcp in block_run.summary["gcps"]:
         assert gcp["name"] in html
 

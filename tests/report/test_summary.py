@@ -11,9 +11,9 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.report import Run, summarize
-from barpc.report.measures import shift_in_image, triangulate_tracks
+from barpc.report.measures import pair_ties, shift_in_image, triangulate_tracks
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import view_angles
+from barpc.sensor.geometry import epipolar_offset, view_angles
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/summary.schema.json").read_text())
 TYPES = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None)}
@@ -138,6 +138,23 @@ def test_base_to_height_is_the_distance_of_two_cameras_one_unit_up(block_run):
             ends.append(np.tan(incidence) * np.array([np.sin(azimuth), np.cos(azimuth)]))
         assert pair["base_to_height"] == pytest.approx(np.hypot(*(ends[0] - ends[1])), rel=0.1)
         assert pair["height_m_per_px"] == pytest.approx(0.5 / pair["base_to_height"], rel=0.1)
+
+
+def test_two_steps_from_the_tie_points_altitudes_find_the_epipolar_offset(block_run):
+    run = block_run.run
+    for ties in pair_ties(run.tracks, run.keep)[:4]:
+        for sensors, when in ((run.before, "before"), (run.after, "after")):
+            i, j = ties.views
+            a, b = run.tracks.xy[ties.a], run.tracks.xy[ties.b]
+            offset, _ = epipolar_offset(sensors[i], sensors[j], a, b, 0.0, steps=20)
+            found = next(
+                p
+                for p in block_run.summary["pairs"]
+                if (p["a"], p["b"]) == tuple(run.views[k].name for k in (i, j))
+            )
+            assert found[f"epipolar_{when}"]["count"] == len(a)
+            assert found[f"epipolar_{when}"]["rms"] == pytest.approx(np.sqrt(np.mean(offset**2)), rel=1e-6)
+            assert found[f"epipolar_{when}"]["median"] == pytest.approx(np.median(offset), abs=1e-7)
 
 
 def test_the_simulated_camera_sees_half_a_metre(block_run):
