@@ -106,7 +106,11 @@ def unique_names(files: Sequence[Path]) -> list[str]:
     while True:
         names = ["_".join([*file.parts[-depth[i] : -1], file.stem]) for i, file in enumerate(files)]
         count = Counter(names)
-        again = [i for i, name in enumerate(names) if count[name] > 1 and depth[i] < len(files[i].parts) - 1]
+        again = [
+            i
+            for i, name in enumerate(names)
+            if count[name] > 1 and depth[i] < len(files[i].relative_to(files[i].anchor).parts)
+        ]
         if not again:
             break
         for i in again:
