@@ -181,13 +181,16 @@ def fits_table(summary: Record) -> DataTable:
 
 def files_table(summary: Record) -> DataTable:
     """Every file with a new RPC, and what each consumer that reopened it read."""
-    rows = []
-    for view in summary["views"]:
-        for file, found in view["outputs"].items():
-            for consumer, reading in found.items():
-                last = Cell(reading, 1e301) if isinstance(reading, str) else figure(reading, ".1e")
-                rows.append([name(file), name(consumer), last])
-    return DataTable("files", "Files reopened", ["file", "read by", "largest difference to P_BA [px]"], rows)
+    outputs = {file: found for view in summary["views"] for file, found in view["outputs"].items()}
+    consumers = list(dict.fromkeys(consumer for found in outputs.values() for consumer in found))
+    rows = [[name(file), *(_reading(found.get(c)) for c in consumers)] for file, found in outputs.items()]
+    caption = "Files reopened as their readers do: largest difference to P_BA [px]"
+    return DataTable("files", caption, ["file", *(f"{consumer} [px]" for consumer in consumers)], rows)
+
+
+def _reading(found: float | str | None) -> Cell:
+    """What a consumer read, or why it did not."""
+    return Cell(found, 1e301) if isinstance(found, str) else figure(found, ".1e")
 
 
 def gcps_table(summary: Record) -> DataTable:

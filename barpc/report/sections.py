@@ -88,7 +88,11 @@ def _bonds(views: Sequence[Record], pairs: Sequence[Record]) -> str:
     groups = connected_groups(len(views), links)
     partners = np.bincount(np.array(links, dtype=np.int64).ravel(), minlength=len(views))
     lonely = [view["name"] for view, n in zip(views, partners, strict=True) if n == 1]
-    answer = "All images hang together." if len(groups) == 1 else f"They fall into {len(groups)} groups."
+    answer = (
+        "All images hang together."
+        if len(groups) == 1
+        else f"By tie points they fall into {len(groups)} groups."
+    )
     if lonely and len(views) > 2:
         answer += f" Tied to one other image only: {_some(lonely)}."
     return answer
@@ -210,9 +214,10 @@ def _corrections(files: RunFiles) -> Section | None:
     sigma = max(float(np.hypot(*move["center_sigma_px"])) for move in moves)
     answer = (
         f"Up to {largest:.2f} px in the middle of an image. The adjustment itself predicts this to be known to"
-        f" {sigma:.2g} px (one sigma, the worst image); without control most of that is common to all images: the"
-        " scene's own place, which no tie point can tell."
+        f" {sigma:.2g} px (one sigma, the worst image)."
     )
+    if not files.summary["gcps"]:
+        answer += " Most of that is common to all images: the scene's own place, which no tie point can tell."
     labels = numbered([view["name"] for view in views])
     chart = (charts.corrections(views, labels), _which(views, "images", "shift"))
     table = datatables.corrections_table(files.summary)
@@ -265,8 +270,8 @@ def _run(files: RunFiles) -> Section:
     seconds = sum(stage["seconds"] for stage in summary["stages"])
     tracks = summary["tracks"]
     answer = (
-        f"{seconds:.1f} s for {len(summary['views'])} images and {tracks['num_tracks']} tie points"
-        f" ({tracks['num_observations']} observations)."
+        f"{len(summary['views'])} images, {tracks['num_tracks']} tie points, {tracks['num_observations']} observations"
+        + (f", {seconds:.1f} s." if summary["stages"] else ".")
     )
     if not summary["tables"]["complete"]:
         answer += (

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from barpc import __version__
-from barpc.ba import Adjustment
+from barpc.ba import Adjustment, check_residuals
 from barpc.fit import RpcFit
 from barpc.report.measures import (
     PairOffset,
@@ -58,6 +58,7 @@ def summarize(run: Run) -> dict[str, Any]:
         "tables": _tables(run),
         "scene": None if run.adjustment is None else _scene(run.adjustment),
         "gcps": _gcps(run),
+        "check_points": _check_points(run),
         "stages": list(run.stages),
         "options": plain(run.options),
         "versions": _versions(),
@@ -84,6 +85,7 @@ def _views(run: Run) -> list[dict[str, Any]]:
             **_geometry(run, i),
             "num_observations": int(count[i]),
             "num_rejected": int((~keep & of_view).sum()),
+            "num_gcps": 0 if run.gcps is None else int((run.gcps.view == i).sum()),
             "tie_coverage": coverage(tracks.xy[keep & of_view], view.size),
             "rmse_before": first[i],
             "rmse_after": None if last is None else last[i],
@@ -249,6 +251,28 @@ def _gcps(run: Run) -> list[dict[str, Any]]:
         for name, place, sigma, r in zip(
             run.gcps.names, run.gcps.lonlatalt, run.gcps.sigma, left, strict=True
         )
+    ]
+
+
+def _check_points(run: Run) -> list[dict[str, Any]]:
+    """Points that stayed out of the adjustment: image residuals of each observation, and the ground error."""
+    if run.check_points is None:
+        return []
+    points = run.check_points
+    left = check_residuals(run.before if run.after is None else run.after, points)
+    return [
+        {
+            "name": name,
+            "lon": place[0],
+            "lat": place[1],
+            "alt_m": place[2],
+            "residual_enu_m": left.ground[i],
+            "observations": [
+                {"view": run.views[points.view[row]].name, "residual_px": left.image[row]}
+                for row in np.flatnonzero(points.point == i)
+            ],
+        }
+        for i, (name, place) in enumerate(zip(points.names, points.lonlatalt, strict=True))
     ]
 
 

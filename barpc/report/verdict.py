@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from barpc.ba import check_residuals
 from barpc.ba.gauge import Mode
 from barpc.geodesy import Array
 from barpc.report.run import Run
@@ -15,6 +16,8 @@ GOOD_RMSE = 0.5
 """A view whose tie points are left with more than this [px] is called doubtful."""
 FEW_OBSERVATIONS = 30
 """A view with fewer is called weakly tied."""
+ENOUGH_GCPS = 3
+"""Control points that hold a view without any tie point."""
 MANY_REJECTED = 0.3
 """A view that lost a larger share of its observations is called doubtful."""
 
@@ -81,12 +84,14 @@ def _failure(view: View, run: Run) -> tuple[str, str]:
 
 def _weakness(view: View) -> tuple[str, str]:
     few = view["num_observations"]
-    return "weak", f"only {few} tie points: check overlap, clouds and dates" if few < FEW_OBSERVATIONS else ""
+    if few >= FEW_OBSERVATIONS:
+        return "weak", ""
+    return "weak", f"{f'only {few}' if few else 'no'} tie points: check overlap, clouds and dates"
 
 
 def _doubt(view: View, run: Run) -> tuple[str, str]:
     error = view["rmse_after"] if run.kind == "adjust" else view["rmse_before"]
-    if not error <= GOOD_RMSE:
+    if not error <= GOOD_RMSE and view["num_observations"]:
         if run.kind == "check":
             return "doubtful", f"tie points disagree by {error:.2f} px: adjust the cameras"
         return (
@@ -136,10 +141,10 @@ def _adjusted_lines(run: Run, views: Sequence[View]) -> list[str]:
     assert run.adjustment is not None
     before, after = (_median([view[f"rmse_{when}"] for view in views]) for when in ("before", "after"))
     gauge = run.adjustment.gauge
-    lines = [
-        f"Tie points of {len(views)} images agree to {after:.3f} px (before: {before:.3f} px).",
-        f"The scene as a whole moved by {_enu(gauge.shift)}.",
-    ]
+    lines = [f"Tie points of {len(views)} images agree to {after:.3f} px (before: {before:.3f} px)."]
+    if not len(run.tracks):
+        lines = ["There are no tie points: the cameras are held by control points alone."]
+    lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
     known = ", ".join(metres(s) for s in gauge.sigma)
     if run.gcps is None:
         lines.append(
@@ -149,6 +154,12 @@ def _adjusted_lines(run: Run, views: Sequence[View]) -> list[str]:
         lines.append(
             f"With {len(run.gcps.names)} GCPs its place is known to {known} (east, north, up; one sigma)."
         )
+    if run.check_points is not None and run.after is not None:
+        image, ground = check_residuals(run.after, run.check_points).rms()
+        seen = f"{np.hypot(*image):.2f} px in the images"
+        if np.isfinite(ground).all():
+            seen += f" and {', '.join(metres(r) for r in ground)} on the ground (east, north, up)"
+        lines.append(f"{len(run.check_points.names)} check points, not used above, are met to {seen} (RMS).")
     return lines
 
 

@@ -24,6 +24,8 @@ frame.addEventListener("load", () => {
   }
   found.wide = [...page.querySelectorAll("h1, h2, p, li, figure, figcaption, .scroll, summary")]
     .filter(e => e.getBoundingClientRect().right > page.documentElement.clientWidth + 1).map(e => e.textContent.slice(0, 60));
+  found.squeezed = [...page.querySelectorAll(".bars li > span:first-child")]
+    .filter(e => e.getBoundingClientRect().width < 120).map(e => e.textContent);
   found.unnamed = [...page.querySelectorAll("svg")].filter(svg => !page.getElementById(svg.getAttribute("aria-labelledby").split(" ")[0])).length;
   const table = page.querySelector("#t-images"), heads = [...table.tHead.rows[0].cells];
   const column = name => heads.findIndex(head => head.textContent.startsWith(name));

@@ -75,7 +75,7 @@ def test_it_opens_without_errors_and_nothing_overflows_or_overlaps(fixture, widt
     assert found["charts"] > 5
     assert found["hidden"] == found["unnamed"] == 0
     assert found["width"] <= width
-    assert found["wide"] == []
+    assert found["wide"] == found["squeezed"] == []
     assert found["outside"] == []
     assert found["overlaps"] == []
 
