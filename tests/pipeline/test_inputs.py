@@ -158,3 +158,17 @@ def test_paths_with_spaces_and_accents_and_equal_stems(tmp_path):
     assert names == ["été 1_scène", "été 2_scène"]
     for name in names:
         assert read_rpc(Path(tmp_path / "out à moi" / f"{name}.vrt")) is not None
+
+
+def test_check_points_are_measured_and_not_used(matched, tmp_path):
+    ties, known = str(matched[1] / "matches.npz"), (str(SAMPLES / "gcps.geojson"),)
+    free = adjust(IMAGES, tmp_path / "free", RunOptions(matches=ties))
+    checked = adjust(IMAGES, tmp_path / "checked", RunOptions(matches=ties, check_points=known))
+    np.testing.assert_array_equal(checked.adjustment.params, free.adjustment.params)
+    points = checked.summary["check_points"]
+    assert len(points) == 5
+    height = np.array([point["residual_enu_m"][2] for point in points])
+    sigma = checked.summary["scene"]["sigma_enu_m"][2]
+    assert (np.abs(height) < 3 * sigma).all()
+    assert np.abs(height).min() > 10  # without control the scene floats, and that is what they show
+    assert any("5 check points" in line for line in checked.summary["verdict"])
