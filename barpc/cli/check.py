@@ -1,26 +1,74 @@
-"""`barpc check`: the residuals of cameras as they are."""
+"""`barpc check`: the residuals of cameras as they are, or how far they lie from others."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import click
 
-from barpc.cli.options import TIE_FLAGS, with_flags
+from barpc.cli.main import EXIT_GATE
+from barpc.cli.options import TIE_FLAGS, image_paths, with_flags
 from barpc.cli.runs import run
 
 
 @click.command("check")
 @click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
+@click.option("--against", metavar="PATH", help="Compare with this RPC (one image), or those of this folder.")
 @with_flags(*TIE_FLAGS)
 @click.pass_obj
-def command(obj: dict[str, Any], /, images: tuple[str, ...], **flags: Any) -> int:
+def command(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, **flags: Any) -> int:
     r"""Measure how well the cameras of overlapping images agree, without adjusting or writing anything.
 
+    With --against, no tie points are matched: each image's RPC is compared with another one over the image and
+    its altitudes; exit 3 where one differs by more than a millionth of a pixel.
+
     \b
-    Example:
+    Examples:
       barpc check adjusted/*.vrt
+      barpc check adjusted/*.vrt --against delivered/
     """
+    if against is not None:
+        return _compare(image_paths(images, flags["image_list"]), Path(against), flags["as_json"])
     from barpc.pipeline import check
 
     return run(obj, check, images, flags)
+
+
+def _compare(images: list[str], against: Path, as_json: bool) -> int:
+    from barpc.handoff import TOLERANCE, difference
+    from barpc.pipeline import load_views
+    from barpc.rpcio import read_rpc
+
+    views = load_views(images, min_views=1).views
+    found = {}
+    for view in views:
+        other = _counterpart(Path(view.path), against)
+        found[view.path] = (str(other), difference(view.sensor, read_rpc(other), view.size, view.alt_range))
+    if as_json:
+        entries = [{"image": a, "against": b, "max_px": px} for a, (b, px) in found.items()]
+        click.echo(json.dumps(entries, indent=1))
+    else:
+        for path, (other, px) in found.items():
+            click.echo(f"{path}  {other}  max {px:.3g} px")
+    return 0 if all(px <= TOLERANCE for _, px in found.values()) else EXIT_GATE
+
+
+def _counterpart(image: Path, against: Path) -> Path:
+    """The file to compare with: `against` itself, or the one in that folder that has the image's name."""
+    from barpc.errors import InputError
+
+    if not against.is_dir():
+        return against
+    names = [
+        image.name,
+        f"{image.stem}.vrt",
+        f"{image.stem}.tif",
+        f"{image.stem}.TIF",
+        f"{image.stem}_RPC.TXT",
+    ]
+    for name in (*names, f"{image.stem}.RPB", f"{image.stem}.geom"):
+        if (against / name).is_file():
+            return against / name
+    raise InputError(f"{against}: holds no RPC for {image.name}")

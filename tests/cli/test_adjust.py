@@ -291,3 +291,17 @@ def test_the_accuracy_stated_in_a_new_rpc_is_what_is_known_now(crops, tmp_path):
     with rasterio.open(tmp_path / "o/view_00.vrt") as image:
         assert image.rpcs.err_bias == pytest.approx(np.sqrt(np.mean(np.square(sigma))), rel=1e-6)
         assert image.rpcs.err_rand == pytest.approx(0.1)
+
+
+def test_check_compares_with_other_cameras(crops, tmp_path):
+    barpc("adjust", *crops, "-o", tmp_path / "o")
+    new = sorted((tmp_path / "o").glob("*.vrt"))
+    code, out, _ = barpc("check", new[0], "--against", tmp_path / "o/view_00_RPC.TXT", "--json")
+    assert code == 0
+    assert json.loads(out)[0]["max_px"] <= 1e-9
+    code, out, _ = barpc("check", *new, "--against", crops[0].parent, "--json")
+    assert code == 3
+    assert min(entry["max_px"] for entry in json.loads(out)) > 1
+    code, _, err = barpc("check", new[0], "--against", tmp_path)
+    assert code == 1
+    assert "view_00.vrt" in err
