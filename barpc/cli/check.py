@@ -50,8 +50,8 @@ def _compare(images: list[str], against: Path, as_json: bool) -> int:
         entries = [{"image": a, "against": b, "max_px": px} for a, (b, px) in found.items()]
         click.echo(json.dumps(entries, indent=1))
     else:
-        for path, (other, px) in found.items():
-            click.echo(f"{path}  {other}  max {px:.3g} px")
+        for path, (compared, px) in found.items():
+            click.echo(f"{path}  {compared}  max {px:.3g} px")
     return 0 if all(px <= TOLERANCE for _, px in found.values()) else EXIT_GATE
 
 
