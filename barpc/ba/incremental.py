@@ -6,6 +6,8 @@ points may observe old views; an observation that the old block has used must no
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -70,7 +72,7 @@ class BlockPrior:
             with np.load(path, allow_pickle=False) as file:
                 names = tuple(str(name) for name in file["names"])
                 return cls(names, str(file["model"]), int(file["drift"]), *(file[name] for name in _FIELDS))
-        except (OSError, KeyError, ValueError) as error:
+        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from barpc.ba import AdjustOptions
 from barpc.errors import InputError
@@ -103,6 +104,7 @@ def with_values(options: Any, values: Mapping[str, Any], where: str = "options")
         An unknown field, or a value of the wrong type; the message names it.
     """
     known = {f.name: getattr(options, f.name) for f in fields(options)}
+    kinds = get_type_hints(type(options))
     changed: dict[str, Any] = {}
     for name, value in values.items():
         if name not in known:
@@ -113,26 +115,43 @@ def with_values(options: Any, values: Mapping[str, Any], where: str = "options")
                 raise InputError(f"{where}: [{name}] must be a table, found {value!r}")
             changed[name] = with_values(old, value, f"{where} [{name}]")
         else:
-            changed[name] = _like(old, value, f"{where}: {name}")
+            changed[name] = _as(kinds[name], value, f"{where}: {name}")
     try:
         return replace(options, **changed)
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: {error}") from error
 
 
-def _like(old: object, value: Any, where: str) -> Any:
-    """`value` as the type of the default `old`, or an error."""
-    if isinstance(old, tuple) and isinstance(value, list):
-        return tuple(value)
-    if isinstance(old, bool) or old is None or not isinstance(old, (int, float, str)):
-        if isinstance(old, bool) and not isinstance(value, bool):
-            raise InputError(f"{where} must be true or false, found {value!r}")
+def _as(kind: Any, value: Any, where: str) -> Any:
+    """`value` as the declared type of an option, or an error."""
+    parts = get_args(kind)
+    if get_origin(kind) in (Union, UnionType):
+        return _as(next(part for part in parts if part is not NoneType), value, where)
+    if get_origin(kind) is tuple:
+        return _as_tuple(parts, value, where)
+    if get_origin(kind) is Literal:
+        if value not in parts:
+            raise InputError(f"{where} must be one of {', '.join(map(str, parts))}, found {value!r}")
         return value
-    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, type(old)) or isinstance(value, bool):
-        raise InputError(f"{where} must be a {type(old).__name__}, found {value!r}")
+    if get_origin(kind) is Mapping:
+        if not isinstance(value, Mapping):
+            raise InputError(f"{where} must be a table, found {value!r}")
+        return {str(key): _as(parts[1], item, f"{where}.{key}") for key, item in value.items()}
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind or value != value:  # NaN
+        raise InputError(f"{where} must be a {kind.__name__}, found {value!r}")
     return value
+
+
+def _as_tuple(kinds: Sequence[Any], value: Any, where: str) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise InputError(f"{where} must be a list, found {value!r}")
+    if kinds[-1] is ...:
+        kinds = [kinds[0]] * len(value)
+    if len(value) != len(kinds):
+        raise InputError(f"{where} must have {len(kinds)} values, found {value!r}")
+    return tuple(_as(kind, item, where) for kind, item in zip(kinds, value, strict=True))
 
 
 def read_options(path: str | Path, options: RunOptions | None = None) -> RunOptions:

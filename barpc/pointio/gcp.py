@@ -74,10 +74,16 @@ def read_gcps(
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     views = ViewNames(names, str(path))
-    found = list(_reader(head)(path, views))
+    try:
+        found = list(_reader(head)(path, views))
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text of GCPs ({error})") from error
     if not found:
         raise InputError(f"{path}: no GCP of {', '.join(names[:10])}")
-    return _assembled(found, sigma, image_sigma)
+    try:
+        return _assembled(found, sigma, image_sigma)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def _reader(head: bytes) -> Callable[[Path, ViewNames], Iterator[_Point]]:
@@ -150,9 +156,10 @@ def _assembled(found: list[_Point], sigma: float | None, image_sigma: float | No
     first = {places[point.name, point.lonlatalt]: point for point in reversed(found)}
     points = [first[i] for i in range(len(places))]
     numbers = np.array([point.lonlatalt for point in points])
-    if not (np.abs(numbers[:, 1]) <= 90.0).all():
+    wrong = ~(np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, 1]) <= 90.0))
+    if wrong.any():
         raise InputError(
-            f"GCP {points[int(np.abs(numbers[:, 1]).argmax())].name}: its latitude is beyond 90 degrees"
+            f"GCP {points[int(wrong.argmax())].name}: a coordinate is not finite, or its latitude beyond 90 degrees"
         )
     return GroundPoints(
         names=tuple(point.name for point in points),

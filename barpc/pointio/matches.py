@@ -8,6 +8,8 @@ known, `sigma` [px], in any order. npz: arrays `names`, `view`, `track`, `xy` (K
 from __future__ import annotations
 
 import csv
+import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -59,8 +61,10 @@ def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA
             view, point, xy, spread = _read_asp([path], views, sigma)
         else:
             view, point, xy, spread = _read_csv(path, views, sigma)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, EOFError, UnicodeDecodeError, csv.Error, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: cannot be read as tie points ({error})") from error
+    if not (np.isfinite(xy).all() and np.isfinite(spread).all() and (spread > 0).all()):
+        raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
     return _tracks(path, view, point, xy, spread)
 
 

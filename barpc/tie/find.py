@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.errors import TiePointError
+from barpc.errors import InputError, TiePointError
 from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
-from barpc.tie.features import Keypoints, bounded, detect_tile, join, tiles
+from barpc.tie.features import DETECTORS, Keypoints, bounded, detect_tile, join, tiles
+from barpc.tie.guided import MATCHERS
 from barpc.tie.link import link, thin
 from barpc.tie.matching import Matches, PairReport, match_pair
 from barpc.tie.options import TieOptions
@@ -151,6 +152,7 @@ def find_tracks(
     ImageError
         An image cannot be read.
     """
+    require_known(options)
     pairs = select_pairs(views, options, sensors=sensors)
     keypoints = detect(views, options, pairs=pairs, sensors=sensors, executor=executor, progress=progress)
     matched = match(views, keypoints, pairs, options, sensors=sensors, executor=executor, progress=progress)
@@ -170,6 +172,16 @@ def find_tracks(
     tracks = thin(tracks, sizes, most)
     require_tracks(views, tracks, pairs, reports, options)
     return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
+
+
+def require_known(options: TieOptions) -> None:
+    """Raise InputError unless the detector and the matcher have a row in their tables."""
+    for what, name, table in (
+        ("detector", options.detector, DETECTORS),
+        ("matcher", options.matcher, MATCHERS),
+    ):
+        if name not in table:
+            raise InputError(f"{what} {name!r} is not one of {', '.join(table)}")
 
 
 def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
