@@ -134,8 +134,9 @@ def _errors(files: RunFiles) -> Section | None:
 
 
 def _which(rows: Sequence[Any], what: str, by: str) -> str:
-    most = MAX_ROWS
-    return f"All {len(rows)} {what}." if len(rows) <= most else f"The {most} {what} with the largest {by}."
+    if len(rows) <= MAX_ROWS:
+        return f"All {what}."
+    return f"The {MAX_ROWS} of {len(rows)} {what} with the largest {by}."
 
 
 def _randomness(files: RunFiles) -> Section | None:

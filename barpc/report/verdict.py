@@ -14,6 +14,8 @@ from barpc.report.run import Run
 
 GOOD_RMSE = 0.5
 """A view whose tie points are left with more than this [px] is called doubtful."""
+LARGEST_RMSE = 1.0
+"""A run with a view that is left with more than this [px] has missed its quality gate."""
 FEW_OBSERVATIONS = 30
 """A view with fewer is called weakly tied."""
 ENOUGH_GCPS = 3
@@ -68,6 +70,12 @@ def view_status(view: View, run: Run) -> dict[str, str]:
         if advice:
             return {"status": status, "advice": advice}
     return {"status": "adjusted" if run.kind == "adjust" else "consistent", "advice": ""}
+
+
+def meets_gates(view: View, run: Run) -> bool:
+    """Whether a view was adjusted, and its tie points agree afterwards; a check alone has no second gate."""
+    good = run.kind != "adjust" or not view["num_observations"] or view["rmse_after"] <= LARGEST_RMSE
+    return bool(view["status"] != "failed" and good)
 
 
 def _failure(view: View, run: Run) -> tuple[str, str]:
