@@ -10,9 +10,11 @@ import numpy as np
 
 from barpc.ba import BlockPrior
 from barpc.dem import Dem
+from barpc.errors import InputError
 from barpc.pipeline.options import RunOptions
 from barpc.pointio.gcp import read_gcps
-from barpc.scene import BoolArray, GroundPoints, Tracks
+from barpc.scene import BoolArray, GroundPoints, Tracks, View
+from barpc.sensor.geometry import footprint
 
 PRIOR = "block.npz"
 """The file in a run folder that a later run starts from."""
@@ -51,19 +53,32 @@ class Given:
     prior: BlockPrior | None
 
     @classmethod
-    def read(cls, options: RunOptions, names: Sequence[str]) -> Given:
+    def read(cls, options: RunOptions, views: Sequence[View]) -> Given:
         """Read them all; a file that cannot be used stops the run here, and not after an hour.
 
         Raises
         ------
         InputError
-            A file is missing or does not parse.
+            A file is missing or does not parse, or a DEM holds no height under any of the views.
         """
+        names = [view.name for view in views]
         load_gcps(options.gcp, names)
         load_gcps(options.check_points, names)
         dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
+        if dem is not None:
+            _require_cover(dem, str(options.dem), views)
         prior = None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
         return cls(dem, prior)
+
+
+def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
+    """Raise unless the terrain is known somewhere along the outlines of the views."""
+    rings = [footprint(view.sensor, view.size, sum(view.alt_range) / 2) for view in views]
+    lon, lat = np.concatenate(rings).T
+    if np.isnan(dem(lon, lat)).all():
+        raise InputError(
+            f"{path}: holds no height at the images' place ({lon[0]:.4f}, {lat[0]:.4f}); is it another tile?"
+        )
 
 
 def input_files(options: RunOptions) -> list[Path]:

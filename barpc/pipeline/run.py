@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment, adjust_tracks, block_prior
-from barpc.errors import DisconnectedError, InputError
+from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.pipeline.crew import Crew
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new
@@ -116,6 +116,9 @@ def adjust(
         if run.adjustment is not None and options.stop_after == "all":
             with workspace.stage("fit and write"):
                 run = _fit_and_write(run, options, workspace, progress)
+        if run.adjustment is not None:
+            with workspace.output(PRIOR) as partial:
+                block_prior(run.adjustment).save(partial)
         run = replace(run, stages=workspace.stages, out_dir=str(out_dir))
         summary = summarize(run)
         write_tables(workspace, run, summary)
@@ -162,7 +165,7 @@ def _solve(
 ) -> Run:
     """Tie points and the adjustment, as often as there are passes."""
     run = _empty_run("adjust", loaded, options)
-    given = Given.read(options, [view.name for view in run.views])
+    given = Given.read(options, run.views)
     adjustment: Adjustment | None = None
     passes = 1 if options.matches is not None else options.num_passes
     for number in range(passes):
@@ -175,8 +178,6 @@ def _solve(
         with workspace.stage("adjustment" + again):
             run, adjustment = _adjusted(run, options, given)
     assert adjustment is not None
-    with workspace.output(PRIOR) as partial:
-        block_prior(adjustment).save(partial)
     return replace(run, adjustment=adjustment)
 
 
@@ -257,7 +258,10 @@ def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
     for i, (view, model) in enumerate(zip(run.views, run.adjustment.sensors, strict=True)):
-        fit = fit_rpc(model, view.size, view.alt_range, options=options.fit, strict=not options.force)
+        try:
+            fit = fit_rpc(model, view.size, view.alt_range, options=options.fit, strict=not options.force)
+        except FitError as error:
+            raise FitError(f"{view.name}: {error}") from error
         rand = view.sensor.err_rand if isinstance(view.sensor, RPC) else None
         known = bias if np.isfinite(bias) and bias > 0 else None
         fits.append(replace(fit, rpc=replace(fit.rpc, err_bias=known, err_rand=rand)))

@@ -255,7 +255,7 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     ),
     "images from nearly the same place": (
         lambda s: [s.a, rewrite(Path(shutil.copy(s.a, s.folder / "twin.tif")), camera=nudge)],
-        0,
+        3,
         (),
     ),
     "images from the same place, where that is refused": (
@@ -296,7 +296,7 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     "an unknown detector": (given("--detector", "magic"), 1, ("magic", "sift")),
     "an unknown RPC format": (given("--rpc-format", "doc"), 1, ("doc", "txt")),
     "a fixed view that is not there": (given("--fixed", "nobody"), 1, ("nobody",)),
-    "all views fixed": (given("--fixed", "view_00", "--fixed", "view_01"), 0, ()),
+    "all views fixed": (given("--fixed", "view_00", "--fixed", "view_01"), 3, ()),
     "a negative sigma": (given("--sigma-attitude", "-1"), 1, ("sigma",)),
     "a share above one": (given("--min-overlap", "2"), 1, ("min_overlap",)),
     "a negative search": (given("--search", "-5"), 1, ("search",)),
@@ -367,7 +367,7 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
         1,
         ("too few", "view_00"),
     ),
-    "nine wrong tie points in ten": (outliers, 1, ("view_00",)),
+    "nine wrong tie points in ten": (outliers, 3, ()),
     "an earlier run that is none": (given("--fixed-run", "/nowhere"), 1, ("/nowhere",)),
     "an earlier run that is damaged": (
         lambda s: [s.a, s.b, "--fixed-run", s.file("block.npz", "PK\3\4x").parent],
@@ -418,9 +418,9 @@ def test_a_fault_is_one_line_and_leaves_nothing(name, scene, tmp_path, monkeypat
     before = hashes([scene.folder])
     said = barpc("adjust", *(arg for arg in args if arg != "NO -o"), *out)
     assert hashes([scene.folder]) == before
-    if code:
+    if code in (1, 2):
         assert_one_line(said, code, *words)
         assert not (tmp_path / "out").exists()
     else:
-        assert (said.code, said.err) == (0, "")
+        assert (said.code, said.err) == (code, "")
         assert (tmp_path / "out/view_00_RPC.TXT").exists()
