@@ -17,6 +17,8 @@ from barpc.sensor.rpc import RPC
 Record = Mapping[str, Any]
 
 _NODES = 7
+_NO_EFFECT = ("overwrite", "keep_going")
+"""Options that do not change a finished run."""
 
 
 def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
@@ -131,7 +133,8 @@ def _rms(pair: Record) -> float | None:
 def _options(run_a: Record, run_b: Record) -> list[dict[str, Any]]:
     a, b = (flat_options(run["options"] or {}) for run in (run_a, run_b))
     keys = [*a, *(key for key in b if key not in a)]
-    return [{"option": k, "values": [a.get(k), b.get(k)]} for k in keys if a.get(k) != b.get(k)]
+    changed = [key for key in keys if a.get(key) != b.get(key) and key not in _NO_EFFECT]
+    return [{"option": key, "values": [a.get(key), b.get(key)]} for key in changed]
 
 
 def flat_options(options: Record, before: str = "") -> dict[str, Any]:

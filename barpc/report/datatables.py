@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from barpc.report.compare import flat_options
 from barpc.report.verdict import STATUS_WORDS
 
@@ -31,6 +33,10 @@ class Cell:
     kind: str = "number"
 
 
+MAX_TABLE_ROWS = 1000
+"""A table of the page shows so many rows; the files beside it have all."""
+
+
 @dataclass(frozen=True)
 class DataTable:
     """A table with its caption and the heads of its columns, units in them; `folded` ones open on demand."""
@@ -40,6 +46,18 @@ class DataTable:
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     folded: bool = False
+
+    @property
+    def shown(self) -> Sequence[Sequence[Cell]]:
+        """The rows on the page."""
+        return self.rows[:MAX_TABLE_ROWS]
+
+    @property
+    def heading(self) -> str:
+        """The caption, which says where rows are missing."""
+        if len(self.rows) <= MAX_TABLE_ROWS:
+            return self.caption
+        return f"{self.caption}; the first {MAX_TABLE_ROWS} of {len(self.rows)}, all in the files beside this page"
 
     @property
     def kinds(self) -> list[str]:
@@ -201,6 +219,18 @@ def gcps_table(summary: Record) -> DataTable:
         sigma = Cell(", ".join(f"{s:.2g}" for s in gcp["sigma_m"]), max(gcp["sigma_m"]))
         rows.append([name(gcp["name"]), *(figure(r, "+.3f") for r in gcp["residual_enu_m"]), sigma])
     return DataTable("gcps", "Ground control: adjusted minus given place", columns, rows)
+
+
+def check_points_table(summary: Record) -> DataTable:
+    """Check points: where the new cameras put them minus where they are."""
+    columns = ["check point", "images", "in the images [px]", "east [m]", "north [m]", "up [m]"]
+    rows = []
+    for point in summary["check_points"]:
+        seen = [o["residual_px"] for o in point["observations"] if None not in o["residual_px"]]
+        rms = float(np.sqrt(np.mean(np.square(seen).sum(axis=1)))) if seen else None
+        left = [figure(value, "+.3f") for value in point["residual_enu_m"]]
+        rows.append([name(point["name"]), figure(len(seen), "d"), figure(rms), *left])
+    return DataTable("check-points", "Check points: found minus given place", columns, rows)
 
 
 def stages_table(summary: Record) -> DataTable:

@@ -65,8 +65,8 @@ def ground_map(files: RunFiles) -> str:
     """Footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
     summary = files.summary
     rings = [ring for outline in files.outlines for ring in outline]
-    gcps = np.array([[gcp["lon"], gcp["lat"]] for gcp in summary["gcps"]]).reshape(-1, 2)
-    plane = plane_of(np.concatenate([*rings, files.points[:, :2], gcps]))
+    known = {kind: _lonlat(summary[kind]) for kind in ("gcps", "check_points")}
+    plane = plane_of(np.concatenate([*rings, files.points[:, :2], *known.values()]))
     grid, degrees = _graticule(plane)
     points = plane(files.points[:: max(1, -(-len(files.points) // _DOTS)), :2])
     parts = [*grid, *(tag("circle", cx=x, cy=y, r=1.1, class_="point") for x, y in points)]
@@ -79,12 +79,23 @@ def ground_map(files: RunFiles) -> str:
         parts += [
             label(stack.place[0], stack.place[1] + 4, stack.text, "middle", "stack") for stack in stacks
         ]
-    for gcp, (x, y) in zip(summary["gcps"], plane(gcps), strict=True):
-        parts.append(
-            titled(path([(x, y - 6), (x + 5, y + 4), (x - 5, y + 4)], "gcp", closed=True), gcp["name"])
-        )
-    described = f"{len(summary['views'])} outlines, {len(summary['pairs'])} pairs, {len(gcps)} GCPs."
+    for kind, places in known.items():
+        for point, (x, y) in zip(summary[kind], plane(places), strict=True):
+            ends = (
+                [(x, y - 6), (x + 5, y + 4), (x - 5, y + 4)]
+                if kind == "gcps"
+                else [(x, y + 6), (x + 5, y - 4), (x - 5, y - 4)]
+            )
+            parts.append(titled(path(ends, kind, closed=True), point["name"]))
+    described = (
+        f"{len(summary['views'])} outlines, {len(summary['pairs'])} pairs, {len(known['gcps'])} GCPs, "
+        f"{len(known['check_points'])} check points."
+    )
     return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees])
+
+
+def _lonlat(points: Sequence[Mapping[str, Any]]) -> Array:
+    return np.array([[point["lon"], point["lat"]] for point in points], dtype=np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, eq=False)

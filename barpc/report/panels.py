@@ -14,6 +14,7 @@ from barpc.report.svg import path, sheet, tag
 
 Record = Mapping[str, Any]
 
+_MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _CELLS = 8
 _PANEL = 180.0
@@ -67,7 +68,7 @@ class Panels:
     Parameters
     ----------
     charts : list of (str, str)
-        SVG texts and captions.
+        SVG texts and captions, of the `_MOST` images with the largest systematic part.
     shares : list of float
         Part of each image's cells that are systematic.
     key : str
@@ -98,19 +99,24 @@ def residual_panels(views: Sequence[Record], observations: Observations, when: s
     use = observations.used & np.isfinite(residuals).all(axis=1)
     norm = np.hypot(*residuals[use].T)
     longest = (float(np.quantile(norm, 0.95)) if len(norm) else 0.0) or 1.0
-    most = min(max(_VECTORS // max(len(views), 1), 40), 300)
-    charts, shares = [], []
+    most = min(_VECTORS // min(max(len(views), 20), _MOST), 300)
+    grids, shares = [], []
     for k, view in enumerate(views):
         rows = np.flatnonzero(use & (observations.view == k))
-        cells = cells_of(observations.xy[rows], residuals[rows], view["size"])
+        grids.append((rows, cells_of(observations.xy[rows], residuals[rows], view["size"])))
+        shares.append(grids[-1][1].share)
+    charts = []
+    for k in sorted(sorted(range(len(views)), key=lambda k: -shares[k])[:_MOST]):
+        rows, cells = grids[k]
         rows = rows[:: max(1, -(-len(rows) // most))]
-        svg = _panel(f"{when}{k}", view, cells, observations.xy[rows], residuals[rows], longest)
-        charts.append((svg, f"{k + 1} {view['name']}: {_note(cells)}"))
-        shares.append(cells.share)
+        svg = _panel(f"{when}{k}", views[k], cells, observations.xy[rows], residuals[rows], longest)
+        charts.append((svg, f"{k + 1} {views[k]['name']}: {_note(cells)}"))
     key = (
         f"A thin line of a {_PANEL / _REACH:.0f}th of a panel's width is {longest:.2g} px;"
         " bold arrows are drawn twice as long."
     )
+    if len(charts) < len(views):
+        key += f" The {len(charts)} of {len(views)} images with the largest systematic part are shown."
     return Panels(charts, shares, key)
 
 

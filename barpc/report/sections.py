@@ -69,11 +69,14 @@ def _images(files: RunFiles) -> Section:
 
 def _map(files: RunFiles) -> Section | None:
     views, pairs = files.summary["views"], files.summary["pairs"]
+    known = files.summary["gcps"] + files.summary["check_points"]
     shown = []
     if any(files.outlines):
         caption = (
             "Outlines at the altitude of the scene with their numbers in the table of images; dots are tie points;"
-            " a stronger line stands for more matches; triangles are GCPs."
+            " a stronger line stands for more matches."
+            + " Triangles are GCPs, those on their tip check points."
+            * bool(known)
         )
         shown.append((ground_map(files), caption))
     if pairs and len(views) > 2:
@@ -251,6 +254,25 @@ def _sentence(words: str) -> str:
     return f"{words[0].upper()}{words[1:]}"
 
 
+def _check_points(files: RunFiles) -> Section | None:
+    points = files.summary["check_points"]
+    if not points:
+        return None
+    observations = [o["residual_px"] for point in points for o in point["observations"]]
+    image = np.array([r for r in observations if None not in r]).reshape(-1, 2)
+    ground = np.array([p["residual_enu_m"] for p in points if None not in p["residual_enu_m"]]).reshape(-1, 3)
+    parts = []
+    if len(image):
+        parts.append(f"{np.sqrt((image**2).sum(axis=1).mean()):.2f} px in the images")
+    if len(ground):
+        rms = ", ".join(metres(value) for value in np.sqrt((ground**2).mean(axis=0)))
+        parts.append(f"{rms} east, north, up on the ground")
+    found = " and ".join(parts) or "nothing: no camera sees them"
+    answer = f"{len(points)} check points, which the adjustment did not see, are met to {found} (RMS)."
+    table = datatables.check_points_table(files.summary)
+    return Section("accuracy", "How accurate is it on the ground?", answer, tables=[table])
+
+
 def _files(files: RunFiles) -> Section | None:
     summary = files.summary
     tables = [datatables.fits_table(summary)] if all(view["fit"] for view in summary["views"]) else []
@@ -292,6 +314,7 @@ SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
     _pairs,
     _corrections,
     _gauge,
+    _check_points,
     _files,
     _run,
 )

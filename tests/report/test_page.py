@@ -5,14 +5,22 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import time
+from dataclasses import replace
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from barpc.cli.main import cli
 from barpc.errors import BarpcError, InputError
-from barpc.report import page
+from barpc.pipeline import outputs
+from barpc.report import Run, charts, datatables, page, panels, sections, summarize
+from barpc.report.tables import TABLES
+from barpc.report.verdict import metres
+from barpc.scene import Tracks
+from tests.report.conftest import run_of_block, written
 
 pytest.importorskip("jinja2")
 
@@ -91,13 +99,43 @@ def test_a_check_asks_only_what_it_can_answer(check_run):
     assert "new RPC files" not in html
 
 
+def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_path):
+    run = block_run.run
+    summary = written(replace(run, gcps=None, check_points=run.gcps), tmp_path / "run")
+    html = (tmp_path / "run/report.html").read_text()
+    assert "How accurate is it on the ground?" in html
+    left = np.array([point["residual_enu_m"] for point in summary["check_points"]], dtype=float)
+    up = metres(np.sqrt((left[:, 2] ** 2).mean()))
+    assert f"{up} east, north, up on the ground" in html
+    assert 'class="check_points"' in html
+
+
+def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatch):
+    monkeypatch.setattr(panels, "_MOST", 4)
+    monkeypatch.setattr(datatables, "MAX_TABLE_ROWS", 5)
+    monkeypatch.setattr(charts, "MAX_ROWS", 3)
+    monkeypatch.setattr(sections, "MAX_ROWS", 3)
+    html = page.report_html(block_run.summary, block_run.folder)
+    assert "The 4 of 9 images with the largest systematic part are shown." in html
+    assert "the first 5 of 9, all in the files beside this page" in html
+    assert "The 3 of 9 images with the largest error." in html
+    assert html.count('id="panel-after') == 2 * 4  # title and description
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*held in height")
+def test_fifty_images_make_less_than_3_mb_in_less_than_5_seconds(tmp_path):
+    run = run_of_block(50, 20_000, outliers=0.05)
+    start = time.process_time()
+    summary = summarize(run)
+    for name, content in TABLES.items():
+        (tmp_path / name).write_bytes(content(run, summary))
+    html = page.report_html(summary, tmp_path)
+    assert time.process_time() - start < 5.0
+    assert len(html.encode()) < 3e6
+
+
 def test_a_run_without_a_single_tie_point_still_has_a_page(block_run, tmp_path):
-    import numpy as np
-
-    from barpc.report import Run
-    from barpc.scene import Tracks
-    from tests.report.conftest import written
-
     none = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
     written(Run("check", block_run.run.views, (), none), tmp_path / "run")
     html = (tmp_path / "run/report.html").read_text()
@@ -137,9 +175,6 @@ def test_a_table_that_is_missing_or_damaged_is_named(block_run, tmp_path, name, 
 
 
 def test_without_jinja2_the_run_is_whole_and_the_verb_says_what_to_install(block_run, tmp_path, monkeypatch):
-    from barpc.pipeline import outputs
-    from tests.report.conftest import written
-
     monkeypatch.setattr(outputs, "can_render", lambda: False)
     written(block_run.run, tmp_path / "run")
     assert (tmp_path / "run/summary.json").is_file()
