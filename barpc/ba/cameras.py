@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from barpc.ba.unknowns import Unknowns
-from barpc.geodesy import Array, ground_from_ecef, ground_from_ecef_jacobian, wrap_longitude
+from barpc.geodesy import Array, ground_from_ecef, ground_rows_from_ecef, wrap_longitude
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import rotation_left_jacobian, rotation_matrix
@@ -119,24 +119,28 @@ class Cameras:
             image, by_point = self._by_ecef(ecef, views, bounds)
             return _only(Projected(*unknowns.in_image(params, index, image, by_point)), wanted)
         rotation, translation = unknowns.rotation(params[views], views), unknowns.translation(params[views])
-        local, center = index - views.start, unknowns.center[index].T
         row, first_by_point = None, None
+        runs: IntArray | None = bounds
         if unknowns.drift:
             first, first_by_point = self._by_ecef(ecef, views, bounds)
             row = unknowns.normalized_row(first[1], index)
-            rotation = rotation[local] + unknowns.drift_rotation(params, index, row)
-            local = np.arange(len(index))
-        matrix = _last(rotation_matrix(rotation)).take(local, axis=2)
-        lever = _times(matrix, (ecef - translation[index - views.start].T - center)[:, None])[:, 0]
+            rotation = rotation[index - views.start] + unknowns.drift_rotation(params, index, row)
+            runs = None
+        count = np.diff(bounds)
+        center = unknowns.center[views]
+        matrix = rotation_matrix(rotation)
+        lever = _turned(matrix, ecef - np.repeat((translation + center).T, count, axis=1), runs)
+        moved = lever + np.repeat(center.T, count, axis=1)
         if wanted == "image":
-            return _only(Projected(self._image(lever + center, views, bounds), matrix, matrix), wanted)
-        image, by_moved = self._by_ecef(lever + center, views, bounds)
-        by_point = _times(by_moved, matrix)
+            none = np.empty((2, 0, len(index)))
+            return Projected(self._image(moved, views, bounds), none, none)
+        image, by_moved = self._by_ecef(moved, views, bounds)
+        by_point = _turned(matrix.swapaxes(1, 2), by_moved, runs)
         if wanted == "points" and row is None:
             return _only(Projected(image, by_point, by_point), wanted)
-        left = _last(rotation_left_jacobian(rotation)).take(local, axis=2)
-        by_rotation = _times(_cross(lever, by_moved), left)
-        by_unknown = unknowns.stack(by_rotation, -by_point, index, row)
+        left = rotation_left_jacobian(rotation).swapaxes(1, 2)
+        by_rotation = _turned(left, _cross(lever, by_moved), runs)
+        by_unknown = unknowns.stack(by_rotation, by_point, index, row)
         if row is not None and first_by_point is not None:
             rate = unknowns.drift_rate(params, index, row)
             by_row = (by_rotation * rate).sum(axis=1) / unknowns.row_scale[index]
@@ -147,19 +151,19 @@ class Cameras:
         """Uncorrected image points (2, n) without a derivative."""
         ground = ground_from_ecef(ecef.T)
         if self.is_rpc[views.start]:
-            return self._stack.image(ground, views, bounds)
+            return self._stack.image(ground.T, views, bounds)
         image: Array = self.sensors[views.start].project(ground).T
         return image
 
     def _by_ecef(self, ecef: Array, views: slice, bounds: IntArray) -> tuple[Array, Array]:
         """Uncorrected image points (2, n) and their derivative by ECEF (2, 3, n)."""
-        ground = ground_from_ecef(ecef.T)
+        ground, by_ecef = ground_rows_from_ecef(ecef)
         if self.is_rpc[views.start]:
             image, by_ground = self._stack.project(ground, views, bounds)
         else:
-            points, jacobian = self.sensors[views.start].project_jacobian(ground)
+            points, jacobian = self.sensors[views.start].project_jacobian(ground.T)
             image, by_ground = points.T, _last(jacobian)
-        return image, _times(by_ground, _last(ground_from_ecef_jacobian(ground)))
+        return image, _times(by_ground, by_ecef)
 
 
 class _RpcStack:
@@ -173,40 +177,46 @@ class _RpcStack:
         for i, sensor in enumerate(sensors):
             if isinstance(sensor, RPC):
                 by_axis = Rational(sensor.coeffs, np.ones(2)).gradients.reshape(3, 4, 10)
+                by_axis = by_axis / sensor.ground_scale[:, None, None]
                 self.coeffs[i], self.gradient[i] = sensor.coeffs, by_axis.swapaxes(0, 1).reshape(12, 10)
                 self.ground_offset[i], self.ground_scale[i] = sensor.ground_offset, sensor.ground_scale
                 self.image_offset[i], self.image_scale[i] = sensor.image_offset, sensor.image_scale
 
     def image(self, ground: Array, views: slice, bounds: IntArray) -> Array:
-        """Image points (2, n) of ground points (n, 3) seen by consecutive views."""
-        index, basis = self._basis(ground, views, bounds)
-        poly = _polynomials(self.coeffs[views], basis, bounds)
+        """Image points (2, n) of ground points (3, n) seen by consecutive views."""
+        count = np.diff(bounds)
+        poly = _polynomials(self.coeffs[views], self._basis(ground, views, count), bounds)
         with np.errstate(all="ignore"):
             value = poly[::2] / poly[1::2]
-        image: Array = value * self.image_scale[index].T + self.image_offset[index].T
-        return image
+        value *= np.repeat(self.image_scale[views].T, count, axis=1)
+        value += np.repeat(self.image_offset[views].T, count, axis=1)
+        return value
 
     def project(self, ground: Array, views: slice, bounds: IntArray) -> tuple[Array, Array]:
-        """Image points (2, n) and derivative (2, 3, n) of ground points (n, 3) seen by consecutive views."""
-        index, basis = self._basis(ground, views, bounds)
+        """Image points (2, n) and derivative (2, 3, n) of ground points (3, n) seen by consecutive views."""
+        count = np.diff(bounds)
+        basis = self._basis(ground, views, count)
         poly = _polynomials(self.coeffs[views], basis, bounds)
         slope = _polynomials(self.gradient[views], basis[:10], bounds).reshape(4, 3, -1)
-        image_scale = self.image_scale[index].T
+        image_scale = np.repeat(self.image_scale[views].T, count, axis=1)
         with np.errstate(all="ignore"):
             inverse = 1.0 / poly[1::2]
             value = poly[::2] * inverse
-            jacobian = (slope[::2] - value[:, None] * slope[1::2]) * (inverse * image_scale)[:, None]
-        jacobian /= self.ground_scale[index].T
-        return value * image_scale + self.image_offset[index].T, jacobian
+            inverse *= image_scale
+            jacobian = value[:, None] * slope[1::2]
+            np.subtract(slope[::2], jacobian, out=jacobian)
+            jacobian *= inverse[:, None]
+        value *= image_scale
+        value += np.repeat(self.image_offset[views].T, count, axis=1)
+        return value, jacobian
 
-    def _basis(self, ground: Array, views: slice, bounds: IntArray) -> tuple[IntArray, Array]:
-        """The view of every point (n,), and the monomials (20, n) of its normalised coordinates."""
-        index = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
-        normalized = np.array(ground.T)
-        normalized[0] = wrap_longitude(normalized[0], self.ground_offset[index, 0])
-        normalized -= self.ground_offset[index].T
-        normalized /= self.ground_scale[index].T
-        return index, monomials(normalized)
+    def _basis(self, ground: Array, views: slice, count: IntArray) -> Array:
+        """Monomials (20, n) of the normalised coordinates of ground points, `count` of each view."""
+        normalized = ground - np.repeat(self.ground_offset[views].T, count, axis=1)
+        if not np.abs(normalized[0]).max(initial=0.0) <= 180.0:
+            normalized[0] = wrap_longitude(normalized[0])
+        normalized *= np.repeat(1.0 / self.ground_scale[views].T, count, axis=1)
+        return monomials(normalized)
 
 
 def _polynomials(coeffs: Array, basis: Array, bounds: IntArray) -> Array:
@@ -240,6 +250,16 @@ def _times(a: Array, b: Array) -> Array:
     out: Array = a[:, 0, None] * b[0]
     for j in range(1, len(b)):
         out += a[:, j, None] * b[j]
+    return out
+
+
+def _turned(matrices: Array, rows: Array, bounds: IntArray | None) -> Array:
+    """Matrices (m, 3, 3) times the columns bounds[i] : bounds[i + 1] of rows (..., 3, n); None: a column each."""
+    if bounds is None:
+        return np.asarray(np.einsum("nij,...jn->...in", matrices, rows))
+    out = np.empty_like(rows)
+    for matrix, start, stop in zip(matrices, bounds[:-1], bounds[1:], strict=True):
+        np.matmul(matrix, rows[..., start:stop], out=out[..., start:stop])
     return out
 
 

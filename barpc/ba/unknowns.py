@@ -110,17 +110,17 @@ class Unknowns:
         rate: Array = np.einsum("nd,ndi->in", powers, self.drift_vectors(params)[index])
         return rate
 
-    def stack(self, by_rotation: Array, by_translation: Array, index: IntArray, row: Array | None) -> Array:
-        """Derivatives (2, 3, n) by rotation [px/rad] and translation as derivatives (2, q, n) by unknowns."""
+    def stack(self, by_rotation: Array, by_point: Array, index: IntArray, row: Array | None) -> Array:
+        """Derivatives (2, 3, n) by rotation [px/rad] and point as derivatives (2, q, n) by unknowns."""
         parts = []
-        by_metre = by_rotation / self.distance[index] if self.rotates else by_rotation
+        by_metre = by_rotation * (1.0 / self.distance)[index] if self.rotates else by_rotation
         if self.rotates:
             parts.append(by_metre)
         if self.translates:
-            parts.append(by_translation)
+            parts.append(-by_point)
         if row is not None:
             parts += [by_metre * row**power for power in range(1, self.drift + 1)]
-        return np.concatenate(parts, axis=1)
+        return np.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]
 
     def in_image(
         self, params: Array, index: IntArray, image: Array, by_point: Array
