@@ -43,6 +43,8 @@ TIE_FLAGS = (
     Flag(
         "--matches", "matches", "Tie points (CSV, npz, ASP text) to use instead of matching.", metavar="FILE"
     ),
+    Flag("--overlap-list", "overlap_list", "Match only these pairs: two image names a line.", metavar="FILE"),
+    Flag("--aoi", "aoi", "Tie points only inside: polygons in lon/lat (GeoJSON).", metavar="FILE"),
     Flag("--detector", "tie.detector", "Keypoint detector.", metavar="NAME"),
     Flag("--ip-per-image", "tie.keypoints_per_image", "Keypoints an image, at most.", type=COUNT),
     Flag("--max-pairwise-matches", "tie.points_per_image", "Tie points an image, at most.", type=COUNT),

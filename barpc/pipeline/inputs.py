@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from barpc.dem import Dem
 from barpc.errors import InputError
 from barpc.pipeline.options import RunOptions
 from barpc.pointio.gcp import read_gcps
+from barpc.pointio.names import ViewNames
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint
 
@@ -83,8 +85,77 @@ def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
 
 def input_files(options: RunOptions) -> list[Path]:
     """Every file that the options name; none of them is ever written."""
-    named = [*options.gcp, *options.check_points, options.dem, options.geoid, options.matches]
+    ties = (options.matches, options.overlap_list, options.aoi)
+    named = [*options.gcp, *options.check_points, options.dem, options.geoid, *ties]
     return [Path(path) for path in named if path is not None]
+
+
+def read_pairs(
+    path: str | Path, views: Sequence[View], left_out: Sequence[str | Path] = ()
+) -> list[tuple[int, int]]:
+    """The pairs of a list: two image names or paths a line; blank lines and # comments are skipped.
+
+    Parameters
+    ----------
+    path : path
+        The list. Relative paths in it start from where it lies, or from the current folder.
+    views : sequence of View
+        The images.
+    left_out : sequence of path
+        Images that a run was given but does not use: their pairs are passed over.
+
+    Returns
+    -------
+    pairs : list of (int, int)
+        Indices of the views.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, a line is not two images of the run, or none is left; the message names it.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a list of pairs: {error}") from error
+    find = _ViewFinder(Path(path).parent, views, left_out)
+    pairs = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            words = shlex.split(line.replace("\0", "?"), comments=True)  # no file's name holds a zero
+            if len(words) not in (0, 2):
+                raise ValueError(f"two image names are expected, found {len(words)}; quote names with spaces")
+            found = [index for index in map(find, words) if index is not None]
+            if len(found) == 2 and found[0] == found[1]:
+                raise ValueError(f"{words[0]} is paired with itself")
+        except ValueError as error:
+            raise InputError(f"{path}, line {number}: {error}") from error
+        if len(found) == 2:
+            pairs.append((found[0], found[1]))
+    if not pairs:
+        raise InputError(f"{path}: lists no pair of the images given")
+    return pairs
+
+
+class _ViewFinder:
+    """Views by what a list calls them: a path, from the list's folder or the current one, or a name."""
+
+    def __init__(self, folder: Path, views: Sequence[View], left_out: Sequence[str | Path]) -> None:
+        self._starts = (folder, Path())
+        self._views = ViewNames([view.name for view in views], "the list of pairs")
+        self._left_out = ViewNames([Path(path).name for path in left_out], "")
+        self._places: dict[Path, int | None] = {Path(path).resolve(): None for path in left_out}
+        self._places.update({Path(view.path).resolve(): index for index, view in enumerate(views)})
+
+    def __call__(self, word: str) -> int | None:
+        """Index of a view; None for an image that was left out; InputError for a stranger."""
+        for start in self._starts:
+            place = (start / word).resolve()
+            if place in self._places:
+                return self._places[place]
+        if self._views.find(word) is None and self._left_out.find(word) is not None:
+            return None
+        return self._views.index(word)
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:

@@ -47,6 +47,10 @@ class RunOptions:
         Replace the results of an earlier run in the same folder.
     matches : str or None
         A tie-point table to use instead of matching.
+    overlap_list : str or None
+        A file of two image names or paths a line: only these pairs are matched.
+    aoi : str or None
+        A GeoJSON file of polygons: tie points only inside, and only what may show it is read.
     gcp : tuple of str
         Files of ground control points.
     check_points : tuple of str
@@ -70,6 +74,8 @@ class RunOptions:
     force: bool = False
     overwrite: bool = False
     matches: str | None = None
+    overlap_list: str | None = None
+    aoi: str | None = None
     gcp: tuple[str, ...] = ()
     check_points: tuple[str, ...] = ()
     fixed_run: str | None = None
@@ -84,6 +90,11 @@ class RunOptions:
             raise InputError(f"num_passes must be at least 1, found {self.num_passes}")
         if self.geoid is not None and self.dem is None:
             raise InputError("geoid is given without dem: there are no heights to convert")
+        for name in ("overlap_list", "aoi"):
+            if self.matches is not None and getattr(self, name) is not None:
+                raise InputError(
+                    f"{name} is given with matches: nothing is matched then; leave one of them out"
+                )
 
 
 def with_values(options: Any, values: Mapping[str, Any], where: str = "options") -> Any:

@@ -15,7 +15,7 @@ from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.pipeline.crew import Crew
-from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new
+from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
 from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import SUFFIXES, file_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import LoadedViews, load_views
@@ -24,7 +24,7 @@ from barpc.report import Run, summarize
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
-from barpc.tie import find_tracks
+from barpc.tie import find_tracks, read_area
 from barpc.workspace import Workspace, fingerprint
 
 logger = logging.getLogger(__name__)
@@ -207,9 +207,14 @@ def _with_ties(
         return replace(run, tracks=read_matches(options.matches, [view.name for view in run.views]))
     if len(run.views) < 2:
         return run
-    sensors = None if adjustment is None else adjustment.sensors
+    given: dict[str, Any] = {"executor": executor, "progress": progress}
+    given["sensors"] = None if adjustment is None else adjustment.sensors
+    if options.overlap_list is not None:
+        given["only"] = read_pairs(options.overlap_list, run.views, [path for path, _ in run.left_out])
+    if options.aoi is not None:
+        given["area"] = read_area(options.aoi)
     try:
-        ties = find_tracks(run.views, options.tie, executor=executor, progress=progress, sensors=sensors)
+        ties = find_tracks(run.views, options.tie, **given)
     except DisconnectedError as error:
         if not options.adjust.keep_largest or len(error.groups[0]) < 2:
             raise

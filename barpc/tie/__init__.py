@@ -3,6 +3,7 @@
 `find_tracks` runs all stages: `select_pairs`, `detect`, `match`, `link`, `thin`, `refine`.
 """
 
+from barpc.tie.area import Area, read_area
 from barpc.tie.features import Keypoints
 from barpc.tie.find import TieResult, detect, find_tracks, match, require_matches
 from barpc.tie.link import common_tracks, link, thin
@@ -12,6 +13,7 @@ from barpc.tie.pairs import Pair, select_pairs
 from barpc.tie.refine import refine
 
 __all__ = [
+    "Area",
     "Keypoints",
     "Matches",
     "Pair",
@@ -24,6 +26,7 @@ __all__ = [
     "link",
     "match",
     "match_pair",
+    "read_area",
     "refine",
     "require_matches",
     "select_pairs",

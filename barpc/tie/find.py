@@ -9,8 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.errors import InputError, TiePointError
+from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
+from barpc.sensor.geometry import triangulate
+from barpc.tie.area import Area
 from barpc.tie.features import DETECTORS, Keypoints, bounded, detect_tile, join, tiles
 from barpc.tie.guided import MATCHERS
 from barpc.tie.link import link, thin
@@ -49,6 +52,7 @@ def detect(
     options: TieOptions = _DEFAULTS,
     *,
     pairs: Sequence[Pair] | None = None,
+    area: Area | None = None,
     sensors: Sequence[SensorModel] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -63,6 +67,8 @@ def detect(
         Band, detector, tiles, quotas.
     pairs : sequence of Pair, optional
         As `select_pairs` gave them: tiles that no partner may see are not read. None: all are.
+    area : Area, optional
+        Together with `pairs`: tiles outside are not read either.
     sensors : sequence of SensorModel, optional
         Corrected cameras to use instead of the views' own.
     executor : Executor, optional
@@ -78,7 +84,7 @@ def detect(
     stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
     boxes = [tiles(view.size, options) for view in views]
     if pairs is not None:
-        wanted = shared_boxes(views, pairs, boxes, options, sensors=sensors)
+        wanted = shared_boxes(views, pairs, boxes, options, sensors=sensors, area=area)
         boxes = [
             [box for box, keep in zip(*both, strict=True) if keep] for both in zip(boxes, wanted, strict=True)
         ]
@@ -122,6 +128,8 @@ def find_tracks(
     executor: Executor | None = None,
     progress: Progress | None = None,
     sensors: Sequence[SensorModel] | None = None,
+    only: Sequence[tuple[int, int]] = (),
+    area: Area | None = None,
 ) -> TieResult:
     """Find the tie points of overlapping images.
 
@@ -137,6 +145,10 @@ def find_tracks(
         `progress(stage, done, total)`.
     sensors : sequence of SensorModel, optional
         Corrected cameras to use instead of the views' own (a second pass).
+    only : sequence of (int, int)
+        Match these pairs and no others.
+    area : Area, optional
+        Tie points only here, as the cameras see it; None: everywhere.
 
     Returns
     -------
@@ -153,13 +165,16 @@ def find_tracks(
         An image cannot be read.
     """
     require_known(options)
-    pairs = select_pairs(views, options, sensors=sensors)
-    keypoints = detect(views, options, pairs=pairs, sensors=sensors, executor=executor, progress=progress)
+    pairs = select_pairs(views, options, sensors=sensors, only=only, area=area)
+    keypoints = detect(
+        views, options, pairs=pairs, area=area, sensors=sensors, executor=executor, progress=progress
+    )
     matched = match(views, keypoints, pairs, options, sensors=sensors, executor=executor, progress=progress)
     reports = tuple(report for _, report in matched)
     require_matches(views, pairs, reports)
     sizes, most = [view.size for view in views], options.points_per_image
     linked = link([len(k) for k in keypoints], [found for found, _ in matched])
+    linked = inside(views, linked, area, sensors)
     tracks = refine(
         views,
         thin(linked, sizes, int(_SPARE * most)),
@@ -169,7 +184,7 @@ def find_tracks(
         executor=executor,
         progress=progress,
     )
-    tracks = thin(tracks, sizes, most)
+    tracks = thin(inside(views, tracks, area, sensors), sizes, most)
     require_tracks(views, tracks, pairs, reports, options)
     return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
 
@@ -182,6 +197,28 @@ def require_known(options: TieOptions) -> None:
     ):
         if name not in table:
             raise InputError(f"{what} {name!r} is not one of {', '.join(table)}")
+
+
+def inside(
+    views: Sequence[View], tracks: Tracks, area: Area | None, sensors: Sequence[SensorModel] | None = None
+) -> Tracks:
+    """The tracks whose ground points lie in an area; all without one.
+
+    Raises
+    ------
+    TiePointError
+        There are tracks, but none in the area.
+    """
+    if area is None or not len(tracks):
+        return tracks
+    cameras = [view.sensor for view in views] if sensors is None else sensors
+    alt = float(np.mean([view.alt_range for view in views]))
+    points = triangulate(cameras, tracks.view, tracks.point, tracks.xy, alt=alt).points
+    ground = ground_from_ecef(points)
+    kept = area.contains(ground[:, :2])
+    if not kept.any():
+        raise TiePointError(f"none of {len(kept)} tie points lies in the area of interest: enlarge it")
+    return tracks.select(kept[tracks.point])
 
 
 def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:

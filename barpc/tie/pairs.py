@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -13,8 +14,11 @@ from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.scene import BoolArray, View, connected_groups
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import convergence_angle, footprint
+from barpc.tie.area import Area
 from barpc.tie.options import TieOptions
 from barpc.tie.raster import Box
+
+logger = logging.getLogger(__name__)
 
 _BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined
 _ANGLE_DECAY = 15.0  # deg
@@ -77,9 +81,13 @@ class Footprints:
 
 
 def footprints(
-    views: Sequence[View], sensors: Sequence[SensorModel], alt: float, reach: float = 0.0
+    views: Sequence[View],
+    sensors: Sequence[SensorModel],
+    alt: float,
+    reach: float = 0.0,
+    area: Area | None = None,
 ) -> Footprints:
-    """Outlines of views at one altitude.
+    """Outlines of views at one altitude, as far as they lie in an area.
 
     Parameters
     ----------
@@ -88,19 +96,25 @@ def footprints(
     alt : float
         Altitude [m].
     reach : float
-        How far the cameras may be wrong [px]: the outlines grow by as much.
+        How far the cameras may be wrong [px]: the outlines grow by as much, and the area does.
+    area : Area, optional
+        None: everywhere.
     """
     rings = [footprint(sensor, view.size, alt)[:, :2] for view, sensor in zip(views, sensors, strict=True)]
     usable = [ring[np.isfinite(ring).all(axis=1)] for ring in rings]
     first = next((ring[0] for ring in usable if len(ring)), np.zeros(2))
     plane = Footprints(first, alt, ())
+    wanted = None if area is None else area.plane(plane.origin, plane._scale)
     outlines = []
     for view, ring in zip(views, usable, strict=True):
         outline = (
             shapely.make_valid(shapely.Polygon(plane.plane(ring))) if len(ring) > 3 else shapely.Polygon()
         )
         pixel = float(np.sqrt(outline.area / (view.size[0] * view.size[1])))
-        outlines.append(outline.buffer(reach * pixel) if reach else outline)
+        grown = shapely.buffer(outline, reach * pixel) if reach else outline
+        if wanted is not None:
+            grown = shapely.intersection(grown, shapely.buffer(wanted, reach * pixel) if reach else wanted)
+        outlines.append(grown)
     return Footprints(first, alt, tuple(outlines))
 
 
@@ -112,7 +126,11 @@ def _levels(views: Sequence[View]) -> tuple[float, float, float]:
 
 
 def overlapping_pairs(
-    views: Sequence[View], sensors: Sequence[SensorModel], options: TieOptions, reach: float = 0.0
+    views: Sequence[View],
+    sensors: Sequence[SensorModel],
+    options: TieOptions,
+    reach: float = 0.0,
+    area: Area | None = None,
 ) -> list[Pair]:
     """All pairs that overlap enough at some altitude, under an angle that is asked for, ascending.
 
@@ -124,10 +142,12 @@ def overlapping_pairs(
         `min_overlap`, `min_angle`, `max_angle`.
     reach : float
         How far the cameras may be wrong [px].
+    area : Area, optional
+        Where the overlap counts; None: everywhere.
     """
     best: dict[tuple[int, int], Pair] = {}
     for alt in _levels(views):
-        for pair in _overlapping_at(footprints(views, sensors, alt, reach), sensors, options):
+        for pair in _overlapping_at(footprints(views, sensors, alt, reach, area), sensors, options):
             if pair.views not in best or pair.overlap > best[pair.views].overlap:
                 best[pair.views] = pair
     return [best[views] for views in sorted(best)]
@@ -158,6 +178,7 @@ def select_pairs(
     *,
     sensors: Sequence[SensorModel] | None = None,
     only: Sequence[tuple[int, int]] = (),
+    area: Area | None = None,
 ) -> list[Pair]:
     """The pairs of views to match.
 
@@ -172,7 +193,9 @@ def select_pairs(
     sensors : sequence of SensorModel, optional
         Corrected cameras to use instead of the views' own.
     only : sequence of (int, int)
-        Consider only these pairs.
+        These pairs, all that overlap, and no others.
+    area : Area, optional
+        Where the overlap counts; None: everywhere.
 
     Returns
     -------
@@ -190,26 +213,48 @@ def select_pairs(
         raise TiePointError(f"{len(views)} image given: tie points need at least two that overlap")
     cameras = [view.sensor for view in views] if sensors is None else sensors
     wanted = {(min(pair), max(pair)) for pair in only}
-    pairs = overlapping_pairs(views, cameras, options)
-    partners = np.bincount([i for pair in pairs for i in pair.views], minlength=len(views))
-    groups = connected_groups(len(views), [pair.views for pair in pairs])
-    if len(groups) > 1 or partners.min() < min(
-        2, len(views) - 1
-    ):  # a camera may be wrong by more than the overlap
-        known = {pair.views for pair in pairs}
-        lonely = (partners < 2) | ~np.isin(np.arange(len(views)), groups[0])
-        grown = overlapping_pairs(views, cameras, options, options.search)
-        pairs += [p for p in grown if p.views not in known and lonely[list(p.views)].any()]
-    pairs = [pair for pair in pairs if not wanted or pair.views in wanted]
+    pairs = _candidates(views, cameras, options, wanted, area)
+    where = "between them" + (" among the listed pairs" if wanted else "")
+    where += " inside the area of interest" if area is not None else ""
     require_connected(
         views,
         [pair.views for pair in pairs],
         f"no overlap of at least {options.min_overlap:.0%} under {options.min_angle:g} to "
-        f"{options.max_angle:g} deg between them; remove the stray images or lower the minimum overlap",
+        f"{options.max_angle:g} deg {where}; remove the stray images or lower the minimum overlap",
     )
-    ranked = sorted(pairs, key=lambda pair: (-pair.score, pair.views))
-    taken = [0] * len(views)
-    parent = list(range(len(views)))
+    for i, j in sorted(wanted - {pair.views for pair in pairs}):
+        logger.warning("%s - %s: listed, but they do not overlap as asked", views[i].name, views[j].name)
+    return pairs if wanted else _best(pairs, len(views), options.neighbours)
+
+
+def _candidates(
+    views: Sequence[View],
+    cameras: Sequence[SensorModel],
+    options: TieOptions,
+    wanted: set[tuple[int, int]],
+    area: Area | None,
+) -> list[Pair]:
+    """Pairs that overlap, of those wanted (none: all); with grown outlines where that leaves something out."""
+    pairs = overlapping_pairs(views, cameras, options, area=area)
+    pairs = [pair for pair in pairs if not wanted or pair.views in wanted]
+    known = {pair.views for pair in pairs}
+    partners = np.bincount([i for pair in known for i in pair], minlength=len(views))
+    lonely = partners < min(2, len(views) - 1)
+    lonely |= ~np.isin(np.arange(len(views)), connected_groups(len(views), sorted(known))[0])
+    if not (wanted - known if wanted else lonely.any()):
+        return pairs
+    grown = overlapping_pairs(views, cameras, options, options.search, area)  # a camera may be wrong by more
+    for pair in grown:
+        worth = pair.views in wanted if wanted else lonely[list(pair.views)].any()
+        if worth and pair.views not in known:
+            pairs.append(pair)
+    return sorted(pairs, key=lambda pair: pair.views)
+
+
+def _best(pairs: Sequence[Pair], num_views: int, neighbours: int) -> list[Pair]:
+    """The best partners of every view, and what connects all views, ascending."""
+    taken = [0] * num_views
+    parent = list(range(num_views))
 
     def root(i: int) -> int:
         while parent[i] != i:
@@ -217,10 +262,10 @@ def select_pairs(
         return i
 
     chosen = []
-    for pair in ranked:
+    for pair in sorted(pairs, key=lambda pair: (-pair.score, pair.views)):
         i, j = pair.views
         joins = root(i) != root(j)
-        if joins or min(taken[i], taken[j]) < options.neighbours:
+        if joins or min(taken[i], taken[j]) < neighbours:
             chosen.append(pair)
             taken[i] += 1
             taken[j] += 1
@@ -258,6 +303,7 @@ def shared_boxes(
     options: TieOptions,
     *,
     sensors: Sequence[SensorModel] | None = None,
+    area: Area | None = None,
 ) -> list[BoolArray]:
     """Which windows of the views a partner may see at some altitude: only those are worth reading.
 
@@ -273,6 +319,8 @@ def shared_boxes(
         `search`: how far the cameras may be wrong.
     sensors : sequence of SensorModel, optional
         Corrected cameras to use instead of the views' own.
+    area : Area, optional
+        What lies outside is not worth reading either.
 
     Returns
     -------
@@ -287,7 +335,7 @@ def shared_boxes(
         partners[j].append(i)
     masks = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     for alt in _levels(views):
-        prints = footprints(views, cameras, alt, options.search)
+        prints = footprints(views, cameras, alt, options.search, area)
         for i, of_view in enumerate(boxes):
             seen = shapely.union_all([prints.outlines[j] for j in partners[i]])
             corners = np.array([[(c, r), (c + w, r), (c + w, r + h), (c, r + h)] for c, r, w, h in of_view])

@@ -1,0 +1,122 @@
+"""The area of interest: polygons from a GeoJSON file, wherever longitudes wrap."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely import affinity
+
+from barpc.errors import InputError
+from barpc.geodesy import Array, wrap_longitude
+from barpc.scene import BoolArray
+
+_WGS84 = ("CRS84", "4326", "4979")
+
+
+@dataclass(frozen=True, eq=False)
+class Area:
+    """Part of the ground, at any altitude.
+
+    Parameters
+    ----------
+    outline : shapely geometry
+        Polygons in lon, lat [deg]; everything stands there three times, a whole turn apart.
+    """
+
+    outline: shapely.Geometry
+
+    def plane(self, origin: Array, scale: Array) -> shapely.Geometry:
+        """The area in a plane [m]: (lon, lat) minus `origin` (2,) [deg], times `scale` (2,) [m/deg]."""
+        near = np.array([float(wrap_longitude(origin[0])), origin[1]])
+        return shapely.transform(self.outline, lambda lonlat: (lonlat - near) * scale)
+
+    def contains(self, lonlat: Array) -> BoolArray:
+        """Which points (N, 2), lon, lat [deg], lie inside; NaN does not."""
+        shapely.prepare(self.outline)
+        inside: BoolArray = shapely.contains_xy(self.outline, wrap_longitude(lonlat[:, 0]), lonlat[:, 1])
+        return inside
+
+
+def read_area(path: str | os.PathLike[str]) -> Area:
+    """The polygons of a GeoJSON file as one area.
+
+    Parameters
+    ----------
+    path : path
+        A Polygon, a MultiPolygon, or features and collections of them; lon, lat [deg] on WGS84. An outline may
+        cross the antimeridian with or without a jump of its longitudes, or be cut there (RFC 7946).
+
+    Returns
+    -------
+    area : Area
+        The union of all polygons.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or holds no polygon in degrees; the message names it.
+    """
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+        _refuse_projection(data)
+        polygons = [shapely.make_valid(polygon) for polygon in _polygons(data)]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, shapely.GEOSException) as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not an area of interest, GeoJSON polygons in degrees ({said})") from error
+    turns = [affinity.translate(polygon, turn) for polygon in polygons for turn in (-360.0, 0.0, 360.0)]
+    outline = shapely.union_all(turns)
+    if not outline.area > 0:
+        raise InputError(f"{path}: the area of interest holds no polygon of any extent")
+    return Area(outline)
+
+
+def _refuse_projection(data: dict[str, Any]) -> None:
+    """GeoJSON of before 2016 could name another reference system."""
+    crs = data.get("crs")
+    if crs is not None and not str(crs["properties"]["name"]).endswith(_WGS84):
+        raise ValueError(f"its coordinates are in {crs['properties']['name']}")
+
+
+def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
+    """All polygons of a GeoJSON object, whatever they are wrapped in."""
+    kind = data["type"]
+    if kind == "FeatureCollection":
+        for feature in data["features"]:
+            yield from _polygons(feature)
+    elif kind == "Feature":
+        yield from _polygons(data["geometry"])
+    elif kind == "GeometryCollection":
+        for geometry in data["geometries"]:
+            yield from _polygons(geometry)
+    elif kind in ("Polygon", "MultiPolygon"):
+        parts = data["coordinates"] if kind == "MultiPolygon" else [data["coordinates"]]
+        for part in parts:
+            rings = [_ring(ring) for ring in part]
+            for hole in rings[1:]:
+                hole[:, 0] += 360.0 * np.rint((rings[0][0, 0] - hole[0, 0]) / 360.0)
+            yield shapely.Polygon(rings[0], rings[1:])
+    else:
+        raise ValueError(f"a {kind} is no polygon")
+
+
+def _ring(positions: list[list[float]]) -> Array:
+    """Vertices (N, 2) of an outline, the first between -180 and 180, its longitudes without jumps."""
+    ring = np.array([position[:2] for position in positions], dtype=np.float64).reshape(-1, 2)
+    if not (np.isfinite(ring).all() and (np.abs(ring) <= [540.0, 90.0]).all()):
+        raise ValueError("a position is not a longitude and a latitude")
+    step = np.diff(ring[:, 0])
+    jump = np.where(
+        np.abs(step) < 360.0, np.rint(step / 360.0), 0.0
+    )  # a full turn is an edge along a parallel
+    ring[1:, 0] -= 360.0 * np.cumsum(jump)
+    ring[:, 0] += wrap_longitude(ring[:1, 0]) - ring[0, 0]
+    return ring

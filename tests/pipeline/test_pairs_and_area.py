@@ -1,0 +1,143 @@
+"""`--overlap-list` and `--aoi`: which pairs are matched, and where."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.errors import InputError
+from barpc.geodesy import ground_from_ecef
+from barpc.pipeline import RunOptions
+from barpc.pipeline.inputs import input_files, read_pairs
+from barpc.pipeline.views import load_views
+from barpc.pointio.matches import read_matches
+from barpc.scene import View
+from barpc.sensor.geometry import triangulate
+from barpc.tie import read_area
+
+from .test_synthetic import SAMPLES
+
+IMAGES = [str(path) for path in sorted(SAMPLES.glob("*.tif"))]
+
+
+@pytest.fixture(scope="module")
+def views() -> tuple[View, ...]:
+    return load_views(IMAGES).views
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "view_00 view_01\nview_01 view_02\n",
+        "# by hand\nview_00.tif view_01.tif  # the best\n\nsomewhere/view_01.tif\tview_02.tif",
+        "{0} {1}\n{1} {2}\n",
+        "\ufeff'view_00' \"view_01\"\r\nview_01 view_02\r\n",
+        "view_00 view_01\nview_01 view_02\nview_01 gone.tif\nelsewhere/gone.tif view_00\n",
+    ],
+    ids=["names", "files and comments", "paths", "quotes", "left out"],
+)
+def test_a_list_names_images_in_any_way(views, tmp_path, text) -> None:
+    path = tmp_path / "pairs.txt"
+    path.write_bytes(text.format(*IMAGES).encode())
+    assert read_pairs(path, views, [tmp_path / "elsewhere/gone.tif"]) == [(0, 1), (1, 2)]
+
+
+def test_paths_tell_images_of_one_name_apart(views, tmp_path) -> None:
+    copies = []
+    for index, folder in enumerate(("a", "b")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "img.tif").symlink_to(IMAGES[index])
+        copies.append(tmp_path / folder / "img.tif")
+    path = tmp_path / "pairs.txt"
+    path.write_text("b/img.tif a/img.tif\n")
+    assert read_pairs(path, load_views(copies).views) == [(1, 0)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("view_00 view_07\n", "line 1: the list of pairs: no view is named 'view_07'"),
+        ("view_00 view_01\nview_02\n", "line 2: two image names are expected, found 1"),
+        ("view_00 view_01 view_02\n", "line 1: two image names are expected, found 3"),
+        ("view_00 view_00.tif\n", "line 1: view_00 is paired with itself"),
+        ("view_00 'view_01\n", "line 1: No closing quotation"),
+        ("# nothing\n", "lists no pair"),
+        ("", "lists no pair"),
+        ("\0 \0", "line 1"),
+    ],
+)
+def test_a_bad_list_is_refused_in_one_line(views, tmp_path, text, message) -> None:
+    path = tmp_path / "pairs.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_pairs(path, views)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [None, b"\xff\xfe\x00"], ids=["missing", "no text"])
+def test_a_list_that_cannot_be_read_is_refused(views, tmp_path, content) -> None:
+    path = tmp_path / "pairs.txt"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match="not a list of pairs"):
+        read_pairs(path, views)
+
+
+def test_the_files_are_inputs_that_a_run_never_writes() -> None:
+    options = RunOptions(overlap_list="pairs.txt", aoi="area.json")
+    assert input_files(options) == [Path("pairs.txt"), Path("area.json")]
+
+
+@pytest.mark.parametrize("name", ["overlap_list", "aoi"])
+def test_what_tells_how_to_match_contradicts_given_matches(name) -> None:
+    with pytest.raises(InputError, match=f"{name} is given with matches"):
+        RunOptions(matches="m.csv", **{name: "file"})
+
+
+def run(*args: object) -> tuple[int, str]:
+    command = [sys.executable, "-m", "barpc", "-q", *map(str, args)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    return done.returncode, done.stderr
+
+
+def area_file(path: Path, views: tuple[View, ...]) -> Path:
+    """The northern half of what the first image shows."""
+    view = views[0]
+    image = np.array([[0.0, 0.0], [view.size[0], 0.5 * view.size[1]]])
+    (west, north, _), (east, south, _) = view.sensor.localize(image, np.full(2, np.mean(view.alt_range)))
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    return path
+
+
+def test_only_the_listed_pairs_are_matched_and_only_in_the_area(views, tmp_path) -> None:
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("view_00 view_01\nview_02 view_01\n")
+    area = area_file(tmp_path / "area.json", views)
+    out = tmp_path / "out"
+    code, err = run("match", *IMAGES, "-o", out, "--overlap-list", pairs, "--aoi", area)
+    assert (code, err) == (0, "")
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["options"]["aoi"] == str(area)
+    tracks = read_matches(out / "matches.npz", [view.name for view in views])
+    assert tracks.num_points > 500
+    assert (np.bincount(tracks.point[tracks.view == 1]) == 1).all(), "a track without the middle view"
+    sensors = [view.sensor for view in views]
+    ground = ground_from_ecef(triangulate(sensors, tracks.view, tracks.point, tracks.xy).points)
+    assert read_area(area).contains(ground[:, :2]).all()
+
+
+@pytest.mark.parametrize(("flag", "word"), [("--overlap-list", "list of pairs"), ("--aoi", "cannot be read")])
+def test_a_missing_file_ends_the_run_with_one_line(tmp_path, flag, word) -> None:
+    gone = tmp_path / "gone.txt"
+    code, err = run("match", *IMAGES, "-o", tmp_path / "out", flag, gone)
+    assert code == 1
+    (line,) = err.splitlines()
+    assert line.startswith(f"barpc: {gone}: ")
+    assert word in line

@@ -1,0 +1,201 @@
+"""Where tie points are wanted: polygons from a file, pairs and windows and tracks inside them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from barpc.errors import DisconnectedError, InputError, TiePointError
+from barpc.geodesy import ground_from_ecef
+from barpc.sensor.geometry import triangulate
+from barpc.tie import TieOptions, find, find_tracks, read_area, select_pairs
+from barpc.tie.features import tiles
+from barpc.tie.pairs import shared_boxes
+
+from .test_pairs import METRE, camera, views
+
+
+def written(path: Path, data: object) -> Path:
+    path.write_text(data if isinstance(data, str) else json.dumps(data))
+    return path
+
+
+def box(west: float, south: float, east: float, north: float) -> dict[str, object]:
+    return {
+        "type": "Polygon",
+        "coordinates": [[[west, south], [east, south], [east, north], [west, north], [west, south]]],
+    }
+
+
+def wrapped(geometry: object) -> dict[str, object]:
+    feature = {"type": "Feature", "properties": {}, "geometry": geometry}
+    return {"type": "FeatureCollection", "features": [feature]}
+
+
+PLACES = np.array([[5.0, 43.0], [365.0, 43.0], [5.2, 43.0], [np.nan, 43.0], [-5.0, 43.0]])
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        box(4.9, 42.9, 5.1, 43.1),
+        box(364.9, 42.9, 365.1, 43.1),
+        wrapped(box(4.9, 42.9, 5.1, 43.1)),
+        {"type": "GeometryCollection", "geometries": [box(4.9, 42.9, 5.0, 43.1), box(5.0, 42.9, 5.1, 43.1)]},
+        {"type": "MultiPolygon", "coordinates": [box(4.9, 42.9, 5.1, 43.1)["coordinates"]]},
+        {**box(4.9, 42.9, 5.1, 43.1), "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}},
+        {
+            "type": "Polygon",
+            "coordinates": [[[4.9, 42.9, 7], [5.1, 43.1, 7], [5.1, 42.9, 7], [4.9, 43.1, 7], [4.9, 42.9, 7]]],
+        },
+    ],
+    ids=["polygon", "0..360", "features", "collection", "multi", "crs", "crossing itself, with altitudes"],
+)  # fmt: skip
+def test_any_geojson_of_polygons_is_an_area(tmp_path, data) -> None:
+    places = PLACES.copy()
+    places[0] = 4.95, 43.0  # inside the bow tie, too
+    places[1] = 364.95, 43.0
+    assert (
+        read_area(written(tmp_path / "a.json", data)).contains(places).tolist() == [True, True] + [False] * 3
+    )
+
+
+def test_a_hole_is_outside(tmp_path) -> None:
+    outer, inner = box(4.0, 42.0, 6.0, 44.0), box(364.9, 42.9, 365.1, 43.1)
+    data = {"type": "Polygon", "coordinates": [*outer["coordinates"], *inner["coordinates"]]}
+    assert read_area(written(tmp_path / "a.json", data)).contains(PLACES).tolist()[:3] == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        box(179.9, -1, -179.9, 1),
+        box(179.9, -1, 180.1, 1),
+        box(-180.1, -1, -179.9, 1),
+        {
+            "type": "MultiPolygon",
+            "coordinates": [box(179.9, -1, 180, 1)["coordinates"], box(-180, -1, -179.9, 1)["coordinates"]],
+        },
+    ],
+    ids=["jump", "beyond 180", "beyond -180", "cut"],
+)  # fmt: skip
+def test_an_area_may_cross_the_antimeridian(tmp_path, data) -> None:
+    area = read_area(written(tmp_path / "a.json", data))
+    places = np.array([[179.95, 0.0], [-179.95, 0.0], [180.0, 0.0], [-180.0, 0.5], [0.0, 0.0], [179.8, 0.0]])
+    assert area.contains(places).tolist() == [True] * 4 + [False] * 2
+    for origin in (180.0, -180.0, 179.99, 540.0):
+        plane = area.plane(np.array([origin, 0.0]), np.array([100.0, 100.0]))
+        near = shapely.intersection(plane, shapely.box(-100, -100, 100, 100))
+        assert near.area == pytest.approx(0.2 * 100 * 200, rel=1e-6)
+        assert near.geom_type == "Polygon"
+
+
+def test_the_whole_world_is_an_area(tmp_path) -> None:
+    area = read_area(written(tmp_path / "a.json", box(-180, -90, 180, 90)))
+    assert area.contains(np.array([[0.0, 0.0], [179.0, 89.0], [-179.0, -89.0]])).all()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("{", "not an area of interest"),
+        ("[]", "not an area of interest"),
+        ("{}", "not an area of interest"),
+        ({"type": "Point", "coordinates": [5, 43]}, "a Point is no polygon"),
+        ({"type": "Feature", "geometry": None}, "not an area of interest"),
+        ({"type": "Polygon", "coordinates": [[[5, 43], [6, 44]]]}, "not an area of interest"),
+        ({"type": "Polygon", "coordinates": [[["a", 43], [6, 44], [5, 44], [5, 43]]]}, "not an area of interest"),
+        ({"type": "Polygon", "coordinates": [[[1], [2], [3], [1]]]}, "not an area of interest"),
+        ({"type": "Polygon", "coordinates": []}, "not an area of interest"),
+        (box(500000, 4800000, 501000, 4801000), "not a longitude and a latitude"),
+        ('{"type": "Polygon", "coordinates": [[[5, NaN], [6, 44], [5, 44], [5, 43]]]}', "not a longitude"),
+        (box(5, 43, 5, 44), "of any extent"),
+        (wrapped({"type": "MultiPolygon", "coordinates": []}), "of any extent"),
+        ({**box(1, 2, 3, 4), "crs": {"properties": {"name": "EPSG:32631"}}}, "EPSG:32631"),
+        ('{"type": "FeatureCollection", "features":' * 5000, "not an area of interest"),
+        ('{"type": "GeometryCollection", "geometries":[' * 900 + "]}" * 900, "not an area of interest|any extent"),
+    ],
+)  # fmt: skip
+def test_what_is_no_area_is_refused_in_one_line(tmp_path, data, message) -> None:
+    path = written(tmp_path / "a.json", data)
+    with pytest.raises(InputError, match=message) as caught:
+        read_area(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match=r"gone\.json: cannot be read"):
+        read_area(tmp_path / "gone.json")
+    (tmp_path / "b.json").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(InputError, match="not an area of interest"):
+        read_area(tmp_path / "b.json")
+
+
+@pytest.mark.parametrize("lon", [0.0, 180.0, -180.0, 359.9999])
+def test_only_windows_in_the_area_are_read(tmp_path, lon) -> None:
+    two = views(camera(lon, lean=0.0), camera(lon, lean=0.0))  # 500 m a side
+    side = METRE * np.array([-240, -240, -140, 240])  # the western quarter, not up to its border
+    west, south, east, north = side + [lon, 0.0, lon, 0.0]
+    area = read_area(written(tmp_path / "a.json", box(west, south, east, north)))
+    options = TieOptions(search=10, tile=250, cell=50)
+    (pair,) = select_pairs(two, options, area=area)
+    assert pair.overlap == pytest.approx(1.0)
+    boxes = [tiles((1000, 1000), options)] * 2
+    for mask in shared_boxes(two, [pair], boxes, options, area=area):
+        assert mask.reshape(4, 4).tolist() == [[True, False, False, False]] * 4
+
+
+def test_views_that_do_not_see_the_area_are_named(tmp_path) -> None:
+    three = views(camera(0.0), camera(100 * METRE), camera(400 * METRE))
+    area = read_area(written(tmp_path / "a.json", box(-200 * METRE, -0.001, -100 * METRE, 0.001)))
+    assert len(select_pairs(three, TieOptions())) == 3
+    with pytest.raises(DisconnectedError, match=r"v0, v1; v2.*inside the area of interest"):
+        select_pairs(three, TieOptions(search=10), area=area)
+
+
+def corner(scene, share: float) -> dict[str, object]:
+    """A box over the south-western part of the first view's footprint, `share` of a side."""
+    view = scene.views[0]
+    image = np.array([[0.0, view.size[1]], [share * view.size[0], (1 - share) * view.size[1]]])
+    (west, south, _), (east, north, _) = view.sensor.localize(image, np.full(2, np.mean(view.alt_range)))
+    return box(*sorted((west, east))[:1], min(south, north), max(west, east), max(south, north))
+
+
+def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(
+    render, tmp_path, monkeypatch
+) -> None:
+    scene = render(views=2)
+    area = read_area(written(tmp_path / "a.json", corner(scene, 0.4)))
+    read: list[tuple[str, tuple[int, ...]]] = []
+    original = find.detect_tile
+    monkeypatch.setattr(
+        find,
+        "detect_tile",
+        lambda view, box, *rest: read.append((view.name, box)) or original(view, box, *rest),
+    )
+    options = TieOptions(tile=150, search=30)
+    result = find_tracks(scene.views, options, area=area)
+    limited = len(read)
+    everywhere = find_tracks(scene.views, options)
+    assert limited < 0.7 * (len(read) - limited)
+    tracks = result.tracks
+    sensors = [view.sensor for view in scene.views]
+    ground = ground_from_ecef(triangulate(sensors, tracks.view, tracks.point, tracks.xy).points)
+    assert area.contains(ground[:, :2]).all()
+    of_all = everywhere.tracks
+    whole = ground_from_ecef(triangulate(sensors, of_all.view, of_all.point, of_all.xy).points)
+    expected = area.contains(whole[:, :2]).sum()
+    assert expected > 50
+    assert tracks.num_points >= 0.9 * expected
+
+
+def test_an_area_without_tie_points_is_said(render, tmp_path) -> None:
+    scene = render(views=2)
+    area = read_area(written(tmp_path / "a.json", corner(scene, 0.002)))
+    with pytest.raises(TiePointError, match=r"none of [0-9]+ tie points lies in the area of interest"):
+        find_tracks(scene.views, area=area)
