@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import argparse
 import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -25,7 +27,7 @@ MARGIN = 20.0
 PATCH = 10
 
 
-def image_of(path: str) -> np.ndarray:
+def image_of(path: str | Path) -> np.ndarray:
     """Band 1, stretched to 8 bits."""
     with open_raster(path) as dataset:
         pixels = dataset.read(1).astype(np.float64)
@@ -57,10 +59,14 @@ def rectification(cameras, sizes, alts):
     a, b, alt = virtual_matches(cameras, sizes, alts)
     rows = np.hstack([a, b])
     mean = rows.mean(axis=0)
-    n = np.linalg.svd(rows - mean, full_matrices=False)[2][-1]  # n . (a, b) = n . mean: affine epipolar geometry
+    n = np.linalg.svd(rows - mean, full_matrices=False)[2][
+        -1
+    ]  # n . (a, b) = n . mean: affine epipolar geometry
     n = n if n[1] > 0 else -n
     k = np.sqrt(np.hypot(*n[:2]) * np.hypot(*n[2:]))
-    left = np.array([[n[1], -n[0], 0.0], [n[0], n[1], -n[:2] @ mean[:2]]]) / np.array([[np.hypot(*n[:2])], [k]])
+    left = np.array([[n[1], -n[0], 0.0], [n[0], n[1], -n[:2] @ mean[:2]]]) / np.array(
+        [[np.hypot(*n[:2])], [k]]
+    )
     y_b = -(b - mean[2:]) @ n[2:] / k
     x_a = a @ left[0, :2]
     middle = abs(alt - np.mean(alts)) < 1
@@ -93,7 +99,12 @@ def vertical_offsets(a, b, disparities):
         for x in range(PATCH + max(high, 0), a.shape[1] - PATCH + min(low, 0), 2 * PATCH):
             patch = a[y - PATCH : y + PATCH + 1, x - PATCH : x + PATCH + 1]
             window = b[y - PATCH - reach : y + PATCH + reach + 1, x - high - PATCH : x - low + PATCH + 1]
-            if window.shape[1] < 2 * PATCH + 4 or (patch == 0).any() or (window == 0).any() or patch.std() < 8:
+            if (
+                window.shape[1] < 2 * PATCH + 4
+                or (patch == 0).any()
+                or (window == 0).any()
+                or patch.std() < 8
+            ):
                 continue
             score = cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED)
             row, col = np.unravel_index(score.argmax(), score.shape)
@@ -120,6 +131,29 @@ def valid_share(a, b, disparities):
     return float((ok & sees).sum() / sees.sum())
 
 
+@dataclass(frozen=True)
+class Measure:
+    """What a pair of cameras is worth to dense matching."""
+
+    patches: int
+    offset: float
+    spread: float
+    far: float
+    valid: float
+
+
+def measure(images: Sequence[str | Path], sources: Sequence[str | Path], run: Path) -> Measure:
+    """Resample two images along the epipolar lines of the cameras in `sources`, and match."""
+    pixels = [image_of(path) for path in images]
+    sizes = [(image.shape[1], image.shape[0]) for image in pixels]
+    left, right, disparities = rectification([read_rpc(source) for source in sources], sizes, heights(run))
+    a, b = resample(pixels, left, right)
+    dy = vertical_offsets(a, b, disparities)
+    middle = float(np.median(dy))
+    spread = 1.4826 * float(np.median(abs(dy - middle)))
+    return Measure(len(dy), middle, spread, float(np.mean(abs(dy) > 0.5)), valid_share(a, b, disparities))
+
+
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -127,22 +161,13 @@ def main() -> None:
     parser.add_argument("right")
     parser.add_argument("adjusted", type=Path)
     arguments = parser.parse_args()
-    paths = [arguments.left, arguments.right]
-    images = [image_of(path) for path in paths]
-    sizes = [(image.shape[1], image.shape[0]) for image in images]
-    alts = heights(arguments.adjusted)
-    after = [arguments.adjusted / f"{Path(path).stem}.vrt" for path in paths]
-    print(f"heights {alts[0]:.0f} .. {alts[1]:.0f} m")
+    images = [arguments.left, arguments.right]
+    after = [arguments.adjusted / f"{Path(path).stem}.vrt" for path in images]
+    print("heights {:.0f} .. {:.0f} m".format(*heights(arguments.adjusted)))
     print(f"{'cameras':12}{'patches':>8}{'dy median':>11}{'dy spread':>11}{'|dy| > 0.5':>12}{'valid':>8}")
-    for name, sources in (("delivered", paths), ("adjusted", after)):
-        left, right, disparities = rectification([read_rpc(source) for source in sources], sizes, alts)
-        a, b = resample(images, left, right)
-        dy = vertical_offsets(a, b, disparities)
-        middle = np.median(dy)
-        spread = 1.4826 * np.median(abs(dy - middle))
-        far = np.mean(abs(dy) > 0.5)
-        share = valid_share(a, b, disparities)
-        print(f"{name:12}{len(dy):8}{middle:+11.3f}{spread:11.3f}{far:12.1%}{share:8.1%}")
+    for name, sources in (("delivered", images), ("adjusted", after)):
+        m = measure(images, sources, arguments.adjusted)
+        print(f"{name:12}{m.patches:8}{m.offset:+11.3f}{m.spread:11.3f}{m.far:12.1%}{m.valid:8.1%}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Write docs/options.md from the option records and the verbs' flags.
 
-    python docs/generate_options.py            # writes it
-    python docs/generate_options.py --print    # prints it
+python docs/generate_options.py            # writes it
+python docs/generate_options.py --print    # prints it
 """
 
 from __future__ import annotations
@@ -145,7 +145,9 @@ def page() -> str:
 
 def main() -> None:
     """Write or print the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--print", action="store_true", dest="show", help="print instead of writing")
     if parser.parse_args().show:
         print(page(), end="")
