@@ -91,3 +91,19 @@ def test_every_benchmark_says_what_it_does(name):
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert "usage:" in done.stdout
+
+
+def test_the_citation_file_names_the_paper_and_the_licence_of_the_package():
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert "license: Apache-2.0" in text
+    assert "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging" in text
+    for author in ("Akiki", "Marí", "de Franchis", "Morel", "Facciolo"):
+        assert f"family-names: {author}" in text
+
+
+def test_changelog_fragments_have_a_type_that_the_changelog_knows():
+    configuration = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    types = set(re.findall(r'^directory = "(\w+)"$', configuration, re.MULTILINE))
+    for path in (ROOT / "changelog.d").iterdir():
+        assert re.fullmatch(r"[\w-]+\.(\w+)\.md", path.name), path.name
+        assert path.name.split(".")[1] in types, path.name

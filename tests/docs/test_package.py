@@ -1,0 +1,86 @@
+"""What users install: a wheel with the package and nothing else, an archive with all that it takes to test it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+
+import barpc
+from tests.docs.pages import ROOT
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The wheel and the source archive, built by the backend that pip uses."""
+    pytest.importorskip("hatchling")
+    out = tmp_path_factory.mktemp("dist")
+    code = "from hatchling import build; print(build.build_wheel({0!r})); print(build.build_sdist({0!r}))"
+    command = [sys.executable, "-c", code.format(str(out))]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    wheel, sdist = done.stdout.split()[-2:]
+    return out / wheel, out / sdist
+
+
+def test_the_wheel_holds_the_whole_package_and_no_tests_or_samples(archives):
+    with zipfile.ZipFile(archives[0]) as wheel:
+        names = set(wheel.namelist())
+    packaged = {name for name in names if ".dist-info/" not in name}
+    expected = {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "barpc").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert packaged == expected
+    assert {"barpc/py.typed", "barpc/report/template.html.j2"} <= packaged
+    assert sum(1 for name in names if name.endswith("licenses/LICENSE")) == 1
+
+
+def test_the_wheel_says_what_it_is(archives):
+    with zipfile.ZipFile(archives[0]) as wheel:
+        name = next(name for name in wheel.namelist() if name.endswith("METADATA"))
+        said = Parser().parsestr(wheel.read(name).decode())
+        scripts = next(n for n in wheel.namelist() if n.endswith("entry_points.txt"))
+        assert "barpc = barpc.cli:main" in wheel.read(scripts).decode()
+    assert said["Version"] == barpc.__version__
+    assert said["License-Expression"] == "Apache-2.0"
+    assert said["Requires-Python"] == ">=3.11"
+    versions = [c.rpartition(" ")[2] for c in said.get_all("Classifier") if "Python :: 3." in c]
+    assert versions == ["3.11", "3.12", "3.13"]
+    needed = {r.split(">")[0] for r in said.get_all("Requires-Dist") if "extra ==" not in r}
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    assert needed == {r.split(">")[0] for r in declared}
+
+
+def test_the_source_archive_holds_what_it_takes_to_test_and_to_build_the_manual(archives):
+    with tarfile.open(archives[1]) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    for name in ("pyproject.toml", "README.md", "LICENSE", "CITATION.cff", "mkdocs.yml", "barpc/py.typed"):
+        assert name in names, name
+    for name in ("tests/conftest.py", "data_samples/view_00.tif", "docs/index.md", "benchmarks/kernels.py"):
+        assert name in names, name
+    assert not [name for name in names if "__pycache__" in name]
+    assert archives[1].stat().st_size < 10e6
+
+
+def test_the_wheel_works_where_nothing_else_of_the_project_is(archives, tmp_path):
+    with zipfile.ZipFile(archives[0]) as wheel:
+        wheel.extractall(tmp_path / "site")
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r}); import barpc; print(barpc.__file__); "
+        "from barpc.cli import main; main(['info', '--json', sys.argv[1]])"
+    )
+    command = [sys.executable, "-c", code, str(ROOT / "data_samples" / "view_00.tif")]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(str(tmp_path / "site"))
+    assert '"rpc"' in done.stdout
