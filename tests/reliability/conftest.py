@@ -15,12 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from rasterio.windows import Window
 
 from barpc.cli import main
 
-SAMPLES = sorted((Path(__file__).resolve().parents[2] / "data_samples").glob("*.tif"))
-SIDE = 300  # px of a crop: half a second a run
+from .trials import SAMPLES, crop
 
 
 @dataclass(frozen=True)
@@ -71,16 +69,6 @@ def hashes(paths: Sequence[Path]) -> dict[Path, str]:
     return found
 
 
-def outputs(folder: Path) -> dict[str, bytes]:
-    """The final files of a run by name; `stages` tells about the run itself, and the report shows it."""
-    found = {}
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if path.is_file() and not name.startswith(".barpc") and name != "report.html":
-            found[name] = path.read_bytes()
-    return found
-
-
 def rewrite(
     path: Path,
     *,
@@ -115,19 +103,7 @@ def _no_georeference() -> Iterator[None]:
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Three overlapping crops; never written to."""
     folder = tmp_path_factory.mktemp("pristine")
-    found = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        for path in SAMPLES:
-            with rasterio.open(path) as image:
-                pixels, rpcs = image.read(1, window=Window(200, 200, SIDE, SIDE)), image.rpcs
-            rpcs.samp_off -= 200
-            rpcs.line_off -= 200
-            shape = {"width": SIDE, "height": SIDE, "count": 1, "dtype": "uint16"}
-            with rasterio.open(folder / path.name, "w", driver="GTiff", rpcs=rpcs, **shape) as out:
-                out.write(pixels, 1)
-            found.append(folder / path.name)
-    return found
+    return [crop(path, folder / path.name) for path in SAMPLES]
 
 
 @pytest.fixture

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
 import struct
 from collections.abc import Callable
@@ -18,9 +16,9 @@ import pytest
 import rasterio
 
 from barpc.rpcio import read_rpc, write_rpc
-from barpc.workspace import Workspace
 
-from .conftest import SIDE, assert_one_line, barpc, hashes, outputs, rewrite
+from .conftest import assert_one_line, barpc, hashes, rewrite
+from .trials import SIDE
 
 Args = list[object]
 RNG = np.random.default_rng(5)
@@ -220,12 +218,12 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     "a name with a zero byte": (lambda s: [s.a, "a\0b.tif"], 1, ("no such file",)),
     "no RPC": (damaged(lambda p: rewrite(p, camera=None) and strip_rpc(p)), 1, ("view_01.tif", "no RPC")),
     "an unparsable sidecar": (
-        lambda s: [s.a, s.b, *([] if s.file("view_01_RPC.TXT", "LINE_OFF: x\n") else [])],
+        given(view_01_RPC__TXT="LINE_OFF: x\n"),
         1,
         ("view_01_RPC.TXT",),
     ),
     "an empty sidecar": (
-        lambda s: [s.a, s.b, *([] if s.file("view_01.RPB", "") else [])],
+        given(view_01__RPB=""),
         1,
         ("view_01.RPB",),
     ),

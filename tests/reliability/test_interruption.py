@@ -1,0 +1,297 @@
+"""A run that is killed, interrupted, or out of disk: the same command goes on, and the bytes are the same."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from barpc.workspace import Workspace
+
+from .conftest import assert_one_line, barpc, hashes
+from .trials import SAMPLES, crop, outputs
+
+ROOT = Path(__file__).resolve().parents[2]
+posix = pytest.mark.skipif(os.name != "posix", reason="signals and forks")
+
+
+def sweep(trials: int, seed: int) -> dict[str, object]:
+    """The trials in a process of their own, which may fork."""
+    command = [sys.executable, "-m", "tests.reliability.trials", str(trials), "--seed", str(seed)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, timeout=600)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@posix
+@pytest.mark.parametrize("trials", [5, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(trials):
+    found = sweep(trials, seed=trials)
+    assert found["identical"] == trials
+    assert found["inputs_unchanged"]
+    assert found["killed_at_work"] >= trials / 2
+    assert trials < 50 or found["resumed_from_kept_results"] >= trials / 4
+
+
+def started(*args: object) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "barpc", *map(str, args)]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
+def wait_for(condition, process: subprocess.Popen[str], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a process has started, and theirs."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        for word in (task / "children").read_text().split():
+            found += [int(word), *children(int(word))]
+    return found
+
+
+def working(pid: int) -> list[int]:
+    """Workers of a process pool among the children."""
+    found = []
+    for child in children(pid):
+        with contextlib.suppress(OSError):
+            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+                found.append(child)
+    return found
+
+
+@pytest.fixture(scope="module")
+def wide(tmp_path_factory) -> list[Path]:
+    """Two larger crops: time enough to be interrupted."""
+    folder = tmp_path_factory.mktemp("wide")
+    return [crop(path, folder / path.name, side=600, start=100) for path in SAMPLES[:2]]
+
+
+@posix
+@pytest.mark.parametrize(("number", "jobs"), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 2)])
+def test_an_interrupted_run_ends_within_two_seconds_and_says_how_to_go_on(wide, tmp_path, number, jobs):
+    command = ("adjust", *wide, "-o", tmp_path / "out", "-j", jobs)
+    process = started(*command)
+    wait_for(lambda: list(tmp_path.glob("out/.barpc/cache/*/*.npz")), process)
+    workers = working(process.pid)
+    assert len(workers) == (jobs if jobs > 1 else 0)
+    process.send_signal(number)
+    began = time.monotonic()
+    out, err = process.communicate(timeout=20)
+    seconds = time.monotonic() - began
+    assert process.returncode == 130
+    assert out == ""
+    assert err.strip() == "barpc: interrupted; run the same command again to go on"
+    assert seconds < 2 * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))  # on a machine of one's own: 2
+    for worker in workers:
+        wait_until_gone(worker)
+    kept = len(list(tmp_path.glob("out/.barpc/cache/*/*.npz")))
+    assert kept >= 1
+    assert barpc(*command).code == 0
+
+
+def wait_until_gone(pid: int) -> None:
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        try:
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return
+        except OSError:
+            return
+        time.sleep(0.02)
+    pytest.fail(f"process {pid} is still there")
+
+
+@posix
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="children are listed in /proc")
+def test_a_worker_that_dies_is_one_line_and_the_same_command_goes_on(wide, tmp_path):
+    command = ("adjust", *wide, "-o", tmp_path / "out", "-j", 2)
+    process = started(*command)
+    wait_for(lambda: list(tmp_path.glob("out/.barpc/cache/*/*.npz")), process)
+    os.kill(working(process.pid)[0], signal.SIGKILL)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (1, "")
+    assert err.startswith("barpc: a worker process died")
+    assert len(err.strip().splitlines()) == 1
+    assert barpc(*command).code == 0
+    alone = barpc("adjust", *wide, "-o", tmp_path / "alone")
+    assert alone.code == 0
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "alone")
+
+
+@posix
+def test_workers_end_with_a_parent_that_was_killed(wide, tmp_path):
+    process = started("adjust", *wide, "-o", tmp_path / "out", "-j", 2)
+    wait_for(lambda: list(tmp_path.glob("out/.barpc/cache/*/*.npz")), process)
+    workers = working(process.pid)
+    process.kill()
+    process.communicate()
+    for worker in workers:
+        wait_until_gone(worker)
+
+
+# -- caches and folders -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def truth(pristine, tmp_path_factory) -> dict[str, bytes]:
+    """What an undisturbed run of the first two crops gives."""
+    folder = tmp_path_factory.mktemp("truth")
+    images = [Path(shutil.copy(path, folder)) for path in pristine[:2]]
+    assert barpc("adjust", *images, "-o", folder / "out", "--overwrite").code == 0
+    return relative(outputs(folder / "out"), folder)
+
+
+def relative(found: dict[str, bytes], folder: Path) -> dict[str, bytes]:
+    """The outputs with the folder that the images lie in left out."""
+    return {name: content.replace(str(folder).encode(), b"") for name, content in found.items()}
+
+
+def cut_short(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def other_content(path: Path) -> None:
+    path.write_bytes(b"PK\x03\x04" + b"\0" * 200)
+
+
+def flipped(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    "damage", [cut_short, other_content, flipped, Path.unlink, lambda p: p.write_bytes(b"")]
+)
+def test_damaged_results_are_made_again(crops, tmp_path, truth, damage):
+    images = [Path(shutil.copy(path, tmp_path)) for path in crops]
+    assert barpc("adjust", *images, "-o", tmp_path / "out").code == 0
+    for path in tmp_path.glob("out/.barpc/cache/*/*.npz"):
+        damage(path)
+    assert barpc("adjust", *images, "-o", tmp_path / "out", "--overwrite").code == 0
+    assert relative(outputs(tmp_path / "out"), tmp_path) == truth
+
+
+def test_results_of_another_version_are_not_used(crops, tmp_path, monkeypatch):
+    made = []
+    store = Workspace.store
+    monkeypatch.setattr(Workspace, "store", lambda *args: (made.append(args[1]), store(*args)))
+    assert barpc("adjust", *crops, "-o", tmp_path / "out").code == 0
+    first = len(made)
+    assert first > 0
+    assert barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite").code == 0
+    assert len(made) == first
+    monkeypatch.setattr("barpc.workspace.code_version", lambda: "another")
+    assert barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite").code == 0
+    assert len(made) == 2 * first
+
+
+def test_an_image_that_changed_is_worked_on_again_whatever_its_date(crops, tmp_path):
+    assert barpc("adjust", *crops, "-o", tmp_path / "out").code == 0
+    first = outputs(tmp_path / "out")["observations.csv"]
+    times = crops[0].stat()
+    data = bytearray(crops[0].read_bytes())
+    data[20000:60000] = bytes(40000)
+    crops[0].write_bytes(data)
+    os.utime(crops[0], ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite").code == 0
+    assert outputs(tmp_path / "out")["observations.csv"] != first
+
+
+@pytest.mark.parametrize("year", [1971, 2099])
+def test_a_clock_that_goes_wrong_changes_nothing(crops, tmp_path, truth, year):
+    images = [Path(shutil.copy(path, tmp_path)) for path in crops]
+    assert barpc("adjust", *images, "-o", tmp_path / "out").code == 0
+    then = (year - 1970) * 365.25 * 86400
+    for path in [*images, *tmp_path.rglob("out/**/*")]:
+        os.utime(path, (then, then))
+    assert barpc("adjust", *images, "-o", tmp_path / "out", "--overwrite").code == 0
+    assert relative(outputs(tmp_path / "out"), tmp_path) == truth
+
+
+def test_a_folder_in_use_is_left_alone(crops, tmp_path):
+    with Workspace(tmp_path / "out"):
+        before = hashes([tmp_path])
+        assert_one_line(barpc("adjust", *crops, "-o", tmp_path / "out"), 1, "another run")
+        assert hashes([tmp_path]) == before
+
+
+def test_existing_results_are_left_alone(crops, tmp_path):
+    assert barpc("adjust", *crops, "-o", tmp_path / "out").code == 0
+    before = hashes([tmp_path])
+    assert_one_line(barpc("adjust", *crops, "-o", tmp_path / "out"), 1, "--overwrite")
+    assert hashes([tmp_path]) == before
+
+
+@pytest.mark.parametrize("where", ["/proc/barpc", "/dev/null/out"])
+def test_a_place_that_cannot_be_written_is_named(crops, where):
+    assert_one_line(barpc("adjust", *crops, "-o", where), 1, where)
+
+
+def test_a_cache_that_cannot_be_written_is_named(crops, tmp_path):
+    (tmp_path / "out/.barpc").mkdir(parents=True)
+    (tmp_path / "out/.barpc/cache").write_text("in the way")
+    said = barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite")
+    assert_one_line(said, 1, "out", "cannot be written")
+    assert (tmp_path / "out/.barpc/cache").read_text() == "in the way"
+
+
+def test_results_never_take_the_place_of_an_input(crops):
+    before = hashes(crops)
+    said = barpc("adjust", *crops, "-o", crops[0].parent, "--overwrite", "--images", "copy")
+    assert_one_line(said, 1, "view_00.tif", "input")
+    assert hashes(crops) == before
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), OSError(24, "Too many open files")])
+def test_an_error_of_the_machine_is_one_line(crops, tmp_path, monkeypatch, error):
+    def fail(*_args, **_kwargs):
+        raise error
+
+    monkeypatch.setattr("barpc.pipeline.run.adjust_tracks", fail)
+    said = barpc("adjust", *crops, "-o", tmp_path / "out")
+    assert said.code == 1
+    assert len(said.err.strip().splitlines()) == 1
+    assert said.err.startswith("barpc: ")
+    assert "Traceback" not in said.err
+    monkeypatch.undo()
+    assert barpc("adjust", *crops, "-o", tmp_path / "out").code == 0
+
+
+def test_debug_shows_the_traceback_of_a_bug(crops, tmp_path, monkeypatch):
+    def fail(*_args, **_kwargs):
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr("barpc.pipeline.run.adjust_tracks", fail)
+    said = barpc("--debug", "adjust", *crops, "-o", tmp_path / "out")
+    assert said.code == 1
+    assert "Traceback" in said.err
+    assert "report" in said.err.splitlines()[-1]
+
+
+def test_stages_are_told_with_seconds_and_memory(crops, tmp_path, caplog):
+    with caplog.at_level("INFO"):
+        assert barpc("-v", "adjust", *crops, "-o", tmp_path / "out").code == 0
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    names = [stage["stage"] for stage in summary["stages"]]
+    assert {"tie points", "adjustment", "fit and write"} <= set(names)
+    for stage in summary["stages"]:
+        assert stage["seconds"] >= 0
+        assert stage["peak_memory_mb"] > 20
+        assert f"{stage['stage']}: " in caplog.text

@@ -1,0 +1,143 @@
+"""Kill a run at a random moment, give the same command again, compare every byte; as often as asked.
+
+::
+
+    python -m tests.reliability.trials 50 --seed 1 --jobs 1
+
+Everything is imported once; each run is a fork of this process, which itself never works on an image.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import warnings
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from rasterio.windows import Window
+
+import barpc.cli.adjust  # (imported before the forks)
+import barpc.cli.tables
+import barpc.pipeline  # noqa: F401
+from barpc.cli import main as barpc_main
+from barpc.workspace import code_version
+
+SAMPLES = sorted((Path(__file__).resolve().parents[2] / "data_samples").glob("*.tif"))
+SIDE = 300  # px of a crop: half a second a run
+ABOUT_THE_RUN = ("stages", "out_dir")
+"""What summary.json tells about the run and not about its result; report.html shows the stages, too."""
+
+
+def crop(source: Path, target: Path, side: int = SIDE, start: int = 200) -> Path:
+    """A corner of a sample with its exact RPC."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        with rasterio.open(source) as image:
+            pixels, rpcs = image.read(1, window=Window(start, start, side, side)), image.rpcs
+        rpcs.samp_off -= start
+        rpcs.line_off -= start
+        shape = {"width": side, "height": side, "count": 1, "dtype": "uint16"}
+        with rasterio.open(target, "w", driver="GTiff", rpcs=rpcs, **shape) as out:
+            out.write(pixels, 1)
+    return target
+
+
+def outputs(folder: Path) -> dict[str, bytes]:
+    """The final files of a run by name, without what tells about the run itself."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and not name.startswith(".barpc/") and name != "report.html":
+            found[name] = path.read_bytes()
+    if "summary.json" in found:
+        summary = json.loads(found["summary.json"])
+        kept = {key: value for key, value in summary.items() if key not in ABOUT_THE_RUN}
+        found["summary.json"] = json.dumps(kept).encode()
+    return found
+
+
+def start(command: list[str], log: Path) -> int:
+    """Fork, and run a command in the child; its process id."""
+    pid = os.fork()
+    if pid:
+        return pid
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    code = 99
+    try:
+        barpc_main(command)
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else 98
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def finish(pid: int) -> int:
+    """Exit code of a child; -9 when it was killed."""
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def sweep(trials: int, seed: int, jobs: int, folder: Path) -> dict[str, object]:
+    """Kill so many runs; how many came out identical, and what was found on the way."""
+    rng = np.random.default_rng(seed)
+    code_version()
+    images = [crop(path, folder / path.name) for path in SAMPLES[:2]]
+    before = [sha256(path.read_bytes()).digest() for path in images]
+    out, log = folder / "out", folder / "log.txt"
+    command = ["-q", "adjust", *map(str, images), "-o", str(out), "-j", str(jobs)]
+    began = time.monotonic()
+    code = finish(start(command, log))
+    seconds = time.monotonic() - began
+    if code:
+        raise SystemExit(f"the undisturbed run ended with {code}: {log.read_text()}")
+    truth = outputs(out)
+    identical = killed = leftovers = resumed = 0
+    for _ in range(trials):
+        shutil.rmtree(out)
+        pid = start(command, log)
+        time.sleep(rng.uniform(0.0, seconds))
+        os.kill(pid, signal.SIGKILL)
+        killed += finish(pid) == -signal.SIGKILL
+        leftovers += any(out.rglob(".barpc-partial-*"))
+        resumed += len(list(out.glob(".barpc/cache/*/*.npz"))) > 0
+        again = finish(start(command, log))  # 1: it had been finished, and is not written over
+        state = json.loads((out / ".barpc/state.json").read_text())["status"]
+        clean = not list(out.rglob(".barpc-partial-*"))
+        identical += again in (0, 1) and state == "done" and clean and outputs(out) == truth
+    unchanged = [sha256(path.read_bytes()).digest() for path in images] == before
+    return {
+        "trials": trials,
+        "identical": identical,
+        "killed_at_work": killed,
+        "resumed_from_kept_results": resumed,
+        "left_partial_files": leftovers,
+        "inputs_unchanged": unchanged,
+        "seconds_of_a_run": round(seconds, 2),
+    }
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("trials", type=int, nargs="?", default=50)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=1, help="worker processes of the killed runs")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        print(json.dumps(sweep(given.trials, given.seed, given.jobs, Path(folder))))
+
+
+if __name__ == "__main__":
+    main()
