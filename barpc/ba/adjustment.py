@@ -100,7 +100,7 @@ def adjust_tracks(
         view=tracks.view,
         noise=outcome.noise,
         cost_history=final.history,
-        steps=len(final.history),
+        steps=len(final.history) - outcome.passes,
         status=f"{outcome.passes} passes of cutting; {covariance.factor.method} factorisation",
         cameras=cameras,
         covariance=covariance,

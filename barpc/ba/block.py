@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.ba.options import AdjustOptions
+from barpc.ba.structure import counting_sort
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, connected_groups
@@ -130,7 +131,7 @@ def join(views: tuple[View, ...], tracks: Tracks, gcps: GroundPoints | None, opt
             "loosen the matching or leave these views out"
         )
     left_out = _left_out(names, view[rows], point[rows], tracks.num_points, options)
-    order = np.argsort(view, kind="stable")
+    order, _ = counting_sort(view, len(views))
     weight = np.array([options.view_weights.get(name, 1.0) for name in names])
     use = ~np.isin(view, np.flatnonzero(np.isin(names, left_out)))
     return Block(

@@ -69,12 +69,11 @@ class Covariance:
     def points(self, index: IntArray) -> Array:
         """Covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,): their own noise and the cameras'."""
         structure = self.reduced.structure
-        sums = structure.point_sum
         out = np.empty((len(index), 3, 3))
         lower = self.reduced.lower[:, index]
         inverse = _inverse_transposed(lower)
         for n, p in enumerate(index):
-            rows = sums.indices[sums.indptr[p] : sums.indptr[p + 1]]
+            rows = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
             sensitivity = -inverse[n] @ self.reduced.cross[rows].transpose(1, 0, 2).reshape(3, -1)
             cameras = self.joint(structure.view[rows])
             out[n] = inverse[n] @ inverse[n].T + sensitivity @ cameras @ sensitivity.T

@@ -23,13 +23,13 @@ def convergence_angles(structure: Structure, projected: Projected, points: Array
     """Largest angle (P,) [rad] between a point's rays and their mean, doubled: the angle of two rays."""
     by_point = projected.by_point
     ray = np.cross(by_point[0], by_point[1], axis=0)
-    up = points.T[:, structure.point]
+    up = structure.of_points(points)
     with np.errstate(all="ignore"):
         ray *= np.sign((ray * up).sum(axis=0)) / np.linalg.norm(ray, axis=0)
     ray = np.nan_to_num(ray)
-    mean = structure.sum_points(ray.T)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
-    apart = np.linalg.norm(ray.T - mean[structure.point], axis=1)
+    mean = structure.sum_points(ray)
+    mean /= np.maximum(np.linalg.norm(mean, axis=0), 1e-12)
+    apart = np.linalg.norm(ray - mean.take(structure.point, axis=1, mode="clip"), axis=0)
     largest = np.zeros(structure.num_points)
     np.maximum.at(largest, structure.point, apart)
     angle: Array = 4.0 * np.arcsin(np.minimum(0.5 * largest, 1.0))

@@ -7,6 +7,7 @@ g = sum B^T r - sum Y^T h, where h_p = L^-1 sum A^T r.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +17,8 @@ from barpc.ba.linear import Matrix
 from barpc.ba.structure import Structure
 from barpc.geodesy import Array
 
-CHUNK = 65536
-"""Pairs of observations multiplied at a time."""
+CHUNK = 8192
+"""Observations, or pairs of them, multiplied at a time."""
 
 DENSE_UNKNOWNS = 900
 """Up to so many camera unknowns the reduced matrix is a plain array."""
@@ -59,8 +60,12 @@ class Reduced:
 
     def point_step(self, step: Array) -> Array:
         """The move of the points (P, 3) [m] that goes with a step (N, q) of the camera unknowns."""
-        moved = np.einsum("kjq,kq->kj", self.cross, step[self.structure.view])
-        return -solve_transposed(self.lower, (self.half + self.structure.sum_points(moved)).T).T
+        structure = self.structure
+        moved = np.empty((3, len(self.cross)))
+        for v, (start, stop) in enumerate(zip(structure.bounds[:-1], structure.bounds[1:], strict=True)):
+            rows = self.cross[start:stop].reshape(-1, step.shape[1])
+            moved[:, start:stop] = (rows @ step[v]).reshape(-1, 3).T
+        return -solve_transposed(self.lower, self.half.T + structure.sum_points(moved)).T
 
 
 def reduce_normal(
@@ -94,17 +99,11 @@ def reduce_normal(
         `cost` without the priors' part.
     """
     q = by_unknown.shape[1]
-    sums = structure.sum_points(point_products(by_point, residual)).T
+    sums = structure.sum_points(point_products(by_point, residual))
     lower = cholesky3(sums[:6] + point_matrix)
     half = solve_lower(lower, sums[6:] + point_gradient)
-    whitened = _whiten(by_point, lower, structure)  # (2, 3, K): A L^-T
-    cross = np.empty((residual.shape[1], 3, q))
-    for j in range(3):
-        for a in range(q):
-            cross[:, j, a] = (by_unknown[:, a] * whitened[:, j]).sum(axis=0)
-    gradient = structure.sum_views((by_unknown * residual[:, None]).sum(axis=0))
-    pulled = np.einsum("kja,jk->ak", cross, half[:, structure.point])
-    gradient += camera_gradient - structure.sum_views(pulled)
+    cross, slope = _eliminate(structure, residual, by_point, by_unknown, lower, half)
+    gradient = camera_gradient + structure.sum_views(slope)
     diagonal = _diagonal_blocks(structure, by_unknown, cross)
     diagonal[:, np.arange(q), np.arange(q)] += camera_diagonal
     matrix = _assemble(structure, diagonal, _pair_blocks(structure, cross))
@@ -121,13 +120,20 @@ def reduce_normal(
 
 
 def point_products(by_point: Array, residual: Array) -> Array:
-    """(K, 9): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
-    products = np.empty((residual.shape[1], 9))
-    for n, (i, j) in enumerate(TRIANGLE):
-        products[:, n] = by_point[0, i] * by_point[0, j] + by_point[1, i] * by_point[1, j]
-    for i in range(3):
-        products[:, 6 + i] = by_point[0, i] * residual[0] + by_point[1, i] * residual[1]
+    """(9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
+    products = np.empty((9, residual.shape[1]))
+    for part in parts(residual.shape[1]):
+        (a, b), r = by_point[..., part], residual[:, part]
+        for n, (i, j) in enumerate(TRIANGLE):
+            np.add(a[i] * a[j], b[i] * b[j], out=products[n, part])
+        np.add(a * r[0], b * r[1], out=products[6:, part])
     return products
+
+
+def parts(count: int) -> Iterator[slice]:
+    """Pieces of `count` observations that stay in cache."""
+    for start in range(0, count, CHUNK):
+        yield slice(start, min(start + CHUNK, count))
 
 
 def cholesky3(matrix: Array) -> Array:
@@ -163,9 +169,27 @@ def solve_transposed(lower: Array, rhs: Array) -> Array:
     return np.stack([(rhs[0] - l10 * y - l20 * z) / l00, y, z])
 
 
-def _whiten(by_point: Array, lower: Array, structure: Structure) -> Array:
-    """A L^-T, (2, 3, K)."""
-    l00, l10, l20, l11, l21, l22 = lower[:, structure.point]
+def _eliminate(
+    structure: Structure, residual: Array, by_point: Array, by_unknown: Array, lower: Array, half: Array
+) -> tuple[Array, Array]:
+    """Y (K, 3, q), and what every observation adds to the gradient, B^T r - Y^T h, (q, K)."""
+    q, count = by_unknown.shape[1:]
+    cross, slope = np.empty((count, 3, q)), np.empty((q, count))
+    for part in parts(count):
+        point = structure.point[part]
+        whitened = _whiten(by_point[..., part], lower.take(point, axis=1, mode="clip"))
+        unknown, r = by_unknown[..., part], residual[:, part]
+        rows = whitened[0, :, None] * unknown[0]
+        rows += whitened[1, :, None] * unknown[1]
+        cross[part] = rows.reshape(3 * q, -1).T.reshape(-1, 3, q)
+        rows *= half.take(point, axis=1, mode="clip")[:, None]
+        np.subtract(unknown[0] * r[0] + unknown[1] * r[1], rows.sum(axis=0), out=slope[:, part])
+    return cross, slope
+
+
+def _whiten(by_point: Array, lower: Array) -> Array:
+    """A L^-T, (2, 3, n), of derivatives (2, 3, n) and factors (6, n)."""
+    l00, l10, l20, l11, l21, l22 = lower
     out = np.empty_like(by_point)
     np.divide(by_point[:, 0], l00, out=out[:, 0])
     np.divide(by_point[:, 1] - l10 * out[:, 0], l11, out=out[:, 1])
@@ -178,9 +202,9 @@ def _diagonal_blocks(structure: Structure, by_unknown: Array, cross: Array) -> A
     q = cross.shape[2]
     out = np.empty((structure.num_views, q, q))
     for v, (start, stop) in enumerate(zip(structure.bounds[:-1], structure.bounds[1:], strict=True)):
-        rows = np.moveaxis(by_unknown[..., start:stop], 1, 0).reshape(q, -1)
+        col, row = by_unknown[..., start:stop]
         pulled = cross[start:stop].reshape(-1, q)
-        np.subtract(rows @ rows.T, pulled.T @ pulled, out=out[v])
+        np.subtract(col @ col.T + row @ row.T, pulled.T @ pulled, out=out[v])
     return out
 
 
@@ -193,13 +217,14 @@ def _pair_blocks(structure: Structure, cross: Array) -> Array:
     while m < len(out):  # as many whole view pairs as fit the chunk, at least one
         stop = max(m + 1, int(np.searchsorted(bounds, bounds[m] + CHUNK, side="right")) - 1)
         base = bounds[m]
-        first = cross[structure.first[base : bounds[stop]]].reshape(-1, q)
-        second = cross[structure.second[base : bounds[stop]]].reshape(-1, q)
+        rows = slice(base, bounds[stop])  # "clip": indices are right, and unchecked they are taken faster
+        first = cross.take(structure.first[rows], axis=0, mode="clip").reshape(-1, q)
+        second = cross.take(structure.second[rows], axis=0, mode="clip").reshape(-1, q)
         for n in range(m, stop):
             part = slice(3 * (bounds[n] - base), 3 * (bounds[n + 1] - base))
-            np.matmul(-first[part].T, second[part], out=out[n])
+            np.matmul(first[part].T, second[part], out=out[n])
         m = stop
-    return out
+    return np.negative(out, out=out)
 
 
 def _assemble(structure: Structure, diagonal: Array, pairs: Array) -> Matrix:

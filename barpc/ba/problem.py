@@ -60,7 +60,7 @@ class Problem:
     def residuals(self, params: Array, points: Array) -> Array:
         """Projected - observed (2, K) [px], sorted by view."""
         structure = self.structure
-        ecef = points.T[:, structure.point]
+        ecef = structure.of_points(points)
         return self.cameras.project(params, ecef, structure.bounds, "image").image - self.xy
 
     def prior_cost(self, params: Array, points: Array) -> float:
@@ -72,10 +72,10 @@ class Problem:
             cost += float((self.point_prior.residual(points) ** 2).sum())
         return cost
 
-    def cost(self, params: Array, points: Array, weight: Array) -> float:
-        """The whole sum of squares."""
-        residual = self.residuals(params, points) * weight
-        return float((residual**2).sum()) + self.prior_cost(params, points)
+    def cost(self, params: Array, points: Array, whitened: Array) -> float:
+        """The whole sum of squares, of whitened residuals (2, K) and the priors'."""
+        flat = whitened.ravel()
+        return float(flat @ flat) + self.prior_cost(params, points)
 
     def reduce(self, params: Array, points: Array, weight: Array) -> Reduced:
         """Linearise at a state and eliminate the points.
@@ -94,7 +94,7 @@ class Problem:
         Reduced
         """
         structure = self.structure
-        projected = self.cameras.project(params, points.T[:, structure.point], structure.bounds)
+        projected = self.cameras.project(params, structure.of_points(points), structure.bounds)
         residual = (projected.image - self.xy) * weight
         by_point, by_unknown = projected.by_point, projected.by_unknown
         by_point *= weight
@@ -115,13 +115,13 @@ class Problem:
     def project_points(self, params: Array, points: Array) -> Projected:
         """Image points and their derivative by the points, for `triangulate`."""
         structure = self.structure
-        return self.cameras.project(params, points.T[:, structure.point], structure.bounds, "points")
+        return self.cameras.project(params, structure.of_points(points), structure.bounds, "points")
 
     def triangulate(self, points: Array, projected: Projected, weight: Array) -> Array:
         """One Gauss-Newton step of all points (P, 3) [m] with the cameras held."""
         residual = (projected.image - self.xy) * weight
         matrix, gradient = self._point_terms(points)
-        sums = self.structure.sum_points(point_products(projected.by_point * weight, residual)).T
+        sums = self.structure.sum_points(point_products(projected.by_point * weight, residual))
         lower = cholesky3(sums[:6] + matrix)
         step = solve_transposed(lower, solve_lower(lower, sums[6:] + gradient))
         return points - step.T

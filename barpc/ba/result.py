@@ -41,9 +41,9 @@ class Adjustment:
     noise : float
         Observed over stated standard deviation of the observations.
     cost_history : tuple of float
-        Sum of squared whitened residuals at each linearisation.
+        Sum of squared whitened residuals at each linearisation of the passes, and where each pass ended.
     steps : int
-        Linearisations in all.
+        Linearisations of the passes in all.
     status : str
         One line: what the solver did.
     cameras : Cameras

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,7 +73,7 @@ class Observations:
         structure = self.structure
         largest = np.zeros(structure.num_points)
         np.maximum.at(largest, structure.point, counted)
-        count = structure.sum_points(counted[:, None])[:, 0] / np.maximum(largest, 1e-300)
+        count = structure.sum_points(counted[None])[0] / np.maximum(largest, 1e-300)
         rows = 2.0 * np.maximum(count, 1.0)
         free = np.where(self.has_prior, rows, np.maximum(rows - 3.0, 0.25))
         freedom: Array = (2.0 * free / rows)[structure.point]
@@ -94,8 +94,9 @@ class Observations:
     def noise(self, residual: Array, use: BoolArray, problem: Problem) -> float:
         """Observed over stated standard deviation of the observations in use; 1 where there are too few."""
         whitened = residual[:, use] / self.sigma[use]
-        seen = np.unique(self.structure.point[use & ~self.has_prior[self.structure.point]])
-        freedom = whitened.size - 3 * len(seen) - int(problem.free.sum())
+        seen = np.zeros(self.structure.num_points, dtype=bool)
+        seen[self.structure.point[use]] = True
+        freedom = whitened.size - 3 * int((seen & ~self.has_prior).sum()) - int(problem.free.sum())
         if freedom < _LEAST_FREEDOM:
             return 1.0
         return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
@@ -103,7 +104,7 @@ class Observations:
     def tied(self, use: BoolArray) -> BoolArray:
         """`use` without the observations whose point is left without a second one (or a prior)."""
         structure = self.structure
-        count = structure.sum_points(use[:, None].astype(np.float64))[:, 0]
+        count = np.bincount(structure.point[use], minlength=structure.num_points)
         tied: BoolArray = use & ((count >= 2) | self.has_prior)[structure.point]
         return tied
 
@@ -157,13 +158,15 @@ def run_rounds(
         found = minimise(problem, state, weight, options.solver, options.max_steps, options.tolerance)
         state = found.state
         residual = problem.residuals(state.params, state.points)
+        cost = problem.cost(state.params, state.points, residual * weight)
+        state = replace(state, cost=cost, history=(*state.history, cost))
         same = passes > 1 and int((kept != use).sum()) <= _SAME * len(use)
         use, before = kept, noise
         noise = observations.noise(residual, use, problem)
         _LOG.info("pass %d: %d of %d observations, noise %.3f", passes, use.sum(), len(use), noise)
         settled = not options.estimate_noise or abs(noise / before - 1.0) < _SAME_NOISE
         if passes > options.num_passes or (settled and (same or options.loss == "linear")):
-            return Outcome(problem, found, residual, use, noise, passes)
+            return Outcome(problem, replace(found, state=state), residual, use, noise, passes)
 
 
 def _robust(

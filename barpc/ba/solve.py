@@ -45,7 +45,7 @@ class State:
     cost : float
         Sum of squared whitened residuals.
     history : tuple of float
-        The cost at every linearisation so far.
+        The cost at every linearisation, and at the end of every pass, so far.
     """
 
     params: Array
@@ -109,8 +109,8 @@ def minimise(
     max_steps : int
         Linearisations.
     tolerance : float
-        The step that is expected to gain less than this fraction of the cost is taken and is the last; the
-        iteration converges quadratically, so what remains is of the order of its square.
+        The step that is expected to gain less than this fraction of the cost is taken and is the last, and
+        so is one that is expected to leave a thousandth of it (see `_settled`).
 
     Returns
     -------
@@ -137,6 +137,14 @@ def minimise(
         "%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, time.process_time() - start
     )
     return result
+
+
+def _settled(gain: float, before: float, cost: float, tolerance: float) -> bool:
+    """Whether a step that should gain `gain`, after one that should have gained `before`, is the last.
+
+    The gains shrink at least in the proportion of the last two: what the step leaves is gain^2 / before.
+    """
+    return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
 
 
 def gauss_newton(problem: Problem, state: State, weight: Array) -> State:
@@ -172,7 +180,7 @@ def _levenberg_marquardt(
     problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float
 ) -> Minimum:
     """Gauss-Newton steps, damped only when one fails."""
-    damping = 0.0
+    damping, before = 0.0, np.inf
     reduced = problem.reduce(state.params, state.points, weight)
     state = replace(state, cost=_finite(reduced.cost), history=(*state.history, reduced.cost))
     for _ in range(max_steps):
@@ -182,12 +190,13 @@ def _levenberg_marquardt(
             damping = max(10.0 * damping, 1e-8)
             continue
         ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
-        if gain <= tolerance * state.cost:
+        if _settled(gain, before, state.cost, tolerance):
             return Minimum(ahead, reduced, factor if not damping else None)
         trial = problem.reduce(ahead.params, ahead.points, weight)
         if trial.cost <= state.cost * (1.0 + 1e-12):
             state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
-            reduced, damping = trial, damping / 10.0 if damping > 1e-8 else 0.0
+            reduced, before = trial, gain if not damping else np.inf
+            damping = damping / 10.0 if damping > 1e-8 else 0.0
         elif gain <= _ROUNDING * state.cost:
             return Minimum(state, reduced)
         elif damping > 1e8:
@@ -198,14 +207,18 @@ def _levenberg_marquardt(
     return Minimum(state, reduced)
 
 
+class _SettledError(Exception):
+    """Ends scipy's iteration: the last step is known."""
+
+
 class _Compressed:
     """The problem as scipy sees it, in unknowns x = U0 p whitened by the first linearisation.
 
     In them the matrix is nearly the identity: the gradient's size is what a step would gain.
     """
 
-    def __init__(self, problem: Problem, state: State, weight: Array) -> None:
-        self.problem, self.weight = problem, weight
+    def __init__(self, problem: Problem, state: State, weight: Array, tolerance: float) -> None:
+        self.problem, self.weight, self.tolerance = problem, weight, tolerance
         self.reduced = problem.reduce(state.params, state.points, weight)
         self.state = replace(
             state, cost=_finite(self.reduced.cost), history=(*state.history, self.reduced.cost)
@@ -225,8 +238,8 @@ class _Compressed:
         upper = self._cholesky()
         gradient = self.reduced.gradient[self.problem.free]
         self.whitened = la.solve_triangular(upper, gradient, trans="T", check_finite=False)
-        square = float(self.whitened @ self.whitened)
-        self.rest = np.sqrt(max(self.reduced.cost - self.reduced.gain - square, 0.0))
+        self.gain = self.reduced.gain + float(self.whitened @ self.whitened)
+        self.rest = np.sqrt(max(self.reduced.cost - self.gain, 0.0))
         self.slope = la.solve_triangular(self.upper0, upper.T, trans="T", check_finite=False).T
 
     def params(self, x: Array) -> Array:
@@ -244,8 +257,10 @@ class _Compressed:
         self.reduced = self.problem.reduce(state.params, state.points, self.weight)
         cost = self.reduced.cost
         self.state = replace(state, cost=cost, history=(*self.state.history, cost))
-        self.key = x.tobytes()
+        self.key, before = x.tobytes(), self.gain
         self._compress()
+        if _settled(self.gain, before, cost, self.tolerance):
+            raise _SettledError
 
     def residual(self, x: Array) -> Array:
         """The N q + 1 residuals."""
@@ -259,24 +274,25 @@ class _Compressed:
 
 
 def _scipy(problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float) -> Minimum:
-    compressed = _Compressed(problem, state, weight)
+    compressed = _Compressed(problem, state, weight, tolerance)
     count = len(compressed.whitened)
-    result = least_squares(
-        compressed.residual,
-        np.zeros(count),
-        compressed.jacobian,
-        method="trf",
-        x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # the first step is not cut short
-        ftol=1e-15,
-        xtol=None,
-        gtol=float(np.sqrt(tolerance / count)) * max(compressed.rest, 1e-9),
-        max_nfev=max_steps,
-    )
-    if not np.isfinite(result.cost):
-        raise AdjustError(f"no usable solution: {result.message}")
-    compressed.at(result.x)
-    if result.status == 0:
-        _LOG.warning("the adjustment did not settle in %d steps", max_steps)
+    if not _settled(compressed.gain, np.inf, compressed.state.cost, tolerance):
+        try:
+            least_squares(
+                compressed.residual,
+                np.zeros(count),
+                compressed.jacobian,
+                method="trf",
+                x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # no first step cut short
+                ftol=1e-15,
+                xtol=None,
+                gtol=None,
+                max_nfev=max_steps,
+            )
+            _LOG.warning("the adjustment did not settle in %d steps", max_steps)
+        except _SettledError:
+            pass
+    _finite(compressed.state.cost)
     reduced = compressed.reduced
     step, gain, factor = camera_step(problem, reduced)  # what the last gradient still asks for
     return Minimum(compressed.state.moved(step, reduced, max(reduced.cost - gain, 0.0)), reduced, factor)

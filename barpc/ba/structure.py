@@ -23,8 +23,10 @@ class Structure:
         Indices of every observation.
     bounds : (N + 1,)
         Observations of view v are bounds[v] : bounds[v + 1].
-    point_sum : (P, K) sparse
-        Sums over the observations of a point.
+    by_point : (K,)
+        Observations sorted by point.
+    point_bounds : (P + 1,)
+        Observations of point p are by_point[point_bounds[p] : point_bounds[p + 1]].
     first, second : (Q,)
         Pairs of observations of one point, sorted by their pair of views.
     pair_view : (M, 2)
@@ -38,16 +40,22 @@ class Structure:
     view: IntArray
     point: IntArray
     bounds: IntArray
-    point_sum: sp.csr_array
+    by_point: IntArray
+    point_bounds: IntArray
     first: IntArray
     second: IntArray
     pair_view: IntArray
     pair_bounds: IntArray
 
     def sum_points(self, rows: Array) -> Array:
-        """Sums (P, m) over every point's observations of rows (K, m)."""
-        total: Array = self.point_sum @ rows
+        """Sums (m, P) over every point's observations of rows (m, K)."""
+        total: Array = np.array([np.bincount(self.point, row, self.num_points) for row in rows])
         return total
+
+    def of_points(self, points: Array) -> Array:
+        """Coordinates (3, K) of every observation's point, of points (P, 3)."""
+        rows: Array = np.ascontiguousarray(points.T).take(self.point, axis=1, mode="clip")
+        return rows
 
     def sum_views(self, rows: Array) -> Array:
         """Sums (N, m) over every view's observations of rows (m, K)."""
@@ -72,15 +80,13 @@ def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: 
     -------
     Structure
     """
-    count = len(view)
     bounds = np.searchsorted(view, np.arange(num_views + 1))
-    by_point = np.argsort(point, kind="stable")
-    starts = np.searchsorted(point[by_point], np.arange(num_points + 1))
-    point_sum = sp.csr_array((np.ones(count), by_point, starts), shape=(num_points, count))
-    first, second = _pairs(by_point, starts)
+    by_point, point_bounds = counting_sort(point, num_points)
+    first, second = _pairs(by_point, point_bounds)
+    order, _ = counting_sort(view[second], num_views)
+    order = order[counting_sort(view[first[order]], num_views)[0]]
+    first, second = first[order], second[order]
     key = view[first] * num_views + view[second]
-    order = np.argsort(key, kind="stable")
-    key = key[order]
     at = np.flatnonzero(np.diff(key, prepend=-1))
     keys = key[at]
     pair_view = np.column_stack([keys // num_views, keys % num_views])
@@ -91,12 +97,24 @@ def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: 
         view,
         point,
         bounds,
-        point_sum,
-        first[order],
-        second[order],
+        by_point,
+        point_bounds,
+        first,
+        second,
         pair_view,
         pair_bounds,
     )
+
+
+def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
+    """The stable order (n,) of keys 0 .. size - 1, and where each key's part of it begins and ends (size + 1,).
+
+    What scipy does to compress the rows of a sparse matrix, three times as fast as `argsort`.
+    """
+    count = len(key)
+    rows = sp.coo_array((np.zeros(count, dtype=np.int8), (key, np.arange(count))), shape=(size, count))
+    compressed = rows.tocsr()
+    return compressed.indices.astype(np.int64), compressed.indptr.astype(np.int64)
 
 
 def _pairs(by_point: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
