@@ -26,8 +26,9 @@ HEAD = """# Speed
 
 <!-- Written by benchmarks/speed.py --write. Do not edit. -->
 
-What the scripts in `benchmarks/` printed in one run, barpc and each peer in turns, one thread, CPU seconds (not the clock): {machine}. {versions}.
-Other processes used the machine at the same time (load {load:.1f} of {cores} cores): take the ratios, not the seconds.
+What the scripts in `benchmarks/` printed in one run, barpc and each peer in turns, one thread, CPU seconds (not the
+clock): {machine}. {versions}.
+Other processes used the machine at the same time (load {load:.1f} on {cores} cores): take the ratios, not the seconds.
 
 `python benchmarks/speed.py --data DATA --peers PYTHON --rpcfit SITE_PACKAGES --write` makes this page again.
 """
@@ -75,7 +76,8 @@ def section(benchmark: Benchmark) -> str:
     print(f"{benchmark.script}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
     text = done.stdout.rstrip() if done.returncode == 0 else f"failed: {done.stderr.strip().splitlines()[-1]}"
     text = re.sub(r"(?:/[\w.+-]+)+/", "", text)  # folders of this machine say nothing
-    return f"\n## {benchmark.title}\n\n`benchmarks/{benchmark.script}`; method: [{benchmark.page}]({benchmark.page})\n\n```text\n{text}\n```\n"
+    source = f"`benchmarks/{benchmark.script}`; method: [{benchmark.page}]({benchmark.page})"
+    return f"\n## {benchmark.title}\n\n{source}\n\n```text\n{text}\n```\n"
 
 
 def machine() -> str:
