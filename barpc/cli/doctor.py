@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 REQUIRED = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely", "click", "rich", "filelock")
-OPTIONAL = {"jinja2": "report", "matplotlib": "report", "distributed": "cluster"}
+OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
 
 
 def _version(package: str) -> str | None:
