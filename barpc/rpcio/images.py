@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import warnings
@@ -12,7 +13,8 @@ from typing import Any
 from xml.sax.saxutils import escape
 
 import rasterio
-from rasterio.errors import NotGeoreferencedWarning
+from rasterio._err import CPLE_BaseError
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.shutil import copy as raster_copy
 from rasterio.windows import Window
 
@@ -24,6 +26,8 @@ from barpc.rpcio.fixed import nitf_record
 from barpc.rpcio.tiff import GEOREFERENCE_TAGS, put_tag
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.rpc import RPC
+
+_FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk
 
 
 def write_rpc_vrt(
@@ -157,7 +161,9 @@ def write_rpc_copy(
             if driver == "GTiff":
                 shutil.copyfile(source, partial)
             else:
-                _convert(dataset, partial)
+                with _gdal_writes(target):
+                    _convert(dataset, partial)
+                _require_same(dataset, Window(0, 0, dataset.width, dataset.height), partial, target)
             put_tag(partial, printable(rpc), drop)
 
 
@@ -182,7 +188,9 @@ def write_rpc_nitf(
     _refuse_same(source, target)
     record = nitf_record(rpc)
     with _copying(source) as dataset, replacing(target, overwrite=overwrite) as partial:
-        raster_copy(dataset, str(partial), driver="NITF", TRE=f"RPC00B={record}")
+        with _gdal_writes(target):
+            raster_copy(dataset, str(partial), driver="NITF", TRE=f"RPC00B={record}")
+        _require_same(dataset, Window(0, 0, dataset.width, dataset.height), partial, target)
 
 
 def write_crop(
@@ -229,7 +237,9 @@ def write_crop(
                 f"{image_path}: window {window} is not inside the image of {dataset.width} x {dataset.height}"
             )
         with replacing(target, overwrite=overwrite) as partial:
-            _copy_window(dataset, partial, Window(col, row, width, height))
+            with _gdal_writes(target):
+                _copy_window(dataset, partial, Window(col, row, width, height))
+            _require_same(dataset, Window(col, row, width, height), partial, target)
             put_tag(partial, cropped, () if dataset.crs is not None else GEOREFERENCE_TAGS)
     return cropped
 
@@ -260,6 +270,34 @@ def _copy_window(dataset: Any, target: Path, window: Window) -> None:
                     window.col_off + block.col_off, window.row_off + block.row_off, block.width, block.height
                 )
                 crop.write(dataset.read(window=part), window=block)
+
+
+@contextmanager
+def _gdal_writes(target: Path) -> Iterator[None]:
+    """What GDAL says when it cannot write, which it does not always, as one error."""
+    try:
+        yield
+    except (RasterioError, CPLE_BaseError) as error:
+        raise _unwritten(target, str(error.__cause__ or error)) from error
+
+
+def _require_same(dataset: Any, window: Window, partial: Path, target: Path) -> None:
+    """Raise unless a copy holds the pixels of a window: GDAL closes a file on a full disk without a word."""
+    try:
+        with open_raster(partial) as copy:
+            for _, block in copy.block_windows(1):
+                place = Window(
+                    window.col_off + block.col_off, window.row_off + block.row_off, block.width, block.height
+                )
+                if dataset.read(window=place).tobytes() != copy.read(window=block).tobytes():
+                    raise _unwritten(target, "it holds other pixels than were written")
+    except ImageError as error:
+        raise _unwritten(target, "it cannot be read back") from error
+
+
+def _unwritten(target: Path, reason: str) -> OutputError:
+    full = shutil.disk_usage(target.parent).free < _FULL
+    return OutputError(f"{target}: cannot be written ({os.strerror(errno.ENOSPC) if full else reason})")
 
 
 def _refuse_same(source: Path, target: Path) -> None:
