@@ -78,13 +78,13 @@ class Rendered:
             self.views.append(View(shot.name, str(path), options.size, shot.delivered, self.scene.alt_range))
             altitude = picture.altitude.astype(np.float64)
             filled = np.where(np.isfinite(altitude), altitude, 1e6)
-            step = ndimage.maximum_filter(filled, 7) - ndimage.minimum_filter(filled, 7) > 3.0
+            step = ndimage.maximum_filter(filled, 3) - ndimage.minimum_filter(filled, 3) > 3.0
             self.altitude.append(np.where(step, np.nan, altitude))
 
     def errors(self, first: int, second: int, xy_first: np.ndarray, xy_second: np.ndarray) -> np.ndarray:
         """True place in the second view minus the measured one (M, 2) [px], where the truth is known.
 
-        Within 3 px of a step of the ground it is not: the patch may show the one side or the other.
+        Beside a step of the ground (one pixel) it is not: what is seen may be the one side or the other.
         """
         corner = np.minimum(np.floor(xy_first).astype(int), np.subtract(self.scene.options.size, 2))
         x, y = (xy_first - corner).T
