@@ -21,6 +21,7 @@ from barpc.pipeline.outputs import SUFFIXES, file_names, refuse_shadows, write_t
 from barpc.pipeline.views import LoadedViews, load_views
 from barpc.pointio.matches import read_matches, write_matches
 from barpc.report import Run, summarize
+from barpc.report.page import remake_report
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
@@ -65,6 +66,18 @@ class AdjustResult:
     def tracks(self) -> Tracks:
         """The tie points."""
         return self.run.tracks
+
+    def report(self) -> Path:
+        """Make report.html of this run again (extra `report`), from the files in its folder; its path.
+
+        Raises
+        ------
+        InputError
+            The run wrote no files (a check), or jinja2 is not installed.
+        """
+        if not self.run.out_dir:
+            raise InputError("a check writes no files, so there is nothing to make a report of")
+        return remake_report(Path(self.run.out_dir))
 
 
 def adjust(

@@ -125,3 +125,10 @@ def test_the_samples_run_within_a_gigabyte_and_half_a_minute_of_one_core(tmp_pat
     assert memory < 1e9
     assert "before" in done.stdout
     assert "after" in done.stdout
+
+
+def test_a_result_can_make_its_report_again(samples):
+    result, out = samples
+    before = (out / "report.html").read_bytes()
+    assert result.report() == out / "report.html"
+    assert (out / "report.html").read_bytes() == before
