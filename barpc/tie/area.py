@@ -17,6 +17,9 @@ from barpc.errors import InputError
 from barpc.geodesy import Array, wrap_longitude
 from barpc.scene import BoolArray
 
+_MALFORMED = (
+    ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, shapely.GEOSException,
+)  # fmt: skip
 _WGS84 = ("CRS84", "4326", "4979")
 
 
@@ -69,8 +72,8 @@ def read_area(path: str | os.PathLike[str]) -> Area:
         polygons = [shapely.make_valid(polygon) for polygon in _polygons(data)]
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, shapely.GEOSException) as error:
-        said = " ".join(str(error).split()) or type(error).__name__
+    except _MALFORMED as error:
+        said = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"{path}: not an area of interest, GeoJSON polygons in degrees ({said})") from error
     turns = [affinity.translate(polygon, turn) for polygon in polygons for turn in (-360.0, 0.0, 360.0)]
     outline = shapely.union_all(turns)

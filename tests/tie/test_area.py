@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from barpc.errors import DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
@@ -126,6 +128,42 @@ def test_what_is_no_area_is_refused_in_one_line(tmp_path, data, message) -> None
         read_area(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+NUMBERS = st.one_of(
+    st.integers(-(10**400), 10**400), st.floats(), st.integers(-180, 180), st.none(), st.text(max_size=2)
+)
+POSITIONS = st.one_of(st.lists(NUMBERS, max_size=4), st.lists(st.floats(-90, 90), min_size=2, max_size=2))
+JSON = st.recursive(
+    st.one_of(NUMBERS, POSITIONS, st.lists(st.lists(POSITIONS, max_size=6), max_size=3)),
+    lambda inner: st.fixed_dictionaries(
+        {
+            "type": st.sampled_from(
+                ["Polygon", "MultiPolygon", "Feature", "FeatureCollection", "GeometryCollection"]
+            )
+        },
+        optional={
+            "coordinates": inner,
+            "geometry": inner,
+            "features": st.one_of(inner, st.lists(inner, max_size=3)),
+            "geometries": st.lists(inner, max_size=3),
+            "crs": inner,
+        },
+    ),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(JSON)
+def test_any_json_is_an_area_or_one_line(tmp_path_factory, data) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.json"
+    try:
+        area, said = read_area(written(path, data)), ""
+    except InputError as error:
+        area, said = None, str(error)
+    assert said == "" or (said.startswith(str(path)) and "\n" not in said and len(said) < 1000)
+    assert area is None or (area.outline.is_valid and area.contains(PLACES).shape == (5,))
 
 
 def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path) -> None:

@@ -83,6 +83,28 @@ def test_the_listed_pairs_only_are_chosen_where_a_list_is_given() -> None:
     assert [p.views for p in pairs] == [(0, 1), (1, 2)]
 
 
+def test_all_listed_pairs_are_chosen_however_many_partners_a_view_then_has() -> None:
+    many = views(*(camera(10 * METRE * k) for k in range(6)))
+    listed = [(0, k) for k in range(1, 6)] + [(1, 2)]
+    pairs = select_pairs(many, TieOptions(neighbours=1), only=listed)
+    assert [p.views for p in pairs] == sorted(listed)
+
+
+def test_a_listed_pair_is_tried_where_the_cameras_may_be_wrong_and_named_where_it_cannot_overlap(
+    caplog,
+) -> None:
+    four = views(*(camera(400 * METRE * k) for k in range(4)))
+    listed = [(0, 1), (1, 2), (2, 3), (0, 2), (0, 3)]
+    pairs = select_pairs(four, TieOptions(search=400), only=listed)
+    assert [p.views for p in pairs] == [(0, 1), (0, 2), (1, 2), (2, 3)]
+    assert [r.message for r in caplog.records] == ["v0 - v3: listed, but they do not overlap as asked"]
+
+
+def test_listed_pairs_that_leave_groups_are_refused() -> None:
+    with pytest.raises(DisconnectedError, match=r"v0, v1; v2\).*among the listed pairs"):
+        select_pairs(views(camera(0.0), camera(50 * METRE), camera(100 * METRE)), TieOptions(), only=[(0, 1)])
+
+
 def test_too_small_an_angle_and_too_small_an_overlap_are_left_out() -> None:
     two = views(camera(0.0, lean=0.0), camera(250 * METRE, lean=0.05))
     for options in (TieOptions(min_angle=5.0), TieOptions(min_overlap=0.9), TieOptions(max_angle=0.5)):
