@@ -19,8 +19,6 @@ import logging
 import os
 import shutil
 import time
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -36,7 +34,7 @@ import numpy.typing as npt
 from barpc import __version__
 from barpc.atomic import remove_leftovers, replacing, write_text
 from barpc.errors import BarpcError, OutputError
-from barpc.record import Record
+from barpc.record import Record, load_npz
 
 logger = logging.getLogger(__name__)
 
@@ -222,9 +220,8 @@ class Workspace:
         if not path.exists():
             return None
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-                return {name: data[name] for name in data.files}
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+            return load_npz(path)
+        except (OSError, ValueError) as error:
             logger.warning("%s: a damaged cache file is made again (%s)", path, error)
             path.unlink(missing_ok=True)
             return None

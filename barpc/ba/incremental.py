@@ -6,8 +6,6 @@ points may observe old views; an observation that the old block has used must no
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +17,7 @@ from barpc.ba.blocks import CameraPrior, JointPrior
 from barpc.ba.solve import free_part
 from barpc.errors import InputError
 from barpc.geodesy import Array
+from barpc.record import load_npz
 
 if TYPE_CHECKING:
     from barpc.ba.result import Adjustment
@@ -69,10 +68,10 @@ class BlockPrior:
             The file is missing or holds something else.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
-                names = tuple(str(name) for name in file["names"])
-                return cls(names, str(file["model"]), int(file["drift"]), *(file[name] for name in _FIELDS))
-        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+            file = load_npz(path)
+            names = tuple(str(name) for name in file["names"])
+            return cls(names, str(file["model"]), int(file["drift"]), *(file[name] for name in _FIELDS))
+        except (OSError, KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
 
 

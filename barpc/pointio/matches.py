@@ -8,8 +8,6 @@ known, `sigma` [px], in any order. npz: arrays `names`, `view`, `track`, `xy` (K
 from __future__ import annotations
 
 import csv
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.pointio.names import ViewNames
+from barpc.record import load_npz
 from barpc.scene import IntArray, Tracks
 
 SIGMA = 0.5
@@ -61,7 +60,7 @@ def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA
             view, point, xy, spread = _read_asp([path], views, sigma)
         else:
             view, point, xy, spread = _read_csv(path, views, sigma)
-    except (OSError, EOFError, UnicodeDecodeError, csv.Error, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as tie points ({error})") from error
     if not (np.isfinite(xy).all() and np.isfinite(spread).all() and (spread > 0).all()):
         raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
@@ -143,14 +142,12 @@ def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
 
 def _read_npz(path: Path, views: ViewNames, sigma: float) -> Columns:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
-            view, point = own[file["view"].astype(np.int64)], file["track"].astype(np.int64)
-            xy = np.asarray(file["xy"], dtype=np.float64).reshape(len(view), 2)
-            spread = (
-                np.asarray(file["sigma"], dtype=np.float64) if "sigma" in file else np.full(len(view), sigma)
-            )
-    except (KeyError, ValueError, IndexError) as error:
+        file = load_npz(path)
+        own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
+        view, point = own[file["view"].astype(np.int64)], file["track"].astype(np.int64)
+        xy = np.asarray(file["xy"], dtype=np.float64).reshape(len(view), 2)
+        spread = np.asarray(file["sigma"], dtype=np.float64) if "sigma" in file else np.full(len(view), sigma)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
         raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({error})") from error
     keep = view >= 0
     return view[keep], point[keep], xy[keep], spread[keep]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
+from barpc.record import load_npz
 
 MAX_BYTES = 512 << 20
 """Larger tables are refused [bytes]."""
@@ -155,9 +155,8 @@ def read_csv(path: Path) -> Correspondences:
 def read_npz(path: Path) -> Correspondences:
     """Arrays ``ground`` (N, 3) and ``image`` (N, 2), or one array a column; ``sigma`` (N,) if known."""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {name: np.asarray(file[name], dtype=np.float64) for name in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        arrays = {name: np.asarray(value, dtype=np.float64) for name, value in load_npz(path).items()}
+    except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path}: not an npz of numbers ({error})") from error
     if "ground" in arrays and "image" in arrays:
         return Correspondences(arrays["ground"], arrays["image"], arrays.get("sigma"))
