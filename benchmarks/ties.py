@@ -3,6 +3,7 @@
     python benchmarks/ties.py IMG IMG [IMG...]          this project, stage by stage, and OpenCV's SIFT + FLANN
     python benchmarks/ties.py IMG IMG --cars PYTHON     and cars-bundleadjustment, run by that interpreter
     python benchmarks/ties.py --memory SIDE             peak memory on a made-up pair of SIDE x SIDE pixels
+    python benchmarks/ties.py --memory SIDE --area 0.3  the same with an area of interest, so much of a side wide
 
 Ratios are of CPU seconds, measured in the same run, one thread.
 """
@@ -30,7 +31,18 @@ from rasterio.windows import Window  # noqa: E402
 from barpc.pipeline.views import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor.rpc import RPC  # noqa: E402
-from barpc.tie import TieOptions, common_tracks, detect, find_tracks, link, match, refine, select_pairs  # noqa: E402
+from barpc.tie import (  # noqa: E402
+    Area,
+    TieOptions,
+    common_tracks,
+    detect,
+    find_tracks,
+    link,
+    match,
+    read_area,
+    refine,
+    select_pairs,
+)
 from barpc.tie.epipolar import agreeing, frame, mad  # noqa: E402
 from barpc.tie.raster import read_pixels, sample_stretch  # noqa: E402
 
@@ -155,7 +167,16 @@ def linear_rpc(side: int, parallax: float) -> RPC:
     return RPC(coeffs, np.array([5.0, 0.0, 100.0]), np.array([degrees, degrees, 100.0]), half, half)
 
 
-def memory(side: int) -> None:
+def middle(share: float, degrees: float, folder: str) -> Area:
+    """The middle of the made-up scene, as an area of interest."""
+    reach = share * degrees
+    ring = [[5 + x * reach, y * reach] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+    path = Path(folder) / "area.json"
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    return read_area(path)
+
+
+def memory(side: int, share: float | None) -> None:
     """Peak memory of a pair of `side` x `side` images, textured in spots, empty between them."""
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
@@ -178,7 +199,8 @@ def memory(side: int) -> None:
         ]
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         start = time.process_time()
-        result = find_tracks(views)
+        area = None if share is None else middle(share, 0.25 * side / 111000.0, folder)
+        result = find_tracks(views, area=area)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(f"{side} x {side}: {result.keypoints} keypoints, {result.tracks.num_points} tracks")
     print(
@@ -194,9 +216,10 @@ def main() -> int:
     parser.add_argument("images", nargs="*", type=Path, metavar="IMG")
     parser.add_argument("--cars", metavar="PYTHON", help="interpreter of an environment with cars")
     parser.add_argument("--memory", type=int, metavar="SIDE", help="measure memory on a made-up pair")
+    parser.add_argument("--area", type=float, metavar="SHARE", help="only in the middle of that pair")
     given = parser.parse_args()
     if given.memory:
-        memory(given.memory)
+        memory(given.memory, given.area)
     if given.images:
         views = list(load_views(given.images).views)
         start = time.process_time()
