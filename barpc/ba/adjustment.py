@@ -78,11 +78,12 @@ def adjust_tracks(
     problem = make_problem(block, options, centers, prior)
     state, heights = _start(problem, block, options, gcps, dem)
     heights.warn()
-    before = problem.residuals(state.params, state.points)
+    projected = problem.linearise(state.params, state.points)
+    before = projected.image - problem.xy
     observations = Observations(
         heights.hold(problem, state.points), block.sigma, options.noise_floor, block.point < block.num_tracks
     )
-    outcome = run_rounds(problem, observations, state, options, block.use, heights.hold, before)
+    outcome = run_rounds(problem, observations, state, options, block.use, heights.hold, projected)
     final = outcome.minimum.state
     covariance = outcome.minimum.covariance(problem.free)
     seen = np.zeros(block.num_points, dtype=bool)

@@ -63,7 +63,14 @@ class Cameras:
         self.is_rpc = np.array([isinstance(sensor, RPC) for sensor in self.sensors])
         self._stack = _RpcStack(self.sensors)
 
-    def project(self, params: Array, ecef: Array, bounds: IntArray, wanted: Wanted = "unknowns") -> Projected:
+    def project(
+        self,
+        params: Array,
+        ecef: Array,
+        bounds: IntArray,
+        wanted: Wanted = "unknowns",
+        out: Projected | None = None,
+    ) -> Projected:
         """Corrected image points with derivatives.
 
         Parameters
@@ -77,14 +84,15 @@ class Cameras:
         wanted : str
             "image": no derivatives; "points": by the points; "unknowns": by the unknowns too. What is not
             wanted has no rows.
+        out : Projected or None
+            Where to put them.
 
         Returns
         -------
         Projected
         """
-        count = ecef.shape[1]
-        image, by_point = np.empty((2, count)), np.empty((2, 0 if wanted == "image" else 3, count))
-        by_unknown = np.empty((2, self.unknowns.size if wanted == "unknowns" else 0, count))
+        found = self.room(ecef.shape[1], wanted) if out is None else out
+        image, by_point, by_unknown = found.image, found.by_point, found.by_unknown
         for views in self._chunks(bounds):
             for part in _parts(bounds[views.start], bounds[views.stop]):
                 of_view = np.clip(bounds[views.start : views.stop + 1], part.start, part.stop) - part.start
@@ -92,7 +100,13 @@ class Cameras:
                 image[:, part] = piece.image
                 by_point[..., part] = piece.by_point
                 by_unknown[..., part] = piece.by_unknown
-        return Projected(image, by_point, by_unknown)
+        return found
+
+    def room(self, count: int, wanted: Wanted = "unknowns") -> Projected:
+        """Empty arrays for `count` observations."""
+        by_point = np.empty((2, 0 if wanted == "image" else 3, count))
+        by_unknown = np.empty((2, self.unknowns.size if wanted == "unknowns" else 0, count))
+        return Projected(np.empty((2, count)), by_point, by_unknown)
 
     def _chunks(self, bounds: IntArray) -> Iterator[slice]:
         """Runs of views of one kind with about CHUNK observations together; other sensors one by one."""

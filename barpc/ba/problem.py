@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -52,6 +52,7 @@ class Problem:
     free: BoolArray
     joint_prior: JointPrior | None = None
     point_prior: PointPrior | None = None
+    _room: list[Projected] = field(default_factory=list, repr=False)
 
     def with_point_prior(self, prior: PointPrior | None) -> Problem:
         """The same problem with other priors on its points."""
@@ -77,7 +78,17 @@ class Problem:
         flat = whitened.ravel()
         return float(flat @ flat) + self.prior_cost(params, points)
 
-    def reduce(self, params: Array, points: Array, weight: Array) -> Reduced:
+    def linearise(self, params: Array, points: Array) -> Projected:
+        """Image points with all derivatives, for `reduce`; the next call writes over them."""
+        if not self._room:
+            self._room.append(self.cameras.room(self.xy.shape[1]))
+        structure = self.structure
+        ecef = structure.of_points(points)
+        return self.cameras.project(params, ecef, structure.bounds, out=self._room[0])
+
+    def reduce(
+        self, params: Array, points: Array, weight: Array, projected: Projected | None = None
+    ) -> Reduced:
         """Linearise at a state and eliminate the points.
 
         Parameters
@@ -88,13 +99,15 @@ class Problem:
             ECEF [m].
         weight : (K,)
             1 / sigma of every observation [1/px], 0 for one that does not count.
+        projected : Projected or None
+            `linearise` of this state, which is used up.
 
         Returns
         -------
         Reduced
         """
         structure = self.structure
-        projected = self.cameras.project(params, structure.of_points(points), structure.bounds)
+        projected = self.linearise(params, points) if projected is None else projected
         residual = (projected.image - self.xy) * weight
         by_point, by_unknown = projected.by_point, projected.by_unknown
         by_point *= weight

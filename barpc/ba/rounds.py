@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from barpc.ba.cameras import Projected
 from barpc.ba.loss import LOSSES
 from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
@@ -116,7 +117,7 @@ def run_rounds(
     options: AdjustOptions,
     use: BoolArray,
     hold: Callable[[Problem, Array], Problem],
-    residual: Array,
+    projected: Projected,
 ) -> Outcome:
     """Robust rounds, cuts and the final least squares.
 
@@ -134,18 +135,19 @@ def run_rounds(
         Observations to start with.
     hold : callable
         The problem with its points' priors renewed at points (P, 3).
-    residual : (2, K)
-        Of `state` [px].
+    projected : Projected
+        `Problem.linearise` of `state`; it is used up.
 
     Returns
     -------
     Outcome
     """
+    residual, ahead = projected.image - problem.xy, True
     everything = use = observations.tied(use & np.isfinite(residual).all(axis=0))
     problem = hold(problem, state.points)
     noise, passes = 1.0, 0
     if options.loss != "linear":
-        state, residual, noise = _robust(problem, observations, state, residual, use, options)
+        state, residual, noise = _robust(problem, observations, state, projected, use, options)
     while True:
         problem = hold(problem, state.points)
         passes += 1
@@ -155,8 +157,16 @@ def run_rounds(
             kept = observations.tied(everything & (s <= (options.robust_threshold * noise) ** 2))
         wanted = noise if options.estimate_noise else 1.0
         weight = observations.weight(kept, wanted)
-        found = minimise(problem, state, weight, options.solver, options.max_steps, options.tolerance)
-        state = found.state
+        found = minimise(
+            problem,
+            state,
+            weight,
+            options.solver,
+            options.max_steps,
+            options.tolerance,
+            projected if ahead else None,
+        )
+        state, ahead = found.state, False
         residual = problem.residuals(state.params, state.points)
         cost = problem.cost(state.params, state.points, residual * weight)
         state = replace(state, cost=cost, history=(*state.history, cost))
@@ -173,11 +183,13 @@ def _robust(
     problem: Problem,
     observations: Observations,
     state: State,
-    residual: Array,
+    projected: Projected,
     use: BoolArray,
     options: AdjustOptions,
 ) -> tuple[State, Array, float]:
     """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
+
+    `projected` is of the state, and in the end of the one that is returned.
 
     The noise is a median that counts observations by their weights: as the scale shrinks, it leaves the
     wrong ones behind. It cannot fall below what the best fifth of all observations shows, nor below half of
@@ -185,6 +197,7 @@ def _robust(
     """
     loss = LOSSES[options.loss]
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
+    residual = projected.image - problem.xy
     s = observations.squared(residual, counted)
     for _ in range(_ROBUST_ROUNDS):
         least = float(np.sqrt(np.quantile(s[use], _LOW) / _LOW)) if use.any() else 1.0
@@ -193,8 +206,8 @@ def _robust(
             break
         scale = 3.0 * noise if np.isinf(scale) else max(3.0 * noise, 0.5 * scale)
         counted = use * loss(s / scale**2)[1]
-        state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted))
-        residual = problem.residuals(state.params, state.points)
+        state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
+        residual = problem.linearise(state.params, state.points).image - problem.xy  # into `projected`
         s = observations.squared(residual, counted)
         counted = use * loss(s / scale**2)[1]
     return state, residual, noise

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.optimize import least_squares
 
+from barpc.ba.cameras import Projected
 from barpc.ba.covariance import Covariance
 from barpc.ba.linear import Factor, Matrix, factorize
 from barpc.ba.normal import Reduced
@@ -25,7 +26,7 @@ from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
-SCIPY_UNKNOWNS = 600
+SCIPY_UNKNOWNS = 200
 """Up to so many camera unknowns "auto" takes scipy, whose dense decomposition grows as their cube."""
 
 _ROUNDING = 1e-9
@@ -93,6 +94,7 @@ def minimise(
     solver: str = "auto",
     max_steps: int = 30,
     tolerance: float = 1e-6,
+    projected: Projected | None = None,
 ) -> Minimum:
     """Minimise at fixed weights from a state near the minimum.
 
@@ -111,6 +113,8 @@ def minimise(
     tolerance : float
         The step that is expected to gain less than this fraction of the cost is taken and is the last, and
         so is one that is expected to leave a thousandth of it (see `_settled`).
+    projected : Projected or None
+        `Problem.linearise` of the state, which is used up.
 
     Returns
     -------
@@ -128,11 +132,12 @@ def minimise(
     result = None
     if solver == "scipy":
         try:
-            result = _scipy(problem, state, weight, max_steps, tolerance)
+            result = _scipy(problem, state, weight, max_steps, tolerance, projected)
         except np.linalg.LinAlgError as error:  # its SVD may fail on a finite matrix
             _LOG.warning("least_squares failed (%s): going on by Levenberg-Marquardt", error)
+            projected = None
     if result is None:
-        result = _levenberg_marquardt(problem, state, weight, max_steps, tolerance)
+        result = _levenberg_marquardt(problem, state, weight, max_steps, tolerance, projected)
     _LOG.info(
         "%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, time.process_time() - start
     )
@@ -147,9 +152,9 @@ def _settled(gain: float, before: float, cost: float, tolerance: float) -> bool:
     return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
 
 
-def gauss_newton(problem: Problem, state: State, weight: Array) -> State:
-    """One undamped step: for rounds whose weights change anyway."""
-    reduced = problem.reduce(state.params, state.points, weight)
+def gauss_newton(problem: Problem, state: State, weight: Array, projected: Projected) -> State:
+    """One undamped step from a linearised state: for rounds whose weights change anyway."""
+    reduced = problem.reduce(state.params, state.points, weight, projected)
     step, gain, _ = camera_step(problem, reduced)
     return state.moved(step, reduced, max(_finite(reduced.cost) - gain, 0.0))
 
@@ -177,11 +182,16 @@ def free_part(free: BoolArray, matrix: Matrix) -> Matrix:
 
 
 def _levenberg_marquardt(
-    problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float
+    problem: Problem,
+    state: State,
+    weight: Array,
+    max_steps: int,
+    tolerance: float,
+    projected: Projected | None,
 ) -> Minimum:
     """Gauss-Newton steps, damped only when one fails."""
     damping, before = 0.0, np.inf
-    reduced = problem.reduce(state.params, state.points, weight)
+    reduced = problem.reduce(state.params, state.points, weight, projected)
     state = replace(state, cost=_finite(reduced.cost), history=(*state.history, reduced.cost))
     for _ in range(max_steps):
         try:
@@ -217,9 +227,11 @@ class _Compressed:
     In them the matrix is nearly the identity: the gradient's size is what a step would gain.
     """
 
-    def __init__(self, problem: Problem, state: State, weight: Array, tolerance: float) -> None:
+    def __init__(
+        self, problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
+    ) -> None:
         self.problem, self.weight, self.tolerance = problem, weight, tolerance
-        self.reduced = problem.reduce(state.params, state.points, weight)
+        self.reduced = problem.reduce(state.params, state.points, weight, projected)
         self.state = replace(
             state, cost=_finite(self.reduced.cost), history=(*state.history, self.reduced.cost)
         )
@@ -273,8 +285,15 @@ class _Compressed:
         return np.vstack([self.slope, np.zeros((1, len(x)))])
 
 
-def _scipy(problem: Problem, state: State, weight: Array, max_steps: int, tolerance: float) -> Minimum:
-    compressed = _Compressed(problem, state, weight, tolerance)
+def _scipy(
+    problem: Problem,
+    state: State,
+    weight: Array,
+    max_steps: int,
+    tolerance: float,
+    projected: Projected | None,
+) -> Minimum:
+    compressed = _Compressed(problem, state, weight, tolerance, projected)
     count = len(compressed.whitened)
     if not _settled(compressed.gain, np.inf, compressed.state.cost, tolerance):
         try:
