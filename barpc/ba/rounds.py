@@ -25,6 +25,8 @@ _SAME = 1e-3  # a cut that changes less than this part of the observations is no
 _SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
 _LEAST_FREEDOM = 20
 _ROBUST_ROUNDS = 20
+_SHRINK = 0.25  # of the loss's scale in one round, at most
+_FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,7 @@ def run_rounds(
             weight,
             options.solver,
             options.max_steps,
-            options.tolerance,
+            options.tolerance if passes > 1 or options.loss == "linear" else _FIRST_TOLERANCE,
             projected if ahead else None,
         )
         state, ahead = found.state, False
@@ -204,7 +206,7 @@ def _robust(
         noise = max(float(np.sqrt(_median(s, counted) / _MEDIAN)), least, _LEAST_NOISE)
         if scale <= 3.6 * noise:
             break
-        scale = 3.0 * noise if np.isinf(scale) else max(3.0 * noise, 0.5 * scale)
+        scale = 3.0 * noise if np.isinf(scale) else max(3.0 * noise, _SHRINK * scale)
         counted = use * loss(s / scale**2)[1]
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual = problem.linearise(state.params, state.points).image - problem.xy  # into `projected`
