@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.ba import AdjustOptions
+from barpc.errors import DisconnectedError, InputError
 from barpc.geodesy import ground_from_ecef
-from barpc.pipeline import RunOptions
+from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline.inputs import input_files, read_pairs
 from barpc.pipeline.views import load_views
 from barpc.pointio.matches import read_matches
@@ -141,3 +143,14 @@ def test_a_missing_file_ends_the_run_with_one_line(tmp_path, flag, word) -> None
     (line,) = err.splitlines()
     assert line.startswith(f"barpc: {gone}: ")
     assert word in line
+
+
+def test_an_image_that_the_list_leaves_alone_can_be_left_out(tmp_path) -> None:
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("view_00 view_01\n")
+    options = RunOptions(overlap_list=str(pairs), stop_after="matching")
+    with pytest.raises(DisconnectedError, match=r"view_00, view_01; view_02\).*among the listed pairs"):
+        adjust(IMAGES, tmp_path / "out", options)
+    kept = adjust(IMAGES, tmp_path / "out", replace(options, adjust=AdjustOptions(keep_largest=True)))
+    assert [view.name for view in kept.run.views] == ["view_00", "view_01"]
+    assert kept.tracks.num_points > 500
