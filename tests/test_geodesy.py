@@ -31,6 +31,20 @@ def test_there_and_back_is_a_few_nanometres(ground):
     assert np.abs(back[:, 2] - ground[:, 2]).max() <= 8e-9
 
 
+def test_rows_with_their_derivative_are_the_points_with_theirs(ground):
+    ecef = geodesy.ecef_from_ground(ground)
+    rows, jacobian = geodesy.ground_rows_from_ecef(np.ascontiguousarray(ecef.T))
+    np.testing.assert_array_equal(rows.T, geodesy.ground_from_ecef(ecef))
+    expected = np.moveaxis(geodesy.ground_from_ecef_jacobian(ground), 0, -1)
+    np.testing.assert_allclose(jacobian, expected, rtol=1e-12, atol=1e-17)
+
+
+def test_the_centre_of_the_earth_and_its_axis_raise_nothing():
+    assert geodesy.ground_from_ecef([0.0, 0.0, 0.0])[2] == -geodesy.WGS84_A
+    with_pole, _ = geodesy.ground_rows_from_ecef(np.array([[0.0], [0.0], [6.4e6]]))
+    np.testing.assert_allclose(with_pole[:, 0], [0, 90, 6.4e6 - geodesy.WGS84_B], atol=1e-8)
+
+
 def test_the_poles_and_the_equator_have_an_answer():
     ecef = [[0, 0, 6.4e6], [0, 0, -6.4e6], [geodesy.WGS84_A, 0, 0], [0, -geodesy.WGS84_A - 100, 0]]
     ground = geodesy.ground_from_ecef(ecef)

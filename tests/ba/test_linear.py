@@ -9,6 +9,7 @@ import scipy.sparse as sp
 
 from barpc.ba import linear, normal, solve
 from barpc.ba.solve import State
+from barpc.ba.structure import counting_sort
 from barpc.errors import AdjustError
 from tests.ba.conftest import solve as adjust
 
@@ -76,3 +77,10 @@ def test_the_reduced_system_is_the_schur_complement_of_the_whole(block):
     stacked = np.moveaxis(projected.by_point[..., rows], -1, 0).reshape(-1, 3) / 0.1
     np.testing.assert_allclose(matrix @ matrix.T, stacked.T @ stacked, rtol=1e-5, atol=1e-3)
     assert isinstance(State(found.params, found.points), State)
+
+
+def test_counting_sorts_as_a_stable_sort_does():
+    key = np.random.default_rng(0).integers(0, 40, 500)
+    order, bounds = counting_sort(key, 41)
+    np.testing.assert_array_equal(order, np.argsort(key, kind="stable"))
+    np.testing.assert_array_equal(bounds, np.searchsorted(np.sort(key), np.arange(42)))
