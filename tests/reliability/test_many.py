@@ -1,0 +1,90 @@
+"""A thousand images: files are opened late and closed early, and nothing is held for each of them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.rpcio import read_rpc, write_rpc_vrt
+
+from .conftest import barpc
+from .trials import SAMPLES, crop
+
+LIMIT = 256  # open files (ulimit -n)
+
+
+def shifted(source: Path, folder: Path, count: int) -> list[Path]:
+    """VRTs of one image, a chain of RPCs each a step east of the last: neighbours overlap, others do not."""
+    rpc = read_rpc(source)
+    step = 0.002  # deg: a little less than the image is wide
+    found = []
+    for n in range(count):
+        offset = rpc.ground_offset + np.array([step * n, 0.0, 0.0])
+        path = folder / f"view_{n:04d}.vrt"
+        write_rpc_vrt(type(rpc)(**{**fields_of(rpc), "ground_offset": offset}), source, path)
+        found.append(path)
+    return found
+
+
+def fields_of(rpc) -> dict[str, object]:
+    from dataclasses import fields
+
+    return {f.name: getattr(rpc, f.name) for f in fields(rpc) if f.init}
+
+
+PROGRAM = """
+import json, resource, sys, threading
+from pathlib import Path
+resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]),) * 2)
+from barpc.pipeline import load_views
+from barpc.tie import TieOptions, detect
+from barpc.workspace import fingerprint
+most, over = 0, threading.Event()
+def watch():
+    global most
+    while not over.wait(0.002):
+        most = max(most, len(list(Path("/proc/self/fd").iterdir())))
+threading.Thread(target=watch, daemon=True).start()
+loaded = load_views(sorted(Path(sys.argv[2]).glob("*.vrt")))
+prints = {fingerprint(view.path) for view in loaded.views}
+found = detect(loaded.views, TieOptions())
+over.set()
+usage = resource.getrusage(resource.RUSAGE_SELF)
+told = {"views": len(found), "keypoints": min(len(k) for k in found), "prints": len(prints), "files": most}
+print(json.dumps(told | {"mb": usage.ru_maxrss / 1e3, "cpu": usage.ru_utime + usage.ru_stime}))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="open files are counted in /proc")
+def test_a_thousand_images_are_read_with_few_open_files(tmp_path):
+    source = crop(SAMPLES[0], tmp_path / "source.tif", side=128)
+    shifted(source, tmp_path, 1000)
+    command = [sys.executable, "-c", PROGRAM, str(LIMIT), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert (told["views"], told["prints"]) == (1000, 1000)
+    assert told["keypoints"] > 0
+    assert told["files"] < LIMIT / 2
+    assert told["mb"] < 600
+    print(told)
+
+
+def test_one_bad_image_of_many_is_named_and_left_out_when_asked(pristine, tmp_path):
+    bad = tmp_path / "bad.tif"
+    bad.write_text("hello")
+    said = barpc("adjust", *pristine, bad, "-o", tmp_path / "out")
+    assert said.code == 1
+    assert "bad.tif" in said.err
+    assert not (tmp_path / "out").exists()
+    said = barpc("adjust", *pristine, bad, "-o", tmp_path / "out", "--keep-going", "--json")
+    assert said.code == 3
+    summary = json.loads(said.out)
+    assert [Path(left["path"]).name for left in summary["left_out"]] == ["bad.tif"]
+    assert len(summary["views"]) == 3
