@@ -30,15 +30,16 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 sys.path.insert(0, str(ROOT / "docs" / "figures"))
 
-import barpc
 import stereo
+from concepts import SAMPLES, cameras, errors_of_place
+
+import barpc
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.errors import BarpcError, BarpcWarning
 from barpc.pipeline import RunOptions
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import altitude_range, camera_center
 from barpc.simulate import simulate_block
-from concepts import SAMPLES, cameras, errors_of_place
 
 HEAD = """# Accuracy
 
