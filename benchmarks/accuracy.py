@@ -103,7 +103,7 @@ def blocks() -> Iterator[str]:
         "Images of 20,000 x 20,000 px, noise 0.1 px and 10 % false observations, attitude 15 microradians "
         "and position 1 m wrong; the median of five. Error of the adjusted cameras on 500 points that the "
         "adjustment does not see, exact image points. `noise_floor = 0` is right for these independent "
-        "errors, the default (0.1 px) for real images."
+        "errors, the default (0.02 px) for real images."
     )
     yield from table("views, tie points", "as delivered [px]", "default [px]", "`noise_floor = 0` [px]")
     for views, tracks in ((3, 2000), (10, 5000), (30, 10_000)):

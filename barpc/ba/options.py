@@ -84,7 +84,7 @@ class AdjustOptions:
     sigma_position: float | None = None
     sigma_drift: float | None = None
     sigma_shift: float = 20.0
-    noise_floor: float = 0.1
+    noise_floor: float = 0.02
     loss: str = "geman_mcclure"
     robust_threshold: float = 4.0
     num_passes: int = 5

@@ -22,6 +22,7 @@ from barpc.pipeline.views import LoadedViews, load_views
 from barpc.pointio.matches import read_matches, write_matches
 from barpc.report import Run, summarize
 from barpc.report.page import remake_report
+from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
@@ -117,6 +118,9 @@ def adjust(
     if unknown:
         raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(SUFFIXES)}")
     loaded = _load(images, options)
+    if options.images == "vrt":
+        for view in loaded.views:
+            plain_source(view.path)  # refuses what no VRT can point at, before any work
     keep = {
         Path(path)
         for view, source in zip(loaded.views, loaded.sources, strict=True)

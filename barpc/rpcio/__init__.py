@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import FORMATS, Format, write_rpc
-from barpc.rpcio.images import write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.rpcio.images import plain_source, write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
 from barpc.rpcio.sources import RpcSource, Sidecar, read_rpc, read_rpc_source, shadows, sidecars
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "ReadOptions",
     "RpcSource",
     "Sidecar",
+    "plain_source",
     "read_rpc",
     "read_rpc_source",
     "shadows",

@@ -25,6 +25,7 @@ from barpc.rpcio.digits import printable
 from barpc.rpcio.fixed import nitf_record
 from barpc.rpcio.tiff import GEOREFERENCE_TAGS, put_tag
 from barpc.rpcio.xml import rpc_domain
+from barpc.safexml import parse_xml
 from barpc.sensor.rpc import RPC
 
 _FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk
@@ -56,15 +57,45 @@ def write_rpc_vrt(
     OutputError
         The VRT exists or cannot be written.
     """
-    source, driver = identify(image_path)
-    if driver == "VRT":
-        raise ImageError(f"{image_path}: a VRT of a VRT is not written; give the image that it is made of")
+    source = plain_source(image_path)
     target = Path(vrt_path).absolute()
     _refuse_same(source, target)
     name = os.path.relpath(source.resolve(), target.parent.resolve()) if relative else str(source)
     with open_raster(source) as dataset:
         text = _vrt(dataset, rpc, name, relative)
     write_text(target, text, overwrite=overwrite)
+
+
+def plain_source(image_path: Path | str) -> Path:
+    """The file that holds an image's pixels: itself, or what a VRT written here points at.
+
+    Raises
+    ------
+    ImageError
+        The image cannot be read, or is a VRT that shows more, or less, than one whole image as it is.
+    """
+    source, driver = identify(image_path)
+    if driver != "VRT":
+        return source
+    root = parse_xml(source)
+    width, height = root.get("rasterXSize"), root.get("rasterYSize")
+    frame = {"xOff": "0", "yOff": "0", "xSize": width, "ySize": height}
+    found = set()
+    for band in root.iter("VRTRasterBand"):
+        for part in band.iter():
+            if part.tag == "ComplexSource" or (part.tag in ("SrcRect", "DstRect") and part.attrib != frame):
+                found.add("")
+            if part.tag == "SourceBand" and part.text not in (band.get("band"), "mask,1"):
+                found.add("")
+            if part.tag == "SourceFilename":
+                relative = part.get("relativeToVRT") == "1"
+                found.add(str((source.parent if relative else Path("/")) / (part.text or "")))
+    if len(found) != 1 or "" in found:
+        raise ImageError(
+            f"{image_path}: a VRT that is more than one whole image is not pointed at; give the image that it is "
+            "made of, or have copies written"
+        )
+    return Path(found.pop()).resolve()
 
 
 def _vrt(dataset: Any, rpc: RPC, source: str, relative: bool) -> str:

@@ -305,3 +305,16 @@ def test_check_compares_with_other_cameras(crops, tmp_path):
     code, _, err = barpc("check", new[0], "--against", tmp_path)
     assert code == 1
     assert "view_00.vrt" in err
+
+
+def test_adjusted_images_can_be_adjusted_again(crops, tmp_path):
+    barpc("adjust", *crops, "-o", tmp_path / "one")
+    code, out, err = barpc(
+        "adjust", *sorted((tmp_path / "one").glob("*.vrt")), "-o", tmp_path / "two", "--json"
+    )
+    assert code == 0, err
+    assert abs(json.loads(out)["pairs"][0]["epipolar_after"]["median"]) < 0.03
+    text = (tmp_path / "two/view_00.vrt").read_text()
+    assert str(crops[0].name) in text
+    with rasterio.open(tmp_path / "two/view_00.vrt") as new, rasterio.open(crops[0]) as old:
+        np.testing.assert_array_equal(new.read(), old.read())

@@ -44,7 +44,14 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(trials):
 def started(*args: object) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "barpc", *map(str, args)]
     return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(
+            signal.SIGINT, signal.SIG_DFL
+        ),  # a background shell's jobs ignore it
     )
 
 
