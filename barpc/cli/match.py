@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 @with_flags(*MATCH_FLAGS, *TIE_FLAGS)
 @click.pass_obj
 def command(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
-    r"""Match tie points and stop: matches.csv and matches.npz, for `barpc adjust --matches` and other tools.
+    r"""Match tie points and stop, for `barpc adjust --matches` and other tools.
+
+    Writes matches.csv and matches.npz, and a text match file for each pair as ASP reads them (folder asp).
 
     \b
     Examples:

@@ -19,8 +19,9 @@ from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new
 from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import SUFFIXES, file_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import LoadedViews, load_views
-from barpc.pointio.matches import read_matches, write_matches
+from barpc.pointio.matches import asp_text, read_matches, write_matches
 from barpc.report import Run, summarize
+from barpc.report.measures import pair_ties
 from barpc.report.page import remake_report
 from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
@@ -246,6 +247,10 @@ def _write_matches(run: Run, workspace: Workspace) -> None:
     for name in ("matches.csv", "matches.npz"):
         with workspace.output(name) as partial:
             write_matches(partial, run.tracks, names)
+    for ties in pair_ties(run.tracks):
+        i, j = ties.views
+        text = asp_text(run.tracks.xy[ties.a], run.tracks.xy[ties.b])
+        workspace.write_text(f"asp/{names[i]}__{names[j]}.txt", text)
 
 
 def _only(run: Run, names: frozenset[str]) -> Run:

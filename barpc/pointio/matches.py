@@ -106,6 +106,32 @@ def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> Non
             writer.writerow([names[view], repr(col), repr(row), point, repr(sigma)])
 
 
+def asp_text(first: Array, second: Array) -> str:
+    """The matches of a pair as an ASP text match file.
+
+    The counts on the first line, then one keypoint a line, those of the first image first: x, y, their whole
+    pixels, orientation, scale, interest, polarity, octave, scale level and the length of the descriptor (0).
+
+    Parameters
+    ----------
+    first, second : (M, 2)
+        col, row [px] in the two images.
+
+    Examples
+    --------
+    >>> print(asp_text(np.array([[1.25, 2.0]]), np.array([[3.5, 4.0]])), end="")
+    1 1
+    1.25 2.0 1 2 0 1 1 0 0 0 0
+    3.5 4.0 4 4 0 1 1 0 0 0 0
+    """
+    rows = [
+        f"{col!r} {row!r} {round(col)} {round(row)} 0 1 1 0 0 0 0"
+        for points in (first, second)
+        for col, row in points.tolist()
+    ]
+    return "\n".join([f"{len(first)} {len(second)}", *rows]) + "\n"
+
+
 Columns = tuple[IntArray, IntArray, Array, Array]
 
 

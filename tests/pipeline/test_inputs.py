@@ -13,6 +13,7 @@ import pytest
 from barpc.errors import DisconnectedError, InputError
 from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline.inputs import only_new
+from barpc.pointio.matches import read_matches
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks
 
@@ -41,6 +42,23 @@ def test_tie_points_from_a_file_give_the_same_answer(matched, tmp_path):
         np.testing.assert_array_equal(again.tracks.sigma, result.tracks.sigma)
         runs.append(again.adjustment.params)
     np.testing.assert_array_equal(*runs)
+
+
+def test_asp_text_matches_hold_the_same_tie_points(matched):
+    result, out = matched
+    assert sorted(path.name for path in (out / "asp").iterdir()) == [
+        "view_00__view_01.txt",
+        "view_00__view_02.txt",
+        "view_01__view_02.txt",
+    ]
+    back = read_matches(out / "asp", [view.name for view in result.views])
+    # the format knows a keypoint by its place only: the few tracks that share one are ambiguous and left out
+    assert result.tracks.num_points >= back.num_points > 0.97 * result.tracks.num_points
+    ours = {
+        (view, *xy) for view, xy in zip(result.tracks.view.tolist(), result.tracks.xy.tolist(), strict=True)
+    }
+    theirs = {(view, *xy) for view, xy in zip(back.view.tolist(), back.xy.tolist(), strict=True)}
+    assert theirs <= ours
 
 
 def test_control_points_put_the_scene_in_its_place(matched, truth, tmp_path):
