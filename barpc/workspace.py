@@ -161,8 +161,11 @@ class Workspace:
     def _check_free(self, overwrite: bool) -> None:
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder}: is a file; give -o a folder")
-        used = self.folder.is_dir() and any(self.folder.iterdir())
-        if used and not overwrite and self._read_state().get("status") not in ("running", "failed"):
+        names = {path.name for path in self.folder.iterdir()} if self.folder.is_dir() else set()
+        status = self._read_state().get("status")
+        # without a state: nothing but our own folder is left by a run that was killed in its first moment
+        unfinished = status in ("running", "failed") or (status is None and names <= {STATE})
+        if names and not overwrite and not unfinished:
             raise OutputError(f"{self.folder}: exists and is not empty; give --overwrite or another -o")
 
     def __enter__(self) -> Workspace:

@@ -162,6 +162,15 @@ def test_a_read_only_place_is_named(tmp_path):
         Workspace(tmp_path / "run")
 
 
+def test_a_run_killed_before_its_first_state_is_gone_on_with(tmp_path):
+    (tmp_path / "run/.barpc/cache").mkdir(parents=True)
+    (tmp_path / "run/.barpc/lock").touch()
+    with Workspace(tmp_path / "run") as run:
+        run.write_text("summary.json", "{}")
+    with pytest.raises(OutputError, match="--overwrite"):
+        Workspace(tmp_path / "run")
+
+
 def test_a_run_that_is_refused_at_once_leaves_nothing(tmp_path):
     with pytest.raises(TiePointError), Workspace(tmp_path / "new/run") as run:
         run.store("detect", "k", {"x": np.ones(3)})

@@ -12,8 +12,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-import matplotlib.pyplot as plt
 import numpy as np
 
 from barpc import RPC, read_rpc
@@ -25,8 +23,23 @@ from barpc.simulate import simulate_block
 HERE = Path(__file__).resolve().parent
 SAMPLES = HERE.parents[1] / "data_samples"
 COLORS = ("#d1495b", "#2e86ab", "#3a7d44")
-mpl.rcParams |= {"svg.hashsalt": "barpc", "svg.fonttype": "none", "font.size": 10, "axes.grid": True}
-mpl.rcParams |= {"grid.alpha": 0.3, "figure.facecolor": "white"}
+STYLE = {
+    "svg.hashsalt": "barpc",
+    "svg.fonttype": "none",
+    "font.size": 10,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "figure.facecolor": "white",
+}
+
+
+def pyplot() -> Any:
+    """matplotlib, loaded when a figure is drawn: what is only measured here does without it."""
+    import matplotlib as mpl
+    import matplotlib.pyplot as plt
+
+    mpl.rcParams |= STYLE
+    return plt
 
 
 def cameras(folder: Path, ending: str) -> list[RPC]:
@@ -38,7 +51,7 @@ def save(figure: Any, name: str) -> None:
     """As SVG, the same bytes each time."""
     figure.tight_layout()
     figure.savefig(HERE / f"{name}.svg", metadata={"Date": None})
-    plt.close(figure)
+    pyplot().close(figure)
 
 
 def rays(delivered: list[RPC], adjusted: list[RPC], truth: dict[str, Any]) -> None:
@@ -46,7 +59,7 @@ def rays(delivered: list[RPC], adjusted: list[RPC], truth: dict[str, Any]) -> No
     point = next(p for p in truth["check_points"] if len(p["image"]) == 3)
     xy = [np.array(point["image"][f"view_{i:02}"]) for i in range(3)]
     alt = np.linspace(0, 300, 2401)
-    figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.2), sharey=True)
+    figure, axes = pyplot().subplots(1, 2, figsize=(8.6, 3.2), sharey=True)
     for axis, name, models in zip(axes, ("as delivered", "adjusted"), (delivered, adjusted), strict=True):
         ground = [m.localize(np.broadcast_to(p, (2401, 2)), alt) for m, p in zip(models, xy, strict=True)]
         ecef = [ecef_from_ground(g) for g in ground]
@@ -76,7 +89,7 @@ def errors_of_place(models: list[RPC], truth: dict[str, Any]) -> np.ndarray:
 
 def gauge(steps: dict[str, list[RPC]], truth: dict[str, Any]) -> None:
     """Shape and place: what tie points repair and what only ground control does."""
-    figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.0))
+    figure, axes = pyplot().subplots(1, 2, figsize=(8.6, 3.0))
     errors = {name: errors_of_place(models, truth) for name, models in steps.items()}
     shape = [np.linalg.norm((e - e.mean(axis=0)).std(axis=0)) for e in errors.values()]
     place = [np.linalg.norm(e.mean(axis=0)) for e in errors.values()]
@@ -92,7 +105,7 @@ def gauge(steps: dict[str, list[RPC]], truth: dict[str, Any]) -> None:
 
 def tie_points() -> None:
     """What noise, number and false matches do to cameras, measured on points that the adjustment does not see."""
-    figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.2))
+    figure, axes = pyplot().subplots(1, 2, figsize=(8.6, 3.2))
     counts = (20, 50, 150, 500, 1500)
     for color, noise in zip(COLORS, (0.3, 0.1, 0.03), strict=True):
         rms = [held_out(count, noise, 0.0) for count in counts]

@@ -15,8 +15,8 @@ import numpy as np
 import rasterio
 
 from barpc import read_rpc
-from barpc.tie import find_tracks
 from barpc.pipeline import load_views
+from barpc.tie import find_tracks
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
 HALF = 28
