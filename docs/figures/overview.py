@@ -23,6 +23,7 @@ HALF = 28
 
 
 def patch(image, x, y):
+    """A window about a point, stretched to 0..1, and its corner."""
     c, r = round(x), round(y)
     pixels = image[r - HALF : r + HALF + 1, c - HALF : c + HALF + 1]
     low, high = np.percentile(pixels, [1, 99])
@@ -30,6 +31,7 @@ def patch(image, x, y):
 
 
 def main(adjusted: str) -> None:
+    """Draw the figure from the samples and the run in `adjusted`."""
     loaded = load_views(sorted(SAMPLES.glob("*.tif")))
     tracks = find_tracks(loaded.views).tracks
     images = []
