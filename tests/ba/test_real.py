@@ -80,6 +80,8 @@ def test_the_triplet_agrees_and_stays_where_it_was(shared_data, triplet):
     names = [view.name for view in triplet]
     tracks = _pairs(shared_data, "phr_triplet_north", TRIPLET, names, "sift")
     checks = _pairs(shared_data, "phr_triplet_north", TRIPLET, names, "ncc_check")
+    capped = adjust_tracks(triplet, tracks, AdjustOptions(noise_floor=0.1))
+    assert np.abs(_shift(triplet, capped, checks)).max() <= 0.1
     found = adjust_tracks(triplet, tracks)
     for offset in _offsets(shared_data, found, "phr_triplet_north", TRIPLET):
         assert abs(np.median(offset)) <= 0.03

@@ -58,7 +58,9 @@ def expanded(word: str) -> list[str]:
 @pytest.mark.parametrize("page", RUN, ids=lambda page: str(page.relative_to(DOCS)))
 def test_the_commands_of_a_page_run_as_they_stand(page, folder, codes, monkeypatch):
     monkeypatch.chdir(folder)
-    for block in blocks(page, "bash", "python"):
+    found = blocks(page, "bash", "python")
+    assert found, "a page of commands without any"
+    for block in found:
         if block.language == "python":
             exec(compile(block.text, str(page), "exec"), {"__name__": "page"})
             continue

@@ -146,6 +146,7 @@ def test_workers_end_with_a_parent_that_was_killed(wide, tmp_path):
     process = started("adjust", *wide, "-o", tmp_path / "out", "-j", 2)
     wait_for(lambda: list(tmp_path.glob("out/.barpc/cache/*/*.npz")), process)
     workers = working(process.pid)
+    assert len(workers) == 2
     process.kill()
     process.communicate()
     for worker in workers:

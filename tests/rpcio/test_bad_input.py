@@ -57,11 +57,13 @@ def test_a_file_that_is_cut_off_anywhere_in_its_numbers_is_refused(sample):
 def test_a_flipped_byte_is_read_or_refused_never_anything_else(sample):
     data = SAMPLES[sample].encode()
     rng = np.random.default_rng(7)
+    found = set()
     for _ in range(150):
         broken = bytearray(data)
         for position in rng.integers(0, len(data), rng.integers(1, 4)):
             broken[position] ^= 1 << rng.integers(0, 8)
-        outcome(bytes(broken))
+        found.add(outcome(bytes(broken)))
+    assert len(found) > 1  # damage was found, and not always the same
 
 
 @each_sample
@@ -169,8 +171,8 @@ def test_any_edit_of_a_file_is_read_or_refused(sample, data):
 
 @settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=400))
-def test_any_bytes_are_refused_or_read(data):
-    outcome(data)
+def test_any_bytes_are_refused(data):
+    assert outcome(data) != "read"  # 400 bytes hold no 80 coefficients
 
 
 def test_a_tiff_with_any_byte_of_its_directory_flipped_never_raises_anything_else(tmp_path):
