@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,12 +17,17 @@ from barpc.ba.incremental import BlockPrior, apply_prior
 from barpc.ba.options import AdjustOptions, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
-from barpc.ba.rounds import Observations, run_rounds
+from barpc.ba.rounds import Observations, Outcome, run_rounds
+from barpc.ba.smooth import Smooth
 from barpc.ba.solve import State
 from barpc.ba.structure import make_structure
 from barpc.ba.unknowns import make_unknowns
+from barpc.ba.variances import Variances
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.scene import GroundPoints, Tracks, View
+
+SMOOTH_LEAST = 0.03
+"""Smooth residuals below this [px] are left alone: two views share what one is wrong by."""
 
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
 
@@ -75,15 +81,17 @@ def adjust_tracks(
     options = AdjustOptions() if options is None else options
     views = tuple(views)
     block = join(views, tracks, gcps, options)
-    problem = make_problem(block, options, centers, prior)
+    drift = _first_drift(options, prior)
+    problem = make_problem(block, options, centers, prior, drift)
     state, heights = _start(problem, block, options, gcps, dem)
     heights.warn()
-    projected = problem.linearise(state.params, state.points)
-    before = projected.image - problem.xy
-    observations = Observations(
-        heights.hold(problem, state.points), block.sigma, options.noise_floor, block.point < block.num_tracks
-    )
-    outcome = run_rounds(problem, observations, state, options, block.use, heights.hold, projected)
+    before = problem.residuals(state.params, state.points)
+    outcome = _rounds(problem, block, state, options, heights)
+    if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
+        bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
+        params = np.hstack([outcome.minimum.state.params, np.zeros((len(views), 3))])
+        again = _rounds(bent, block, replace(outcome.minimum.state, params=params), options, heights)
+        problem, outcome = bent, again
     final = outcome.minimum.state
     covariance = outcome.minimum.covariance(problem.free)
     seen = np.zeros(block.num_points, dtype=bool)
@@ -106,6 +114,8 @@ def adjust_tracks(
         cameras=cameras,
         covariance=covariance,
         gauge=gauge,
+        prior=outcome.prior,
+        smooth=outcome.smooth,
         held=heights.weak[: block.num_tracks],
         left_out=block.left_out,
         gcp_residuals=_gcp_residuals(final.points[block.num_tracks :], gcps),
@@ -114,18 +124,40 @@ def adjust_tracks(
     )
 
 
+def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
+    """The degree of the drift to start with."""
+    if options.drift is not None:
+        return options.drift
+    if prior is not None:
+        return prior.drift
+    return int("rotation" in options.model)
+
+
+def _rounds(problem: Problem, block: Block, state: State, options: AdjustOptions, heights: Heights) -> Outcome:
+    """Robust rounds and cuts from a state."""
+    unknowns = problem.cameras.unknowns
+    observations = Observations(
+        heights.hold(problem, state.points), block.sigma, options.noise_floor, block.point < block.num_tracks
+    )
+    middle = np.column_stack([unknowns.col_offset, unknowns.row_offset])
+    half = np.column_stack([unknowns.col_scale, unknowns.row_scale])
+    smooth = Smooth(problem.structure, problem.xy, middle, half)
+    variances = Variances.of(problem.camera_prior, unknowns, options)
+    return run_rounds(problem, observations, state, options, block.use, heights.hold, variances, smooth)
+
+
 def make_problem(
-    block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior | None
+    block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior | None, drift: int = 0
 ) -> Problem:
     """Observations, cameras and priors, before anything is known about points."""
     views = block.views
     if prior is not None:
         centers = _known_centers(block, options, centers, prior)
-    unknowns = make_unknowns(views, options.model, options.drift, centers, options.center_method)
-    sigma = prior_sigmas(views, options)
+    unknowns = make_unknowns(views, options.model, drift, centers, options.center_method)
+    sigma = prior_sigmas(views, options, drift)
     on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma), None
     if prior is not None:
-        on_cameras, jointly = apply_prior(prior, block.names, options.model, options.drift, on_cameras)
+        on_cameras, jointly = apply_prior(prior, block.names, options.model, drift, on_cameras)
     return Problem(
         Cameras(views, unknowns),
         make_structure(block.view, block.point, len(views), block.num_points),

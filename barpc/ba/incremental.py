@@ -94,7 +94,7 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
     return BlockPrior(
         tuple(adjustment.names[v] for v in views),
         adjustment.options.model,
-        adjustment.options.drift,
+        adjustment.cameras.unknowns.drift,
         adjustment.params[views],
         dense,
         adjustment.cameras.unknowns.center[views],

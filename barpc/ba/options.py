@@ -19,6 +19,9 @@ MODELS = ("rotation+translation", "rotation", "translation", "shift", "shift-dri
 DEFAULT_ACCURACY = 5.0
 """Horizontal standard deviation [m] of a camera that does not state its own (Pleiades: CE90 8.5 m = 4 m)."""
 
+DRIFT_SIGMA = 0.2
+"""Drift of a view at its first and last row [m]: 0.3 microradian from 700 km, as good platforms have it."""
+
 USABLE_ACCURACY = 0.1
 """Stated accuracies below this [m] are pixels of a fit (as Airbus states them), not metres of geolocation."""
 
@@ -31,16 +34,20 @@ class AdjustOptions:
     ----------
     model : str
         Unknowns of each view, one of `MODELS`.
-    drift : int
-        Degree of the rotation as a polynomial of the image row: 0 constant, 1 or 2.
+    drift : int or None
+        Degree of the rotation as a polynomial of the image row: 0 constant, 1 or 2. None: 1 for models with a
+        rotation, and 2 where the residuals of 1 ask for it.
     sigma_attitude : float or None
         Prior standard deviation of the rotation, metres on the ground (angle x distance). None: the
         accuracy that the RPC states where it is usable, else 5 m.
     sigma_position : float or None
         Prior standard deviation of the translation [m] an axis. None: as for the attitude.
     sigma_drift : float or None
-        Prior standard deviation of the drift at the first and last row, metres on the ground. None: as
-        for the attitude.
+        Prior standard deviation of the drift at the first and last row, metres on the ground. None: learnt
+        from the block, `DRIFT_SIGMA` counting as a few observations of it.
+    learn_priors : bool
+        Widen the priors of rotation and translation where the corrections contradict them, of all views or
+        of an odd one, and learn the drift's.
     sigma_shift : float
         Image models: prior standard deviation of every coefficient at the edge of the image [px].
     noise_floor : float
@@ -79,10 +86,11 @@ class AdjustOptions:
     """
 
     model: str = "rotation+translation"
-    drift: int = 0
+    drift: int | None = None
     sigma_attitude: float | None = None
     sigma_position: float | None = None
     sigma_drift: float | None = None
+    learn_priors: bool = True
     sigma_shift: float = 20.0
     noise_floor: float = 0.02
     loss: str = "geman_mcclure"
@@ -105,7 +113,7 @@ class AdjustOptions:
         _one_of("model", self.model, MODELS)
         _one_of("loss", self.loss, tuple(LOSSES))
         _one_of("solver", self.solver, ("auto", "scipy", "sparse"))
-        _one_of("drift", self.drift, (0, 1, 2))
+        _one_of("drift", self.drift, (None, 0, 1, 2))
         if self.drift and "rotation" not in self.model:
             raise InputError(f"drift {self.drift} needs a model with a rotation, not {self.model!r}")
         for name in ("sigma_attitude", "sigma_position", "sigma_drift", "sigma_shift", "dem_sigma"):
@@ -125,7 +133,7 @@ def stated_accuracy(view: View) -> float:
     return stated if stated is not None and stated > USABLE_ACCURACY else DEFAULT_ACCURACY
 
 
-def prior_sigmas(views: tuple[View, ...], options: AdjustOptions) -> Array:
+def prior_sigmas(views: tuple[View, ...], options: AdjustOptions, drift: int) -> Array:
     """Prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px)."""
     stated = np.array([stated_accuracy(view) for view in views])
     parts = []
@@ -133,7 +141,7 @@ def prior_sigmas(views: tuple[View, ...], options: AdjustOptions) -> Array:
         parts.append(np.tile(_given(options.sigma_attitude, stated), (1, 3)))
     if "translation" in options.model:
         parts.append(np.tile(_given(options.sigma_position, stated), (1, 3)))
-    parts += [np.tile(_given(options.sigma_drift, stated), (1, 3))] * options.drift
+    parts += [np.full((len(views), 3), options.sigma_drift or DRIFT_SIGMA)] * drift
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.model]
         parts.append(np.full((len(views), size), options.sigma_shift))

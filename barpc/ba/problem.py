@@ -58,6 +58,10 @@ class Problem:
         """The same problem with other priors on its points."""
         return replace(self, point_prior=prior)
 
+    def with_camera_prior(self, prior: CameraPrior) -> Problem:
+        """The same problem with other priors on its cameras."""
+        return replace(self, camera_prior=prior)
+
     def residuals(self, params: Array, points: Array) -> Array:
         """Projected - observed (2, K) [px], sorted by view."""
         structure = self.structure
@@ -138,6 +142,14 @@ class Problem:
         lower = cholesky3(sums[:6] + matrix)
         step = solve_transposed(lower, solve_lower(lower, sums[6:] + gradient))
         return points - step.T
+
+    def settled_residual(self, residual: Array, projected: Projected, weight: Array) -> Array:
+        """Residuals (2, K) [px] once the points have moved to where they are smallest, to first order."""
+        sums = self.structure.sum_points(point_products(projected.by_point * weight, residual * weight))
+        lower = cholesky3(sums[:6])
+        step = solve_transposed(lower, solve_lower(lower, sums[6:])).take(self.structure.point, axis=1)
+        settled: Array = residual - (projected.by_point * step).sum(axis=1)
+        return settled
 
     def _point_terms(self, points: Array) -> tuple[Array, Array]:
         """What the priors add to the points' normal matrices (6, P) and gradients (3, P)."""

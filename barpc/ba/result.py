@@ -10,6 +10,8 @@ from barpc.ba.cameras import Cameras
 from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import GaugeReport
 from barpc.ba.options import AdjustOptions
+from barpc.ba.smooth import SmoothTest
+from barpc.ba.variances import PriorTest
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
@@ -52,6 +54,10 @@ class Adjustment:
         Of the corrections, of points, of relative heights.
     gauge : GaugeReport
         Shift of the scene, what it is known to, the weakest modes.
+    prior : PriorTest
+        How the corrections compare with the priors given, and what the priors became.
+    smooth : SmoothTest
+        What is smooth in the residuals that are left.
     held : (P,)
         Tracks held in height because their rays meet under too small an angle.
     left_out : tuple of str
@@ -79,6 +85,8 @@ class Adjustment:
     cameras: Cameras
     covariance: Covariance
     gauge: GaugeReport
+    prior: PriorTest
+    smooth: SmoothTest
     held: BoolArray
     left_out: tuple[str, ...]
     gcp_residuals: Array

@@ -12,7 +12,9 @@ from barpc.ba.cameras import Projected
 from barpc.ba.loss import LOSSES
 from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
+from barpc.ba.smooth import SPLINES, Smooth, SmoothTest
 from barpc.ba.solve import Minimum, State, gauss_newton, minimise
+from barpc.ba.variances import PriorTest, Variances
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
@@ -23,6 +25,10 @@ _LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that 
 _LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
 _SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
 _SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
+_SAME_PRIOR = 0.2  # nor of a prior's standard deviation
+_LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
+_SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
+_BACKFITTING = 6
 _LEAST_FREEDOM = 20
 _ROBUST_ROUNDS = 20
 _SHRINK = 0.25  # of the loss's scale in one round, at most
@@ -47,6 +53,10 @@ class Outcome:
         Observed over stated standard deviation.
     passes : int
         Rounds of cutting.
+    prior : PriorTest
+        How the corrections compare with the priors given, and what the priors became.
+    smooth : SmoothTest
+        What is smooth in the residuals that are left.
     """
 
     problem: Problem
@@ -55,6 +65,8 @@ class Outcome:
     inlier: BoolArray
     noise: float
     passes: int
+    prior: PriorTest
+    smooth: SmoothTest
 
 
 class Observations:
@@ -87,19 +99,27 @@ class Observations:
         s: Array = (residual**2).sum(axis=0) / self.sigma**2 / self.freedom(counted)
         return np.where(np.isfinite(s), s, np.inf)
 
-    def weight(self, use: BoolArray, noise: float) -> Array:
-        """1 / sigma (K,) [1/px], tie points under the cap; 0 where not used."""
+    def weight(self, use: BoolArray, noise: float, misfit: Array | float = 0.0) -> Array:
+        """1 / sigma (K,) [1/px], tie points under the cap; 0 where not used.
+
+        What a view's camera cannot follow, `misfit` (N,) [px], does not average away either: it is as good as
+        `SPLINES` independent errors.
+        """
         weight: Array = use / (self.sigma * noise)
         information = self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0]
-        cap = 1.0 / np.sqrt(np.maximum(information * self.noise_floor**2, 1.0))
+        floor = self.noise_floor**2 + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
+        cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         return np.where(self.is_tie, weight * cap[self.structure.view], weight)
 
-    def noise(self, residual: Array, use: BoolArray, problem: Problem) -> float:
-        """Observed over stated standard deviation of the observations in use; 1 where there are too few."""
+    def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
+        """Observed over stated standard deviation of the observations in use; 1 where there are too few.
+
+        `fitted` further parameters have been taken out of the residuals.
+        """
         whitened = residual[:, use] / self.sigma[use]
         seen = np.zeros(self.structure.num_points, dtype=bool)
         seen[self.structure.point[use]] = True
-        freedom = whitened.size - 3 * int((seen & ~self.has_prior).sum()) - int(problem.free.sum())
+        freedom = whitened.size - 3 * int((seen & ~self.has_prior).sum()) - int(problem.free.sum()) - fitted
         if freedom < _LEAST_FREEDOM:
             return 1.0
         return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
@@ -119,9 +139,13 @@ def run_rounds(
     options: AdjustOptions,
     use: BoolArray,
     hold: Callable[[Problem, Array], Problem],
-    projected: Projected,
+    variances: Variances,
+    smooth: Smooth,
 ) -> Outcome:
     """Robust rounds, cuts and the final least squares.
+
+    Outliers are judged by what is left of their residuals once the smooth part of every view is taken away: a
+    camera that the unknowns cannot follow yet does not make its tie points wrong.
 
     Parameters
     ----------
@@ -137,48 +161,66 @@ def run_rounds(
         Observations to start with.
     hold : callable
         The problem with its points' priors renewed at points (P, 3).
-    projected : Projected
-        `Problem.linearise` of `state`; it is used up.
+    variances : Variances
+        What may be learnt about the cameras' priors.
+    smooth : Smooth
+        The smooth model of the views.
 
     Returns
     -------
     Outcome
     """
-    residual, ahead = projected.image - problem.xy, True
+    robust = options.loss != "linear"
+    projected: Projected | None = problem.linearise(state.params, state.points)
+    assert projected is not None
+    residual = projected.image - problem.xy
     everything = use = observations.tied(use & np.isfinite(residual).all(axis=0))
     problem = hold(problem, state.points)
-    noise, passes = 1.0, 0
-    if options.loss != "linear":
-        state, residual, noise = _robust(problem, observations, state, projected, use, options)
+    noise, passes, counted = 1.0, 0, use.astype(np.float64)
+    floor: Array | float = 0.0
+    if robust:
+        start = problem.with_camera_prior(variances.for_search())
+        state, residual, counted, noise = _robust(start, observations, state, projected, use, options, smooth)
+        floor = smooth.test(residual, use).rms
     while True:
         problem = hold(problem, state.points)
         passes += 1
         kept = use
-        if options.loss != "linear":
-            s = observations.squared(residual, use.astype(np.float64))
+        if robust:
+            scatter = _scatter(problem, observations, smooth, state, residual, counted)
+            s = observations.squared(scatter, use.astype(np.float64))
             kept = observations.tied(everything & (s <= (options.robust_threshold * noise) ** 2))
         wanted = noise if options.estimate_noise else 1.0
-        weight = observations.weight(kept, wanted)
+        weight = observations.weight(kept, wanted, floor)
         found = minimise(
             problem,
             state,
             weight,
             options.solver,
             options.max_steps,
-            options.tolerance if passes > 1 or options.loss == "linear" else _FIRST_TOLERANCE,
-            projected if ahead else None,
+            options.tolerance if passes > 1 or not robust else _FIRST_TOLERANCE,
+            projected,
         )
-        state, ahead = found.state, False
+        state, projected = found.state, None
         residual = problem.residuals(state.params, state.points)
         cost = problem.cost(state.params, state.points, residual * weight)
         state = replace(state, cost=cost, history=(*state.history, cost))
+        prior, tested = variances.learnt(problem, found)
         same = passes > 1 and int((kept != use).sum()) <= _SAME * len(use)
-        use, before = kept, noise
-        noise = observations.noise(residual, use, problem)
+        use, counted, before = kept, kept.astype(np.float64), noise
+        if robust:
+            scatter = _scatter(problem, observations, smooth, state, residual, counted)
+            noise = observations.noise(scatter, use, problem, smooth.parameters(counted))
+            floor = smooth.test(residual, use).rms
+        else:
+            noise = observations.noise(residual, use, problem)
         _LOG.info("pass %d: %d of %d observations, noise %.3f", passes, use.sum(), len(use), noise)
         settled = not options.estimate_noise or abs(noise / before - 1.0) < _SAME_NOISE
-        if passes > options.num_passes or (settled and (same or options.loss == "linear")):
-            return Outcome(problem, replace(found, state=state), residual, use, noise, passes)
+        settled &= bool(np.all(np.abs(np.log(prior.sigma / problem.camera_prior.sigma)) < _SAME_PRIOR))
+        if passes > options.num_passes or (settled and (same or not robust)):
+            minimum = replace(found, state=state)
+            return Outcome(problem, minimum, residual, use, noise, passes, tested, smooth.test(residual, use))
+        problem = problem.with_camera_prior(prior)
 
 
 def _robust(
@@ -188,10 +230,12 @@ def _robust(
     projected: Projected,
     use: BoolArray,
     options: AdjustOptions,
-) -> tuple[State, Array, float]:
+    smooth: Smooth,
+) -> tuple[State, Array, Array, float]:
     """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
 
-    `projected` is of the state, and in the end of the one that is returned.
+    `projected` is of the state, and in the end of the one that is returned, with its residuals, how much every
+    observation counts, and the noise.
 
     The noise is a median that counts observations by their weights: as the scale shrinks, it leaves the
     wrong ones behind. It cannot fall below what the best fifth of all observations shows, nor below half of
@@ -210,9 +254,30 @@ def _robust(
         counted = use * loss(s / scale**2)[1]
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual = problem.linearise(state.params, state.points).image - problem.xy  # into `projected`
-        s = observations.squared(residual, counted)
+        s = observations.squared(residual - smooth.part(residual, counted), counted)
         counted = use * loss(s / scale**2)[1]
-    return state, residual, noise
+    return state, residual, counted, noise
+
+
+def _scatter(
+    problem: Problem, observations: Observations, smooth: Smooth, state: State, residual: Array, counted: Array
+) -> Array:
+    """Residuals (2, K) [px] without the smooth parts of all views that see a point.
+
+    A point shares what one of its views is wrong by among all of them, and relief moves the rows of the views against
+    each other: so the smooth parts are found view by view and the points follow, until they stand.
+    """
+    part = smooth.part(residual, counted)
+    size = float(np.sqrt((counted * (part / observations.sigma) ** 2).sum() / max(counted.sum(), 1.0)))
+    if size < _SMOOTH_SEEN:
+        return residual - part
+    projected = problem.project_points(state.params, state.points)
+    weight = counted**0.5 / observations.sigma
+    left = residual
+    for _ in range(_BACKFITTING):
+        left = problem.settled_residual(residual - part, projected, weight)
+        part += smooth.part(left, counted)
+    return problem.settled_residual(residual - part, projected, weight)
 
 
 def _median(values: Array, weights: Array) -> float:

@@ -1,0 +1,138 @@
+"""What is smooth in the residuals of a view: judged before anything is cut, and tested at the end.
+
+Noise and wrong matches scatter; what a camera model cannot follow (jitter, optics, a crop that was turned) is a
+smooth function of the image. An outlier test that does not know the difference takes the second for the first. So
+the residuals of every view are split into a smooth part, a spline over the row and low polynomials of the column
+fitted by weighted least squares, and the scatter around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from barpc.ba.structure import Structure
+from barpc.geodesy import Array
+from barpc.scene import BoolArray
+
+SPLINES = 14
+"""Cubic B-splines over the rows of an image: what changes over a tenth of it, or more slowly, is smooth."""
+
+_TERMS = SPLINES + 4  # and col, col^2, col^3, row col
+_PER_TERM = 10  # observations a term, or the view is left as it is
+_RIDGE = 1e-6  # of a term's own weight: gaps in the rows leave splines without observations
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothTest:
+    """The smooth part of every view's residuals, and whether it is more than chance.
+
+    Parameters
+    ----------
+    rms : (N,)
+        Root mean square of the smooth part over the view's observations, both coordinates together, less what
+        noise alone would leave [px]; 0 for a view with too few observations.
+    significance : (N,)
+        Probability that noise alone leaves as much (F-test); 1 for a view with too few observations.
+    by_row : (N,)
+        Part of the smooth part's square that the row alone explains; NaN where nothing was fitted.
+    """
+
+    rms: Array
+    significance: Array
+    by_row: Array
+
+    def found(self, least: float, level: float = 1e-4) -> BoolArray:
+        """Views (N,) with a smooth part above `least` [px] that is significant."""
+        return np.asarray((self.rms > least) & (self.significance < level))
+
+
+class Smooth:
+    """The smooth model of a block's views.
+
+    Parameters
+    ----------
+    structure : Structure
+        Observations sorted by view.
+    xy : (2, K)
+        col, row [px].
+    middle, half : (N, 2)
+        Middle and half size of every image, col and row [px].
+    """
+
+    def __init__(self, structure: Structure, xy: Array, middle: Array, half: Array) -> None:
+        self.structure = structure
+        col, row = ((xy - middle.T[:, structure.view]) / half.T[:, structure.view]).clip(-1.0, 1.0)
+        self._basis = np.empty((_TERMS, xy.shape[1]))
+        self._basis[:SPLINES] = _bsplines(row)
+        self._basis[SPLINES:] = col, col**2, col**3, row * col
+
+    def part(self, residual: Array, weight: Array) -> Array:
+        """The smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
+
+        Zero for views with too few observations that count.
+        """
+        out = np.zeros_like(residual)
+        for v, rows in self._views(weight):
+            out[:, rows] = self._coefficients(v, residual, weight) @ self._basis[:, rows]
+        return out
+
+    def parameters(self, weight: Array) -> int:
+        """How many coefficients `part` fits."""
+        return 2 * _TERMS * sum(1 for _ in self._views(weight))
+
+    def test(self, residual: Array, use: BoolArray) -> SmoothTest:
+        """Whether the residuals (2, K) [px] of the observations in use hold more than scatter."""
+        n = self.structure.num_views
+        rms, significance, by_row = np.zeros(n), np.ones(n), np.full(n, np.nan)
+        weight = use.astype(np.float64)
+        residual = np.where(use, residual, 0.0)
+        for v, rows in self._views(weight):
+            count = 2 * float(weight[rows].sum())
+            coefficients = self._coefficients(v, residual, weight)
+            smooth = (coefficients @ self._basis[:, rows]) * weight[rows]
+            explained = float((smooth**2).sum())
+            left = float((residual[:, rows] ** 2).sum()) - explained
+            terms = 2.0 * _TERMS
+            scatter = max(left / (count - terms), 1e-30)
+            significance[v] = float(f_distribution.sf(explained / terms / scatter, terms, count - terms))
+            rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / (0.5 * count))
+            along = (coefficients[:, :SPLINES] @ self._basis[:SPLINES, rows]) * weight[rows]
+            by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)
+        return SmoothTest(rms, significance, by_row)
+
+    def _views(self, weight: Array) -> list[tuple[int, slice]]:
+        """Views with enough observations, and where theirs are."""
+        bounds = self.structure.bounds
+        counts = self.structure.sum_views(weight[None])[:, 0]
+        enough = np.flatnonzero(counts >= _PER_TERM * _TERMS)
+        return [(int(v), slice(int(bounds[v]), int(bounds[v + 1]))) for v in enough]
+
+    def _coefficients(self, v: int, residual: Array, weight: Array) -> Array:
+        """Coefficients (2, terms) of one view."""
+        rows = slice(int(self.structure.bounds[v]), int(self.structure.bounds[v + 1]))
+        basis = self._basis[:, rows]
+        weighted = basis * weight[rows]
+        matrix = weighted @ basis.T
+        diagonal = np.diag(matrix)
+        matrix[np.diag_indices(_TERMS)] += _RIDGE * (diagonal + diagonal.mean())
+        with np.errstate(invalid="ignore"):
+            target = np.where(weight[rows] > 0, residual[:, rows], 0.0)
+        solved: Array = np.linalg.solve(matrix, weighted @ target.T).T
+        return solved
+
+
+def _bsplines(u: Array) -> Array:
+    """Uniform cubic B-splines (SPLINES, n) at u (n,) in -1 .. 1."""
+    pieces = SPLINES - 3
+    t = (u + 1.0) * (0.5 * pieces)
+    piece = np.minimum(t.astype(np.int64), pieces - 1)
+    t = t - piece
+    values = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]) / 6.0
+    out = np.zeros((SPLINES, len(u)))
+    columns = np.arange(len(u))
+    for k in range(4):
+        out[piece + k, columns] = values[k]
+    return out

@@ -1,0 +1,274 @@
+"""Priors on the cameras that learn from the block: variance components, and views that are odd.
+
+A prior's standard deviation is a guess. What the observations say about it is the size of the corrections that they
+determine: with the posterior covariance C of unknowns whose prior is s, gamma = n - trace(C) / s^2 of them are
+determined, and their squares sum to gamma s^2 on average (MacKay 1992, "Bayesian Interpolation", eq. 4.8). Where the
+sum is larger than chance allows, some prior was too narrow: that of one view, if its correction alone explains it
+(every view that would is held possible: three in a row along the flight cannot tell which), else that of all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from barpc.ba.blocks import CameraPrior
+from barpc.ba.covariance import Covariance
+from barpc.ba.linear import factorize
+from barpc.ba.options import AdjustOptions
+from barpc.ba.problem import Problem
+from barpc.ba.solve import Minimum, free_part
+from barpc.ba.unknowns import Unknowns
+from barpc.geodesy import Array
+from barpc.scene import BoolArray
+
+_STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside what the block shows
+_LEVEL = 1e-3  # a sum of squares less probable than this is too large
+_SURE = 5.0  # of two explanations whose evidences differ by less (a factor of 150) none is ruled out
+_LIKELIER = 2.3  # but one odd view is named where it is ten times as likely as that all are worse than stated
+_FREE = 100.0  # times its prior: a view whose camera may be anywhere
+_SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
+_MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some kilometres while an image is taken
+_ITERATIONS = 10
+_STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
+_SMALL = 400  # unknowns up to which every view is tried and the covariance's diagonal is exact
+_PROBES = 32
+_LEAST = 0.5  # degrees of freedom below which nothing is said
+
+
+@dataclass(frozen=True, eq=False)
+class PriorTest:
+    """How the corrections of the views compare with the priors that were given.
+
+    Parameters
+    ----------
+    ratio : float
+        Squared constant corrections (rotation, translation) over the variances given, over their degrees of
+        freedom: about 1 where the priors hold. NaN where the observations determine nothing.
+    freedom : float
+        Constant unknowns that the observations determine.
+    scale : (N,)
+        By how much the standard deviations given were widened; 1: not at all.
+    odd : (N,)
+        Views whose camera alone explains the corrections. More than one: any of them would.
+    drift_sigma : tuple of float
+        Standard deviation of the drift's coefficients in use, degree by degree [m].
+    """
+
+    ratio: float
+    freedom: float
+    scale: Array
+    odd: BoolArray
+    drift_sigma: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Around:
+    """The problem near a minimum, quadratic: its cost, minimum and covariance under other priors."""
+
+    problem: Problem
+    minimum: Minimum
+
+    @property
+    def small(self) -> bool:
+        """Whether it can be solved many times."""
+        return len(self.problem.free) <= _SMALL and isinstance(self.minimum.reduced.matrix, np.ndarray)
+
+    def under(self, prior: CameraPrior) -> tuple[float, Array, Covariance]:
+        """Evidence (logarithm, but for a constant), unknowns (N, q) and covariance under other priors."""
+        now, reduced, start = self.problem.camera_prior, self.minimum.reduced, self.minimum.state.params
+        free = self.problem.free
+        change = np.where(free, (1.0 / prior.sigma**2 - 1.0 / now.sigma**2).ravel(), 0.0)
+        assert isinstance(reduced.matrix, np.ndarray)
+        matrix = reduced.matrix + np.diag(change)
+        part = free_part(free, matrix)
+        covariance = Covariance(replace(reduced, matrix=matrix), factorize(part), free)
+        offset = (start - now.mean).ravel()
+        step = -covariance.solve(change * offset)
+        moved = offset + step
+        cost = float(step @ reduced.matrix @ step + change @ moved**2)
+        held = free & np.isfinite(prior.sigma.ravel())
+        volume = float(np.linalg.slogdet(part)[1]) + 2.0 * float(np.log(prior.sigma.ravel()[held]).sum())
+        return -0.5 * (cost + volume), start + step.reshape(start.shape), covariance
+
+
+@dataclass(frozen=True, eq=False)
+class Variances:
+    """The priors of a block and what may be learnt about them.
+
+    Parameters
+    ----------
+    given : CameraPrior
+        With the standard deviations as they were given.
+    unknowns : Unknowns
+        Which unknown is what.
+    learn_constant, learn_drift : bool
+        Whether the constants' and the drift's standard deviations may change.
+    """
+
+    given: CameraPrior
+    unknowns: Unknowns
+    learn_constant: bool
+    learn_drift: bool
+
+    @classmethod
+    def of(cls, given: CameraPrior, unknowns: Unknowns, options: AdjustOptions) -> Variances:
+        """What the options leave to be learnt."""
+        geometric = unknowns.geometric and options.learn_priors
+        return cls(given, unknowns, geometric, geometric and options.sigma_drift is None)
+
+    @property
+    def constants(self) -> int:
+        """Constant unknowns of a view, which come first."""
+        return 3 * (self.unknowns.rotates + self.unknowns.translates) if self.unknowns.geometric else 0
+
+    def for_search(self) -> CameraPrior:
+        """Priors while outliers are looked for: a drift that was not expected must not look like them."""
+        return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, _SEARCH))
+
+    def learnt(self, problem: Problem, minimum: Minimum) -> tuple[CameraPrior, PriorTest]:
+        """The priors that the block supports, in its linearisation at a minimum.
+
+        Parameters
+        ----------
+        problem : Problem
+            With the priors of the minimum.
+        minimum : Minimum
+            What `minimise` found.
+        """
+        around = _Around(problem, minimum)
+        now, params = problem.camera_prior, minimum.state.params
+        covariance = minimum.covariance(problem.free)
+        n = len(params)
+        wide = np.ones(self._degrees)
+        if around.small and (now.sigma != self._prior(np.ones(n), wide).sigma).any():
+            _, params, covariance = around.under(self._prior(np.ones(n), wide))
+        prior, scale = self._prior(np.ones(n), wide), np.ones(n)
+        odd = np.zeros(n, dtype=bool)
+        known = self._known(covariance, prior if around.small else now)
+        ratio, freedom = self._ratio(params, known)
+        for _ in range(_ITERATIONS):
+            if self.learn_constant and self._too_large(params, known, scale):
+                scale, odd = self._widened(around, params, known, wide)
+            before = prior
+            wide = self._drift(params, known) if self.learn_drift else wide
+            prior = self._prior(scale, wide)
+            if not around.small or np.all(np.abs(np.log(prior.sigma / before.sigma)) < _STANDS):
+                break
+            _, params, covariance = around.under(prior)
+            known = self._known(covariance, prior)
+        c = self.constants
+        drift = tuple(float(np.median(prior.sigma[:, c + 3 * d])) for d in range(self._degrees))
+        return prior, PriorTest(ratio, freedom, scale, odd, drift)
+
+    @property
+    def _degrees(self) -> int:
+        return self.unknowns.drift if self.unknowns.geometric else 0
+
+    def _prior(self, scale: Array, wide: Array) -> CameraPrior:
+        """The priors given, constants wider by `scale` (N,), drifts by `wide` (D,)."""
+        sigma, c = self.given.sigma.copy(), self.constants
+        sigma[:, :c] *= scale[:, None]
+        for degree, factor in enumerate(wide):
+            part = slice(c + 3 * degree, c + 3 * degree + 3)
+            sigma[:, part] *= factor
+            if degree == 0 and self.learn_drift:
+                sigma[:, part] = np.hypot(sigma[:, part], _MOVING * sigma[:, :3])
+        return CameraPrior(self.given.mean, sigma)
+
+    def _known(self, covariance: Covariance, prior: CameraPrior) -> Array:
+        """How far the observations determine each unknown (N, q): 0 not at all, 1 wholly."""
+        shape = prior.sigma.shape
+        use = covariance.free.reshape(shape) & np.isfinite(prior.sigma)
+        known = 1.0 - posterior_variance(covariance, shape) / prior.sigma**2
+        return np.where(use, known.clip(0.0, 1.0), 0.0)
+
+    def _squares(self, params: Array, known: Array, scale: Array | float = 1.0) -> Array:
+        """Squared constants of every view over their variances (N,)."""
+        c = self.constants
+        sigma = self.given.sigma[:, :c] * np.reshape(scale, (-1, 1))
+        used = np.where(known[:, :c] > 0, ((params - self.given.mean)[:, :c] / sigma) ** 2, 0.0)
+        return np.asarray(used.sum(axis=1))
+
+    def _ratio(self, params: Array, known: Array) -> tuple[float, float]:
+        freedom = float(known[:, : self.constants].sum())
+        total = float(self._squares(params, known).sum())
+        return (total / freedom if freedom > _LEAST else float("nan")), freedom
+
+    def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
+        """Whether the corrections are larger than chance allows."""
+        freedom = float(known[:, : self.constants].sum())
+        total = float(self._squares(params, known, scale).sum())
+        return freedom > _LEAST and float(chi2.sf(total, freedom)) < _LEVEL
+
+    def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
+        """By how much each view's prior is to be widened (N,), and which views are odd."""
+        n = len(params)
+        total, freedom = self._squares(params, known), known[:, : self.constants].sum(axis=1)
+        factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
+        odd = np.zeros(n, dtype=bool)
+        if around.small and n > 2:
+            common = np.full(n, np.sqrt(factor))
+            scale, odd, evidence = self._odd(around, wide)
+            together = around.under(self._prior(common, wide))[0]
+            if evidence < together - _SURE:
+                return common, np.zeros(n, dtype=bool)
+            if evidence < together + _LIKELIER:  # both may be: the priors cover both
+                return np.maximum(scale, common), np.zeros(n, dtype=bool)
+            return scale, odd
+        if n > 2:  # one view of many is seen at once
+            own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
+            factor = max((_STRENGTH + own * freedom.sum()) / (_STRENGTH + freedom.sum()), 1.0)
+            odd = chi2.sf(total / factor, np.maximum(freedom, _LEAST)) < _LEVEL / n
+        alone = (_STRENGTH * factor + total) / (_STRENGTH + freedom)
+        return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
+
+    def _odd(self, around: _Around, wide: Array) -> tuple[Array, BoolArray, float]:
+        """Few views whose cameras explain the corrections, by forward selection, and the evidence for them."""
+        n = len(self.given.sigma)
+        odd, chosen = np.zeros(n, dtype=bool), np.ones(n)
+        scale, last = np.ones(n), -np.inf
+        for _ in range(max(1, n // 3)):
+            tried = {v: self._alone(around, wide, chosen, v) for v in np.flatnonzero(chosen == 1.0).tolist()}
+            best = max(tried, key=lambda v: tried[v][0])
+            if tried[best][0] < last + _SURE:
+                break
+            last = tried[best][0]
+            for v, (evidence, size) in tried.items():
+                if evidence > last - _SURE:  # as good an explanation as the best
+                    odd[v], scale[v] = True, size
+            chosen[best] = tried[best][1]
+        return scale, odd, last
+
+    def _alone(self, around: _Around, wide: Array, scale: Array, v: int) -> tuple[float, float]:
+        """Evidence for view v being odd as well, and the factor that its prior then needs."""
+        trial = scale.copy()
+        trial[v] = _FREE
+        prior = self._prior(trial, wide)
+        _, params, covariance = around.under(prior)
+        known = self._known(covariance, prior)
+        total, freedom = self._squares(params, known)[v], known[v, : self.constants].sum()
+        trial[v] = max(np.sqrt((_STRENGTH + total) / (_STRENGTH + freedom)), 1.0)
+        return around.under(self._prior(trial, wide))[0], float(trial[v])
+
+    def _drift(self, params: Array, known: Array) -> Array:
+        """By how much the drift's standard deviations are to be changed (D,), the given ones counting for a few."""
+        c = self.constants
+        factors = np.ones(self._degrees)
+        for degree in range(self._degrees):
+            part = slice(c + 3 * degree, c + 3 * degree + 3)
+            use = known[:, part] > 0
+            total = float((use * ((params - self.given.mean)[:, part] / self.given.sigma[:, part]) ** 2).sum())
+            factors[degree] = np.sqrt((_STRENGTH + total) / (_STRENGTH + float(known[:, part].sum())))
+        return factors
+
+
+def posterior_variance(covariance: Covariance, shape: tuple[int, ...]) -> Array:
+    """Posterior variances (N, q) of all unknowns: exact for small blocks, else by random probes (Hutchinson)."""
+    n = len(covariance.free)
+    if n <= _SMALL:
+        return np.diag(covariance.full).reshape(shape)
+    probes = np.where(np.random.default_rng(n).integers(0, 2, (n, _PROBES)) > 0, 1.0, -1.0)
+    return np.asarray((probes * covariance.solve(probes)).mean(axis=1).reshape(shape))
