@@ -26,7 +26,7 @@ from barpc.ba.variances import Variances
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.scene import GroundPoints, Tracks, View
 
-SMOOTH_LEAST = 0.03
+SMOOTH_LEAST = 0.06
 """Smooth residuals below this [px] are left alone: two views share what one is wrong by."""
 
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it

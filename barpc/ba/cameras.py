@@ -17,7 +17,7 @@ from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array, ground_from_ecef, ground_rows_from_ecef, wrap_longitude
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import rotation_left_jacobian, rotation_matrix
+from barpc.sensor.corrected import Motion
 from barpc.sensor.rational import Rational, monomials
 from barpc.sensor.rpc import RPC
 
@@ -132,33 +132,30 @@ class Cameras:
         if not unknowns.geometric:
             image, by_point = self._by_ecef(ecef, views, bounds)
             return _only(Projected(*unknowns.in_image(params, index, image, by_point)), wanted)
-        rotation, translation = unknowns.rotation(params[views], views), unknowns.translation(params[views])
-        row, first_by_point = None, None
-        runs: IntArray | None = bounds
+        drift, row, first_by_point = None, None, None
         if unknowns.drift:
             first, first_by_point = self._by_ecef(ecef, views, bounds)
             row = unknowns.normalized_row(first[1], index)
-            rotation = rotation[index - views.start] + unknowns.drift_rotation(params, index, row)
-            runs = None
-        count = np.diff(bounds)
-        center = unknowns.center[views]
-        matrix = rotation_matrix(rotation)
-        lever = _turned(matrix, ecef - np.repeat((translation + center).T, count, axis=1), runs)
-        moved = lever + np.repeat(center.T, count, axis=1)
+            drift = unknowns.drift_rotation(params, index, row)
+        of_views = params[views]
+        motion = Motion(
+            ecef,
+            unknowns.rotation(of_views, views),
+            unknowns.translation(of_views),
+            unknowns.center[views],
+            bounds,
+            drift,
+        )
         if wanted == "image":
             none = np.empty((2, 0, len(index)))
-            return Projected(self._image(moved, views, bounds), none, none)
-        image, by_moved = self._by_ecef(moved, views, bounds)
-        by_point = _turned(matrix.swapaxes(1, 2), by_moved, runs)
-        if wanted == "points" and row is None:
-            return _only(Projected(image, by_point, by_point), wanted)
-        left = rotation_left_jacobian(rotation).swapaxes(1, 2)
-        by_rotation = _turned(left, _cross(lever, by_moved), runs)
-        by_unknown = unknowns.stack(by_rotation, by_point, index, row)
+            return Projected(self._image(motion.ecef, views, bounds), none, none)
+        image, by_moved = self._by_ecef(motion.ecef, views, bounds)
+        by_point, by_rotation, by_drift = motion.derivatives(by_moved)
+        by_unknown = unknowns.stack(by_rotation, by_drift, by_point, index, row)
         if row is not None and first_by_point is not None:
             rate = unknowns.drift_rate(params, index, row)
-            by_row = (by_rotation * rate).sum(axis=1) / unknowns.row_scale[index]
-            by_point += by_row[:, None] * first_by_point[1]
+            by_row = (by_drift * rate).sum(axis=1) / unknowns.row_scale[index]
+            by_point = by_point + by_row[:, None] * first_by_point[1]
         return _only(Projected(image, by_point, by_unknown), wanted)
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
@@ -264,22 +261,4 @@ def _times(a: Array, b: Array) -> Array:
     out: Array = a[:, 0, None] * b[0]
     for j in range(1, len(b)):
         out += a[:, j, None] * b[j]
-    return out
-
-
-def _turned(matrices: Array, rows: Array, bounds: IntArray | None) -> Array:
-    """Matrices (m, 3, 3) times the columns bounds[i] : bounds[i + 1] of rows (..., 3, n); None: a column each."""
-    if bounds is None:
-        return np.asarray(np.einsum("nij,...jn->...in", matrices, rows))
-    out = np.empty_like(rows)
-    for matrix, start, stop in zip(matrices, bounds[:-1], bounds[1:], strict=True):
-        np.matmul(matrix, rows[..., start:stop], out=out[..., start:stop])
-    return out
-
-
-def _cross(lever: Array, rows: Array) -> Array:
-    """Lever x row, (2, 3, n): the derivative by a small rotation of what `rows` (2, 3, n) measure."""
-    out = np.empty_like(rows)
-    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-        out[:, i] = lever[j] * rows[:, k] - lever[k] * rows[:, j]
     return out

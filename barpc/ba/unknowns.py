@@ -98,29 +98,41 @@ class Unknowns:
         return normalized
 
     def drift_rotation(self, params: Array, index: IntArray, row: Array) -> Array:
-        """Rotation (n, 3) [rad] that the drift adds at normalised rows (n,)."""
-        powers = row[:, None] ** np.arange(1, self.drift + 1)
-        added: Array = np.einsum("nd,ndi->ni", powers, self.drift_vectors(params)[index])
+        """Rotation (3, n) [rad] that the drift adds at normalised rows (n,)."""
+        vectors = self.drift_vectors(params).transpose(1, 2, 0)[:, :, index]  # (D, 3, n)
+        added: Array = vectors[-1] * row
+        for degree in range(self.drift - 2, -1, -1):
+            added = (added + vectors[degree]) * row
         return added
 
     def drift_rate(self, params: Array, index: IntArray, row: Array) -> Array:
         """d(rotation) / d(normalised row), (3, n) [rad]."""
-        degree = np.arange(1, self.drift + 1)
-        powers = degree * row[:, None] ** (degree - 1)
-        rate: Array = np.einsum("nd,ndi->in", powers, self.drift_vectors(params)[index])
+        vectors = self.drift_vectors(params).transpose(1, 2, 0)[:, :, index]
+        rate: Array = vectors[-1] * float(self.drift)
+        for degree in range(self.drift - 2, -1, -1):
+            rate = rate * row + vectors[degree] * (degree + 1.0)
         return rate
 
-    def stack(self, by_rotation: Array, by_point: Array, index: IntArray, row: Array | None) -> Array:
-        """Derivatives (2, 3, n) by rotation [px/rad] and point as derivatives (2, q, n) by unknowns."""
-        parts = []
-        by_metre = by_rotation * (1.0 / self.distance)[index] if self.rotates else by_rotation
+    def stack(
+        self, by_rotation: Array, by_drift: Array, by_point: Array, index: IntArray, row: Array | None
+    ) -> Array:
+        """Derivatives (2, 3, n) by rotations [px/rad] and point as derivatives (2, q, n) by unknowns."""
+        out = np.empty((2, self.size, len(index)))
+        inverse = (1.0 / self.distance)[index]
+        at = 0
         if self.rotates:
-            parts.append(by_metre)
+            np.multiply(by_rotation, inverse, out=out[:, :3])
+            at = 3
         if self.translates:
-            parts.append(-by_point)
-        if row is not None:
-            parts += [by_metre * row**power for power in range(1, self.drift + 1)]
-        return np.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]
+            np.negative(by_point, out=out[:, at : at + 3])
+            at += 3
+        scale = inverse
+        for _ in range(self.drift):
+            assert row is not None
+            scale = scale * row
+            np.multiply(by_drift, scale, out=out[:, at : at + 3])
+            at += 3
+        return out
 
     def in_image(
         self, params: Array, index: IntArray, image: Array, by_point: Array

@@ -28,6 +28,7 @@ _STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside 
 _LEVEL = 1e-3  # a sum of squares less probable than this is too large
 _SURE = 5.0  # of two explanations whose evidences differ by less (a factor of 150) none is ruled out
 _LIKELIER = 2.3  # but one odd view is named where it is ten times as likely as that all are worse than stated
+_GROSS = 16.0  # times the variance stated: a view whose corrections are smaller is not called odd
 _FREE = 100.0  # times its prior: a view whose camera may be anywhere
 _SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some kilometres while an image is taken
@@ -209,7 +210,9 @@ class Variances:
         total, freedom = self._squares(params, known), known[:, : self.constants].sum(axis=1)
         factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
         odd = np.zeros(n, dtype=bool)
-        if around.small and n > 2:
+        with np.errstate(all="ignore"):
+            gross = bool((total > _GROSS * freedom)[freedom > _LEAST].any())
+        if around.small and n > 2 and gross:
             common = np.full(n, np.sqrt(factor))
             scale, odd, evidence = self._odd(around, wide)
             together = around.under(self._prior(common, wide))[0]
@@ -218,7 +221,7 @@ class Variances:
             if evidence < together + _LIKELIER:  # both may be: the priors cover both
                 return np.maximum(scale, common), np.zeros(n, dtype=bool)
             return scale, odd
-        if n > 2:  # one view of many is seen at once
+        if n > 2 and not around.small:  # one view of many is seen at once
             own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
             factor = max((_STRENGTH + own * freedom.sum()) / (_STRENGTH + freedom.sum()), 1.0)
             odd = chi2.sf(total / factor, np.maximum(freedom, _LEAST)) < _LEVEL / n

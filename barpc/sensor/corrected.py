@@ -1,8 +1,9 @@
 """P_BA: a sensor model behind a rotation and a translation about its camera centre.
 
 The paper's corrected projection, P_BA(X) = P(R (X - T - C) + C) with X in ECEF (eq. 1 of Akiki et al.
-2021, "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging"). R may change along the
-strip, as a polynomial of the image row.
+2021, "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging"). A second rotation, a
+polynomial of the image row, may follow R: the drift of the attitude along the strip. `Motion` is all of it with
+its derivatives, for one view here and for blocks of views in the adjustment.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from barpc.errors import RpcError
 from barpc.geodesy import (
@@ -20,6 +22,8 @@ from barpc.geodesy import (
     ground_from_ecef_jacobian,
 )
 from barpc.sensor import SensorModel
+
+IntArray = npt.NDArray[np.int64]
 
 
 def skew(vector: Array) -> Array:
@@ -59,6 +63,99 @@ def rotation_left_jacobian(rotation: Array) -> Array:
     return jacobian
 
 
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products along the axis before the last of (..., 3, n) arrays, broadcast."""
+    (a0, a1, a2), (b0, b1, b2) = (np.moveaxis(v, -2, 0) for v in (a, b))
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-2)
+
+
+def _by_view(matrices: Array, rows: Array, bounds: IntArray) -> Array:
+    """Matrices (m, 3, 3) times the columns bounds[i] : bounds[i + 1] of rows (..., 3, n)."""
+    out = np.empty_like(rows)
+    for matrix, start, stop in zip(matrices, bounds[:-1], bounds[1:], strict=True):
+        np.matmul(matrix, rows[..., start:stop], out=out[..., start:stop])
+    return out
+
+
+class Motion:
+    """exp(d) R (X - T - C) + C for points of one view or many, and the derivatives: all that P_BA adds to P.
+
+    Arrays are component-major, columns sorted by view; R, T and C are those of each view, the drift d is that of
+    each point.
+
+    Parameters
+    ----------
+    ecef : (3, n)
+        X [m].
+    rotation, translation, center : (m, 3)
+        Rotation vectors [rad], T and C [m] of m views.
+    bounds : (m + 1,)
+        Points of view v are bounds[v] : bounds[v + 1].
+    drift : (3, n) or None
+        Rotation vectors [rad].
+    """
+
+    def __init__(
+        self,
+        ecef: Array,
+        rotation: Array,
+        translation: Array,
+        center: Array,
+        bounds: IntArray,
+        drift: Array | None = None,
+    ) -> None:
+        self._rotation, self._bounds, self._drift = rotation, bounds, drift
+        self._matrix = rotation_matrix(rotation)
+        count = np.diff(bounds)
+        self._lever = _by_view(self._matrix, ecef - np.repeat((translation + center).T, count, axis=1), bounds)
+        turned = self._lever
+        if drift is not None:
+            self._series = _series((drift * drift).sum(axis=0))
+            first = _cross(drift, turned)
+            turned = turned + self._series[0] * first + self._series[1] * _cross(drift, first)
+        self._turned = turned
+        self.ecef = turned + np.repeat(center.T, count, axis=1)
+
+    def derivatives(self, by_moved: Array) -> tuple[Array, Array, Array]:
+        """Derivatives by X, by R and by d of what depends on the moved points; by T they are those by X, negative.
+
+        Parameters
+        ----------
+        by_moved : (2, 3, n)
+            Derivatives by the moved points [1/m].
+
+        Returns
+        -------
+        by_point : (2, 3, n)
+            [1/m], the drift held.
+        by_rotation, by_drift : (2, 3, n)
+            [1/rad]; the second is the first where there is no drift.
+        """
+        back, by_drift = by_moved, None
+        if self._drift is not None:
+            d, (a, b, c) = self._drift, self._series
+            first = _cross(by_moved, d)
+            back = by_moved + a * first + b * _cross(first, d)
+            swung = _cross(self._turned, by_moved)
+            first = _cross(d, swung)
+            by_drift = swung - b * first + c * _cross(d, first)
+        by_point = _by_view(self._matrix.swapaxes(1, 2), back, self._bounds)
+        left = rotation_left_jacobian(self._rotation).swapaxes(1, 2)
+        by_rotation = _by_view(left, _cross(self._lever, back), self._bounds)
+        return by_point, by_rotation, by_rotation if by_drift is None else by_drift
+
+
+def _series(angle2: Array) -> tuple[Array, Array, Array]:
+    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of squared angles."""
+    if angle2.max(initial=0.0) < 1e-4:
+        return 1 - angle2 / 6 * (1 - angle2 / 20), 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120
+    angle = np.sqrt(angle2)
+    sine = np.sinc(angle / np.pi)
+    with np.errstate(all="ignore"):
+        third = np.where(angle2 > 1e-4, (1.0 - sine) / angle2, 1.0 / 6 - angle2 / 120)
+    return sine, 0.5 * np.sinc(0.5 * angle / np.pi) ** 2, third
+
+
 @dataclass(frozen=True, eq=False)
 class Correction:
     """Rotation and translation of one view about its camera centre.
@@ -72,8 +169,8 @@ class Correction:
     center : (3,)
         Camera centre [m], ECEF.
     drift : (D, 3)
-        Rotation [rad] added by the powers u, u^2, ... of the normalised image row
-        u = (row - row_offset) / row_scale, where row is the uncorrected sensor's; D = 0: none.
+        A second rotation [rad] after the first: the vectors times the powers u, u^2, ... of the normalised image
+        row u = (row - row_offset) / row_scale, where row is the uncorrected sensor's; D = 0: none.
     row_offset, row_scale : float
         Row of u = 0 and rows to u = 1 [px].
     """
@@ -107,19 +204,30 @@ class Correction:
         fixed = (*self.rotation.tolist(), *self.translation.tolist(), *self.center.tolist())
         return (*fixed, *self.drift.ravel().tolist(), self.row_offset, self.row_scale)
 
-    def rotation_at(self, row: Array) -> Array:
-        """Rotation vectors (..., 3) [rad] at image rows (...) [px] of the uncorrected sensor."""
+    def drift_at(self, row: Array) -> Array:
+        """Rotation vectors (..., 3) [rad] of the drift at image rows (...) [px] of the uncorrected sensor."""
         u = (np.asarray(row, dtype=np.float64) - self.row_offset) / self.row_scale
-        powers = u[..., None] ** np.arange(1, len(self.drift) + 1)
-        return self.rotation + powers @ self.drift
+        drift: Array = u[..., None] ** np.arange(1, len(self.drift) + 1) @ self.drift
+        return drift
+
+    def drift_rate(self, row: Array) -> Array:
+        """Their derivative by the row (..., 3) [rad/px]."""
+        u = (np.asarray(row, dtype=np.float64) - self.row_offset) / self.row_scale
+        degree = np.arange(1, len(self.drift) + 1)
+        rate: Array = (degree * u[..., None] ** (degree - 1)) @ self.drift / self.row_scale
+        return rate
+
+    def motion(self, ecef: Array, row: Array | None = None) -> Motion:
+        """The motion of points (3, n) [m], ECEF, seen at the rows (n,) of the uncorrected sensor."""
+        of_view = (np.atleast_2d(v) for v in (self.rotation, self.translation, self.center))
+        drift = None if row is None else np.ascontiguousarray(self.drift_at(row).T)
+        return Motion(ecef, *of_view, np.array([0, ecef.shape[1]]), drift)
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
-        """R (X - T - C) + C for ECEF points X (..., 3) [m]; R at the rows (...) where there is a drift."""
-        moved = np.asarray(ecef, dtype=np.float64) - (self.translation + self.center)
-        if row is None:
-            return moved @ rotation_matrix(self.rotation).T + self.center
-        turned: Array = (rotation_matrix(self.rotation_at(row)) @ moved[..., None])[..., 0] + self.center
-        return turned
+        """R (X - T - C) + C for ECEF points X (..., 3) [m]; turned on by the drift at the rows (...) if given."""
+        ecef = np.asarray(ecef, dtype=np.float64)
+        rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
+        return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
 
 
 @dataclass(frozen=True)
@@ -136,12 +244,6 @@ class Corrected:
 
     sensor: SensorModel
     correction: Correction
-    _matrix: Array = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        matrix = rotation_matrix(self.correction.rotation)
-        matrix.setflags(write=False)
-        object.__setattr__(self, "_matrix", matrix)
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
@@ -171,41 +273,29 @@ class Corrected:
             d(image)/dR [px/rad].
         by_translation : (..., 2, 3)
             d(image)/dT [px/m].
-
-        Notes
-        -----
-        The derivative by the drift of degree d is `by_rotation` times u^d.
         """
+        ecef = np.asarray(ecef, dtype=np.float64)
+        columns, shape = np.ascontiguousarray(ecef.reshape(-1, 3).T), ecef.shape[:-1]
+        row, row_by_ecef = None, None
         if len(self.correction.drift):
-            return self._project_ecef_drift(ecef)
-        moved = self.correction.apply(ecef)
-        ground = ground_from_ecef(moved)
-        image, by_ground = self.sensor.project_jacobian(ground)
-        by_moved = by_ground @ ground_from_ecef_jacobian(ground)
-        by_ecef = by_moved @ self._matrix
-        lever = skew(moved - self.correction.center)
-        by_rotation = -by_moved @ lever @ rotation_left_jacobian(self.correction.rotation)
-        return image, by_ecef, by_rotation, -by_ecef
+            first, first_by_ecef = self._by_ecef(columns)
+            row, row_by_ecef = first[1], first_by_ecef[1]
+        motion = self.correction.motion(columns, row)
+        image, by_moved = self._by_ecef(motion.ecef)
+        by_point, by_rotation, by_drift = motion.derivatives(by_moved)
+        by_translation = -by_point
+        if row is not None and row_by_ecef is not None:
+            by_row = (by_drift * self.correction.drift_rate(row).T).sum(axis=1)
+            by_point = by_point + by_row[:, None] * row_by_ecef
+        parts = (np.moveaxis(part, -1, 0).reshape(*shape, *part.shape[:-1]) for part in (by_point, by_rotation, by_translation))
+        by_ecef, of_rotation, of_translation = parts
+        return image.T.reshape(*shape, 2), by_ecef, of_rotation, of_translation
 
-    def _project_ecef_drift(self, ecef: Array) -> tuple[Array, Array, Array, Array]:
-        """`project_ecef` where R depends on the row, and so on X."""
-        correction = self.correction
-        before = ground_from_ecef(ecef)
-        first, first_by_ground = self.sensor.project_jacobian(before)
-        row_by_ecef = (first_by_ground[..., 1:, :] @ ground_from_ecef_jacobian(before))[..., 0, :]
-        rotation = correction.rotation_at(first[..., 1])
-        matrix = rotation_matrix(rotation)
-        moved = correction.apply(ecef, first[..., 1])
-        ground = ground_from_ecef(moved)
+    def _by_ecef(self, ecef: Array) -> tuple[Array, Array]:
+        """The uncorrected sensor's image points (2, n) of ECEF points (3, n), and their derivative (2, 3, n)."""
+        ground = ground_from_ecef(ecef.T)
         image, by_ground = self.sensor.project_jacobian(ground)
-        by_moved = by_ground @ ground_from_ecef_jacobian(ground)
-        by_rotation = -by_moved @ skew(moved - correction.center) @ rotation_left_jacobian(rotation)
-        by_translation = -by_moved @ matrix
-        u = (first[..., 1] - correction.row_offset) / correction.row_scale
-        degree = np.arange(1, len(correction.drift) + 1)
-        rate = (degree * u[..., None] ** (degree - 1)) @ correction.drift / correction.row_scale
-        by_row = by_rotation @ rate[..., None]
-        return image, by_row * row_by_ecef[..., None, :] - by_translation, by_rotation, by_translation
+        return image.T, np.moveaxis(by_ground @ ground_from_ecef_jacobian(ground), 0, -1)
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points seen at image points, at known altitudes.
