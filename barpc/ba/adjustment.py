@@ -159,7 +159,7 @@ def make_problem(
     if prior is not None:
         on_cameras, jointly = apply_prior(prior, block.names, options.model, drift, on_cameras)
     return Problem(
-        Cameras(views, unknowns),
+        Cameras(views, unknowns, block.xy[1]),
         make_structure(block.view, block.point, len(views), block.num_points),
         block.xy,
         on_cameras,

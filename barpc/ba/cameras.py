@@ -55,9 +55,12 @@ class Cameras:
         N views.
     unknowns : Unknowns
         What is corrected, and in which units.
+    row : (K,) or None
+        Observed rows [px], sorted by view: when each point was seen, which a drift asks for.
     """
 
-    def __init__(self, views: Sequence[View], unknowns: Unknowns) -> None:
+    def __init__(self, views: Sequence[View], unknowns: Unknowns, row: Array | None = None) -> None:
+        self.row = row
         self.sensors = tuple(view.sensor for view in views)
         self.unknowns = unknowns
         self.is_rpc = np.array([isinstance(sensor, RPC) for sensor in self.sensors])
@@ -96,7 +99,8 @@ class Cameras:
         for views in self._chunks(bounds):
             for part in _parts(bounds[views.start], bounds[views.stop]):
                 of_view = np.clip(bounds[views.start : views.stop + 1], part.start, part.stop) - part.start
-                piece = self._project(params, ecef[:, part], views, of_view, wanted)
+                row = None if self.row is None else self.row[part]
+                piece = self._project(params, ecef[:, part], views, of_view, wanted, row)
                 image[:, part] = piece.image
                 by_point[..., part] = piece.by_point
                 by_unknown[..., part] = piece.by_unknown
@@ -125,17 +129,17 @@ class Cameras:
             start = stop
 
     def _project(
-        self, params: Array, ecef: Array, views: slice, bounds: IntArray, wanted: Wanted
+        self, params: Array, ecef: Array, views: slice, bounds: IntArray, wanted: Wanted, row: Array | None
     ) -> Projected:
         index = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
         unknowns = self.unknowns
         if not unknowns.geometric:
             image, by_point = self._by_ecef(ecef, views, bounds)
             return _only(Projected(*unknowns.in_image(params, index, image, by_point)), wanted)
-        drift, row, first_by_point = None, None, None
+        drift = None
         if unknowns.drift:
-            first, first_by_point = self._by_ecef(ecef, views, bounds)
-            row = unknowns.normalized_row(first[1], index)
+            assert row is not None
+            row = unknowns.normalized_row(row, index)
             drift = unknowns.drift_rotation(params, index, row)
         of_views = params[views]
         motion = Motion(
@@ -152,10 +156,6 @@ class Cameras:
         image, by_moved = self._by_ecef(motion.ecef, views, bounds)
         by_point, by_rotation, by_drift = motion.derivatives(by_moved)
         by_unknown = unknowns.stack(by_rotation, by_drift, by_point, index, row)
-        if row is not None and first_by_point is not None:
-            rate = unknowns.drift_rate(params, index, row)
-            by_row = (by_drift * rate).sum(axis=1) / unknowns.row_scale[index]
-            by_point = by_point + by_row[:, None] * first_by_point[1]
         return _only(Projected(image, by_point, by_unknown), wanted)
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:

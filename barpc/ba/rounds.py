@@ -31,6 +31,9 @@ _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each v
 _BACKFITTING = 6
 _LEAST_FREEDOM = 20
 _ROBUST_ROUNDS = 20
+_CLEAN = 5.0  # sigmas
+_FEW = 0.002  # of the observations farther away than that
+_NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
 _SHRINK = 0.25  # of the loss's scale in one round, at most
 _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
 
@@ -250,11 +253,13 @@ def _robust(
         noise = max(float(np.sqrt(_median(s, counted) / _MEDIAN)), least, _LEAST_NOISE)
         if scale <= 3.6 * noise:
             break
-        scale = 3.0 * noise if np.isinf(scale) else max(3.0 * noise, _SHRINK * scale)
+        clean = float((s[use] > (_CLEAN * noise) ** 2).mean()) < _FEW  # nothing to be careful about
+        scale = 3.0 * noise if np.isinf(scale) or clean else max(3.0 * noise, _SHRINK * scale)
         counted = use * loss(s / scale**2)[1]
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual = problem.linearise(state.params, state.points).image - problem.xy  # into `projected`
-        s = observations.squared(residual - smooth.part(residual, counted), counted)
+        near = scale <= _NEAR * noise
+        s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
         counted = use * loss(s / scale**2)[1]
     return state, residual, counted, noise
 

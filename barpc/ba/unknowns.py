@@ -105,14 +105,6 @@ class Unknowns:
             added = (added + vectors[degree]) * row
         return added
 
-    def drift_rate(self, params: Array, index: IntArray, row: Array) -> Array:
-        """d(rotation) / d(normalised row), (3, n) [rad]."""
-        vectors = self.drift_vectors(params).transpose(1, 2, 0)[:, :, index]
-        rate: Array = vectors[-1] * float(self.drift)
-        for degree in range(self.drift - 2, -1, -1):
-            rate = rate * row + vectors[degree] * (degree + 1.0)
-        return rate
-
     def stack(
         self, by_rotation: Array, by_drift: Array, by_point: Array, index: IntArray, row: Array | None
     ) -> Array:

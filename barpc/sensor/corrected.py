@@ -25,6 +25,8 @@ from barpc.sensor import SensorModel
 
 IntArray = npt.NDArray[np.int64]
 
+_ROW_STEPS = 3  # a drift turns by a ten-thousandth of a pixel a row or less: each step gains four digits
+
 
 def skew(vector: Array) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3): skew(a) @ b = a x b."""
@@ -170,7 +172,7 @@ class Correction:
         Camera centre [m], ECEF.
     drift : (D, 3)
         A second rotation [rad] after the first: the vectors times the powers u, u^2, ... of the normalised image
-        row u = (row - row_offset) / row_scale, where row is the uncorrected sensor's; D = 0: none.
+        row u = (row - row_offset) / row_scale at which the point is seen; D = 0: none.
     row_offset, row_scale : float
         Row of u = 0 and rows to u = 1 [px].
     """
@@ -205,7 +207,7 @@ class Correction:
         return (*fixed, *self.drift.ravel().tolist(), self.row_offset, self.row_scale)
 
     def drift_at(self, row: Array) -> Array:
-        """Rotation vectors (..., 3) [rad] of the drift at image rows (...) [px] of the uncorrected sensor."""
+        """Rotation vectors (..., 3) [rad] of the drift at image rows (...) [px]."""
         u = (np.asarray(row, dtype=np.float64) - self.row_offset) / self.row_scale
         drift: Array = u[..., None] ** np.arange(1, len(self.drift) + 1) @ self.drift
         return drift
@@ -218,7 +220,7 @@ class Correction:
         return rate
 
     def motion(self, ecef: Array, row: Array | None = None) -> Motion:
-        """The motion of points (3, n) [m], ECEF, seen at the rows (n,) of the uncorrected sensor."""
+        """The motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
         of_view = (np.atleast_2d(v) for v in (self.rotation, self.translation, self.center))
         drift = None if row is None else np.ascontiguousarray(self.drift_at(row).T)
         return Motion(ecef, *of_view, np.array([0, ecef.shape[1]]), drift)
@@ -247,8 +249,13 @@ class Corrected:
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
-        row = self.sensor.project(ground)[..., 1] if len(self.correction.drift) else None
-        return self.sensor.project(ground_from_ecef(self.correction.apply(ecef_from_ground(ground), row)))
+        ecef = ecef_from_ground(ground)
+        if not len(self.correction.drift):
+            return self.sensor.project(ground_from_ecef(self.correction.apply(ecef)))
+        image = self.sensor.project(ground)
+        for _ in range(_ROW_STEPS):
+            image = self.sensor.project(ground_from_ecef(self.correction.apply(ecef, image[..., 1])))
+        return image
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
@@ -276,17 +283,19 @@ class Corrected:
         """
         ecef = np.asarray(ecef, dtype=np.float64)
         columns, shape = np.ascontiguousarray(ecef.reshape(-1, 3).T), ecef.shape[:-1]
-        row, row_by_ecef = None, None
+        row = None
         if len(self.correction.drift):
-            first, first_by_ecef = self._by_ecef(columns)
-            row, row_by_ecef = first[1], first_by_ecef[1]
+            row = self.project(ground_from_ecef(columns.T))[:, 1]
         motion = self.correction.motion(columns, row)
         image, by_moved = self._by_ecef(motion.ecef)
         by_point, by_rotation, by_drift = motion.derivatives(by_moved)
         by_translation = -by_point
-        if row is not None and row_by_ecef is not None:
+        if row is not None:  # the point moves the row, and the row the drift
             by_row = (by_drift * self.correction.drift_rate(row).T).sum(axis=1)
-            by_point = by_point + by_row[:, None] * row_by_ecef
+            share = by_row / (1.0 - by_row[1])
+            by_point, by_rotation, by_translation = (
+                part + share[:, None] * part[1] for part in (by_point, by_rotation, by_translation)
+            )
         parts = (np.moveaxis(part, -1, 0).reshape(*shape, *part.shape[:-1]) for part in (by_point, by_rotation, by_translation))
         by_ecef, of_rotation, of_translation = parts
         return image.T.reshape(*shape, 2), by_ecef, of_rotation, of_translation
