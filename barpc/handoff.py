@@ -8,10 +8,11 @@ image and its altitudes. A vendor's file beside an image, which would be read in
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -25,8 +26,9 @@ from rasterio.transform import RPCTransformer
 
 from barpc.errors import OutputError
 from barpc.geodesy import Array, wrap_longitude
+from barpc.owned import own_files
 from barpc.raster import open_raster
-from barpc.rpcio import read_rpc
+from barpc.rpcio import hidden_by, read_rpc
 from barpc.sensor import SensorModel
 
 TOLERANCE = 1e-6
@@ -92,6 +94,33 @@ def difference(
     if not len(ground):
         return float("nan")
     return float(np.linalg.norm(other.project(ground) - image, axis=1).max())
+
+
+def refuse_hiding(folder: Path, names: Sequence[str], inputs: Collection[Path]) -> None:
+    """Raise if a new file would be read in place of the RPC of an image that is there.
+
+    Parameters
+    ----------
+    folder : Path
+        Where files are to be written.
+    names : sequence of str
+        Their names.
+    inputs : collection of Path
+        What is worked on: for these it does not matter whether barpc wrote such a file before.
+
+    Raises
+    ------
+    OutputError
+        Names the file and the image.
+    """
+    own = own_files(folder) if folder.is_dir() else set()
+    given = {path.resolve() for path in inputs}
+    for path, image, _ in hidden_by(folder / name for name in names):
+        is_input = image.resolve() in given
+        if is_input or not (image.name in own or os.path.lexists(path)):
+            raise OutputError(
+                f"{path}: would be read in place of the RPC of {'the input ' * is_input}{image}; give another -o"
+            )
 
 
 def verify(

@@ -10,11 +10,12 @@ import click
 from barpc.cli.main import EXIT_GATE
 from barpc.cli.points import camera_options, load_camera
 from barpc.errors import InputError
-from barpc.handoff import Reading, verify
+from barpc.handoff import Reading, refuse_hiding, verify
 from barpc.raster import open_raster
-from barpc.rpcio import FORMATS, shadows, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio import FORMATS, rpc_vrt, shadows, write_rpc, write_rpc_copy
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
+from barpc.workspace import Workspace
 
 _ENDS = [*dict.fromkeys(s for row in FORMATS.values() for s in row.suffixes), ".vrt", ".tif"]
 
@@ -54,19 +55,19 @@ def command(
     folder = Path(out_dir)
     formats = [name.strip() for name in rpc_format.split(",") if name.strip()]
     _check(images, folder, formats)
+    sources = [_rpc_file(Path(rpcs), Path(image)) for image in images]
+    names = [_names(Path(image), carrier, formats) for image in images]
+    together = [name for row in names for name in row]
+    inputs = [*map(Path, images), *sources]
+    refuse_hiding(folder, together, inputs)
     readings: list[Reading] = []
-    for image in images:
-        camera = load_camera(str(_rpc_file(Path(rpcs), Path(image))), pixel_convention, band)
-        written = _write(Path(image), camera.rpc, folder, carrier, formats, overwrite)
-        size = _size(image)
-        readings += verify(written, camera.rpc, size, altitude_range(camera.rpc))
-        for sidecar in shadows(image):
-            click.echo(
-                f"barpc: beside {image}: {sidecar.path.name} hides an RPC put into the image", err=True
-            )
-        for sidecar in shadows(written[0]):
-            if sidecar.path not in written:
-                click.echo(f"barpc: {sidecar.path} hides the RPC of {written[0]}: remove it", err=True)
+    with Workspace(folder, overwrite=overwrite, keep=inputs, names=together, adds=True) as workspace:
+        for image, source, row in zip(images, sources, names, strict=True):
+            rpc = load_camera(str(source), pixel_convention, band).rpc
+            _write(workspace, Path(image), rpc, row, formats)
+            written = [folder / name for name in row]
+            readings += verify(written, rpc, _size(image), altitude_range(rpc))
+            _tell_of_shadows(image, written)
     if as_json:
         rows = [
             {
@@ -82,6 +83,14 @@ def command(
         for reading in readings:
             click.echo(f"{reading.path}: {reading.consumer} {reading.note or f'{reading.max_error:.1e} px'}")
     return 0 if all(reading.passed for reading in readings) else EXIT_GATE
+
+
+def _tell_of_shadows(image: str, written: list[Path]) -> None:
+    for sidecar in shadows(image):
+        click.echo(f"barpc: beside {image}: {sidecar.path.name} hides an RPC put into the image", err=True)
+    for sidecar in shadows(written[0]):
+        if sidecar.path not in written:
+            click.echo(f"barpc: {sidecar.path} hides the RPC of {written[0]}: remove it", err=True)
 
 
 def _size(image: str) -> tuple[int, int]:
@@ -115,15 +124,19 @@ def _rpc_file(rpcs: Path, image: Path) -> Path:
     )
 
 
-def _write(
-    image: Path, rpc: RPC, folder: Path, carrier: str, formats: list[str], overwrite: bool
-) -> list[Path]:
-    written = [folder / f"{image.stem}{'.vrt' if carrier == 'vrt' else '.tif'}"]
-    if carrier == "vrt":
-        write_rpc_vrt(rpc, image, written[0], overwrite=overwrite)
-    else:
-        write_rpc_copy(rpc, image, written[0], overwrite=overwrite)
-    for name in formats:
-        written.append(folder / f"{image.stem}{FORMATS[name].suffixes[0]}")
-        write_rpc(rpc, written[-1], format=name, overwrite=overwrite)
-    return written
+def _names(image: Path, carrier: str, formats: list[str]) -> list[str]:
+    """What is written for an image: the raster, then a file for each format."""
+    ends = [".vrt" if carrier == "vrt" else ".tif", *(FORMATS[name].suffixes[0] for name in formats)]
+    return [image.stem + end for end in ends]
+
+
+def _write(workspace: Workspace, image: Path, rpc: RPC, names: list[str], formats: list[str]) -> None:
+    raster, *files = names
+    with workspace.output(raster) as partial:
+        if raster.endswith(".vrt"):
+            partial.write_text(rpc_vrt(rpc, image, workspace.folder / raster), encoding="utf-8")
+        else:
+            write_rpc_copy(rpc, image, partial, overwrite=True)
+    for name, format in zip(files, formats, strict=True):
+        with workspace.output(name) as partial:
+            write_rpc(rpc, partial, format=format, overwrite=True)

@@ -128,10 +128,14 @@ def command(
 
     \b
     Examples:
-      barpc fit image.tif -o image_RPC.TXT --alt-range -100 2500
+      barpc fit image.tif -o refitted/image_RPC.TXT --alt-range -100 2500
       barpc fit points.csv -o points.RPB --tolerance 1
       barpc fit S1A_IW_SLC__1SDV_....SAFE --swath iw1 --pol vv -o iw1_RPC.TXT
     """
+    if output is not None:
+        from barpc.cli.points import check_target
+
+        check_target(output, [source], overwrite)
     fit = _fit(Path(source), flags)
     verdict = fit.verdict(flags["tolerance"])
     reread = None

@@ -9,7 +9,7 @@ import click
 import numpy as np
 
 from barpc.atomic import write_text
-from barpc.cli.points import camera_options, load_camera, middle_altitude
+from barpc.cli.points import camera_options, check_target, load_camera, middle_altitude
 from barpc.errors import RpcError
 from barpc.geojson import collection, feature
 from barpc.sensor.geometry import footprint
@@ -38,6 +38,8 @@ def command(
     Example:
       barpc footprint *.tif -o footprints.geojson
     """
+    if output is not None:
+        check_target(output, images, overwrite)
     features = []
     for image in images:
         camera = load_camera(image, pixel_convention, band, size)

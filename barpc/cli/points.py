@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -13,10 +14,10 @@ from typing import Any, TypeVar
 import click
 import numpy as np
 
-from barpc.errors import ImageError, InputError
+from barpc.errors import ImageError, InputError, OutputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
-from barpc.rpcio import RpcSource, read_rpc_source
+from barpc.rpcio import FORMATS, RpcSource, hidden_by, read_rpc_source, sidecars
 from barpc.sensor.rpc import RPC
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -77,6 +78,39 @@ def load_camera(
         except ImageError:  # an RPC file: there is no raster to ask
             size = None
     return Camera(source, size)
+
+
+def check_target(
+    target: str | Path, sources: Sequence[str | Path], overwrite: bool, rpc: RPC | None = None
+) -> None:
+    """Raise if a file to be written is an input, or would be read in place of the RPC that an image has.
+
+    Parameters
+    ----------
+    target : path
+        The file to be written.
+    sources : sequence of path
+        What was given; the RPC files beside it belong to it.
+    overwrite : bool
+        An image may get another RPC; that is said. An input is never replaced.
+    rpc : RPC, optional
+        What the file will hold: where the image has the same, nothing changes for it.
+    """
+    target = Path(target)
+    inputs = {p.resolve() for s in sources for p in (Path(s), *(sidecar.path for sidecar in sidecars(s)))}
+    if os.path.lexists(target) and target.resolve() in inputs:
+        raise OutputError(f"{target}: belongs to the input and is never replaced; give another name")
+    text = FORMATS["txt"].write
+    assert text is not None
+    for _, image, now in hidden_by([target]):
+        if rpc is not None and text(rpc) == text(now):
+            continue
+        if not overwrite:
+            raise OutputError(
+                f"{target}: would be read in place of the RPC that {image} has; give another folder or name, or "
+                "--overwrite if that is meant"
+            )
+        click.echo(f"barpc: {target} is read in place of the RPC that {image} had", err=True)
 
 
 def read_points(

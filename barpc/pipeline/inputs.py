@@ -87,7 +87,8 @@ def input_files(options: RunOptions) -> list[Path]:
     """Every file that the options name; none of them is ever written."""
     ties = (options.matches, options.overlap_list, options.aoi)
     named = [*options.gcp, *options.check_points, options.dem, options.geoid, *ties]
-    return [Path(path) for path in named if path is not None]
+    prior = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
+    return [*(Path(path) for path in named if path is not None), *prior]
 
 
 def read_pairs(

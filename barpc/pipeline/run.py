@@ -14,10 +14,11 @@ import numpy as np
 from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
+from barpc.handoff import refuse_hiding
 from barpc.pipeline.crew import Crew
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
 from barpc.pipeline.options import RunOptions
-from barpc.pipeline.outputs import SUFFIXES, file_names, refuse_shadows, write_tables, write_view
+from barpc.pipeline.outputs import MATCHES, SUFFIXES, output_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import LoadedViews, load_views
 from barpc.pointio.matches import asp_text, read_matches, write_matches
 from barpc.report import Run, summarize
@@ -128,7 +129,10 @@ def adjust(
         for path in (view.path, source.path)
     }
     keep |= set(input_files(options))
-    with Workspace(out_dir, overwrite=options.overwrite, keep=frozenset(keep)) as workspace:
+    names = output_names(loaded.views, options, Path(out_dir))
+    refuse_hiding(Path(out_dir), names, keep)
+    refuse_shadows(Path(out_dir), names)
+    with Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names) as workspace:
         with _crew(loaded, workspace, executor) as crew:
             run = _solve(loaded, options, workspace, crew, progress)
         if run.adjustment is not None and options.stop_after == "all":
@@ -244,7 +248,7 @@ def _with_ties(
 
 def _write_matches(run: Run, workspace: Workspace) -> None:
     names = [view.name for view in run.views]
-    for name in ("matches.csv", "matches.npz"):
+    for name in MATCHES:
         with workspace.output(name) as partial:
             write_matches(partial, run.tracks, names)
     for ties in pair_ties(run.tracks):
@@ -279,8 +283,6 @@ def _center(view: View, options: RunOptions) -> CameraCenter:
 def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress: Progress | None) -> Run:
     """Refit every P_BA first, and write only when all can be written."""
     assert run.adjustment is not None
-    for view in run.views:
-        refuse_shadows(workspace, file_names(view, options.images, options.rpc_formats))
     fits: list[RpcFit] = []
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))

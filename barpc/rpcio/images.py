@@ -57,13 +57,17 @@ def write_rpc_vrt(
     OutputError
         The VRT exists or cannot be written.
     """
+    write_text(vrt_path, rpc_vrt(rpc, image_path, vrt_path, relative=relative), overwrite=overwrite)
+
+
+def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative: bool = True) -> str:
+    """The text that `write_rpc_vrt` writes."""
     source = plain_source(image_path)
     target = Path(vrt_path).absolute()
     _refuse_same(source, target)
     name = os.path.relpath(source.resolve(), target.parent.resolve()) if relative else str(source)
     with open_raster(source) as dataset:
-        text = _vrt(dataset, rpc, name, relative)
-    write_text(target, text, overwrite=overwrite)
+        return _vrt(dataset, rpc, name, relative)
 
 
 def plain_source(image_path: Path | str) -> Path:

@@ -7,12 +7,12 @@ barpc sees the camera that every other tool sees. What it found, and what it pas
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from barpc.errors import ImageError, RpcError, RpcFormatError
-from barpc.raster import open_raster
+from barpc.raster import identify, open_raster
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.fixed import is_nitf, read_nitf
 from barpc.rpcio.formats import FORMATS, MAX_BYTES, parse
@@ -131,6 +131,34 @@ def shadows(image: Path | str) -> list[Sidecar]:
     vrt = head.lstrip().startswith(b"<VRTDataset")
     own = vrt or _own_rpc(image, head) is not None
     return [s for s in sidecars(image) if s.kind == "geom" or (s.before_tag and not vrt) or not own]
+
+
+def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
+    """Images whose RPC some tool would no longer see if these files were written.
+
+    Yields
+    ------
+    path, image, rpc : Path, Path, RPC
+        The file, an image beside which it would be read, and the RPC that the image has now.
+    """
+    wanted: dict[Path, dict[str, Path]] = {}
+    for path in paths:
+        wanted.setdefault(path.parent, {})[path.name.lower()] = path
+    for folder, files in wanted.items():
+        for image in sorted(folder.iterdir()) if folder.is_dir() else ():
+            beside = (files.get(name.lower()) for _, name, _ in _names(image.name))
+            found = next((path for path in beside if path is not None and path.name != image.name), None)
+            rpc = None if found is None else _rpc_of_image(image)
+            if found is not None and rpc is not None:
+                yield found, image, rpc
+
+
+def _rpc_of_image(path: Path) -> RPC | None:
+    try:
+        identify(path)
+        return read_rpc(path)
+    except (ImageError, RpcError):
+        return None
 
 
 def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:

@@ -247,6 +247,7 @@ def test_apply_gives_images_other_rpcs_and_proves_it(carrier, image, tmp_path, c
         "scene.vrt" if carrier == "vrt" else "scene.tif",
         "scene_RPC.TXT",
         "scene.geom",
+        ".barpc",
     }
     assert image.read_bytes() == before
     assert list(image.parent.iterdir()) == [image]
