@@ -305,7 +305,6 @@ class Workspace:
         OutputError
             It would replace an input or a file that is not barpc's own, or cannot be written.
         """
-        self._refuse_foreign(name)
         with replacing(self.folder / name, overwrite=True, room=self.partial) as partial:
             yield partial
             self._refuse_foreign(name)

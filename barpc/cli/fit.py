@@ -128,7 +128,7 @@ def command(
 
     \b
     Examples:
-      barpc fit image.tif -o refitted/image_RPC.TXT --alt-range -100 2500
+      barpc fit image.tif -o new/image_RPC.TXT --alt-range -100 2500
       barpc fit points.csv -o points.RPB --tolerance 1
       barpc fit S1A_IW_SLC__1SDV_....SAFE --swath iw1 --pol vv -o iw1_RPC.TXT
     """

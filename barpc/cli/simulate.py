@@ -55,7 +55,7 @@ from barpc.cli.progress import progress_bars
 @click.option("--clouds", default=0.0, show_default=True, help="Part of every image under clouds, 0 to 1.")
 @click.option("--checks", default=200, show_default=True, help="Held-out check points.")
 @click.option("--gcps", default=0, show_default=True, help="Ground control points (gcps.geojson).")
-@click.option("--overwrite", is_flag=True, help="Replace files that are there.")
+@click.option("--overwrite", is_flag=True, help="Replace files of an earlier run.")
 @click.pass_obj
 def command(
     obj: dict[str, Any],
