@@ -172,7 +172,12 @@ class Workspace:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         shutil.rmtree(self.partial, ignore_errors=True)  # of a run that was killed
         self._earlier = owned.read_own(self.folder)  # again: another run may have ended in between
-        self._save_state("running")
+        try:
+            self._save_state("running")
+        except BaseException:  # a full disk
+            self._discard()
+            self._lock.release()
+            raise
 
     def _check_free(self, overwrite: bool, names: Iterable[str]) -> None:
         if self.folder.exists() and not self.folder.is_dir():

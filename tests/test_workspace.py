@@ -405,6 +405,19 @@ def test_foreign_partial_files_stay_and_a_run_below_is_left_alone(tmp_path):
     assert [path.read_text() for path in foreign] == ["mine", "mine"]
 
 
+def test_a_run_that_cannot_save_its_first_state_leaves_nothing_and_no_lock(tmp_path, monkeypatch):
+    def full(*_args):
+        raise OutputError("no space")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Workspace, "_save_state", full)
+        with pytest.raises(OutputError, match="no space"):
+            Workspace(tmp_path / "new/run")
+    assert list(tmp_path.iterdir()) == []
+    with Workspace(tmp_path / "new/run"):
+        pass
+
+
 def test_a_refused_run_keeps_the_results_of_a_longer_one_before_it(tmp_path):
     with pytest.raises(RuntimeError), Workspace(tmp_path / "run") as run:
         run.store("detect", "k", {"x": np.ones(3)})
