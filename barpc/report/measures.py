@@ -122,8 +122,8 @@ def whole_shift(ties: PairTies, tracks: Tracks) -> Array | None:
     """
     shift = tracks.xy[ties.b] - tracks.xy[ties.a]
     whole: Array = np.rint(np.median(shift, axis=0))
-    same: BoolArray = (np.abs(shift - whole) <= WHOLE).all(axis=1)
-    return whole if len(shift) >= LEAST and same.mean() >= MOST else None
+    same = np.mean((np.abs(shift - whole) <= WHOLE).all(axis=1))
+    return whole if len(shift) >= LEAST and same >= MOST else None
 
 
 def pair_offset(ties: PairTies, tracks: Tracks, sensors: Sequence[SensorModel], alt: Array) -> PairOffset:
