@@ -41,7 +41,7 @@ def _compare(images: list[str], against: Path, as_json: bool) -> int:
     from barpc.pipeline import load_views
     from barpc.rpcio import read_rpc
 
-    views = load_views(images, min_views=1).views
+    views = load_views(images, min_views=1, distinct=False).views
     found = {}
     for view in views:
         other = _counterpart(Path(view.path), against)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,9 +43,11 @@ class AdjustResult:
     Parameters
     ----------
     views : tuple of View
-        The images; after an adjustment with their refitted RPCs as sensors.
+        The images in the order given, without those left out; after an adjustment with their refitted RPCs
+        as sensors.
     run : Run
-        Everything found on the way.
+        Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`,
+        files) images stand in the order of their names, `run.views`, so that the order given does not matter.
     summary : dict
         What summary.json holds.
     """
@@ -61,13 +63,13 @@ class AdjustResult:
 
     @property
     def adjustment(self) -> Adjustment:
-        """The adjustment itself."""
+        """The adjustment itself; its views are `run.views`."""
         assert self.run.adjustment is not None
         return self.run.adjustment
 
     @property
     def tracks(self) -> Tracks:
-        """The tie points."""
+        """The tie points; `Tracks.view` counts `run.views`."""
         return self.run.tracks
 
     def report(self) -> Path:
@@ -96,7 +98,8 @@ def adjust(
     Parameters
     ----------
     images : sequence of path
-        Two or more rasters with RPCs. They are opened read-only.
+        Two or more rasters with RPCs, in any order: the files written do not depend on it. They are opened
+        read-only.
     out_dir : path
         Folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``.
     options : RunOptions, optional
@@ -145,10 +148,10 @@ def adjust(
         summary = summarize(run)
         write_tables(workspace, run, summary)
         workspace.remove_stale()
-    views = tuple(
+    views = (
         replace(view, sensor=sensor) for view, sensor in zip(run.views, run.after or run.before, strict=True)
     )
-    return AdjustResult(views, run, summary)
+    return AdjustResult(_as_given(views, images), run, summary)
 
 
 def check(
@@ -163,7 +166,12 @@ def check(
     loaded = _load(images, options)
     run = _empty_run("check", loaded, options)
     run = _with_ties(run, options, executor, progress, None)
-    return AdjustResult(loaded.views, run, summarize(run))
+    return AdjustResult(_as_given(run.views, images), run, summarize(run))
+
+
+def _as_given(views: Iterable[View], images: Sequence[str | Path]) -> tuple[View, ...]:
+    place = {str(Path(path).absolute()): number for number, path in enumerate(images)}
+    return tuple(sorted(views, key=lambda view: place[view.path]))
 
 
 def _load(images: Sequence[str | Path], options: RunOptions) -> LoadedViews:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from barpc.errors import BarpcError, ImageError, InputError, RpcError
+from barpc.pipeline.twins import Twins
 from barpc.raster import open_raster
 from barpc.rpcio import RpcSource, read_rpc_source
 from barpc.scene import View
@@ -29,7 +30,7 @@ class LoadedViews:
     Parameters
     ----------
     views : tuple of View
-        In the order given.
+        In the order of their names.
     sources : tuple of RpcSource
         One a view.
     left_out : tuple of (str, str)
@@ -42,9 +43,14 @@ class LoadedViews:
 
 
 def load_views(
-    paths: Sequence[str | Path], *, min_views: int = 2, keep_going: bool = False, band: int = 1
+    paths: Sequence[str | Path],
+    *,
+    min_views: int = 2,
+    keep_going: bool = False,
+    band: int = 1,
+    distinct: bool = True,
 ) -> LoadedViews:
-    """Open every image once and read its camera.
+    """Read the camera of every image, in the order of their names, whatever order they are given in.
 
     Parameters
     ----------
@@ -56,6 +62,8 @@ def load_views(
         Leave a bad file out instead of stopping.
     band : int
         The band that will be read, from 1.
+    distinct : bool
+        Refuse an image that is there twice, also as other files or under another RPC (see `Twins`).
 
     Returns
     -------
@@ -77,10 +85,12 @@ def load_views(
     views: list[View] = []
     sources: list[RpcSource] = []
     left_out: list[tuple[str, str]] = []
-    for name, file in zip(unique_names(files), files, strict=True):
+    twins = Twins(band)
+    for name, file in sorted(zip(unique_names(files), files, strict=True)):
         try:
             view, source = _load(name, file, band)
-            _refuse_twin(view, views)
+            if distinct:
+                twins.add(view)
         except BarpcError as error:
             if not keep_going:
                 raise
@@ -134,12 +144,3 @@ def _load(name: str, file: Path, band: int) -> tuple[View, RpcSource]:
     if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
         raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
     return view, source
-
-
-def _refuse_twin(view: View, others: Sequence[View]) -> None:
-    """The same image under two names ties itself to itself, perfectly and uselessly."""
-    for other in others:
-        same_file = Path(view.path).samefile(other.path)
-        if same_file or (view.size == other.size and view.sensor == other.sensor):
-            what = "the same file" if same_file else "the same size and the same RPC"
-            raise InputError(f"{view.path}: is {what} as {other.path}; give each image once")

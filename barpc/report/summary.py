@@ -20,7 +20,6 @@ from barpc.report.measures import (
     ground_sampling,
     pair_geometry,
     pair_offset,
-    pair_ties,
     rmse_by_view,
     shift_in_image,
 )
@@ -52,7 +51,7 @@ def summarize(run: Run) -> dict[str, Any]:
         "out_dir": run.out_dir,
         "altitude_m": run.altitude,
         "views": views,
-        "pairs": [_pair(run, ties, reports) for ties in pair_ties(run.tracks, run.keep)],
+        "pairs": [_pair(run, ties, reports) for ties in run.pairs],
         "left_out": [{"path": path, "reason": reason} for path, reason in run.left_out],
         "tracks": _tracks(run.tracks),
         "tables": _tables(run),

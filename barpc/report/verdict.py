@@ -98,6 +98,8 @@ def _weakness(view: View) -> tuple[str, str]:
 
 
 def _doubt(view: View, run: Run) -> tuple[str, str]:
+    if view["name"] in run.copies:
+        return "doubtful", f"shows the same pixels as {run.copies[view['name']]}: give each image once"
     error = view["rmse_after"] if run.kind == "adjust" else view["rmse_before"]
     if not error <= GOOD_RMSE and view["num_observations"]:
         if run.kind == "check":

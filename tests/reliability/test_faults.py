@@ -245,6 +245,11 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
         1,
         ("the same RPC", "copy.tif"),
     ),
+    "the same pixels under another RPC": (
+        lambda s: [s.a, twin(s, None, dtype="float32", tiled=True, compress="deflate")],
+        1,
+        ("same pixels", "twin.tif", "view_00.tif"),
+    ),
     "no overlap": (lambda s: [s.a, moved_away(s)[1]], 1, ("overlap",)),
     "two groups": (
         lambda s: [s.a, s.b, *moved_away(s)],
@@ -252,14 +257,14 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
         ("view_00", "far_view_00"),
     ),
     "images from nearly the same place": (
-        lambda s: [s.a, rewrite(Path(shutil.copy(s.a, s.folder / "twin.tif")), camera=nudge)],
+        lambda s: [s.a, twin(s, lambda v: v + 1)],
         3,
         (),
     ),
     "images from the same place, where that is refused": (
         lambda s: [
             s.a,
-            rewrite(Path(shutil.copy(s.a, s.folder / "twin.tif")), camera=nudge),
+            twin(s, lambda v: v + 1),
             "--min-triangulation-angle",
             1,
         ],
@@ -391,6 +396,12 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
 def nudge(rpcs: rasterio.rpc.RPC) -> None:
     """A camera of its own, nearly where the other is."""
     rpcs.samp_off += 0.25
+
+
+def twin(scene: Scene, change: Callable[[np.ndarray], np.ndarray] | None, **how: object) -> Path:
+    """The first image again, from nearly the same place."""
+    copy = Path(shutil.copy(scene.a, scene.folder / "twin.tif"))
+    return rewrite(copy, pixels=change, camera=nudge, **how)
 
 
 def strip_rpc(path: Path) -> None:
