@@ -23,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreference
 def barpc(*args):
     """Run the command in a process of its own: exit code, stdout, stderr."""
     command = [sys.executable, "-m", "barpc", *map(str, args)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=3600)
     return done.returncode, done.stdout, done.stderr
 
 
