@@ -15,13 +15,15 @@ from pathlib import Path
 from barpc.errors import OutputError
 
 _MARK = ".barpc-partial-"
+_END = 16  # characters of a name that hold every suffix
 
 
 @contextmanager
 def replacing(path: Path | str, *, overwrite: bool = False, durable: bool = True) -> Iterator[Path]:
     """A temporary path beside `path`, renamed to it when the block ends without an error.
 
-    The temporary name ends with the target's own, so that what a writer takes from a suffix stays right.
+    The temporary name ends as the target's own does, so that what a writer takes from a suffix stays right, and is
+    short whatever the target is called.
 
     Parameters
     ----------
@@ -45,7 +47,7 @@ def replacing(path: Path | str, *, overwrite: bool = False, durable: bool = True
     path = Path(path)
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
-    partial = path.with_name(f"{_MARK}{uuid.uuid4().hex[:12]}-{path.name}")
+    partial = path.with_name(f"{_MARK}{uuid.uuid4().hex[:12]}-{path.name[-_END:]}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import click
 
-from barpc.cli.main import EXIT_GATE
 from barpc.cli.points import camera_options, load_camera
+from barpc.cli.terminal import echo, say, tell_gate
 from barpc.errors import InputError
 from barpc.handoff import Reading, verify
+from barpc.plain import plain_path
 from barpc.raster import open_raster
 from barpc.rpcio import FORMATS, shadows, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.sensor.geometry import altitude_range
@@ -55,18 +56,19 @@ def command(
     formats = [name.strip() for name in rpc_format.split(",") if name.strip()]
     _check(images, folder, formats)
     readings: list[Reading] = []
+    reasons: list[str] = []
     for image in images:
         camera = load_camera(str(_rpc_file(Path(rpcs), Path(image))), pixel_convention, band)
         written = _write(Path(image), camera.rpc, folder, carrier, formats, overwrite)
         size = _size(image)
         readings += verify(written, camera.rpc, size, altitude_range(camera.rpc))
         for sidecar in shadows(image):
-            click.echo(
-                f"barpc: beside {image}: {sidecar.path.name} hides an RPC put into the image", err=True
-            )
-        for sidecar in shadows(written[0]):
-            if sidecar.path not in written:
-                click.echo(f"barpc: {sidecar.path} hides the RPC of {written[0]}: remove it", err=True)
+            say(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
+        reasons += [
+            f"{sidecar.path} hides the RPC of {written[0]}: move it away."
+            for sidecar in shadows(written[0])
+            if sidecar.path not in written
+        ]
     if as_json:
         rows = [
             {
@@ -77,11 +79,16 @@ def command(
             }
             for r in readings
         ]
-        click.echo(json.dumps(rows))
+        echo(json.dumps(rows))
     else:
         for reading in readings:
-            click.echo(f"{reading.path}: {reading.consumer} {reading.note or f'{reading.max_error:.1e} px'}")
-    return 0 if all(reading.passed for reading in readings) else EXIT_GATE
+            echo(f"{reading.path}: {reading.consumer} {reading.note or f'{reading.max_error:.1e} px'}")
+    reasons += [
+        f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}."
+        for r in readings
+        if not r.passed
+    ]
+    return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
 
 
 def _size(image: str) -> tuple[int, int]:
@@ -94,6 +101,8 @@ def _check(images: tuple[str, ...], folder: Path, formats: list[str]) -> None:
     for name in formats:
         if name not in FORMATS or FORMATS[name].write is None:
             raise click.UsageError(f"--rpc-format {name}: not a format that is written")
+    for path in (*map(Path, images), folder):
+        plain_path(path.absolute())
     stems = [Path(image).stem for image in images]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:
