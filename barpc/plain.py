@@ -27,7 +27,8 @@ def plain_path(path: str | os.PathLike[str]) -> Path:
         if unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") or char in _REFUSED:
             what = "bytes that are not UTF-8" if "\ud800" <= char <= "\udfff" else f"the character {char!a}"
             raise InputError(
-                f"{visible(name)}: its path holds {what}, which not every file and tool takes; rename it, or give a link to it"
+                f"{visible(name)}: its path holds {what}, which not every file and tool takes;"
+                " rename it, or give a link to it"
             )
     return Path(name)
 
