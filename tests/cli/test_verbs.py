@@ -100,7 +100,7 @@ def test_a_point_that_fails_is_nan_counted_and_null_in_json(image, capsys):
     captured = capsys.readouterr()
     assert captured.out.splitlines()[1].startswith("nan,nan")
     assert "1 of 1 points" in captured.err
-    assert run("localize", image, "1e12", "0", "--json") == 0
+    assert run("localize", image, "1e12", "0", "--json") == 3
     assert json.loads(capsys.readouterr().out)[0]["lon"] is None
 
 
