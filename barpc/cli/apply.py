@@ -7,10 +7,11 @@ from pathlib import Path
 
 import click
 
-from barpc.cli.main import EXIT_GATE
 from barpc.cli.points import camera_options, load_camera
+from barpc.cli.terminal import echo, say, tell_gate
 from barpc.errors import InputError
 from barpc.handoff import Reading, refuse_hiding, verify
+from barpc.plain import plain_path
 from barpc.raster import open_raster
 from barpc.rpcio import FORMATS, rpc_vrt, shadows, write_rpc, write_rpc_copy
 from barpc.sensor.geometry import altitude_range
@@ -61,13 +62,14 @@ def command(
     inputs = [*map(Path, images), *sources]
     refuse_hiding(folder, together, inputs)
     readings: list[Reading] = []
+    reasons: list[str] = []
     with Workspace(folder, overwrite=overwrite, keep=inputs, names=together, adds=True) as workspace:
         for image, source, row in zip(images, sources, names, strict=True):
             rpc = load_camera(str(source), pixel_convention, band).rpc
             _write(workspace, Path(image), rpc, row, formats)
             written = [folder / name for name in row]
             readings += verify(written, rpc, _size(image), altitude_range(rpc))
-            _tell_of_shadows(image, written)
+            reasons += _shadow_reasons(image, written)
     if as_json:
         rows = [
             {
@@ -78,19 +80,27 @@ def command(
             }
             for r in readings
         ]
-        click.echo(json.dumps(rows))
+        echo(json.dumps(rows))
     else:
         for reading in readings:
-            click.echo(f"{reading.path}: {reading.consumer} {reading.note or f'{reading.max_error:.1e} px'}")
-    return 0 if all(reading.passed for reading in readings) else EXIT_GATE
+            echo(f"{reading.path}: {reading.consumer} {reading.note or f'{reading.max_error:.1e} px'}")
+    reasons += [
+        f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}."
+        for r in readings
+        if not r.passed
+    ]
+    return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
 
 
-def _tell_of_shadows(image: str, written: list[Path]) -> None:
+def _shadow_reasons(image: str, written: list[Path]) -> list[str]:
+    """What lies beside a new file and hides its RPC; what lies beside the image is only said."""
     for sidecar in shadows(image):
-        click.echo(f"barpc: beside {image}: {sidecar.path.name} hides an RPC put into the image", err=True)
-    for sidecar in shadows(written[0]):
-        if sidecar.path not in written:
-            click.echo(f"barpc: {sidecar.path} hides the RPC of {written[0]}: remove it", err=True)
+        say(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
+    return [
+        f"{sidecar.path} hides the RPC of {written[0]}: move it away."
+        for sidecar in shadows(written[0])
+        if sidecar.path not in written
+    ]
 
 
 def _size(image: str) -> tuple[int, int]:
@@ -103,6 +113,8 @@ def _check(images: tuple[str, ...], folder: Path, formats: list[str]) -> None:
     for name in formats:
         if name not in FORMATS or FORMATS[name].write is None:
             raise click.UsageError(f"--rpc-format {name}: not a format that is written")
+    for path in (*map(Path, images), folder):
+        plain_path(path.absolute())
     stems = [Path(image).stem for image in images]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:

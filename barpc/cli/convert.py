@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from barpc.cli.points import camera_options, check_target, load_camera
+from barpc.cli.terminal import echo, say
 from barpc.rpcio import FORMATS, write_rpc, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
 
 _RASTERS: dict[str, Callable[..., None]] = {
@@ -54,10 +55,10 @@ def command(
     else:
         write_rpc(camera.rpc, target, format=name, overwrite=overwrite)
     if as_json:
-        click.echo(
+        echo(
             json.dumps({"source": str(camera.source.path), "format": camera.source.format, "target": target})
         )
     else:
-        click.echo(f"{camera.source.path} ({camera.source.format}) -> {target}")
+        echo(f"{camera.source.path} ({camera.source.format}) -> {target}")
         for note in camera.source.notes:
-            click.echo(f"barpc: {note}", err=True)
+            say(note)

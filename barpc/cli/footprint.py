@@ -10,6 +10,7 @@ import numpy as np
 
 from barpc.atomic import write_text
 from barpc.cli.points import camera_options, check_target, load_camera, middle_altitude
+from barpc.cli.terminal import echo
 from barpc.errors import RpcError
 from barpc.geojson import collection, feature
 from barpc.sensor.geometry import footprint
@@ -50,6 +51,6 @@ def command(
         features.append(feature(ring, name=Path(image).stem, path=str(image), alt=at))
     text = json.dumps(collection(features)) + "\n"
     if output is None:
-        click.echo(text, nl=False)
+        echo(text, nl=False)
     else:
         write_text(output, text, overwrite=overwrite)

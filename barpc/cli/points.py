@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import click
 import numpy as np
 
+from barpc.cli.terminal import echo, tell_gate
 from barpc.errors import ImageError, InputError, OutputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
@@ -196,11 +197,11 @@ def print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_
             }
             for row in values.tolist()
         ]
-        click.echo(json.dumps(rows))
+        echo(json.dumps(rows))
         return
-    click.echo(",".join(names))
+    echo(",".join(names))
     for row in values.tolist():
-        click.echo(",".join(f"{v:.{d}f}" for v, d in zip(row, digits, strict=True)))
+        echo(",".join(f"{v:.{d}f}" for v, d in zip(row, digits, strict=True)))
 
 
 def middle_altitude(rpc: RPC) -> float:
@@ -208,8 +209,7 @@ def middle_altitude(rpc: RPC) -> float:
     return float(rpc.ground_offset[2])
 
 
-def warn_failures(points: Array, what: str) -> None:
-    """Say on stderr how many points came out without a value."""
+def tell_failures(points: Array, what: str) -> int:
+    """The exit code of a verb on points; where some came out without a value, it is said on stderr."""
     count = int((~np.isfinite(points).all(axis=1)).sum())
-    if count:
-        click.echo(f"barpc: {count} of {len(points)} points {what}", err=True)
+    return tell_gate(f"{count} of {len(points)} points {what}", []) if count else 0

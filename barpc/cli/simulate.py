@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from barpc.cli.progress import progress_bars
+from barpc.cli.terminal import echo
 
 
 @click.command("simulate")
@@ -85,5 +86,5 @@ def command(
     with progress_bars(obj["quiet"]) as progress:
         paths = write_scene(out, options, overwrite=overwrite, progress=progress)
     for path in paths:
-        click.echo(path)
+        echo(path)
     return 0

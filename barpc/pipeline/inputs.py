@@ -36,6 +36,7 @@ def load_gcps(paths: Sequence[str], names: Sequence[str]) -> GroundPoints | None
         view=np.concatenate([part.view for part in parts]),
         xy=np.concatenate([part.xy for part in parts]),
         xy_sigma=np.concatenate([part.xy_sigma for part in parts]),
+        strangers=tuple(dict.fromkeys(name for part in parts for name in part.strangers)),
     )
 
 

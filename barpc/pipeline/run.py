@@ -20,7 +20,9 @@ from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new
 from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import MATCHES, SUFFIXES, output_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import LoadedViews, load_views
+from barpc.plain import plain_path
 from barpc.pointio.matches import asp_text, read_matches, write_matches
+from barpc.pointio.names import pair_name, require_pair_names
 from barpc.report import Run, summarize
 from barpc.report.measures import pair_ties
 from barpc.report.page import remake_report
@@ -122,7 +124,10 @@ def adjust(
     unknown = [name for name in options.rpc_formats if name not in SUFFIXES]
     if unknown:
         raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(SUFFIXES)}")
+    plain_path(Path(out_dir).absolute())
     loaded = _load(images, options)
+    if options.stop_after == "matching":
+        require_pair_names([view.name for view in loaded.views])
     if options.images == "vrt":
         for view in loaded.views:
             plain_source(view.path)  # refuses what no VRT can point at, before any work
@@ -175,6 +180,8 @@ def _as_given(views: Iterable[View], images: Sequence[str | Path]) -> tuple[View
 
 
 def _load(images: Sequence[str | Path], options: RunOptions) -> LoadedViews:
+    for path in input_files(options):
+        plain_path(path)
     least = 1 if options.gcp else 2  # one image and control points are enough
     return load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
 
@@ -204,7 +211,7 @@ def _solve(
             run = _with_ties(run, options, crew, progress, adjustment)
         if options.stop_after == "matching":
             _write_matches(run, workspace)
-            return replace(run, kind="check")
+            return replace(run, kind="match")
         with workspace.stage("adjustment" + again):
             run, adjustment = _adjusted(run, options, given)
     assert adjustment is not None
@@ -262,7 +269,7 @@ def _write_matches(run: Run, workspace: Workspace) -> None:
     for ties in pair_ties(run.tracks):
         i, j = ties.views
         text = asp_text(run.tracks.xy[ties.a], run.tracks.xy[ties.b])
-        workspace.write_text(f"asp/{names[i]}__{names[j]}.txt", text)
+        workspace.write_text(f"asp/{pair_name(names[i], names[j])}.txt", text)
 
 
 def _only(run: Run, names: frozenset[str]) -> Run:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from barpc.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.pipeline.twins import Twins
+from barpc.plain import plain_path
+from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
 from barpc.rpcio import RpcSource, read_rpc_source
 from barpc.scene import View
@@ -74,9 +75,9 @@ def load_views(
     ImageError, RpcError
         A file cannot be used; the message names it.
     InputError
-        Too few images, or the same image twice.
+        Too few images, the same image twice, or a name that the files of a run cannot carry.
     """
-    files = [Path(path).absolute() for path in paths]
+    files = [plain_path(Path(path).absolute()) for path in paths]
     if len(files) < min_views:
         found = files[0] if files else "none"
         raise InputError(
@@ -102,30 +103,6 @@ def load_views(
     if len(views) < min_views:
         raise InputError(f"{len(views)} of {len(files)} images can be used: at least {min_views} are needed")
     return LoadedViews(tuple(views), tuple(sources), tuple(left_out))
-
-
-def unique_names(files: Sequence[Path]) -> list[str]:
-    """A name for each file: its stem, with as many folders before it as it takes to tell them apart.
-
-    Examples
-    --------
-    >>> unique_names([Path("a/img.tif"), Path("b/img.tif"), Path("b/other.tif")])
-    ['a_img', 'b_img', 'other']
-    """
-    depth = dict.fromkeys(range(len(files)), 1)
-    while True:
-        names = ["_".join([*file.parts[-depth[i] : -1], file.stem]) for i, file in enumerate(files)]
-        count = Counter(names)
-        again = [
-            i
-            for i, name in enumerate(names)
-            if count[name] > 1 and depth[i] < len(files[i].relative_to(files[i].anchor).parts)
-        ]
-        if not again:
-            break
-        for i in again:
-            depth[i] += 1
-    return names
 
 
 def _load(name: str, file: Path, band: int) -> tuple[View, RpcSource]:

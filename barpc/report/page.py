@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from barpc.errors import BarpcError
+from barpc.plain import visible
 from barpc.report.load import read_summary, read_tables
 from barpc.report.sections import sections
 from barpc.report.verdict import STATUS_WORDS
@@ -52,7 +53,7 @@ def report_html(summary: Mapping[str, Any], folder: Path | str) -> str:
         lstrip_blocks=True,
     )
     template = environment.get_template("template.html.j2")
-    return template.render(summary=summary, sections=sections(files), words=STATUS_WORDS)
+    return visible(template.render(summary=summary, sections=sections(files), words=STATUS_WORDS))
 
 
 def remake_report(folder: Path | str) -> Path:

@@ -26,8 +26,8 @@ class Run:
 
     Parameters
     ----------
-    kind : {"adjust", "check"}
-        Whether cameras were adjusted.
+    kind : {"adjust", "check", "match"}
+        Whether cameras were adjusted, looked at, or only tied.
     views : tuple of View
         The images.
     sources : tuple of RpcSource

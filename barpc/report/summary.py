@@ -25,7 +25,7 @@ from barpc.report.measures import (
 )
 from barpc.report.run import Run
 from barpc.report.tables import written_tracks
-from barpc.report.verdict import block_verdict, meets_gates, mode_in_words, view_status
+from barpc.report.verdict import block_verdict, mode_in_words, view_status
 from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import CameraCenter, view_angles
@@ -47,7 +47,8 @@ def summarize(run: Run) -> dict[str, Any]:
         "status": block["status"],
         "headline": block["headline"],
         "verdict": block["lines"],
-        "passed": not run.left_out and all(meets_gates(view, run) for view in views),
+        "reasons": block["reasons"],
+        "passed": block["status"] == "good",
         "out_dir": run.out_dir,
         "altitude_m": run.altitude,
         "views": views,

@@ -20,6 +20,7 @@ from rasterio.windows import Window
 
 from barpc.atomic import replacing, write_text
 from barpc.errors import ImageError, OutputError
+from barpc.plain import plain_path
 from barpc.raster import identify, open_raster
 from barpc.rpcio.digits import printable
 from barpc.rpcio.fixed import nitf_record
@@ -62,8 +63,8 @@ def write_rpc_vrt(
 
 def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative: bool = True) -> str:
     """The text that `write_rpc_vrt` writes."""
-    source = plain_source(image_path)
-    target = Path(vrt_path).absolute()
+    source = plain_path(plain_source(image_path))
+    target = plain_path(Path(vrt_path).absolute())
     _refuse_same(source, target)
     name = os.path.relpath(source.resolve(), target.parent.resolve()) if relative else str(source)
     with open_raster(source) as dataset:
