@@ -208,9 +208,9 @@ class Mosaic:
         place[keep] = _converted(values, out.dtype)[keep]
 
 
-def _handed_on(values: Pixels, source: Source, dtype: str) -> tuple[BoolArray, Pixels]:
-    """Which values a source hands on, and what they become."""
-    keep = np.ones(values.shape, dtype=bool)
+def _handed_on(values: Pixels, source: Source, dtype: str) -> tuple[Any, Pixels]:
+    """Which values a source hands on, as an index, and what they become."""
+    keep: Any = ...
     if source.plain:
         return keep, values
     work = np.dtype(np.float64 if dtype in _WIDE else np.float32)

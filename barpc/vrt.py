@@ -118,7 +118,7 @@ _GRAMMAR: dict[str, _Tag] = {
     "ScaleRatio": _Tag(_NUMBER),
 }
 _REPEATED = frozenset(
-    "Metadata MDI GCP Entry Category HistItem VRTRasterBand SimpleSource ComplexSource".split()
+    ["Metadata", "MDI", "GCP", "Entry", "Category", "HistItem", "VRTRasterBand", "SimpleSource", "ComplexSource"]
 )
 
 
