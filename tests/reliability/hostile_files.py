@@ -186,39 +186,37 @@ CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
     "source, element, without vsicurl": lambda t: t.vrt(t.url),
     "source, attribute": lambda t: attribute(t, t.remote),
     "source, attribute, without vsicurl": lambda t: attribute(t, t.url),
-    "source, tags in lower case": lambda t: t.vrt(t.remote).replace("SourceFilename", "sourcefilename"),
-    "source, raw data": lambda t: t.vrt(f"<![CDATA[{t.remote}]]>"),
-    "source, characters by number": lambda t: t.vrt("".join(f"&#{ord(c)};" for c in t.remote)),
+    "source, tags in lower case": lambda t: t.vrt(t.url).replace("SourceFilename", "sourcefilename"),
+    "source, raw data": lambda t: t.vrt(f"<![CDATA[{t.url}]]>"),
+    "source, characters by number": lambda t: t.vrt("".join(f"&#{ord(c)};" for c in t.url)),
     "source, an entity": lambda t: f'<!DOCTYPE V [<!ENTITY x "{t.remote}">]>' + t.vrt("&x;"),
-    "source, split by a comment": lambda t: t.vrt(t.remote[:5] + "<!-- - -->" + t.remote[5:]),
-    "source, behind a comment that one parser ends": lambda t: attribute(t, t.remote).replace(
+    "source, split by a comment": lambda t: t.vrt(t.url[:5] + "<!-- - -->" + t.url[5:]),
+    "source, behind a comment that one parser ends": lambda t: attribute(t, t.url).replace(
         "<Simple", "<!--> --><Simple"
     ),
-    "source, behind an instruction": lambda t: attribute(t, t.remote).replace(
-        "<Simple", "<?x y='>'?><Simple"
-    ),
+    "source, behind an instruction": lambda t: attribute(t, t.url).replace("<Simple", "<?x y='>'?><Simple"),
     "source, unquoted and unclosed": lambda t: (
-        attribute(t, t.remote).replace('"300"', "300").replace("</VRTDataset>", "")
+        attribute(t, t.url).replace('"300"', "300").replace("</VRTDataset>", "")
     ),
     "source, a namespace": lambda t: (
-        attribute(t, t.remote)
+        attribute(t, t.url)
         .replace("SimpleSource", "v:SimpleSource")
         .replace("<VRTDataset", '<VRTDataset xmlns:v="v"')
     ),
     "source, twice": lambda t: t.vrt(
-        f"{t.raster.with_name('good.tif')}</SourceFilename><SourceFilename>{t.remote}"
+        f"{t.raster.with_name('good.tif')}</SourceFilename><SourceFilename>{t.url}"
     ),
     "source, with options": lambda t: t.band(
         f"<SimpleSource><SourceFilename>{t.remote}</SourceFilename><OpenOptions><OOI key='a'>b</OOI></OpenOptions>"
         "</SimpleSource>"
     ),
     "UTF-16": lambda t: ('<?xml version="1.0" encoding="UTF-16"?>' + t.vrt(t.remote)).encode("utf-16"),
-    "a mark in front": lambda t: b"\xef\xbb\xbf" + attribute(t, t.remote).encode(),
-    "lines in front": lambda t: "\n \n" + attribute(t, t.remote),
-    "a declaration in front": lambda t: '<?xml version="1.0"?>' + attribute(t, t.remote),
-    "source, complex": lambda t: t.vrt(t.remote, kind="ComplexSource"),
-    "source, averaged": lambda t: t.vrt(t.remote, kind="AveragedSource"),
-    "source, filtered": lambda t: t.vrt(t.remote, kind="KernelFilteredSource").replace(
+    "a mark in front": lambda t: b"\xef\xbb\xbf" + attribute(t, t.url).encode(),
+    "lines in front": lambda t: "\n \n" + attribute(t, t.url),
+    "a declaration in front": lambda t: '<?xml version="1.0"?>' + attribute(t, t.url),
+    "source, complex": lambda t: t.vrt(t.url, kind="ComplexSource"),
+    "source, averaged": lambda t: t.vrt(t.url, kind="AveragedSource"),
+    "source, filtered": lambda t: t.vrt(t.url, kind="KernelFilteredSource").replace(
         "</KernelF", "<Kernel normalized='1'><Size>3</Size><Coefs>1 1 1 1 1 1 1 1 1</Coefs></Kernel></KernelF"
     ),
     "source, nodata from data": lambda t: t.vrt(t.remote, kind="NoDataFromMaskSource"),
@@ -233,19 +231,19 @@ CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
     "source, a service of coverages": indirect("WCS:URL"),
     "source, Zarr": indirect('ZARR:"REMOTE"'),
     "a mask, element": lambda t: mask(
-        t, f"<SimpleSource><SourceFilename>{t.remote}</SourceFilename></SimpleSource>"
+        t, f"<SimpleSource><SourceFilename>{t.url}</SourceFilename></SimpleSource>"
     ),
-    "a mask, attribute": lambda t: mask(t, f'<SimpleSource SourceFilename="{t.remote}" SourceBand="1"/>'),
+    "a mask, attribute": lambda t: mask(t, f'<SimpleSource SourceFilename="{t.url}" SourceBand="1"/>'),
     "an overview, element": lambda t: t.vrt(t.raster.with_name("good.tif")).replace(
         "</VRTRasterBand>",
-        f"<Overview><SourceFilename>{t.remote}</SourceFilename></Overview></VRTRasterBand>",
+        f"<Overview><SourceFilename>{t.url}</SourceFilename></Overview></VRTRasterBand>",
     ),
     "an overview, attribute": lambda t: t.vrt(t.raster.with_name("good.tif")).replace(
-        "</VRTRasterBand>", f'<Overview SourceFilename="{t.remote}" SourceBand="1"/></VRTRasterBand>'
+        "</VRTRasterBand>", f'<Overview SourceFilename="{t.url}" SourceBand="1"/></VRTRasterBand>'
     ),
     "an overview, metadata": lambda t: t.vrt(
         t.raster.with_name("good.tif"),
-        f'<Metadata domain="OVERVIEWS"><MDI key="OVERVIEW_FILE">{t.remote}</MDI></Metadata>',
+        f'<Metadata domain="OVERVIEWS"><MDI key="OVERVIEW_FILE">{t.url}</MDI></Metadata>',
     ),
     "a coordinate system": lambda t: t.vrt(t.raster.with_name("good.tif"), f"<SRS>{t.url}</SRS>"),
     "a coordinate system of GCPs": lambda t: t.vrt(
@@ -253,12 +251,12 @@ CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
         f'<GCPList Projection="{t.url}"><GCP Pixel="0" Line="0" X="0" Y="0"/></GCPList>',
     ),
     "a derived band": lambda t: t.band(
-        f'<PixelFunctionType>sum</PixelFunctionType><SimpleSource SourceFilename="{t.remote}" SourceBand="1"/>',
+        f'<PixelFunctionType>sum</PixelFunctionType><SimpleSource SourceFilename="{t.url}" SourceBand="1"/>',
         attributes=' subClass="VRTDerivedRasterBand"',
     ),
     "a derived band in Python": lambda t: t.band(
         "<PixelFunctionLanguage>Python</PixelFunctionLanguage><PixelFunctionType>os.system</PixelFunctionType>"
-        f'<SimpleSource SourceFilename="{t.remote}" SourceBand="1"/>',
+        f'<SimpleSource SourceFilename="{t.url}" SourceBand="1"/>',
         attributes=' subClass="VRTDerivedRasterBand"',
     ),
     "a raw band": lambda t: t.band(
@@ -269,14 +267,14 @@ CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
         f"<SourceFilename relativeToVRT='0'>{t.canary}</SourceFilename>",
         attributes=' subClass="VRTRawRasterBand"',
     ),
-    "a warped raster": lambda t: WARPED.format(t.remote),
-    "a processed raster": lambda t: PROCESSED.format(t.remote),
-    "a sharpened raster": lambda t: PANSHARPENED.format(t.remote),
+    "a warped raster": lambda t: WARPED.format(t.url),
+    "a processed raster": lambda t: PROCESSED.format(t.url),
+    "a sharpened raster": lambda t: PANSHARPENED.format(t.url),
     "arrays": lambda t: group(
-        t, f"<Source><SourceFilename>{t.remote}</SourceFilename><SourceBand>1</SourceBand></Source>"
+        t, f"<Source><SourceFilename>{t.url}</SourceFilename><SourceBand>1</SourceBand></Source>"
     ),
     "a template of groups": lambda t: t.band(
-        "", f"<GroupTemplate><SourceFilename>{t.remote}</SourceFilename></GroupTemplate>"
+        "", f"<GroupTemplate><SourceFilename>{t.url}</SourceFilename></GroupTemplate>"
     ),
     "itself": lambda t: t.vrt("ITSELF"),
     "a web service": Trap.wms,
@@ -287,12 +285,12 @@ CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
     "a service of coverages": lambda t: (
         f"<WCS_GDAL><ServiceURL>{t.url}?</ServiceURL><CoverageName>a</CoverageName></WCS_GDAL>"
     ),
-    "an index of tiles": lambda t: TILES.format(t.remote),
+    "an index of tiles": lambda t: TILES.format(t.url),
     "a STAC item": lambda t: (
         f'{{"type":"Feature","stac_version":"1.0.0","assets":{{"a":{{"href":"{t.url}"}}}}}}'
     ),
     "a grid of text": lambda t: GRID,
-    "a VRT in a NITF": lambda t: "NITF02.10 " + t.vrt(t.remote),
+    "a VRT in a NITF": lambda t: "NITF02.10 " + t.vrt(t.url),
     "a TIFF with overviews elsewhere": overviews_in_a_tiff,
     "a JPEG 2000 image with a coordinate system elsewhere": boxes_of_a_jp2,
 }
