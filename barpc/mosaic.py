@@ -152,12 +152,10 @@ class Mosaic:
             ]
             if found != [source]:
                 return None
-        same = (dataset.shape, dataset.dtypes) == (self.shape, self.dtypes)
-        return (
-            file
-            if same and np.array_equal(*map(_numbers, (dataset.nodatavals, self.nodatavals)), True)
-            else None
-        )
+        if (dataset.shape, dataset.dtypes) != (self.shape, self.dtypes):
+            return None
+        nodata = _numbers(dataset.nodatavals), _numbers(self.nodatavals)
+        return file if np.array_equal(*nodata, equal_nan=True) else None
 
     # --- pixels ---------------------------------------------------------------------------------------------
 

@@ -77,9 +77,11 @@ def open_raster(path: str | os.PathLike[str]) -> Iterator[Any]:
     name = os.fspath(path)
     file, driver = identify(name)
     try:
-        with rasterio.Env(**GDAL_OPTIONS, **_ALONE):
-            with _mosaic(file, name) if driver == "VRT" else _opened(file, driver) as dataset:
-                yield dataset
+        with (
+            rasterio.Env(**GDAL_OPTIONS, **_ALONE),
+            _mosaic(file, name) if driver == "VRT" else _opened(file, driver) as dataset,
+        ):
+            yield dataset
     except RasterioError as error:
         reason = " ".join(str(error.__cause__ or error).split())
         raise ImageError(f"{name}: cannot be read as {driver}: {reason}") from error

@@ -118,7 +118,17 @@ _GRAMMAR: dict[str, _Tag] = {
     "ScaleRatio": _Tag(_NUMBER),
 }
 _REPEATED = frozenset(
-    ["Metadata", "MDI", "GCP", "Entry", "Category", "HistItem", "VRTRasterBand", "SimpleSource", "ComplexSource"]
+    [
+        "Metadata",
+        "MDI",
+        "GCP",
+        "Entry",
+        "Category",
+        "HistItem",
+        "VRTRasterBand",
+        "SimpleSource",
+        "ComplexSource",
+    ]
 )
 
 

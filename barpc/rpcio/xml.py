@@ -211,8 +211,10 @@ def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
         except ImageError as error:
             raise RpcFormatError(str(error)) from error
     else:
-        found = root.iterfind("Metadata[@domain='RPC']")
-        domains = {"RPC": {item.get("key", ""): item.text or "" for item in domain} for domain in found}
+        found = root.find("Metadata[@domain='RPC']")
+        domains = (
+            {} if found is None else {"RPC": {e.get("key", ""): e.text or "" for e in found.iter("MDI")}}
+        )
     if "RPC" not in domains:
         raise RpcFormatError(f'{name}: no <Metadata domain="RPC">')
     return rpc_from_domain(domains["RPC"], name, options)
