@@ -18,7 +18,9 @@ from barpc.rpcio.fixed import is_nitf, read_nitf
 from barpc.rpcio.formats import FORMATS, MAX_BYTES, parse
 from barpc.rpcio.text import decode
 from barpc.rpcio.tiff import is_tiff, read_tag
+from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
+from barpc.vrt import MAGIC, read_vrt
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def shadows(image: Path | str) -> list[Sidecar]:
     """
     image = Path(image)
     head = _head(image)
-    vrt = head.lstrip().startswith(b"<VRTDataset")
+    vrt = _is_vrt(head)
     own = vrt or _own_rpc(image, head) is not None
     return [s for s in sidecars(image) if s.kind == "geom" or (s.before_tag and not vrt) or not own]
 
@@ -198,10 +200,12 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     head = _head(path)
     if is_tiff(head) or is_nitf(head) or _is_binary(head):
         return _image_source(path, head, options)
-    data = _content(path)
-    if re.match(rb"\s*<VRTDataset\b", data) and b'domain="RPC"' not in data:
-        return _image_source(path, head, options)
-    rpc, name = parse(data, str(path), options)
+    if _is_vrt(head):
+        items = read_vrt(path).metadata.get("RPC")
+        if items is None:
+            return _image_source(path, head, options)
+        return RpcSource(rpc_from_domain(items, str(path), options), "gdal", path)
+    rpc, name = parse(_content(path), str(path), options)
     return RpcSource(rpc, name, path)
 
 
@@ -218,6 +222,10 @@ def _head(path: Path) -> bytes:
 def _is_binary(head: bytes) -> bool:
     """No RPC text holds a zero byte near its start, unless it is UTF-16, which none is."""
     return b"\0" in head or head[:3] == b"\xff\xd8\xff" or head[:4] == b"\x89PNG"
+
+
+def _is_vrt(head: bytes) -> bool:
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(MAGIC)
 
 
 def _content(path: Path) -> bytes:
