@@ -110,7 +110,7 @@ def adjust_tracks(
         noise=outcome.noise,
         cost_history=final.history,
         steps=len(final.history) - outcome.passes,
-        status=f"{outcome.passes} passes of cutting; {covariance.factor.method} factorisation",
+        status=f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation",
         cameras=cameras,
         covariance=covariance,
         gauge=gauge,

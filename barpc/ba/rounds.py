@@ -199,7 +199,7 @@ def run_rounds(
             problem,
             state,
             weight,
-            options.solver,
+            options.solver if passes > 1 or not robust else "sparse",  # the second pass, which follows always, is exact
             options.max_steps,
             options.tolerance if passes > 1 or not robust else _FIRST_TOLERANCE,
             projected,

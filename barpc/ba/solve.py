@@ -2,7 +2,8 @@
 
 Both see the joint least-squares problem in cameras AND points. In compressed form, with S = U^T U the
 reduced matrix and g its gradient, f = (U^-T g, sqrt(cost - gain - |U^-T g|^2)) and J = (U; 0) have the
-cost, the gradient and the Gauss-Newton step of the full problem, in N q + 1 residuals.
+cost, the gradient and the Gauss-Newton step of the full problem, in N q + 1 residuals. scipy's own tolerances end
+its iteration; the last thing that it evaluates is the linearisation at the minimum, which the covariance comes from.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ from barpc.scene import BoolArray
 _LOG = logging.getLogger(__name__)
 
 SCIPY_UNKNOWNS = 200
-"""Up to so many camera unknowns "auto" takes scipy, whose dense decomposition grows as their cube."""
+"""Up to so many camera unknowns (22 views of 9) "auto" takes scipy, whose dense decomposition grows as their cube."""
 
+_XTOL = 1e-12
 _ROUNDING = 1e-9
 """A cost does not fall any more where the step promises less than this fraction."""
 
@@ -70,20 +72,29 @@ class Minimum:
     state : State
         The minimum.
     reduced : Reduced
-        The last linearisation, one small step before it.
+        The last linearisation: at the minimum (scipy), or one small step before it.
     factor : Factor or None
         Of its matrix, free unknowns only, where it was factorised.
+    status : str
+        Which solver ran, and why it stopped.
     """
 
     state: State
     reduced: Reduced
     factor: Factor | None = None
+    status: str = ""
 
     def covariance(self, free: BoolArray) -> Covariance:
         """The posterior covariance, by the last linearisation."""
         factor = self.factor
         if factor is None:
-            factor = factorize(free_part(free, self.reduced.matrix))
+            try:
+                factor = factorize(free_part(free, self.reduced.matrix))
+            except np.linalg.LinAlgError as error:
+                raise AdjustError(
+                    f"the normal equations are not positive definite at the solution ({error}): do the tie points "
+                    "cover the images, and are the priors finite?"
+                ) from error
         return Covariance(self.reduced, factor, free)
 
 
@@ -201,24 +212,24 @@ def _levenberg_marquardt(
             continue
         ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
         if _settled(gain, before, state.cost, tolerance):
-            return Minimum(ahead, reduced, factor if not damping else None)
+            return Minimum(ahead, reduced, factor if not damping else None, _status(state, "the next step gains too little"))
         trial = problem.reduce(ahead.params, ahead.points, weight)
         if trial.cost <= state.cost * (1.0 + 1e-12):
             state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
             reduced, before = trial, gain if not damping else np.inf
             damping = damping / 10.0 if damping > 1e-8 else 0.0
         elif gain <= _ROUNDING * state.cost:
-            return Minimum(state, reduced)
+            return Minimum(state, reduced, status=_status(state, "what a step gains is lost in rounding"))
         elif damping > 1e8:
             raise AdjustError(f"no step lowers the cost {state.cost:.6g}: the solution is not usable")
         else:
             damping = max(10.0 * damping, 1e-6)
     _LOG.warning("the adjustment did not settle in %d steps", max_steps)
-    return Minimum(state, reduced)
+    return Minimum(state, reduced, status=_status(state, "the number of steps is used up"))
 
 
-class _SettledError(Exception):
-    """Ends scipy's iteration: the last step is known."""
+def _status(state: State, reason: str) -> str:
+    return f"sparse Levenberg-Marquardt, {len(state.history)} evaluations in all: {reason}"
 
 
 class _Compressed:
@@ -228,13 +239,12 @@ class _Compressed:
     """
 
     def __init__(
-        self, problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
+        self, problem: Problem, state: State, weight: Array, projected: Projected | None
     ) -> None:
-        self.problem, self.weight, self.tolerance = problem, weight, tolerance
+        self.problem, self.weight = problem, weight
         self.reduced = problem.reduce(state.params, state.points, weight, projected)
-        self.state = replace(
-            state, cost=_finite(self.reduced.cost), history=(*state.history, self.reduced.cost)
-        )
+        cost = _finite(self.reduced.cost)
+        self.state = replace(state, cost=cost, history=(*state.history, cost))
         self.start = state.params
         self.upper0 = self._cholesky()
         self.key = np.zeros(len(self.upper0)).tobytes()
@@ -250,8 +260,7 @@ class _Compressed:
         upper = self._cholesky()
         gradient = self.reduced.gradient[self.problem.free]
         self.whitened = la.solve_triangular(upper, gradient, trans="T", check_finite=False)
-        self.gain = self.reduced.gain + float(self.whitened @ self.whitened)
-        self.rest = np.sqrt(max(self.reduced.cost - self.gain, 0.0))
+        self.rest = np.sqrt(max(self.reduced.cost - self.reduced.gain - float(self.whitened @ self.whitened), 0.0))
         self.slope = la.solve_triangular(self.upper0, upper.T, trans="T", check_finite=False).T
 
     def params(self, x: Array) -> Array:
@@ -269,10 +278,8 @@ class _Compressed:
         self.reduced = self.problem.reduce(state.params, state.points, self.weight)
         cost = self.reduced.cost
         self.state = replace(state, cost=cost, history=(*self.state.history, cost))
-        self.key, before = x.tobytes(), self.gain
+        self.key = x.tobytes()
         self._compress()
-        if _settled(self.gain, before, cost, self.tolerance):
-            raise _SettledError
 
     def residual(self, x: Array) -> Array:
         """The N q + 1 residuals."""
@@ -293,28 +300,24 @@ def _scipy(
     tolerance: float,
     projected: Projected | None,
 ) -> Minimum:
-    compressed = _Compressed(problem, state, weight, tolerance, projected)
-    count = len(compressed.whitened)
-    if not _settled(compressed.gain, np.inf, compressed.state.cost, tolerance):
-        try:
-            least_squares(
-                compressed.residual,
-                np.zeros(count),
-                compressed.jacobian,
-                method="trf",
-                x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # no first step cut short
-                ftol=1e-15,
-                xtol=None,
-                gtol=None,
-                max_nfev=max_steps,
-            )
-            _LOG.warning("the adjustment did not settle in %d steps", max_steps)
-        except _SettledError:
-            pass
+    compressed = _Compressed(problem, state, weight, projected)
+    found = least_squares(
+        compressed.residual,
+        np.zeros(len(compressed.whitened)),
+        compressed.jacobian,
+        method="trf",
+        x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # no first step cut short
+        ftol=tolerance,
+        xtol=_XTOL,
+        gtol=None,
+        max_nfev=max_steps,
+    )
+    if not found.success:
+        _LOG.warning("the adjustment did not settle in %d steps", max_steps)
+    compressed.at(found.x)
     _finite(compressed.state.cost)
-    reduced = compressed.reduced
-    step, gain, factor = camera_step(problem, reduced)  # what the last gradient still asks for
-    return Minimum(compressed.state.moved(step, reduced, max(reduced.cost - gain, 0.0)), reduced, factor)
+    status = f"scipy least_squares, {found.nfev} evaluations: {found.message.rstrip('.')}"
+    return Minimum(compressed.state, compressed.reduced, status=status)
 
 
 def _finite(cost: float) -> float:
