@@ -11,6 +11,7 @@ import numpy as np
 from barpc.ba.block import Block, join
 from barpc.ba.blocks import CameraPrior, Terrain, ground_control
 from barpc.ba.cameras import Cameras
+from barpc.ba.consensus import agreeing
 from barpc.ba.gauge import gauge_report
 from barpc.ba.heights import Heights, convergence_angles
 from barpc.ba.incremental import BlockPrior, apply_prior
@@ -20,14 +21,18 @@ from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Observations, Outcome, run_rounds
 from barpc.ba.smooth import Smooth
 from barpc.ba.solve import State
-from barpc.ba.structure import make_structure
+from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
 from barpc.ba.variances import Variances
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
-from barpc.scene import GroundPoints, Tracks, View
+from barpc.scene import BoolArray, GroundPoints, Tracks, View
 
 SMOOTH_LEAST = 0.06
 """Smooth residuals below this [px] are left alone: two views share what one is wrong by."""
+
+_MUCH_NOISE = 1.5  # times what is stated
+_MUCH_LOST = 0.85  # of a view's observations are to be left
+_BETTER = 0.8  # of the noise
 
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
 
@@ -86,12 +91,18 @@ def adjust_tracks(
     state, heights = _start(problem, block, options, gcps, dem)
     heights.warn()
     before = problem.residuals(state.params, state.points)
-    outcome = _rounds(problem, block, state, options, heights)
+    outcome = _rounds(problem, block, state, options, heights, block.use)
+    if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
+        projected = problem.project_points(state.params, state.points)
+        start = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
+        again = _rounds(problem, block, state, options, heights, start)
+        if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * start.sum():
+            outcome = again
     if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
         bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
         params = np.hstack([outcome.minimum.state.params, np.zeros((len(views), 3))])
-        again = _rounds(bent, block, replace(outcome.minimum.state, params=params), options, heights)
-        problem, outcome = bent, again
+        there = replace(outcome.minimum.state, params=params)
+        problem, outcome = bent, _rounds(bent, block, there, options, heights, outcome.inlier)
     final = outcome.minimum.state
     covariance = outcome.minimum.covariance(problem.free)
     seen = np.zeros(block.num_points, dtype=bool)
@@ -134,8 +145,16 @@ def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
     return int("rotation" in options.model)
 
 
-def _rounds(problem: Problem, block: Block, state: State, options: AdjustOptions, heights: Heights) -> Outcome:
-    """Robust rounds and cuts from a state."""
+def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
+    """Whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
+    had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
+    return outcome.noise > _MUCH_NOISE or bool((kept < _MUCH_LOST * had).any())
+
+
+def _rounds(
+    problem: Problem, block: Block, state: State, options: AdjustOptions, heights: Heights, use: BoolArray
+) -> Outcome:
+    """Robust rounds and cuts from a state, with the observations in use (K,) to start with."""
     unknowns = problem.cameras.unknowns
     observations = Observations(
         heights.hold(problem, state.points), block.sigma, options.noise_floor, block.point < block.num_tracks
@@ -144,7 +163,9 @@ def _rounds(problem: Problem, block: Block, state: State, options: AdjustOptions
     half = np.column_stack([unknowns.col_scale, unknowns.row_scale])
     smooth = Smooth(problem.structure, problem.xy, middle, half)
     variances = Variances.of(problem.camera_prior, unknowns, options)
-    return run_rounds(problem, observations, state, options, block.use, heights.hold, variances, smooth)
+    return run_rounds(
+        problem, observations, state, options, block.use, use, heights.hold, variances, smooth
+    )
 
 
 def make_problem(

@@ -140,6 +140,7 @@ def run_rounds(
     observations: Observations,
     state: State,
     options: AdjustOptions,
+    everything: BoolArray,
     use: BoolArray,
     hold: Callable[[Problem, Array], Problem],
     variances: Variances,
@@ -160,8 +161,10 @@ def run_rounds(
         Unknowns at their prior, points triangulated.
     options : AdjustOptions
         Loss, threshold, number of passes, solver.
+    everything : (K,)
+        Observations that may be used.
     use : (K,)
-        Observations to start with.
+        Those to start with.
     hold : callable
         The problem with its points' priors renewed at points (P, 3).
     variances : Variances
@@ -177,7 +180,8 @@ def run_rounds(
     projected: Projected | None = problem.linearise(state.params, state.points)
     assert projected is not None
     residual = projected.image - problem.xy
-    everything = use = observations.tied(use & np.isfinite(residual).all(axis=0))
+    everything = observations.tied(everything & np.isfinite(residual).all(axis=0))
+    use = observations.tied(use & everything)
     problem = hold(problem, state.points)
     noise, passes, counted = 1.0, 0, use.astype(np.float64)
     floor: Array | float = 0.0
