@@ -20,6 +20,7 @@ from barpc.geodesy import Array
 from barpc.pointio.names import ViewNames
 from barpc.record import load_npz
 from barpc.scene import IntArray, Tracks
+from barpc.sidefile import TABLE, opened_text, read_text
 
 SIGMA = 0.5
 """Standard deviation of each coordinate [px] where the file states none."""
@@ -60,7 +61,7 @@ def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA
             view, point, xy, spread = _read_asp([path], views, sigma)
         else:
             view, point, xy, spread = _read_csv(path, views, sigma)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as tie points ({error})") from error
     if not (np.isfinite(xy).all() and np.isfinite(spread).all() and (spread > 0).all()):
         raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
@@ -136,7 +137,7 @@ Columns = tuple[IntArray, IntArray, Array, Array]
 
 
 def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
-    with path.open(encoding="utf-8-sig", newline="") as text:
+    with opened_text(path, TABLE, newline="") as text:
         lines = csv.reader(line for line in text if line.strip() and not line.startswith("#"))
         header = [word.strip().lower() for word in next(lines, [])]
         missing = [name for name in _COLUMNS if name not in header]
@@ -215,7 +216,7 @@ def _asp_images(path: Path, views: ViewNames) -> tuple[str, str]:
 def _asp_points(path: Path) -> tuple[Array, Array]:
     """Points (M, 2) of both images: counts on the first line, then one keypoint a line, col and row first."""
     try:
-        lines = path.read_text(encoding="utf-8").split("\n")
+        lines = read_text(path, TABLE).split("\n")
         left, right = (int(word) for word in lines[0].split()[:2])
         rows = [line.split()[:2] for line in lines[1:] if line.strip()]
         points = np.array(rows, dtype=np.float64).reshape(-1, 2)

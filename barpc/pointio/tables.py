@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,9 +17,7 @@ from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
 from barpc.record import load_npz
-
-MAX_BYTES = 512 << 20
-"""Larger tables are refused [bytes]."""
+from barpc.sidefile import GEOJSON, TABLE, read_head, read_json, read_text
 
 _COLUMNS = {
     "lon": ("lon", "long", "longitude", "lng"),
@@ -74,17 +71,12 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
         raise InputError(f"{path}: neither a table of points (CSV, npz, GeoJSON) nor a localisation grid")
     if kind == "grid":
         return read_grid(path, altitudes)
-    if path.stat().st_size > MAX_BYTES:
-        raise InputError(f"{path}: more than {MAX_BYTES >> 20} MB, too large for a table of points")
     return READERS[kind](path)
 
 
 def correspondence_kind(path: Path, altitudes: Sequence[float] | None = None) -> str | None:
     """What a file is: a row of `READERS`, "grid", or None for neither (an image or an RPC file)."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    with path.open("rb") as file:
-        head = file.read(65536)
+    head = read_head(path, TABLE, 65536)
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         with open_raster(path) as dataset:
             return "grid" if altitudes is not None or "ALTITUDE_B0" in dataset.tags() else None
@@ -129,7 +121,7 @@ def read_csv(path: Path) -> Correspondences:
     """A text table: separated by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
     rows: list[list[float]] = []
     columns: dict[str, int] = {}
-    for number, raw in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+    for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
         words = _split(raw.split("#", 1)[0])
         if not words:
             continue
@@ -156,7 +148,9 @@ def read_npz(path: Path) -> Correspondences:
     """Arrays ``ground`` (N, 3) and ``image`` (N, 2), or one array a column; ``sigma`` (N,) if known."""
     try:
         arrays = {name: np.asarray(value, dtype=np.float64) for name, value in load_npz(path).items()}
-    except (OSError, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: not an npz of numbers ({error})") from error
     if "ground" in arrays and "image" in arrays:
         return Correspondences(arrays["ground"], arrays["image"], arrays.get("sigma"))
@@ -176,8 +170,8 @@ def _assembled(columns: dict[str, Array]) -> Correspondences:
 
 def read_geojson(path: Path) -> Correspondences:
     """GCPs as points lon, lat, alt with their image position in the property ``ji`` or ``col``, ``row``."""
+    document = read_json(path, GEOJSON)
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
         points = [_feature(feature) for feature in document["features"]]
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise InputError(f"{path}: not a GeoJSON of 3-D points with a property ji ({error!r})") from error

@@ -26,7 +26,7 @@ from barpc.sensor.rpc import RPC
 
 def _root(text: str, name: str) -> Element:
     return parse_xml(
-        re.sub(r"^\s*<\?xml[^>]*\?>", "", text, count=1).encode(), name=name, strip_namespaces=True
+        re.sub(r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1).encode(), name=name, strip_namespaces=True
     )
 
 
