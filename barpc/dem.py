@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from rasterio import Affine
+from rasterio._err import CPLE_BaseError
 from rasterio.errors import CRSError
 from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
@@ -199,7 +200,7 @@ def _open_raster(path: Path) -> Grid:
         else:
             try:
                 found = warp_points("EPSG:4326", crs, lon, lat)
-            except CRSError as error:
+            except (CRSError, CPLE_BaseError) as error:
                 raise InputError(f"{path}: lon, lat cannot be brought into its CRS ({error})") from error
             x, y = np.asarray(found[0]), np.asarray(found[1])
         return (

@@ -102,10 +102,9 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
     try:
         descriptor = os.open(path, _FLAGS)
     except (FileNotFoundError, NotADirectoryError):
-        raise kind.error(f"{path}: no such file") from None
+        raise kind.error(f"{path}: no such file; {kind.words} is needed") from None
     except ValueError as error:  # a zero byte in the name
         raise kind.error(f"{path}: cannot be read ({error})") from error
-    file = io.FileIO(descriptor, closefd=True)
     try:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
@@ -113,9 +112,9 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
             raise kind.error(f"{path}: {what}, not a file; {kind.words} is needed")
         kind.check(path, found.st_size)
     except BaseException:
-        file.close()
+        os.close(descriptor)
         raise
-    return io.BufferedReader(file)
+    return open(descriptor, "rb")  # noqa: PTH123  (a descriptor, no path)
 
 
 @contextmanager
@@ -154,12 +153,13 @@ def read_text(path: Path | str, kind: Kind) -> str:
         raise kind.error(f"{path}: not a UTF-8 text, so not {kind.words} ({error.reason})") from error
 
 
-def read_names(path: Path | str) -> list[str]:
-    """The lines of a list of names (see `opened`); no line is longer than two paths can be."""
-    lines = read_text(path, NAMES).splitlines()
+def read_names(path: Path | str, words: str) -> list[str]:
+    """The lines of a list of names, called `words` (see `opened`); no line is longer than two paths can be."""
+    kind = replace(NAMES, words=words)
+    lines = read_text(path, kind).splitlines()
     for number, line in enumerate(lines, start=1):
         if len(line) > _LINE:
-            raise NAMES.error(f"{path}, line {number}: {len(line)} characters, no name is so long")
+            raise kind.error(f"{path}, line {number}: {len(line)} characters, no name is so long")
     return lines
 
 

@@ -157,7 +157,7 @@ def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
 
     paths = list(images)
     if image_list is not None:
-        folder, lines = Path(image_list).parent, read_names(image_list)
+        folder, lines = Path(image_list).parent, read_names(image_list, "a list of images")
         paths += [str(folder / line.strip()) for line in lines if line.strip() and not line.startswith("#")]
     return paths
 

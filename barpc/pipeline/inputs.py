@@ -115,7 +115,7 @@ def read_pairs(
     InputError
         The file cannot be read, a line is not two images of the run, or none is left; the message names it.
     """
-    lines = read_names(path)
+    lines = read_names(path, "a list of pairs")
     find = _ViewFinder(Path(path).parent, views, left_out)
     pairs = []
     for number, line in enumerate(lines, start=1):

@@ -171,10 +171,19 @@ def _read_npz(path: Path, views: ViewNames, sigma: float) -> Columns:
     try:
         file = load_npz(path)
         own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
-        view, point = own[file["view"].astype(np.int64)], file["track"].astype(np.int64)
-        xy = np.asarray(file["xy"], dtype=np.float64).reshape(len(view), 2)
-        spread = np.asarray(file["sigma"], dtype=np.float64) if "sigma" in file else np.full(len(view), sigma)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
+        index, point = (np.asarray(file[key], dtype=np.int64) for key in ("view", "track"))
+        xy = np.asarray(file["xy"], dtype=np.float64)
+        spread = (
+            np.asarray(file["sigma"], dtype=np.float64) if "sigma" in file else np.full(len(index), sigma)
+        )
+        if {(*index.shape, 2), (*point.shape, 2), (*spread.shape, 2), xy.shape} != {(len(xy), 2)}:
+            raise ValueError(f"shapes {index.shape}, {point.shape}, {xy.shape}, {spread.shape}")
+        if len(index) and not 0 <= index.min() <= index.max() < len(own):
+            raise ValueError("a view that has no name")
+        view = own[index]
+    except (KeyError, ValueError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({error})") from error
     keep = view >= 0
     return view[keep], point[keep], xy[keep], spread[keep]

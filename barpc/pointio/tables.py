@@ -17,7 +17,9 @@ from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
 from barpc.record import load_npz
-from barpc.sidefile import GEOJSON, TABLE, read_head, read_json, read_text
+from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
+
+GRID_POINTS = Kind("a localisation grid", TABLE.most)
 
 _COLUMNS = {
     "lon": ("lon", "long", "longitude", "lng"),
@@ -141,7 +143,7 @@ def read_csv(path: Path) -> Correspondences:
     if not rows:
         raise InputError(f"{path}: no points in it")
     table = np.array(rows)
-    return _assembled({name: table[:, i] for i, name in enumerate(columns)})
+    return _assembled(path, {name: table[:, i] for i, name in enumerate(columns)})
 
 
 def read_npz(path: Path) -> Correspondences:
@@ -153,19 +155,30 @@ def read_npz(path: Path) -> Correspondences:
             raise
         raise InputError(f"{path}: not an npz of numbers ({error})") from error
     if "ground" in arrays and "image" in arrays:
-        return Correspondences(arrays["ground"], arrays["image"], arrays.get("sigma"))
+        return _checked(path, arrays["ground"], arrays["image"], arrays.get("sigma"))
     columns = {key: arrays[list(arrays)[i]] for key, i in _header(list(arrays)).items()}
     missing = [name for name in _COLUMNS if name not in columns]
     if missing:
         raise InputError(
             f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}"
         )
-    return _assembled(columns)
+    return _assembled(path, columns)
 
 
-def _assembled(columns: dict[str, Array]) -> Correspondences:
+def _assembled(path: Path, columns: dict[str, Array]) -> Correspondences:
+    if len({column.shape for column in columns.values()}) > 1:
+        raise InputError(f"{path}: columns of different lengths")
     ground = np.stack([columns[name] for name in ("lon", "lat", "alt")], axis=-1)
-    return Correspondences(ground, np.stack([columns["col"], columns["row"]], axis=-1), columns.get("sigma"))
+    return _checked(path, ground, np.stack([columns["col"], columns["row"]], axis=-1), columns.get("sigma"))
+
+
+def _checked(path: Path, ground: Array, image: Array, sigma: Array | None) -> Correspondences:
+    """The points, whose arrays must have one length."""
+    shapes = [array.shape for array in (ground, image, sigma) if array is not None]
+    n = len(ground) if ground.ndim else 0
+    if shapes != [(n, 3), (n, 2), (n,)][: len(shapes)]:
+        raise InputError(f"{path}: arrays of shapes {shapes}, not (N, 3), (N, 2), (N,)")
+    return Correspondences(ground, image, sigma)
 
 
 def read_geojson(path: Path) -> Correspondences:
@@ -201,11 +214,13 @@ def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspon
         Of the layers [m]; by default from the tags ``ALTITUDE_B0``, ``ALTITUDE_B2``, ...
     """
     with open_raster(path) as dataset:
-        bands = dataset.read().astype(np.float64)
+        GRID_POINTS.check(f"{path}, read", 8 * dataset.count * dataset.width * dataset.height)
+        bands = np.real(dataset.read()).astype(np.float64)
         to_image, tags = dataset.transform, dataset.tags()
     layers = len(bands) // 2
     if altitudes is None:
-        altitudes = [float(tags.get(f"ALTITUDE_B{2 * i}", "nan")) for i in range(layers)]
+        stated = [_numbers([tags.get(f"ALTITUDE_B{2 * i}", "nan")]) for i in range(layers)]
+        altitudes = [np.nan if value is None else value[0] for value in stated]
     if len(bands) % 2 or len(altitudes) != layers or not np.isfinite(altitudes).all():
         raise InputError(
             f"{path}: {len(bands)} bands are {layers} layers of lon and lat, but {len(altitudes)} altitudes "

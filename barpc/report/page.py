@@ -52,7 +52,8 @@ def report_html(summary: Mapping[str, Any], folder: Path | str) -> str:
         lstrip_blocks=True,
     )
     template = environment.get_template("template.html.j2")
-    return template.render(summary=summary, sections=sections(files), words=STATUS_WORDS)
+    text = template.render(summary=summary, sections=sections(files), words=STATUS_WORDS)
+    return text.encode(errors="backslashreplace").decode()  # a name that is no UTF-8
 
 
 def remake_report(folder: Path | str) -> Path:

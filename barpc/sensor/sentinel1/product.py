@@ -7,7 +7,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from barpc.errors import BarpcError, InputError, RpcFormatError
+from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError
 from barpc.safexml import MAX_BYTES
 from barpc.sensor.sentinel1.annotation import Annotation, read_annotation
 from barpc.sensor.sentinel1.build import from_annotation, mosaic
@@ -64,7 +64,25 @@ def open_product(
     RpcFormatError
         Not a Sentinel-1 product.
     """
-    found = _choose(Path(path), polarisation)
+    try:
+        return _open(Path(path), swath, polarisation, orbit, burst, atmosphere, bistatic)
+    except RpcError as error:
+        guilty = Path(path if orbit is None else orbit)
+        if guilty.name in str(error):
+            raise
+        raise type(error)(f"{guilty}: {error}") from error
+
+
+def _open(
+    path: Path,
+    swath: str | None,
+    polarisation: str | None,
+    orbit: str | Path | None,
+    burst: int | None,
+    atmosphere: bool,
+    bistatic: Bistatic | None,
+) -> RangeDoppler:
+    found = _choose(path, polarisation)
     precise = None if orbit is None else Path(orbit)
     name = None if swath is None else swath.lower()
     if name == MOSAIC:
