@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 import os
 import stat
@@ -19,6 +20,8 @@ from typing import Any, BinaryIO, NoReturn, TextIO
 
 from barpc.errors import BarpcError, ImageError, InputError, RpcFormatError
 
+logger = logging.getLogger(__name__)
+
 MB = 1 << 20
 _FLAGS = (
     os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOCTTY", 0)
@@ -26,6 +29,7 @@ _FLAGS = (
 )  # fmt: skip
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
 _DIGITS = 18  # of a whole number: more do not fit 64 bits
+_LONG = 64 * MB  # what takes longer than two seconds to read and parse says so
 _LINE = 4 * 4096
 _LARGEST = 1e100  # no number of a side file comes near, and its square is finite
 
@@ -111,6 +115,8 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
             what = next((words for test, words in _KINDS.items() if test(found.st_mode)), "a device")
             raise kind.error(f"{path}: {what}, not a file; {kind.words} is needed")
         kind.check(path, found.st_size)
+        if kind.most is not None and found.st_size > _LONG:
+            logger.warning("%s: reading %d MB, which takes a while", path, found.st_size >> 20)
     except BaseException:
         os.close(descriptor)
         raise
