@@ -10,7 +10,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from barpc.ba import AdjustOptions
-from barpc.errors import InputError
+from barpc.errors import FitError, InputError
 from barpc.fit import FitOptions
 from barpc.sidefile import OPTIONS, read_text
 from barpc.tie import TieOptions
@@ -132,7 +132,7 @@ def with_values(options: Any, values: Mapping[str, Any], where: str = "options")
             changed[name] = _as(kinds[name], value, f"{where}: {name}")
     try:
         return replace(options, **changed)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, FitError) as error:
         raise InputError(f"{where}: {error}") from error
 
 

@@ -19,6 +19,7 @@ from barpc.raster import open_raster
 from barpc.record import load_npz
 from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
 
+_FAR = 1e9  # px and m: no node comes near
 GRID_POINTS = Kind("a localisation grid", TABLE.most)
 
 _COLUMNS = {
@@ -233,6 +234,8 @@ def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspon
     alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
     ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)
     ok = np.isfinite(ground).all(axis=1)
+    if (np.abs(ground[ok]) > (540.0, 90.0, _FAR)).any() or not (np.abs(image) <= _FAR).all():
+        raise InputError(f"{path}: a node of it is no longitude, latitude and altitude, or no image point")
     return Correspondences(ground[ok], image[ok])
 
 

@@ -141,8 +141,8 @@ def corrections_table(summary: Record) -> DataTable:
             [
                 name(view["name"]),
                 *(Cell(f"{shift:+.3f} ± {sigma:.2f}", shift) for shift, sigma in moves),
-                figure(correction["angle_urad"], ".2f"),
-                figure(correction["translation_norm_m"], ".2f"),
+                figure(correction.get("angle_urad"), ".2f"),
+                figure(correction.get("translation_norm_m"), ".2f"),
                 figure(altitude and altitude / 1e3, ".0f"),
                 name("-" if center is None else center["method"]),
             ]

@@ -23,6 +23,7 @@ from barpc.cli.options import image_paths
 from barpc.cli.points import read_points
 from barpc.cli.tables import print_comparison
 from barpc.dem import Dem
+from barpc.errors import RpcError
 from barpc.pipeline.inputs import read_pairs
 from barpc.pipeline.options import read_options
 from barpc.pointio.gcp import read_gcps
@@ -210,7 +211,10 @@ def _use_dem(path: Path) -> object:
 
 def _use_grid(path: Path) -> object:
     points = read_correspondences(path)
-    return DirectGrid.from_points(points.ground, points.image).project(points.ground[:5])
+    try:
+        return DirectGrid.from_points(points.ground, points.image).project(points.ground[:5])
+    except RpcError:  # points that are no full grid are a table still
+        return None
 
 
 def _gtx() -> bytes:
@@ -422,7 +426,7 @@ SAMPLES: dict[str, Sample] = {
     "dem hgt": Sample("N43E005.hgt", _use_dem, cache(lambda: bytes(2 * 1201**2)), (), share=0.02),
     "geoid gtx": Sample("geoid.gtx", _use_dem, _gtx, (mutate_header,)),
     "grid": Sample(
-        "grid.tif", _use_grid, _localisation, (_mutate_transform(_localisation), mutate_header), share=0.2
+        "nodes.tif", _use_grid, _localisation, (_mutate_transform(_localisation), mutate_header), share=0.2
     ),
     "prior": Sample("block.npz", _use_prior, _prior, (mutate_npz,)),
     "record": Sample(
