@@ -13,6 +13,7 @@ command again. Nothing is ever pickled.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import logging
@@ -113,6 +114,15 @@ def peak_memory() -> int:
     scale = 1 if os.uname().sysname == "Darwin" else 1024
     usage = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     return max(resource.getrusage(who).ru_maxrss for who in usage) * scale
+
+
+def _is_name(name: str) -> bool:
+    """Whether a system takes it for a path at all."""
+    try:
+        os.stat(name)
+    except (ValueError, OSError) as error:
+        return getattr(error, "errno", None) in (errno.ENOENT, errno.ENOTDIR)
+    return True
 
 
 class Workspace:
@@ -301,14 +311,14 @@ class Workspace:
     def _read_state(self) -> dict[str, Any]:
         try:
             state = json.loads((self.folder / STATE / "state.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return {}
         return state if isinstance(state, dict) else {}
 
     def _read_outputs(self) -> list[str]:
         """What an earlier run says it wrote; never a place outside the folder, whatever the file says."""
         named = self._read_state().get("outputs", [])
-        names = [name for name in named if isinstance(name, str)] if isinstance(named, list) else []
+        names = [n for n in named if isinstance(n, str) and _is_name(n)] if isinstance(named, list) else []
         below = self.folder.resolve()
         return [name for name in names if (self.folder / name).resolve().parent.is_relative_to(below)]
 
