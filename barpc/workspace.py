@@ -119,7 +119,7 @@ def peak_memory() -> int:
 def _is_name(name: str) -> bool:
     """Whether a system takes it for a path at all."""
     try:
-        os.stat(name)
+        Path(name).stat()
     except (ValueError, OSError) as error:
         return getattr(error, "errno", None) in (errno.ENOENT, errno.ENOTDIR)
     return True
