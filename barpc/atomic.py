@@ -1,15 +1,16 @@
-"""Files written whole or not at all: a temporary name beside the target, fsync, rename.
+"""Files written whole or not at all: in a temporary folder beside the target, fsync, rename.
 
 A run that is killed, or a disk that is full, leaves the target as it was: never half a file. What a killed
-run does leave is its temporary file, which `remove_leftovers` clears at the next start.
+run does leave is its temporary folder, which holds nothing else and may be deleted.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from barpc.errors import OutputError
@@ -18,10 +19,13 @@ _MARK = ".barpc-partial-"
 
 
 @contextmanager
-def replacing(path: Path | str, *, overwrite: bool = False, durable: bool = True) -> Iterator[Path]:
-    """A temporary path beside `path`, renamed to it when the block ends without an error.
+def replacing(
+    path: Path | str, *, overwrite: bool = False, durable: bool = True, room: Path | None = None
+) -> Iterator[Path]:
+    """A temporary path for `path`, renamed to it when the block ends without an error.
 
-    The temporary name ends with the target's own, so that what a writer takes from a suffix stays right.
+    The temporary file has the target's own name, in a folder of its own: what a writer takes from a name
+    stays right, and a name as long as the system allows stays possible.
 
     Parameters
     ----------
@@ -31,6 +35,8 @@ def replacing(path: Path | str, *, overwrite: bool = False, durable: bool = True
         Replace an existing file.
     durable : bool
         Wait until the file is on the disk; not needed for what can be made again.
+    room : Path, optional
+        Where the temporary folder is made, on the same disk; None: beside `path`.
 
     Yields
     ------
@@ -43,27 +49,33 @@ def replacing(path: Path | str, *, overwrite: bool = False, durable: bool = True
         The file exists and `overwrite` is false, or it cannot be written.
     """
     path = Path(path)
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
-    partial = path.with_name(f"{_MARK}{uuid.uuid4().hex[:12]}-{path.name}")
+    _refuse_existing(path, overwrite)
+    place = (room or path.parent) / f"{_MARK}{uuid.uuid4().hex[:12]}"
+    partial = place / path.name
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        place.mkdir(parents=True)
         yield partial
         if durable:
-            _sync(partial)
+            sync(partial)
+        _refuse_existing(path, overwrite)  # it may have come while the block was at work
         partial.replace(path)
         if durable:
-            _sync(path.parent)
+            sync(path.parent)
     except OSError as error:
         if isinstance(error, OutputError) or error.errno is None:
             raise
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
-        with suppress(OSError):  # renamed away, or never made
-            partial.unlink()
+        shutil.rmtree(place, ignore_errors=True)
 
 
-def _sync(path: Path) -> None:
+def _refuse_existing(path: Path, overwrite: bool) -> None:
+    if not overwrite and os.path.lexists(path):
+        raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
+
+
+def sync(path: Path) -> None:
     """Ask the system to put a file, or a folder's entries, on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -81,11 +93,3 @@ def write_bytes(path: Path | str, data: bytes, *, overwrite: bool = False) -> No
 def write_text(path: Path | str, text: str, *, overwrite: bool = False) -> None:
     """Write `text` to `path` as UTF-8 with the line ends it has, whole or not at all (`replacing`)."""
     write_bytes(path, text.encode(), overwrite=overwrite)
-
-
-def remove_leftovers(folder: Path | str) -> list[Path]:
-    """Delete the temporary files that killed runs left in `folder`; their paths."""
-    found = sorted(Path(folder).glob(f"{_MARK}*"))
-    for path in found:
-        path.unlink(missing_ok=True)
-    return found

@@ -8,15 +8,18 @@ image and its altitudes. A vendor's file beside an image, which would be read in
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 import rasterio
@@ -25,9 +28,11 @@ from rasterio.transform import RPCTransformer
 
 from barpc.errors import OutputError
 from barpc.geodesy import Array, wrap_longitude
-from barpc.raster import open_raster
-from barpc.rpcio import read_rpc
+from barpc.owned import own_files
+from barpc.raster import GDAL_OPTIONS
+from barpc.rpcio import hidden_by, read_rpc, sidecars
 from barpc.sensor import SensorModel
+from barpc.vrt import Vrt, read_vrt
 
 TOLERANCE = 1e-6
 """Largest difference [px] between a file and its model that passes."""
@@ -94,6 +99,33 @@ def difference(
     return float(np.linalg.norm(other.project(ground) - image, axis=1).max())
 
 
+def refuse_hiding(folder: Path, names: Sequence[str], inputs: Collection[Path]) -> None:
+    """Raise if a new file would be read in place of the RPC of an image that is there.
+
+    Parameters
+    ----------
+    folder : Path
+        Where files are to be written.
+    names : sequence of str
+        Their names.
+    inputs : collection of Path
+        What is worked on: for these it does not matter whether barpc wrote such a file before.
+
+    Raises
+    ------
+    OutputError
+        Names the file and the image.
+    """
+    own = own_files(folder) if folder.is_dir() else set()
+    given = {path.resolve() for path in inputs}
+    for path, image, _ in hidden_by(folder / name for name in names):
+        is_input = image.resolve() in given
+        if is_input or not (image.name in own or os.path.lexists(path)):
+            raise OutputError(
+                f"{path}: would be read in place of the RPC of {'the input ' * is_input}{image}; give another -o"
+            )
+
+
 def verify(
     paths: Sequence[Path | str],
     model: SensorModel,
@@ -138,13 +170,42 @@ def _reading(
     path: Path, name: str, opener: Callable[[Path], Projection], ground: Array, image: Array
 ) -> Reading:
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), nullcontext(path) if name == "barpc" else _lent(path) as lent:
             warnings.simplefilter("ignore")
-            found = opener(path)(ground)
+            found = opener(lent)(ground)
     except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
         return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
     error = float(np.linalg.norm(found - image, axis=1).max())
     return Reading(path, name, error, "" if np.isfinite(error) else "it projects to no finite point")
+
+
+@contextmanager
+def _lent(path: Path) -> Iterator[Path]:
+    """A raster as a foreign reader may have it: beside it nothing but the RPC files that go before its own.
+
+    An overview, a mask or an ``.aux.xml`` beside a file may be, or name, a web service, and so may the sources
+    of a VRT: the pixels, which no consumer needs, are left out of it.
+    """
+    if not path.name.lower().endswith(_RASTERS):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        lent = Path(folder) / path.name
+        if path.suffix.lower() == ".vrt":
+            lent.write_text(_camera_only(read_vrt(path)))
+        else:
+            for file in (path, *(s.path for s in sidecars(path) if s.kind != "pam")):
+                (Path(folder) / file.name).symlink_to(file.absolute())
+        yield lent
+
+
+def _camera_only(vrt: Vrt) -> str:
+    items = vrt.metadata.get("RPC", {}).items()
+    rows = "".join(f"<MDI key={quoteattr(key)}>{escape(value)}</MDI>" for key, value in items)
+    return (
+        f'<VRTDataset rasterXSize="{vrt.size[0]}" rasterYSize="{vrt.size[1]}">'
+        f'<Metadata domain="RPC">{rows}</Metadata><VRTRasterBand dataType="Byte" band="1"/></VRTDataset>\n'
+    )
 
 
 # --- consumers --------------------------------------------------------------------------------------------
@@ -175,10 +236,12 @@ def _transformer(rpcs: Any) -> Projection:
 
 
 def _gdal_raster(path: Path) -> Projection:
-    with open_raster(path, sidecars=True) as dataset:
-        if dataset.rpcs is None:
-            raise OutputError("no RPC")
-        return _transformer(dataset.rpcs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.Env(**GDAL_OPTIONS), rasterio.open(path) as dataset:
+            if dataset.rpcs is None:
+                raise OutputError("no RPC")
+            return _transformer(dataset.rpcs)
 
 
 def _gdal_text(path: Path) -> Projection:

@@ -1,8 +1,9 @@
 """Opening a raster: one regular local file, one driver, nothing fetched.
 
 GDAL decides by content what a file is, and some contents (a VRT, a web service description) make it
-read other files or the network. So the first bytes choose the one driver that may open a file, only a VRT
-that points at plain local rasters is let through, and GDAL does not look at the files beside an image.
+read other files or the network. So the first bytes choose the one driver that may open a file, GDAL does not
+look at the files beside it, and a VRT is not GDAL's affair at all: it is read here (`barpc.vrt`), each of
+its sources is opened as any other raster, and the pixels are put together in `barpc.mosaic`.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from barpc.errors import ImageError
+from barpc.mosaic import Mosaic
+from barpc.vrt import MAGIC, read_vrt
 
 DRIVERS: dict[bytes, str] = {
     b"II*\x00": "GTiff",
@@ -33,7 +35,7 @@ DRIVERS: dict[bytes, str] = {
     b"NSIF": "NITF",
     b"\x89PNG": "PNG",
     b"\xff\xd8\xff": "JPEG",
-    b"<VRTDataset": "VRT",
+    MAGIC: "VRT",
 }
 """First bytes of a file -> the driver that may open it."""
 
@@ -48,76 +50,59 @@ GDAL_OPTIONS: dict[str, Any] = {
 _ALONE: dict[str, Any] = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
 # An .ovr, .msk or .aux.xml beside an image may be, or name, a web service: GDAL is told that there is none.
 
-_VRT_TAGS = frozenset(
-    [
-        "VRTDataset",
-        "SRS",
-        "GeoTransform",
-        "Metadata",
-        "MDI",
-        "GCPList",
-        "GCP",
-        "VRTRasterBand",
-        "ColorInterp",
-        "NoDataValue",
-        "Description",
-        "SimpleSource",
-        "ComplexSource",
-        "SourceFilename",
-        "SourceBand",
-        "SourceProperties",
-        "SrcRect",
-        "DstRect",
-        "NODATA",
-        "BlockXSize",
-        "BlockYSize",
-        "Offset",
-        "Scale",
-        "UnitType",
-        "MaskBand",
-        "ScaleOffset",
-        "ScaleRatio",
-    ]
-)
-_VRT_LIMIT = 1 << 20  # bytes; a VRT that carries an RPC takes a few thousand
 _INDIRECT = re.compile(r"/vsi|[A-Za-z][A-Za-z0-9+._-]+:")
 _WARNINGS = threading.Lock()  # catch_warnings is process-wide
 
 
 @contextmanager
-def open_raster(path: str | os.PathLike[str], *, sidecars: bool = False) -> Iterator[Any]:
+def open_raster(path: str | os.PathLike[str]) -> Iterator[Any]:
     """Open a raster read-only; an error while it is open names the file, too.
 
     Parameters
     ----------
     path : path
         An existing regular file.
-    sidecars : bool
-        Let GDAL look at the files beside it: for files that barpc itself has written, never for inputs.
 
     Yields
     ------
-    dataset : rasterio.DatasetReader
+    dataset : rasterio.DatasetReader or Mosaic
         Open until the block ends.
 
     Raises
     ------
     ImageError
         The file is missing, a folder, empty, of a kind that barpc does not read, damaged, remote, or a
-        VRT that points at anything else than plain local rasters.
+        VRT that is not of the grammar of `barpc.vrt` or points at anything else than plain local rasters.
     """
     name = os.fspath(path)
     file, driver = identify(name)
     try:
-        with rasterio.Env(**GDAL_OPTIONS, **({} if sidecars else _ALONE)):
-            with _WARNINGS, warnings.catch_warnings():
-                warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                dataset = rasterio.open(file, driver=driver)
-            with dataset:
-                yield dataset
+        with (
+            rasterio.Env(**GDAL_OPTIONS, **_ALONE),
+            _mosaic(file, name) if driver == "VRT" else _opened(file, driver) as dataset,
+        ):
+            yield dataset
     except RasterioError as error:
         reason = " ".join(str(error.__cause__ or error).split())
         raise ImageError(f"{name}: cannot be read as {driver}: {reason}") from error
+
+
+def _opened(file: Path, driver: str) -> Any:
+    with _WARNINGS, warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        return rasterio.open(file, driver=driver)
+
+
+def _mosaic(file: Path, name: str) -> Mosaic:
+    """A VRT whose sources are all rasters that are read here."""
+    vrt = read_vrt(file, name=name)
+    drivers: dict[Path, str] = {}
+    for source in vrt.sources:
+        if source.file not in drivers:
+            drivers[source.file] = identify(source.file)[1]
+            if drivers[source.file] == "VRT":
+                raise ImageError(f"{name}: a VRT of a VRT is not read; give the images it is made of")
+    return Mosaic(name, vrt, lambda source: _opened(source, drivers[source]))
 
 
 def identify(path: str | os.PathLike[str]) -> tuple[Path, str]:
@@ -150,31 +135,4 @@ def identify(path: str | os.PathLike[str]) -> tuple[Path, str]:
     if driver is None:
         known = ", ".join(sorted(set(DRIVERS.values())))
         raise ImageError(f"{name}: not a raster that is read here (kinds known: {known})")
-    if driver == "VRT":
-        _check_vrt(file, name)
     return file, driver
-
-
-def _check_vrt(file: Path, name: str) -> None:
-    """Raise unless the VRT only stacks plain local rasters."""
-    if file.stat().st_size > _VRT_LIMIT:
-        raise ImageError(f"{name}: a VRT of more than {_VRT_LIMIT} bytes is not read")
-    text = file.read_bytes()
-    if b"<!" in text.replace(b"<!--", b""):  # DOCTYPE, ENTITY, CDATA
-        raise ImageError(f"{name}: a VRT with a document type or raw data is not read")
-    try:
-        root = ElementTree.fromstring(text)  # noqa: S314  (no document type, size capped)
-    except ElementTree.ParseError as error:
-        raise ImageError(f"{name}: the VRT does not parse: {error}") from error
-    for element in root.iter():
-        if element.tag not in _VRT_TAGS or "subClass" in element.attrib:
-            raise ImageError(f"{name}: a VRT with <{element.tag}> is not read; give the images it is made of")
-        if element.tag == "SourceFilename":
-            relative = element.get("relativeToVRT", "0") == "1"
-            source = Path(file.parent if relative else "/") / (element.text or "")
-            if _INDIRECT.match(element.text or "") or (
-                not relative and not Path(element.text or "").is_absolute()
-            ):
-                raise ImageError(f"{name}: the VRT points at {element.text!r}, which is no plain local file")
-            if identify(source)[1] == "VRT":
-                raise ImageError(f"{name}: a VRT of a VRT is not read; give the images it is made of")

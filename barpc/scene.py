@@ -128,6 +128,8 @@ class GroundPoints:
         col, row [px].
     xy_sigma : (M,)
         Standard deviation of each coordinate [px].
+    strangers : tuple of str
+        Images that their file names and that are none of the views.
     """
 
     names: tuple[str, ...]
@@ -137,6 +139,7 @@ class GroundPoints:
     view: IntArray
     xy: Array
     xy_sigma: Array
+    strangers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         g = len(self.names)

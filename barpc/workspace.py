@@ -3,8 +3,10 @@
 ::
 
     OUT/                     what the user asked for
-    OUT/.barpc/state.json    status, stages with seconds and peak memory, the files this run wrote
+    OUT/.barpc/state.json    status, stages with seconds and peak memory, the outputs with their sha256
+    OUT/.barpc/outputs.jsonl the same of the outputs of a run at work (see `barpc.owned`)
     OUT/.barpc/lock          held while a run is at work
+    OUT/.barpc/partial/      files on their way; emptied at the next start
     OUT/.barpc/cache/<stage>/<key>.npz   results of tasks; a damaged one is made again
 
 The key of a stage is a hash of its inputs, its options and the code; resuming is running the same
@@ -13,15 +15,14 @@ command again. Nothing is ever pickled.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -32,14 +33,14 @@ import filelock
 import numpy as np
 import numpy.typing as npt
 
-from barpc import __version__
-from barpc.atomic import remove_leftovers, replacing, write_text
+from barpc import __version__, owned
+from barpc.atomic import replacing
 from barpc.errors import BarpcError, OutputError
+from barpc.owned import STATE
 from barpc.record import Record, load_npz
 
 logger = logging.getLogger(__name__)
 
-STATE = ".barpc"
 KEEP_AFTER = 30.0
 """A run that is refused within so many seconds leaves nothing; after that its stages are kept."""
 
@@ -116,15 +117,6 @@ def peak_memory() -> int:
     return max(resource.getrusage(who).ru_maxrss for who in usage) * scale
 
 
-def _is_name(name: str) -> bool:
-    """Whether a system takes it for a path at all."""
-    try:
-        Path(name).stat()
-    except (ValueError, OSError) as error:
-        return getattr(error, "errno", None) in (errno.ENOENT, errno.ENOTDIR)
-    return True
-
-
 class Workspace:
     """A run folder, held by one run at a time.
 
@@ -134,27 +126,43 @@ class Workspace:
         Where results go. A folder of an unfinished run is gone on with; any other that is not empty
         needs `overwrite`.
     overwrite : bool
-        Replace the results of an earlier run (files that barpc did not write are left alone).
+        Replace what an earlier run wrote here and nobody has changed since; never anything else.
     keep : frozenset of Path
         Files that must never be written: the inputs.
+    names : iterable of str
+        The outputs to come, as far as they are known: what is in their way is refused before any work.
+    adds : bool
+        Other things may be in the folder: what earlier runs wrote stays theirs, names that are free are
+        written.
 
     Raises
     ------
     OutputError
-        The folder exists and is not empty, is in use by another run, or cannot be written.
+        The folder exists and is not empty, holds a file that is in the way, is in use by another run, or
+        cannot be written.
     """
 
     def __init__(
-        self, folder: str | Path, *, overwrite: bool = False, keep: frozenset[Path] = frozenset()
+        self,
+        folder: str | Path,
+        *,
+        overwrite: bool = False,
+        keep: Iterable[Path] = (),
+        names: Iterable[str] = (),
+        adds: bool = False,
     ) -> None:
         self.folder = Path(folder).absolute()
         self._keep = frozenset(path.resolve() for path in keep)
-        self._check_free(overwrite)
+        self._adds = adds
+        self.outputs: dict[str, str] = {}
+        self.stages: list[dict[str, Any]] = []
+        self._check_free(overwrite, names)
         self._start = time.perf_counter()
-        self._made = [p for p in (self.folder, *self.folder.parents) if not p.exists()]
+        own = self.folder / STATE
+        self._made = [p for p in (own, self.folder, *self.folder.parents) if not p.exists()]
         try:
-            (self.folder / STATE / "cache").mkdir(parents=True, exist_ok=True)
-            self._lock = filelock.FileLock(self.folder / STATE / "lock", timeout=0)
+            self.cache.mkdir(parents=True, exist_ok=True)
+            self._lock = filelock.FileLock(own / owned.LOCK, timeout=0)
             self._lock.acquire()
         except filelock.Timeout:
             raise OutputError(
@@ -162,21 +170,51 @@ class Workspace:
             ) from None
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
-        self._clean()
-        self.earlier_outputs = self._read_outputs()
-        self.outputs: list[str] = []
-        self.stages: list[dict[str, Any]] = []
-        self._save_state("running")
+        shutil.rmtree(self.partial, ignore_errors=True)  # of a run that was killed
+        self._earlier = owned.read_own(self.folder)  # again: another run may have ended in between
+        try:
+            self._save_state("running")
+        except BaseException:  # a full disk
+            self._discard()
+            self._lock.release()
+            raise
 
-    def _check_free(self, overwrite: bool) -> None:
+    def _check_free(self, overwrite: bool, names: Iterable[str]) -> None:
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder}: is a file; give -o a folder")
-        names = {path.name for path in self.folder.iterdir()} if self.folder.is_dir() else set()
-        status = self._read_state().get("status")
+        owned.refuse_odd(self.folder)
+        present = {path.name for path in self.folder.iterdir()} if self.folder.is_dir() else set()
+        status = owned.read_state(self.folder).get("status")
         # without a state: nothing but our own folder is left by a run that was killed in its first moment
-        unfinished = status in ("running", "failed") or (status is None and names <= {STATE})
-        if names and not overwrite and not unfinished:
+        unfinished = status in ("running", "failed") or (status is None and present <= {STATE})
+        self._may_replace = overwrite or unfinished
+        if present and not self._adds and not self._may_replace:
             raise OutputError(f"{self.folder}: exists and is not empty; give --overwrite or another -o")
+        self._earlier = owned.read_own(self.folder)
+        for name in names:
+            self._refuse_foreign(name)
+
+    def _refuse_foreign(self, name: str) -> None:
+        """Raise if an output may not take its name."""
+        path = self.folder / name
+        if path.resolve() in self._keep:
+            raise OutputError(f"{path}: is an input and is never written; give another -o")
+        if path.parent != self.folder and (path.parent.is_symlink() or path.parent.is_file()):
+            raise OutputError(f"{path.parent}: is no folder of barpc's own; move it away, or give another -o")
+        if not os.path.lexists(path):
+            return
+        if not self._may_replace:
+            raise OutputError(f"{path}: exists already; give --overwrite or another -o")
+        if not self.owns(name):
+            raise OutputError(
+                f"{path}: not written by a run in this folder, or changed since, so it is not replaced; move it "
+                "away, or give another -o"
+            )
+
+    def owns(self, name: str) -> bool:
+        """Whether a run in this folder wrote this file, and nobody has changed it since."""
+        known = self._earlier | self.outputs
+        return name in known and owned.owns(self.folder, name, known[name])
 
     def __enter__(self) -> Workspace:
         return self
@@ -188,16 +226,16 @@ class Workspace:
         try:
             self._save_state("done" if kind is None else "failed")
         finally:
-            self._lock.release()
             if refused and time.perf_counter() - self._start < KEEP_AFTER:
                 self._discard()
+            self._lock.release()
 
     def _discard(self) -> None:
-        """Take the folder away again, for a run that was refused before it made anything worth keeping."""
-        if self.outputs or self.earlier_outputs:
+        """Take away what this run made, where it was refused before it made anything worth keeping."""
+        if self.outputs or self.folder / STATE not in self._made:
             return
         shutil.rmtree(self.folder / STATE, ignore_errors=True)
-        for made in self._made:  # innermost first; only what this run made, and only when empty
+        for made in self._made[1:]:  # innermost first; only what this run made, and only when empty
             try:
                 made.rmdir()
             except OSError:
@@ -205,32 +243,10 @@ class Workspace:
 
     # -- stages ------------------------------------------------------------------------------------
 
-    def cached(self, stage: str, key: str, make: Callable[[], Record]) -> Record:
-        """The result of a stage: read back when it is there, made and kept otherwise.
-
-        Parameters
-        ----------
-        stage : str
-            Its name; a folder in the cache.
-        key : str
-            From `key_of`.
-        make : callable
-            Makes the result: a mapping of names to arrays.
-
-        Returns
-        -------
-        record : dict of str to ndarray
-        """
-        record = self.load(stage, key)
-        if record is None:
-            record = make()
-            self.store(stage, key, record)
-        return record
-
     def load(self, stage: str, key: str) -> Record | None:
         """A kept result, or None; one that is damaged is taken away and counts as missing."""
         path = self._cache_path(stage, key)
-        if not path.exists():
+        if path.is_symlink() or not path.is_file():
             return None
         try:
             return load_npz(path)
@@ -242,13 +258,22 @@ class Workspace:
     def store(self, stage: str, key: str, record: Mapping[str, npt.NDArray[Any]]) -> None:
         """Keep a result, under a temporary name until it is whole."""
         path = self._cache_path(stage, key)
-        with replacing(path, overwrite=True, durable=False) as partial, partial.open("wb") as file:
+        with self.keeping(path) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in record.items()})
 
     @property
     def cache(self) -> Path:
         """Where results are kept."""
-        return self.folder / STATE / "cache"
+        return self.folder / STATE / owned.CACHE
+
+    @property
+    def partial(self) -> Path:
+        """Where files are written before they take their names."""
+        return self.folder / STATE / owned.PARTIAL
+
+    def keeping(self, path: Path) -> AbstractContextManager[Path]:
+        """A temporary path for a file among the caches, which can be made again."""
+        return replacing(path, overwrite=True, durable=False, room=self.partial)
 
     def _cache_path(self, stage: str, key: str) -> Path:
         return self.cache / stage / f"{key}.npz"
@@ -283,15 +308,16 @@ class Workspace:
         Raises
         ------
         OutputError
-            It would replace an input, or cannot be written.
+            It would replace an input or a file that is not barpc's own, or cannot be written.
         """
-        path = self.folder / name
-        if path.resolve() in self._keep:
-            raise OutputError(f"{path}: is an input and is never written; give another -o")
-        with replacing(path, overwrite=True) as partial:
+        with replacing(self.folder / name, overwrite=True, room=self.partial) as partial:
             yield partial
-        self.outputs.append(name)
-        self._save_state("running")
+            self._refuse_foreign(name)
+            sha = owned.digest(partial)
+            if sha is None:
+                raise OutputError(f"{self.folder / name}: cannot be written (its temporary file is gone)")
+            owned.note(self.folder, name, sha)
+        self.outputs[name] = sha
 
     def write_text(self, name: str, text: str) -> Path:
         """Write a text output whole."""
@@ -300,35 +326,18 @@ class Workspace:
         return self.folder / name
 
     def remove_stale(self) -> None:
-        """Take away what an earlier run wrote here and this one did not."""
-        for name in self.earlier_outputs:
-            path = self.folder / name
-            if name not in self.outputs and path.is_file() and path.resolve() not in self._keep:
-                path.unlink()
+        """Take away what an earlier run wrote here, nobody has changed, and this run did not write."""
+        for name in self._earlier.keys() - self.outputs.keys():
+            if self.owns(name) and (self.folder / name).resolve() not in self._keep:
+                (self.folder / name).unlink()
 
     # -- state -------------------------------------------------------------------------------------
 
-    def _read_state(self) -> dict[str, Any]:
-        try:
-            state = json.loads((self.folder / STATE / "state.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
-            return {}
-        return state if isinstance(state, dict) else {}
-
-    def _read_outputs(self) -> list[str]:
-        """What an earlier run says it wrote; never a place outside the folder, whatever the file says."""
-        named = self._read_state().get("outputs", [])
-        names = [n for n in named if isinstance(n, str) and _is_name(n)] if isinstance(named, list) else []
-        below = self.folder.resolve()
-        return [name for name in names if (self.folder / name).resolve().parent.is_relative_to(below)]
-
     def _save_state(self, status: str) -> None:
-        outputs = sorted({*self.outputs, *(self.earlier_outputs if status != "done" else ())})
+        """Write state.json with all that is known of the outputs: the notes of single ones have done."""
+        earlier = {} if status == "done" and not self._adds else self._earlier
+        outputs = dict(sorted((earlier | self.outputs).items()))
         state = {"barpc": __version__, "status": status, "stages": self.stages, "outputs": outputs}
-        write_text(self.folder / STATE / "state.json", json.dumps(state, indent=1) + "\n", overwrite=True)
-
-    def _clean(self) -> None:
-        """Leftovers of a run that was killed."""
-        below = (p for p in self.folder.rglob("*") if p.is_dir() and not p.is_symlink())
-        for folder in [self.folder, *below]:
-            remove_leftovers(folder)
+        with replacing(self.folder / STATE / owned.STATE_FILE, overwrite=True, room=self.partial) as partial:
+            partial.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
+        (self.folder / STATE / owned.NOTES).unlink(missing_ok=True)

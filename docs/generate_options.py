@@ -124,8 +124,13 @@ def verb_section(name: str) -> list[str]:
     shown = [record for record in records if record is not None]
     if shown:
         lines += ["", row("flag", "meaning"), row("---", "---")]
-        lines += [row(f"`{names}`", re.sub(r"\s+", " ", text)) for names, text in shown]
+        lines += [row(f"`{names}`", help_text(text)) for names, text in shown]
     return lines
+
+
+def help_text(text: str) -> str:
+    """A flag's help as Markdown, in which `[a] [b]` would be a link."""
+    return re.sub(r"\s+", " ", text).replace("] [", r"] \[")
 
 
 def page() -> str:

@@ -34,6 +34,8 @@ def image(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_file_is_read_by_another_tool_than_barpc_to_a_billionth_of_a_pixel(name, image, tmp_path):
+    if name.endswith(".json"):
+        pytest.importorskip("rpcm", reason="of the other tools only rpcm reads this format")
     rpc = make_rpc()
     readings = verify([write(rpc, image, tmp_path / "out", name)], rpc, SIZE, ALTITUDES)
     assert {reading.consumer for reading in readings} > {"barpc"}

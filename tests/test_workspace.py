@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,21 +24,16 @@ class Options:
     ratio: float = 0.8
 
 
-def test_a_stage_is_made_once_and_read_back_to_the_bit(tmp_path):
-    made = []
-
-    def make():
-        made.append(1)
-        return {"x": np.arange(6.0).reshape(2, 3) / 7, "name": np.array("é")}
-
+def test_a_result_is_kept_and_read_back_to_the_bit(tmp_path):
+    made = {"x": np.arange(6.0).reshape(2, 3) / 7, "name": np.array("é")}
     with Workspace(tmp_path / "run") as run:
-        first = run.cached("detect", key_of("a"), make)
+        assert run.load("detect", key_of("a")) is None
+        run.store("detect", key_of("a"), made)
     with Workspace(tmp_path / "run", overwrite=True) as run:
-        second = run.cached("detect", key_of("a"), make)
-        run.cached("detect", key_of("b"), make)
-    assert len(made) == 2
-    np.testing.assert_array_equal(first["x"], second["x"])
-    assert str(second["name"]) == "é"
+        found = run.load("detect", key_of("a"))
+        assert run.load("detect", key_of("b")) is None
+    np.testing.assert_array_equal(found["x"], made["x"])
+    assert str(found["name"]) == "é"
 
 
 @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 not a zip", None])
@@ -46,7 +44,8 @@ def test_a_damaged_result_is_made_again(tmp_path, damage, caplog):
         path.write_bytes(path.read_bytes()[:500] if damage is None else damage)
         assert run.load("detect", "k") is None
         assert "damaged" in caplog.text
-        np.testing.assert_array_equal(run.cached("detect", "k", lambda: {"x": np.ones(3)})["x"], np.ones(3))
+        run.store("detect", "k", {"x": np.ones(3)})
+        np.testing.assert_array_equal(run.load("detect", "k")["x"], np.ones(3))
 
 
 def test_a_result_with_python_objects_is_refused(tmp_path):
@@ -122,7 +121,7 @@ def test_an_output_appears_whole_or_not_at_all(tmp_path):
         assert [p.name for p in run.folder.iterdir()] == [".barpc"]
         run.write_text("b/a.vrt", "whole")
         assert (run.folder / "b/a.vrt").read_text() == "whole"
-        assert run.outputs == ["b/a.vrt"]
+        assert run.outputs == {"b/a.vrt": hashlib.sha256(b"whole").hexdigest()}
 
 
 def test_what_an_earlier_run_wrote_and_this_one_did_not_goes_away(tmp_path):
@@ -144,14 +143,16 @@ def test_leftovers_of_a_killed_run_are_cleaned_and_its_stages_stay(tmp_path):
         "from barpc.workspace import Workspace\n"
         f"run = Workspace({str(tmp_path / 'run')!r})\n"
         "run.store('detect', 'k', {'x': np.ones(3)})\n"
-        "run.output('a.vrt').__enter__().write_text('half')\n"
+        "output = run.output('a.vrt')\n"
+        "output.__enter__().write_text('half')\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     process = subprocess.run([sys.executable, "-c", code], check=False)
     assert process.returncode == -9
-    assert any("partial" in p.name for p in (tmp_path / "run").iterdir())
+    assert list((tmp_path / "run/.barpc/partial").rglob("a.vrt"))
     with Workspace(tmp_path / "run") as run:
         assert [p.name for p in run.folder.iterdir()] == [".barpc"]
+        assert not run.partial.exists() or not list(run.partial.iterdir())
         assert run.load("detect", "k") is not None
 
 
@@ -195,3 +196,295 @@ def test_stages_are_timed(tmp_path):
     assert stage["stage"] == "detect"
     assert stage["seconds"] >= 0
     assert peak_memory() > 1e6
+
+
+# -- whose a file is -----------------------------------------------------------------------------------
+
+
+def sha(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def put_state(folder: Path, outputs: object, status: str = "done") -> None:
+    (folder / ".barpc").mkdir(parents=True, exist_ok=True)
+    (folder / ".barpc/state.json").write_text(json.dumps({"status": status, "outputs": outputs}))
+
+
+def finished(folder: Path, **texts: str) -> Path:
+    with Workspace(folder, overwrite=True) as run:
+        for name, text in texts.items():
+            run.write_text(name, text)
+    return folder
+
+
+def test_the_state_holds_every_output_with_its_hash(tmp_path):
+    folder = finished(tmp_path / "run", summary="{}", pairs="a,b")
+    state = json.loads((folder / ".barpc/state.json").read_text())
+    assert state["outputs"] == {"pairs": sha("a,b"), "summary": sha("{}")}
+    assert sorted(p.name for p in (folder / ".barpc").iterdir()) == ["cache", "lock", "partial", "state.json"]
+
+
+@pytest.mark.parametrize("early", [True, False])
+@pytest.mark.parametrize("whose", ["the user's", "edited by the user", "of a release without hashes"])
+def test_overwriting_replaces_nothing_but_what_a_run_wrote(tmp_path, whose, early):
+    folder = finished(tmp_path / "run", theirs="theirs" if whose == "edited by the user" else "old", b="old")
+    if whose == "the user's":
+        put_state(folder, {"b": sha("old")})
+    if whose == "of a release without hashes":
+        put_state(folder, ["theirs", "b"])
+    (folder / "theirs").write_text("work of years")
+    before = sorted(p.name for p in folder.iterdir())
+    with pytest.raises(OutputError, match=r"theirs: not written by a run .* give another -o"):
+        with Workspace(folder, overwrite=True, names=["theirs"] * early) as run:
+            run.write_text("theirs", "new")
+    assert (folder / "theirs").read_text() == "work of years"
+    assert sorted(p.name for p in folder.iterdir()) == before
+    with Workspace(folder, overwrite=True) as run:
+        run.remove_stale()
+    assert (folder / "theirs").read_text() == "work of years"
+
+
+def test_a_file_that_comes_while_an_output_is_written_is_left_alone(tmp_path):
+    with pytest.raises(OutputError, match="not written by a run"):
+        with Workspace(tmp_path / "run") as run, run.output("notes.txt") as partial:
+            partial.write_text("new")
+            (run.folder / "notes.txt").write_text("mine")
+    assert (tmp_path / "run/notes.txt").read_text() == "mine"
+
+
+def test_what_is_in_the_way_is_refused_before_the_folder_is_touched(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/summary.json").write_text("mine")
+    with pytest.raises(OutputError, match=r"summary\.json: not written"):
+        Workspace(tmp_path / "run", overwrite=True, names=["summary.json"])
+    assert [p.name for p in (tmp_path / "run").iterdir()] == ["summary.json"]
+
+
+LISTED = [
+    "../thesis.doc",
+    "{root}/thesis.doc",
+    "link/thesis.doc",
+    "sub/../thesis.doc",
+    "./thesis.doc",
+    ".",
+    "",
+]
+LISTED += ["thesis.doc/", "a\0b", "\udcff", "x" * 5000, ".barpc/lock", "hidden/summary.json", "dir", "fifo"]
+
+
+@pytest.mark.parametrize("text", ["thesis", "another"])
+@pytest.mark.parametrize("notes", [False, True])
+def test_nothing_is_deleted_because_a_state_lists_it(tmp_path, text, notes):
+    """Whatever the name, and whatever the hash where the file is not the folder's own."""
+    folder = tmp_path / "run"
+    finished(folder / "hidden", **{"summary.json": "thesis"})
+    (folder / "sub").mkdir()
+    (folder / "dir").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    for place in (tmp_path, folder, tmp_path / "elsewhere"):
+        (place / "thesis.doc").write_text("thesis")
+    (folder / "link").symlink_to(tmp_path / "elsewhere")
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(folder / "fifo")
+    names = [name.format(root=tmp_path) for name in LISTED]
+    put_state(folder, {name: sha(text) for name in names} if not notes else {})
+    if notes:
+        lines = [json.dumps([name, sha(text)]) for name in names]
+        (folder / ".barpc/outputs.jsonl").write_text(
+            "\n".join([*lines, "[", "7", '["a"]', "[[]]", "[" * 9999])
+        )
+    if text != "thesis":
+        put_state(folder, {"thesis.doc": sha(text)})
+    before = {p for p in tmp_path.rglob("*") if ".barpc" not in p.parts}
+    with Workspace(folder, overwrite=True) as run:
+        run.remove_stale()
+    assert {p for p in tmp_path.rglob("*") if ".barpc" not in p.parts} == before
+    assert (folder / "thesis.doc").read_text() == "thesis"
+    assert (folder / "hidden/.barpc/state.json").is_file()
+
+
+STATES = {
+    "empty": b"",
+    "cut": b'{"status": "run',
+    "a list": b"[1, 2]",
+    "a number of 5000 digits": b'{"outputs": ' + b"9" * 5000 + b"}",
+    "deep": b"[" * 100_000,
+    "deep outputs": b'{"outputs": ' + b"[" * 100_000,
+    "no text": b"\xff\xfe\x00",
+    "other types": b'{"status": ["done"], "outputs": {"a": 1, "b": ["c"], "": "x"}, "stages": 3}',
+    "huge": b" " * (33 << 20) + b'{"outputs": {}}',
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_a_state_of_any_content_counts_as_missing_and_loses_nothing(tmp_path, name):
+    folder = tmp_path / "run"
+    (folder / ".barpc").mkdir(parents=True)
+    (folder / ".barpc/state.json").write_bytes(STATES[name])
+    (folder / "a").write_text("mine")
+    with pytest.raises(OutputError, match="not empty"):
+        Workspace(folder)
+    with Workspace(folder, overwrite=True) as run:
+        run.write_text("new", "new")
+        run.remove_stale()
+    assert (folder / "a").read_text() == "mine"
+
+
+ODD = [".barpc", ".barpc/state.json", ".barpc/lock", ".barpc/outputs.jsonl"]
+ODD += [".barpc/partial", ".barpc/cache", ".barpc/cache/detect"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="links and FIFOs")
+@pytest.mark.parametrize("kind", ["link", "dangling link", "FIFO", "hard link"])
+@pytest.mark.parametrize("name", ODD)
+def test_no_link_is_followed_in_the_place_of_barpc_s_own_files(tmp_path, name, kind):
+    victim, path = tmp_path / "victim", tmp_path / "run" / name
+    path.parent.mkdir(parents=True)
+    is_folder = name.endswith((".barpc", "partial", "cache", "detect"))
+    if is_folder:
+        victim.mkdir()
+        (victim / "thesis.doc").write_text("thesis")
+    else:
+        victim.write_text("thesis")
+    if kind == "hard link":
+        if is_folder or path.name == "state.json":  # that one is renamed over, not written to
+            pytest.skip("no such link, or it does no harm")
+        os.link(victim, path)
+    elif kind == "FIFO":
+        if path.name == "detect":
+            pytest.skip("no folder: the stage cannot be kept, and says so")
+        os.mkfifo(path)
+    else:
+        path.symlink_to(victim if kind == "link" else tmp_path / "nowhere")
+    before = {p: p.read_text() for p in victim.rglob("*")} if is_folder else victim.read_text()
+    with pytest.raises(OutputError, match=f"{path.name}: cannot be written: it is not barpc's own"):
+        Workspace(tmp_path / "run", overwrite=True)
+    assert ({p: p.read_text() for p in victim.rglob("*")} if is_folder else victim.read_text()) == before
+    assert not (tmp_path / "nowhere").exists()
+    assert path.exists(follow_symlinks=False) if sys.version_info >= (3, 12) else os.path.lexists(path)
+
+
+def test_a_kept_result_that_is_a_link_or_a_fifo_is_made_again(tmp_path):
+    with Workspace(tmp_path / "run") as run:
+        run.store("detect", "a", {"x": np.ones(3)})
+        place = run.cache / "detect"
+        shutil.move(place / "a.npz", tmp_path / "a.npz")
+        (place / "a.npz").symlink_to(tmp_path / "a.npz")
+        (tmp_path / "thesis").write_text("thesis")
+        (place / "b.npz").symlink_to(tmp_path / "thesis")
+        os.mkfifo(place / "c.npz")
+        for key in "abc":
+            assert run.load("detect", key) is None
+            run.store("detect", key, {"x": np.zeros(3)})
+            np.testing.assert_array_equal(run.load("detect", key)["x"], np.zeros(3))
+    assert (tmp_path / "thesis").read_text() == "thesis"
+    assert np.load(tmp_path / "a.npz")["x"].sum() == 3
+
+
+def test_an_output_does_not_go_through_a_linked_sub_folder(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "run/asp").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OutputError, match="asp: is no folder of barpc's own"):
+        with Workspace(tmp_path / "run", overwrite=True) as run:
+            run.write_text("asp/a__b.txt", "x")
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_foreign_partial_files_stay_and_a_run_below_is_left_alone(tmp_path):
+    (tmp_path / "run/sub").mkdir(parents=True)
+    foreign = [tmp_path / "run" / name for name in (".barpc-partial-x", "sub/.barpc-partial-y")]
+    for path in foreign:
+        path.write_text("mine")
+    with Workspace(tmp_path / "run/sub/below") as below, below.output("a.vrt") as partial:
+        partial.write_text("whole")
+        with Workspace(tmp_path / "run", overwrite=True) as run:
+            run.write_text("b.vrt", "b")
+            run.remove_stale()
+    assert (tmp_path / "run/sub/below/a.vrt").read_text() == "whole"
+    assert [path.read_text() for path in foreign] == ["mine", "mine"]
+
+
+def test_a_run_that_cannot_save_its_first_state_leaves_nothing_and_no_lock(tmp_path, monkeypatch):
+    def full(*_args):
+        raise OutputError("no space")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Workspace, "_save_state", full)
+        with pytest.raises(OutputError, match="no space"):
+            Workspace(tmp_path / "new/run")
+    assert list(tmp_path.iterdir()) == []
+    with Workspace(tmp_path / "new/run"):
+        pass
+
+
+def test_a_refused_run_keeps_the_results_of_a_longer_one_before_it(tmp_path):
+    with pytest.raises(RuntimeError), Workspace(tmp_path / "run") as run:
+        run.store("detect", "k", {"x": np.ones(3)})
+        raise RuntimeError
+    with pytest.raises(TiePointError), Workspace(tmp_path / "run"):
+        raise TiePointError
+    with Workspace(tmp_path / "run") as run:
+        assert run.load("detect", "k") is not None
+
+
+def test_an_added_file_joins_what_is_there_and_replaces_its_own_only(tmp_path):
+    folder = finished(tmp_path / "run", a="a")
+    with Workspace(folder, adds=True) as run:
+        run.write_text("b", "b")
+    with pytest.raises(OutputError, match="b: exists already; give --overwrite"):
+        Workspace(folder, adds=True, names=["b"])
+    with Workspace(folder, adds=True, overwrite=True, names=["b"]) as run:
+        run.write_text("b", "new")
+    assert json.loads((folder / ".barpc/state.json").read_text())["outputs"] == {
+        "a": sha("a"),
+        "b": sha("new"),
+    }
+
+
+KILLED = """
+import os, pathlib, signal, sys
+from barpc.workspace import Workspace
+left, after = int(sys.argv[2]), sys.argv[3] == "after"
+rename = pathlib.Path.replace
+def counted(self, target):
+    global left
+    left -= 1
+    if left == 0 and not after:
+        os.kill(os.getpid(), signal.SIGKILL)
+    moved = rename(self, target)
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return moved
+pathlib.Path.replace = counted
+with Workspace(sys.argv[1], overwrite=sys.argv[4] == "overwrite", names=["a", "b", "asp/c"]) as run:
+    for name in ("a", "b", "asp/c"):
+        run.write_text(name, "new " + name)
+    run.remove_stale()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no SIGKILL here")
+@pytest.mark.parametrize("mode", ["fresh", "overwrite"])
+def test_killed_at_any_rename_the_same_command_finishes(tmp_path, mode):
+    """Every rename: of each output and of the state; the moment before it and the moment after it."""
+    for number in range(1, 6):
+        for when in ("before", "after"):
+            folder = tmp_path / f"{number}{when}"
+            if mode == "overwrite":
+                finished(folder, a="old a", b="old b", stale="old")
+            command = [sys.executable, "-c", KILLED, folder, str(number), when, mode]
+            killed = subprocess.run(command, check=False, capture_output=True)
+            assert killed.returncode == -9, killed.stderr
+            command[4] = "0"
+            again = subprocess.run(command, check=False, capture_output=True)
+            if again.returncode:  # all was done: a finished folder is not written over
+                assert (mode, number, when) == ("fresh", 5, "after"), again.stderr
+            assert {
+                p.name: p.read_text() for p in folder.rglob("*") if ".barpc" not in p.parts and p.is_file()
+            } == {
+                "a": "new a",
+                "b": "new b",
+                "c": "new asp/c",
+            }
+            assert json.loads((folder / ".barpc/state.json").read_text())["status"] == "done"

@@ -108,6 +108,7 @@ def adjust_tracks(
         gauge=gauge,
         held=heights.weak[: block.num_tracks],
         left_out=block.left_out,
+        gcp_inlier=block.in_order(outcome.inlier)[len(tracks) :],
         gcp_residuals=_gcp_residuals(final.points[block.num_tracks :], gcps),
         seconds=time.process_time() - start,
         options=options,

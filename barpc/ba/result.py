@@ -56,6 +56,8 @@ class Adjustment:
         Tracks held in height because their rays meet under too small an angle.
     left_out : tuple of str
         Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
+    gcp_inlier : (M,)
+        Observations of GCPs that were kept.
     gcp_residuals : (G, 3)
         East, north, up [m] of the adjusted GCPs minus their given place.
     seconds : float
@@ -81,6 +83,7 @@ class Adjustment:
     gauge: GaugeReport
     held: BoolArray
     left_out: tuple[str, ...]
+    gcp_inlier: BoolArray
     gcp_residuals: Array
     seconds: float
     options: AdjustOptions = field(repr=False)

@@ -11,6 +11,7 @@ import click
 import numpy as np
 
 from barpc.cli.points import camera_options, load_camera, middle_altitude
+from barpc.cli.terminal import echo
 from barpc.sensor.geometry import convergence_angle, view_angles
 
 
@@ -54,9 +55,9 @@ def command(
         ratio = 2 * float(np.tan(np.radians(angle) / 2))
         pairs.append({"a": views[i]["name"], "b": views[j]["name"], "convergence": angle, "b_over_h": ratio})
     if as_json:
-        click.echo(json.dumps({"views": views, "pairs": pairs}))
+        echo(json.dumps({"views": views, "pairs": pairs}))
         return
     for view in views:
-        click.echo(f"{view['name']}: incidence {view['incidence']:.3f}, azimuth {view['azimuth']:.3f}")
+        echo(f"{view['name']}: incidence {view['incidence']:.3f}, azimuth {view['azimuth']:.3f}")
     for pair in pairs:
-        click.echo(f"{pair['a']} - {pair['b']}: {pair['convergence']:.3f}, B/H {pair['b_over_h']:.3f}")
+        echo(f"{pair['a']} - {pair['b']}: {pair['convergence']:.3f}, B/H {pair['b_over_h']:.3f}")

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import click
 
-from barpc.cli.main import EXIT_GATE
 from barpc.cli.points import camera_options, load_camera
+from barpc.cli.terminal import echo, say, tell_gate
 from barpc.errors import InputError
-from barpc.handoff import Reading, verify
+from barpc.handoff import Reading, refuse_hiding, verify
+from barpc.plain import plain_path
 from barpc.raster import open_raster
-from barpc.rpcio import FORMATS, shadows, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio import FORMATS, rpc_vrt, shadows, write_rpc, write_rpc_copy
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
+from barpc.workspace import Workspace
 
 _ENDS = [*dict.fromkeys(s for row in FORMATS.values() for s in row.suffixes), ".vrt", ".tif"]
 
@@ -54,19 +56,20 @@ def command(
     folder = Path(out_dir)
     formats = [name.strip() for name in rpc_format.split(",") if name.strip()]
     _check(images, folder, formats)
+    sources = [_rpc_file(Path(rpcs), Path(image)) for image in images]
+    names = [_names(Path(image), carrier, formats) for image in images]
+    together = [name for row in names for name in row]
+    inputs = [*map(Path, images), *sources]
+    refuse_hiding(folder, together, inputs)
     readings: list[Reading] = []
-    for image in images:
-        camera = load_camera(str(_rpc_file(Path(rpcs), Path(image))), pixel_convention, band)
-        written = _write(Path(image), camera.rpc, folder, carrier, formats, overwrite)
-        size = _size(image)
-        readings += verify(written, camera.rpc, size, altitude_range(camera.rpc))
-        for sidecar in shadows(image):
-            click.echo(
-                f"barpc: beside {image}: {sidecar.path.name} hides an RPC put into the image", err=True
-            )
-        for sidecar in shadows(written[0]):
-            if sidecar.path not in written:
-                click.echo(f"barpc: {sidecar.path} hides the RPC of {written[0]}: remove it", err=True)
+    reasons: list[str] = []
+    with Workspace(folder, overwrite=overwrite, keep=inputs, names=together, adds=True) as workspace:
+        for image, source, row in zip(images, sources, names, strict=True):
+            rpc = load_camera(str(source), pixel_convention, band).rpc
+            _write(workspace, Path(image), rpc, row, formats)
+            written = [folder / name for name in row]
+            readings += verify(written, rpc, _size(image), altitude_range(rpc))
+            reasons += _shadow_reasons(image, written)
     if as_json:
         rows = [
             {
@@ -77,11 +80,27 @@ def command(
             }
             for r in readings
         ]
-        click.echo(json.dumps(rows))
+        echo(json.dumps(rows))
     else:
         for reading in readings:
-            click.echo(f"{reading.path}: {reading.consumer} {reading.note or f'{reading.max_error:.1e} px'}")
-    return 0 if all(reading.passed for reading in readings) else EXIT_GATE
+            echo(f"{reading.path}: {reading.consumer} {reading.note or f'{reading.max_error:.1e} px'}")
+    reasons += [
+        f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}."
+        for r in readings
+        if not r.passed
+    ]
+    return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
+
+
+def _shadow_reasons(image: str, written: list[Path]) -> list[str]:
+    """What lies beside a new file and hides its RPC; what lies beside the image is only said."""
+    for sidecar in shadows(image):
+        say(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
+    return [
+        f"{sidecar.path} hides the RPC of {written[0]}: move it away."
+        for sidecar in shadows(written[0])
+        if sidecar.path not in written
+    ]
 
 
 def _size(image: str) -> tuple[int, int]:
@@ -94,6 +113,8 @@ def _check(images: tuple[str, ...], folder: Path, formats: list[str]) -> None:
     for name in formats:
         if name not in FORMATS or FORMATS[name].write is None:
             raise click.UsageError(f"--rpc-format {name}: not a format that is written")
+    for path in (*map(Path, images), folder):
+        plain_path(path.absolute())
     stems = [Path(image).stem for image in images]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:
@@ -115,15 +136,19 @@ def _rpc_file(rpcs: Path, image: Path) -> Path:
     )
 
 
-def _write(
-    image: Path, rpc: RPC, folder: Path, carrier: str, formats: list[str], overwrite: bool
-) -> list[Path]:
-    written = [folder / f"{image.stem}{'.vrt' if carrier == 'vrt' else '.tif'}"]
-    if carrier == "vrt":
-        write_rpc_vrt(rpc, image, written[0], overwrite=overwrite)
-    else:
-        write_rpc_copy(rpc, image, written[0], overwrite=overwrite)
-    for name in formats:
-        written.append(folder / f"{image.stem}{FORMATS[name].suffixes[0]}")
-        write_rpc(rpc, written[-1], format=name, overwrite=overwrite)
-    return written
+def _names(image: Path, carrier: str, formats: list[str]) -> list[str]:
+    """What is written for an image: the raster, then a file for each format."""
+    ends = [".vrt" if carrier == "vrt" else ".tif", *(FORMATS[name].suffixes[0] for name in formats)]
+    return [image.stem + end for end in ends]
+
+
+def _write(workspace: Workspace, image: Path, rpc: RPC, names: list[str], formats: list[str]) -> None:
+    raster, *files = names
+    with workspace.output(raster) as partial:
+        if raster.endswith(".vrt"):
+            partial.write_text(rpc_vrt(rpc, image, workspace.folder / raster), encoding="utf-8")
+        else:
+            write_rpc_copy(rpc, image, partial, overwrite=True)
+    for name, format in zip(files, formats, strict=True):
+        with workspace.output(name) as partial:
+            write_rpc(rpc, partial, format=format, overwrite=True)

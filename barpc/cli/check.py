@@ -8,9 +8,9 @@ from typing import Any
 
 import click
 
-from barpc.cli.main import EXIT_GATE
 from barpc.cli.options import TIE_FLAGS, image_paths, with_flags
 from barpc.cli.runs import run
+from barpc.cli.terminal import echo, tell_gate
 
 
 @click.command("check")
@@ -41,18 +41,19 @@ def _compare(images: list[str], against: Path, as_json: bool) -> int:
     from barpc.pipeline import load_views
     from barpc.rpcio import read_rpc
 
-    views = load_views(images, min_views=1).views
+    views = load_views(images, min_views=1, distinct=False).views
     found = {}
     for view in views:
         other = _counterpart(Path(view.path), against)
         found[view.path] = (str(other), difference(view.sensor, read_rpc(other), view.size, view.alt_range))
     if as_json:
         entries = [{"image": a, "against": b, "max_px": px} for a, (b, px) in found.items()]
-        click.echo(json.dumps(entries, indent=1))
+        echo(json.dumps(entries, indent=1))
     else:
         for path, (compared, px) in found.items():
-            click.echo(f"{path}  {compared}  max {px:.3g} px")
-    return 0 if all(px <= TOLERANCE for _, px in found.values()) else EXIT_GATE
+            echo(f"{path}  {compared}  max {px:.3g} px")
+    off = [f"{path}: {px:.3g} px." for path, (_, px) in found.items() if not px <= TOLERANCE]
+    return tell_gate(f"{len(off)} of {len(found)} RPCs differ.", off) if off else 0
 
 
 def _counterpart(image: Path, against: Path) -> Path:

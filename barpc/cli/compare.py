@@ -6,6 +6,8 @@ import json
 
 import click
 
+from barpc.cli.terminal import echo
+
 
 @click.command("compare")
 @click.argument("run_a", metavar="RUN_A")
@@ -23,7 +25,7 @@ def command(run_a: str, run_b: str, as_json: bool) -> int:
 
     comparison = compare_runs(run_a, run_b)
     if as_json:
-        click.echo(json.dumps(comparison, indent=1))
+        echo(json.dumps(comparison, indent=1))
     else:
         from barpc.cli.tables import print_comparison
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import click
 
-from barpc.cli.points import camera_options, load_camera
+from barpc.cli.points import camera_options, check_target, load_camera
+from barpc.cli.terminal import echo, say
 from barpc.rpcio import FORMATS, write_rpc, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
 
 _RASTERS: dict[str, Callable[..., None]] = {
@@ -47,16 +48,17 @@ def command(
       barpc convert vendor.XML with_rpc.vrt --image image.tif
     """
     camera = load_camera(source, pixel_convention, band)
+    check_target(target, [source, *([image] if image else [])], overwrite, camera.rpc)
     writer = _RASTERS.get(Path(target).suffix.lower()) if name is None else None
     if writer is not None:
         writer(camera.rpc, image or source, target, overwrite=overwrite)
     else:
         write_rpc(camera.rpc, target, format=name, overwrite=overwrite)
     if as_json:
-        click.echo(
+        echo(
             json.dumps({"source": str(camera.source.path), "format": camera.source.format, "target": target})
         )
     else:
-        click.echo(f"{camera.source.path} ({camera.source.format}) -> {target}")
+        echo(f"{camera.source.path} ({camera.source.format}) -> {target}")
         for note in camera.source.notes:
-            click.echo(f"barpc: {note}", err=True)
+            say(note)

@@ -7,7 +7,8 @@ import json
 import click
 import numpy as np
 
-from barpc.cli.points import Camera, camera_options, load_camera, middle_altitude
+from barpc.cli.points import Camera, camera_options, check_target, load_camera, middle_altitude
+from barpc.cli.terminal import echo
 from barpc.rpcio import write_crop
 from barpc.sensor.geometry import image_border
 
@@ -44,9 +45,10 @@ def command(
     if bbox is not None:
         window = _window(camera, bbox, middle_altitude(camera.rpc) if alt is None else alt)
     assert window is not None
+    check_target(output, [image], overwrite)
     write_crop(camera.rpc, image, output, window, overwrite=overwrite)
     text = f"{output}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
-    click.echo(json.dumps({"path": output, "window": window}) if as_json else text)
+    echo(json.dumps({"path": output, "window": window}) if as_json else text)
 
 
 def _window(camera: Camera, bbox: tuple[float, float, float, float], alt: float) -> tuple[int, int, int, int]:

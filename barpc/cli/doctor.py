@@ -14,6 +14,8 @@ from typing import Any
 
 import click
 
+from barpc.cli.terminal import echo
+
 REQUIRED = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely", "click", "rich", "filelock")
 OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
 
@@ -96,11 +98,11 @@ def command(as_json: bool) -> int:
             results[name] = {"ok": False, "found": f"{type(error).__name__}: {error}"}
     good = all(result["ok"] for result in results.values()) and "MISSING" not in versions.values()
     if as_json:
-        click.echo(json.dumps({"versions": versions, "checks": results, "ok": good}, indent=1))
+        echo(json.dumps({"versions": versions, "checks": results, "ok": good}, indent=1))
     else:
         for name, found in versions.items():
-            click.echo(f"{name:<24} {found}")
+            echo(f"{name:<24} {found}")
         for name, result in results.items():
-            click.echo(f"{'ok  ' if result['ok'] else 'FAIL'} {name}: {result['found']}")
-        click.echo(f"platform: {platform.platform()}, {sys.executable}", err=True)
+            echo(f"{'ok  ' if result['ok'] else 'FAIL'} {name}: {result['found']}")
+        echo(f"platform: {platform.platform()}, {sys.executable}", err=True)
     return 0 if good else 1

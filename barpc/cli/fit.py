@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.main import EXIT_GATE
+from barpc.cli.terminal import echo, tell_gate
 
 if TYPE_CHECKING:
     from barpc.fit import RpcFit
@@ -128,27 +128,31 @@ def command(
 
     \b
     Examples:
-      barpc fit image.tif -o image_RPC.TXT --alt-range -100 2500
+      barpc fit image.tif -o new/image_RPC.TXT --alt-range -100 2500
       barpc fit points.csv -o points.RPB --tolerance 1
       barpc fit S1A_IW_SLC__1SDV_....SAFE --swath iw1 --pol vv -o iw1_RPC.TXT
     """
+    if output is not None:
+        from barpc.cli.points import check_target
+
+        check_target(output, [source], overwrite)
     fit = _fit(Path(source), flags)
     verdict = fit.verdict(flags["tolerance"])
     reread = None
     if output is not None and (force or not verdict):
         reread = _write(fit, source, output, overwrite)
     if as_json:
-        click.echo(
+        echo(
             json.dumps({**fit.summary(), "verdict": verdict, "output": output if reread else None}, indent=1)
         )
     elif not obj["quiet"]:
-        click.echo(_certificate(fit, verdict))
+        echo(_certificate(fit, verdict))
         if reread:
-            click.echo(f"written       {reread}")
+            echo(f"written       {reread}")
     if verdict:
         written = "written all the same" if reread else "nothing written (--force writes it all the same)"
-        click.echo(f"barpc: {verdict}; {written}", err=True)
-    return EXIT_GATE if verdict else 0
+        return tell_gate(f"{verdict}; {written}", [])
+    return 0
 
 
 def _fit(source: Path, flags: dict[str, Any]) -> RpcFit:

@@ -9,7 +9,8 @@ import click
 import numpy as np
 
 from barpc.atomic import write_text
-from barpc.cli.points import camera_options, load_camera, middle_altitude
+from barpc.cli.points import camera_options, check_target, load_camera, middle_altitude
+from barpc.cli.terminal import echo
 from barpc.errors import RpcError
 from barpc.geojson import collection, feature
 from barpc.sensor.geometry import footprint
@@ -38,6 +39,8 @@ def command(
     Example:
       barpc footprint *.tif -o footprints.geojson
     """
+    if output is not None:
+        check_target(output, images, overwrite)
     features = []
     for image in images:
         camera = load_camera(image, pixel_convention, band, size)
@@ -48,6 +51,6 @@ def command(
         features.append(feature(ring, name=Path(image).stem, path=str(image), alt=at))
     text = json.dumps(collection(features)) + "\n"
     if output is None:
-        click.echo(text, nl=False)
+        echo(text, nl=False)
     else:
         write_text(output, text, overwrite=overwrite)

@@ -9,6 +9,7 @@ import click
 import numpy as np
 
 from barpc.cli.points import Camera, camera_options, load_camera, middle_altitude
+from barpc.cli.terminal import echo
 from barpc.fit.certificate import smallest_denominator
 from barpc.geojson import polygon
 from barpc.sensor.geometry import (
@@ -36,13 +37,13 @@ def command(
     """
     reports = [describe(load_camera(image, pixel_convention, band, size)) for image in images]
     if as_json:
-        click.echo(json.dumps(reports))
+        echo(json.dumps(reports))
         return
     for image, report in zip(images, reports, strict=True):
-        click.echo(image)
+        echo(image)
         for key, value in report.items():
             if key != "footprint":
-                click.echo(f"  {key.replace('_', ' ')}: {_text(value)}")
+                echo(f"  {key.replace('_', ' ')}: {_text(value)}")
 
 
 def describe(camera: Camera) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from barpc.cli.points import (
     middle_altitude,
     print_points,
     read_points,
-    warn_failures,
+    tell_failures,
 )
 from barpc.dem import Dem, localize_on_terrain
 from barpc.sensor.geometry import altitude_range
@@ -35,7 +35,7 @@ def command(
     pixel_convention: str,
     band: int,
     as_json: bool,
-) -> None:
+) -> int:
     r"""Print the ground points (lon, lat, alt) seen at image points.
 
     \b
@@ -52,4 +52,4 @@ def command(
     else:
         ground = camera.rpc.localize(at[:, :2], at[:, 2])
     print_points(("lon", "lat", "alt"), ground, (10, 10, 4), as_json)
-    warn_failures(ground, "have no ground point")
+    return tell_failures(ground, "have no ground point")

@@ -18,6 +18,7 @@ from typing import Any
 import click
 
 from barpc import __version__
+from barpc.cli.terminal import Formatter, echo, say
 from barpc.errors import BarpcError, BarpcWarning
 
 EXIT_FAILED = 1
@@ -99,12 +100,15 @@ def cli(ctx: click.Context, verbose: int, quiet: bool, debug: bool) -> None:
     Example:
       barpc adjust scene/*.tif -o adjusted
 
-    Exit codes: 0 done, 1 an error (one line says which file and what to do), 2 wrong usage, 3 finished but a
-    quality gate was missed, 130 interrupted.
+    Exit codes: 0 done, and nothing needs a look; 1 an error (one line says which file and what to do); 2 wrong
+    usage; 3 finished, but an image, a control point or a file needs a look (the last line says which and why); 130
+    interrupted.
     """
     ctx.obj = {"quiet": quiet, "verbose": verbose}
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname).1s %(name)s: %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(Formatter("%(levelname).1s %(name)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])
     warnings.showwarning = _log_warning
 
 
@@ -131,8 +135,8 @@ def main(args: list[str] | None = None) -> None:
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001  (nobody wants a traceback)
             code, message = _told(error)
             if "--debug" in argv:
-                traceback.print_exc()
-            click.echo(f"barpc: {' '.join(message.split())}", err=True)
+                echo(traceback.format_exc(), err=True)
+            say(message)
     sys.exit(code if isinstance(code, int) else 0)
 
 

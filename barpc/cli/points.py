@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 import numpy as np
 
-from barpc.errors import ImageError, InputError
+from barpc.cli.terminal import echo, tell_gate
+from barpc.errors import ImageError, InputError, OutputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
-from barpc.rpcio import RpcSource, read_rpc_source
+from barpc.rpcio import FORMATS, RpcSource, hidden_by, read_rpc_source, sidecars
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import TABLE, opened_text
 
@@ -78,6 +81,39 @@ def load_camera(
         except ImageError:  # an RPC file: there is no raster to ask
             size = None
     return Camera(source, size)
+
+
+def check_target(
+    target: str | Path, sources: Sequence[str | Path], overwrite: bool, rpc: RPC | None = None
+) -> None:
+    """Raise if a file to be written is an input, or would be read in place of the RPC that an image has.
+
+    Parameters
+    ----------
+    target : path
+        The file to be written.
+    sources : sequence of path
+        What was given; the RPC files beside it belong to it.
+    overwrite : bool
+        An image may get another RPC; that is said. An input is never replaced.
+    rpc : RPC, optional
+        What the file will hold: where the image has the same, nothing changes for it.
+    """
+    target = Path(target)
+    inputs = {p.resolve() for s in sources for p in (Path(s), *(sidecar.path for sidecar in sidecars(s)))}
+    if os.path.lexists(target) and target.resolve() in inputs:
+        raise OutputError(f"{target}: belongs to the input and is never replaced; give another name")
+    text = FORMATS["txt"].write
+    assert text is not None
+    for _, image, now in hidden_by([target]):
+        if rpc is not None and text(rpc) == text(now):
+            continue
+        if not overwrite:
+            raise OutputError(
+                f"{target}: would be read in place of the RPC that {image} has; give another folder or name, or "
+                "--overwrite if that is meant"
+            )
+        click.echo(f"barpc: {target} is read in place of the RPC that {image} had", err=True)
 
 
 def read_points(
@@ -155,11 +191,11 @@ def print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_
             }
             for row in values.tolist()
         ]
-        click.echo(json.dumps(rows))
+        echo(json.dumps(rows))
         return
-    click.echo(",".join(names))
+    echo(",".join(names))
     for row in values.tolist():
-        click.echo(",".join(f"{v:.{d}f}" for v, d in zip(row, digits, strict=True)))
+        echo(",".join(f"{v:.{d}f}" for v, d in zip(row, digits, strict=True)))
 
 
 def middle_altitude(rpc: RPC) -> float:
@@ -167,8 +203,7 @@ def middle_altitude(rpc: RPC) -> float:
     return float(rpc.ground_offset[2])
 
 
-def warn_failures(points: Array, what: str) -> None:
-    """Say on stderr how many points came out without a value."""
+def tell_failures(points: Array, what: str) -> int:
+    """The exit code of a verb on points; where some came out without a value, it is said on stderr."""
     count = int((~np.isfinite(points).all(axis=1)).sum())
-    if count:
-        click.echo(f"barpc: {count} of {len(points)} points {what}", err=True)
+    return tell_gate(f"{count} of {len(points)} points {what}", []) if count else 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 import numpy as np
 
-from barpc.cli.points import NUMBERS, camera_options, load_camera, print_points, read_points, warn_failures
+from barpc.cli.points import NUMBERS, camera_options, load_camera, print_points, read_points, tell_failures
 from barpc.dem import Dem
 
 
@@ -27,7 +27,7 @@ def command(
     pixel_convention: str,
     band: int,
     as_json: bool,
-) -> None:
+) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
 
     \b
@@ -42,4 +42,4 @@ def command(
         ground[:, 2] = terrain(ground[:, 0], ground[:, 1])
     found = camera.rpc.project(ground)
     print_points(("col", "row"), found, (6, 6), as_json)
-    warn_failures(found, "could not be projected")
+    return tell_failures(found, "could not be projected")

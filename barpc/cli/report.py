@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import click
 
+from barpc.cli.terminal import echo
+
 
 @click.command("report")
 @click.argument("run_dir", metavar="RUN_DIR")
@@ -16,5 +18,5 @@ def command(run_dir: str) -> int:
     """
     from barpc.report.page import remake_report
 
-    click.echo(remake_report(run_dir))
+    echo(remake_report(run_dir))
     return 0

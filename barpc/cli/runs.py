@@ -7,11 +7,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from barpc.cli.main import EXIT_GATE
 from barpc.cli.options import image_paths, run_options
 from barpc.cli.progress import executor_for, progress_bars
+from barpc.cli.terminal import echo, tell_gate
 
 if TYPE_CHECKING:
     from barpc.pipeline import AdjustResult
@@ -45,9 +43,9 @@ def run(
     with executor_for(jobs, dask) as executor, progress_bars(obj["quiet"]) as progress:
         result = work(paths, options, executor=executor, progress=progress)
     if as_json:
-        click.echo(json.dumps(result.summary, indent=1))
+        echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
         from barpc.cli.tables import print_summary
 
         print_summary(result.summary)
-    return 0 if result.passed else EXIT_GATE
+    return 0 if result.passed else tell_gate(result.summary["headline"], result.summary["reasons"])

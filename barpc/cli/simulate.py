@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from barpc.cli.progress import progress_bars
+from barpc.cli.terminal import echo
 
 
 @click.command("simulate")
@@ -55,7 +56,7 @@ from barpc.cli.progress import progress_bars
 @click.option("--clouds", default=0.0, show_default=True, help="Part of every image under clouds, 0 to 1.")
 @click.option("--checks", default=200, show_default=True, help="Held-out check points.")
 @click.option("--gcps", default=0, show_default=True, help="Ground control points (gcps.geojson).")
-@click.option("--overwrite", is_flag=True, help="Replace files that are there.")
+@click.option("--overwrite", is_flag=True, help="Replace files of an earlier run.")
 @click.pass_obj
 def command(
     obj: dict[str, Any],
@@ -85,5 +86,5 @@ def command(
     with progress_bars(obj["quiet"]) as progress:
         paths = write_scene(out, options, overwrite=overwrite, progress=progress)
     for path in paths:
-        click.echo(path)
+        echo(path)
     return 0

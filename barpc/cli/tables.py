@@ -12,7 +12,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import click
+from barpc.cli.terminal import echo
 
 Summary = Mapping[str, Any]
 
@@ -32,16 +32,16 @@ def print_summary(summary: Summary) -> None:
     ):
         if len(table) > 1:
             _echo_table(title, table, width)
-    click.secho(summary["headline"], bold=True, fg=_COLORS[summary["status"]])
+    echo(summary["headline"], bold=True, fg=_COLORS[summary["status"]])
     _echo_lines(summary["verdict"], width)
     if summary.get("out_dir"):
-        click.echo(f"Written to {summary['out_dir']}")
+        echo(f"Written to {summary['out_dir']}")
 
 
 def print_comparison(comparison: Mapping[str, Any]) -> None:
     """Two runs side by side, on stdout."""
     width = output_width()
-    click.echo(f"A: {comparison['a']}\nB: {comparison['b']}\n")
+    echo(f"A: {comparison['a']}\nB: {comparison['b']}\n")
     views = [
         [
             "image",
@@ -133,13 +133,13 @@ def _block(heads: Sequence[str], row: Sequence[str]) -> list[str]:
 
 
 def _echo_table(title: str, table: Sequence[Sequence[str]], width: int | None) -> None:
-    click.secho("\n".join([title] if width is None else textwrap.wrap(title, width)), bold=True)
-    click.echo("\n".join(layout(table, width)) + "\n")
+    echo("\n".join([title] if width is None else textwrap.wrap(title, width)), bold=True)
+    echo("\n".join(layout(table, width)) + "\n")
 
 
 def _echo_lines(lines: Sequence[str], width: int | None) -> None:
     for line in lines:
-        click.echo(line if width is None else textwrap.fill(line, width, break_on_hyphens=False))
+        echo(line if width is None else textwrap.fill(line, width, break_on_hyphens=False))
 
 
 def _number(value: float | None, digits: int = 3) -> str:

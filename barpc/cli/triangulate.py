@@ -5,7 +5,15 @@ from __future__ import annotations
 import click
 import numpy as np
 
-from barpc.cli.points import NUMBERS, camera_options, load_camera, middle_altitude, print_points, read_points
+from barpc.cli.points import (
+    NUMBERS,
+    camera_options,
+    load_camera,
+    middle_altitude,
+    print_points,
+    read_points,
+    tell_failures,
+)
 from barpc.geodesy import ground_from_ecef
 from barpc.sensor.geometry import triangulate
 
@@ -22,7 +30,7 @@ def command(
     pixel_convention: str,
     band: int,
     as_json: bool,
-) -> None:
+) -> int:
     r"""Print the ground points where the lines of sight of several images meet, and the error that is left.
 
     A point that an image does not see has nan there. `error` is the root mean square distance between a
@@ -50,6 +58,4 @@ def command(
     with np.errstate(invalid="ignore", divide="ignore"):
         table[: len(found.points), 3] = np.sqrt(square / count)
     print_points(("lon", "lat", "alt", "error"), table, (10, 10, 4, 4), as_json)
-    failed = int(np.isnan(table[:, 0]).sum())
-    if failed:
-        click.echo(f"barpc: {failed} of {len(table)} points could not be intersected", err=True)
+    return tell_failures(table[:, :1], "could not be intersected")

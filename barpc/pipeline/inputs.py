@@ -37,6 +37,7 @@ def load_gcps(paths: Sequence[str], names: Sequence[str]) -> GroundPoints | None
         view=np.concatenate([part.view for part in parts]),
         xy=np.concatenate([part.xy for part in parts]),
         xy_sigma=np.concatenate([part.xy_sigma for part in parts]),
+        strangers=tuple(dict.fromkeys(name for part in parts for name in part.strangers)),
     )
 
 
@@ -88,7 +89,8 @@ def input_files(options: RunOptions) -> list[Path]:
     """Every file that the options name; none of them is ever written."""
     ties = (options.matches, options.overlap_list, options.aoi)
     named = [*options.gcp, *options.check_points, options.dem, options.geoid, *ties]
-    return [Path(path) for path in named if path is not None]
+    prior = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
+    return [*(Path(path) for path in named if path is not None), *prior]
 
 
 def read_pairs(

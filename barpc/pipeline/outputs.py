@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,18 @@ import numpy as np
 from barpc.errors import OutputError
 from barpc.fit import RpcFit
 from barpc.handoff import verify
+from barpc.owned import own_files
+from barpc.pipeline.inputs import PRIOR
+from barpc.pipeline.options import RunOptions
 from barpc.report import Run
 from barpc.report.page import can_render, report_html
 from barpc.report.tables import TABLES
-from barpc.rpcio import FORMATS, sidecars, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio import rpc_vrt, sidecars, write_rpc, write_rpc_copy
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.workspace import Workspace
+
+MATCHES = ("matches.csv", "matches.npz")
 
 SUFFIXES = {"txt": "_RPC.TXT", "rpb": ".RPB", "geom": ".geom", "json": ".rpc.json", "xml": ".rpc.xml"}
 """RPC file written for each format, after the view's name."""
@@ -61,7 +67,7 @@ def write_view(
     for name in names:
         with run.output(name) as partial:
             if name.endswith(".vrt"):
-                write_rpc_vrt(fit.rpc, view.path, partial, overwrite=True)
+                partial.write_text(rpc_vrt(fit.rpc, view.path, run.folder / name), encoding="utf-8")
             elif name.endswith(".tif"):
                 write_rpc_copy(fit.rpc, view.path, partial, overwrite=True)
             else:
@@ -85,25 +91,32 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
     return names + [view.name + SUFFIXES[key] for key in formats]
 
 
-def refuse_shadows(run: Workspace, names: Sequence[str]) -> None:
-    """Raise if a foreign RPC file would be read in place of one that is about to be written.
+def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
+    """The outputs of a run, before it starts; of the tie points of pairs those that are in the folder."""
+    names = [*TABLES, "summary.json", *(["report.html"] if can_render() else [])]
+    if options.stop_after == "matching":
+        stems = {view.name for view in views}
+        pairs = [path.name for path in (folder / "asp").glob("*__*.txt") if _is_pair(path.stem, stems)]
+        return [*names, *MATCHES, *(f"asp/{name}" for name in pairs)]
+    if options.stop_after == "all":
+        names += [name for view in views for name in file_names(view, options.images, options.rpc_formats)]
+    return [*names, PRIOR]
 
-    Parameters
-    ----------
-    run : Workspace
-        Where to.
-    names : sequence of str
-        The files to be written for one image.
 
-    Raises
-    ------
-    OutputError
-        Names the file that is in the way.
-    """
-    for name in names:
-        for sidecar in sidecars(run.folder / name) if name.endswith((".vrt", ".tif")) else []:
+def _is_pair(stem: str, names: Set[str]) -> bool:
+    """Whether a file name is two view names with __ between them; either may hold one, too."""
+    parts = stem.split("__")
+    cuts = (("__".join(parts[:i]), "__".join(parts[i:])) for i in range(1, len(parts)))
+    return any(a in names and b in names for a, b in cuts)
+
+
+def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
+    """Raise if a file in the folder, not of barpc, would be read in place of an RPC that is to be written."""
+    own = own_files(folder) if folder.is_dir() else set()
+    for name in names if folder.is_dir() else ():
+        for sidecar in sidecars(folder / name) if name.endswith((".vrt", ".tif")) else ():
             read_first = sidecar.kind == "geom" or (sidecar.before_tag and not name.endswith(".vrt"))
-            if read_first and sidecar.path.name not in {*names, *run.earlier_outputs}:
+            if read_first and sidecar.path.name not in own.union(names):
                 raise OutputError(
                     f"{sidecar.path}: lies beside {name} and would be read in place of the new RPC; "
                     "move it away, or give another -o"
@@ -128,8 +141,3 @@ def write_tables(workspace: Workspace, run: Run, summary: Mapping[str, Any]) -> 
     if can_render():
         workspace.write_text("report.html", report_html(summary, workspace.folder))
     workspace.write_text("summary.json", json.dumps(summary, indent=1) + "\n")
-
-
-def unknown_formats(formats: Sequence[str]) -> list[str]:
-    """Names that are not formats barpc writes."""
-    return [name for name in formats if name not in SUFFIXES or name not in FORMATS]

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from barpc.atomic import replacing
 from barpc.errors import InputError
 from barpc.record import Record, from_record, to_record
 from barpc.workspace import Workspace
@@ -61,7 +60,7 @@ class Shelf:
     """Where large arrays lie while a run is at work: a folder among its caches."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self._folder = workspace.cache / "arrays"
+        self._workspace, self._folder = workspace, workspace.cache / "arrays"
 
     def packed(
         self, args: tuple[Any, ...], digest: Callable[[np.ndarray[Any, Any]], str]
@@ -80,7 +79,7 @@ class Shelf:
     def _put(self, array: np.ndarray[Any, Any], digest: str) -> str:
         path = self._folder / f"{hashlib.sha256(digest.encode()).hexdigest()[:32]}.npy"
         if not path.exists():
-            with replacing(path, overwrite=True, durable=False) as partial, partial.open("wb") as file:
+            with self._workspace.keeping(path) as partial, partial.open("wb") as file:
                 np.save(file, array, allow_pickle=False)
         return str(path)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,12 +14,15 @@ import numpy as np
 from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
+from barpc.handoff import refuse_hiding
 from barpc.pipeline.crew import Crew
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
 from barpc.pipeline.options import RunOptions
-from barpc.pipeline.outputs import SUFFIXES, file_names, refuse_shadows, write_tables, write_view
+from barpc.pipeline.outputs import MATCHES, SUFFIXES, output_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import LoadedViews, load_views
+from barpc.plain import plain_path
 from barpc.pointio.matches import asp_text, read_matches, write_matches
+from barpc.pointio.names import pair_name, require_pair_names
 from barpc.report import Run, summarize
 from barpc.report.measures import pair_ties
 from barpc.report.page import remake_report
@@ -42,9 +45,11 @@ class AdjustResult:
     Parameters
     ----------
     views : tuple of View
-        The images; after an adjustment with their refitted RPCs as sensors.
+        The images in the order given, without those left out; after an adjustment with their refitted RPCs
+        as sensors.
     run : Run
-        Everything found on the way.
+        Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`,
+        files) images stand in the order of their names, `run.views`, so that the order given does not matter.
     summary : dict
         What summary.json holds.
     """
@@ -60,13 +65,13 @@ class AdjustResult:
 
     @property
     def adjustment(self) -> Adjustment:
-        """The adjustment itself."""
+        """The adjustment itself; its views are `run.views`."""
         assert self.run.adjustment is not None
         return self.run.adjustment
 
     @property
     def tracks(self) -> Tracks:
-        """The tie points."""
+        """The tie points; `Tracks.view` counts `run.views`."""
         return self.run.tracks
 
     def report(self) -> Path:
@@ -95,7 +100,8 @@ def adjust(
     Parameters
     ----------
     images : sequence of path
-        Two or more rasters with RPCs. They are opened read-only.
+        Two or more rasters with RPCs, in any order: the files written do not depend on it. They are opened
+        read-only.
     out_dir : path
         Folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``.
     options : RunOptions, optional
@@ -118,7 +124,10 @@ def adjust(
     unknown = [name for name in options.rpc_formats if name not in SUFFIXES]
     if unknown:
         raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(SUFFIXES)}")
+    plain_path(Path(out_dir).absolute())
     loaded = _load(images, options)
+    if options.stop_after == "matching":
+        require_pair_names([view.name for view in loaded.views])
     if options.images == "vrt":
         for view in loaded.views:
             plain_source(view.path)  # refuses what no VRT can point at, before any work
@@ -128,7 +137,10 @@ def adjust(
         for path in (view.path, source.path)
     }
     keep |= set(input_files(options))
-    with Workspace(out_dir, overwrite=options.overwrite, keep=frozenset(keep)) as workspace:
+    names = output_names(loaded.views, options, Path(out_dir))
+    refuse_hiding(Path(out_dir), names, keep)
+    refuse_shadows(Path(out_dir), names)
+    with Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names) as workspace:
         with _crew(loaded, workspace, executor) as crew:
             run = _solve(loaded, options, workspace, crew, progress)
         if run.adjustment is not None and options.stop_after == "all":
@@ -142,10 +154,10 @@ def adjust(
         summary = summarize(run)
         write_tables(workspace, run, summary)
         workspace.remove_stale()
-    views = tuple(
+    views = (
         replace(view, sensor=sensor) for view, sensor in zip(run.views, run.after or run.before, strict=True)
     )
-    return AdjustResult(views, run, summary)
+    return AdjustResult(_as_given(views, images), run, summary)
 
 
 def check(
@@ -160,10 +172,17 @@ def check(
     loaded = _load(images, options)
     run = _empty_run("check", loaded, options)
     run = _with_ties(run, options, executor, progress, None)
-    return AdjustResult(loaded.views, run, summarize(run))
+    return AdjustResult(_as_given(run.views, images), run, summarize(run))
+
+
+def _as_given(views: Iterable[View], images: Sequence[str | Path]) -> tuple[View, ...]:
+    place = {str(Path(path).absolute()): number for number, path in enumerate(images)}
+    return tuple(sorted(views, key=lambda view: place[view.path]))
 
 
 def _load(images: Sequence[str | Path], options: RunOptions) -> LoadedViews:
+    for path in input_files(options):
+        plain_path(path)
     least = 1 if options.gcp else 2  # one image and control points are enough
     return load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
 
@@ -193,7 +212,7 @@ def _solve(
             run = _with_ties(run, options, crew, progress, adjustment)
         if options.stop_after == "matching":
             _write_matches(run, workspace)
-            return replace(run, kind="check")
+            return replace(run, kind="match")
         with workspace.stage("adjustment" + again):
             run, adjustment = _adjusted(run, options, given)
     assert adjustment is not None
@@ -245,13 +264,13 @@ def _with_ties(
 
 def _write_matches(run: Run, workspace: Workspace) -> None:
     names = [view.name for view in run.views]
-    for name in ("matches.csv", "matches.npz"):
+    for name in MATCHES:
         with workspace.output(name) as partial:
             write_matches(partial, run.tracks, names)
     for ties in pair_ties(run.tracks):
         i, j = ties.views
         text = asp_text(run.tracks.xy[ties.a], run.tracks.xy[ties.b])
-        workspace.write_text(f"asp/{names[i]}__{names[j]}.txt", text)
+        workspace.write_text(f"asp/{pair_name(names[i], names[j])}.txt", text)
 
 
 def _only(run: Run, names: frozenset[str]) -> Run:
@@ -280,8 +299,6 @@ def _center(view: View, options: RunOptions) -> CameraCenter:
 def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress: Progress | None) -> Run:
     """Refit every P_BA first, and write only when all can be written."""
     assert run.adjustment is not None
-    for view in run.views:
-        refuse_shadows(workspace, file_names(view, options.images, options.rpc_formats))
     fits: list[RpcFit] = []
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))

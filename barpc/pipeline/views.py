@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from barpc.errors import BarpcError, ImageError, InputError, RpcError
+from barpc.pipeline.twins import Twins
+from barpc.plain import plain_path
+from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
 from barpc.rpcio import RpcSource, read_rpc_source
 from barpc.scene import View
@@ -29,7 +31,7 @@ class LoadedViews:
     Parameters
     ----------
     views : tuple of View
-        In the order given.
+        In the order of their names.
     sources : tuple of RpcSource
         One a view.
     left_out : tuple of (str, str)
@@ -42,9 +44,14 @@ class LoadedViews:
 
 
 def load_views(
-    paths: Sequence[str | Path], *, min_views: int = 2, keep_going: bool = False, band: int = 1
+    paths: Sequence[str | Path],
+    *,
+    min_views: int = 2,
+    keep_going: bool = False,
+    band: int = 1,
+    distinct: bool = True,
 ) -> LoadedViews:
-    """Open every image once and read its camera.
+    """Read the camera of every image, in the order of their names, whatever order they are given in.
 
     Parameters
     ----------
@@ -56,6 +63,8 @@ def load_views(
         Leave a bad file out instead of stopping.
     band : int
         The band that will be read, from 1.
+    distinct : bool
+        Refuse an image that is there twice, also as other files or under another RPC (see `Twins`).
 
     Returns
     -------
@@ -66,9 +75,9 @@ def load_views(
     ImageError, RpcError
         A file cannot be used; the message names it.
     InputError
-        Too few images, or the same image twice.
+        Too few images, the same image twice, or a name that the files of a run cannot carry.
     """
-    files = [Path(path).absolute() for path in paths]
+    files = [plain_path(Path(path).absolute()) for path in paths]
     if len(files) < min_views:
         found = files[0] if files else "none"
         raise InputError(
@@ -77,10 +86,12 @@ def load_views(
     views: list[View] = []
     sources: list[RpcSource] = []
     left_out: list[tuple[str, str]] = []
-    for name, file in zip(unique_names(files), files, strict=True):
+    twins = Twins(band)
+    for name, file in sorted(zip(unique_names(files), files, strict=True)):
         try:
             view, source = _load(name, file, band)
-            _refuse_twin(view, views)
+            if distinct:
+                twins.add(view)
         except BarpcError as error:
             if not keep_going:
                 raise
@@ -92,30 +103,6 @@ def load_views(
     if len(views) < min_views:
         raise InputError(f"{len(views)} of {len(files)} images can be used: at least {min_views} are needed")
     return LoadedViews(tuple(views), tuple(sources), tuple(left_out))
-
-
-def unique_names(files: Sequence[Path]) -> list[str]:
-    """A name for each file: its stem, with as many folders before it as it takes to tell them apart.
-
-    Examples
-    --------
-    >>> unique_names([Path("a/img.tif"), Path("b/img.tif"), Path("b/other.tif")])
-    ['a_img', 'b_img', 'other']
-    """
-    depth = dict.fromkeys(range(len(files)), 1)
-    while True:
-        names = ["_".join([*file.parts[-depth[i] : -1], file.stem]) for i, file in enumerate(files)]
-        count = Counter(names)
-        again = [
-            i
-            for i, name in enumerate(names)
-            if count[name] > 1 and depth[i] < len(files[i].relative_to(files[i].anchor).parts)
-        ]
-        if not again:
-            break
-        for i in again:
-            depth[i] += 1
-    return names
 
 
 def _load(name: str, file: Path, band: int) -> tuple[View, RpcSource]:
@@ -134,12 +121,3 @@ def _load(name: str, file: Path, band: int) -> tuple[View, RpcSource]:
     if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
         raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
     return view, source
-
-
-def _refuse_twin(view: View, others: Sequence[View]) -> None:
-    """The same image under two names ties itself to itself, perfectly and uselessly."""
-    for other in others:
-        same_file = Path(view.path).samefile(other.path)
-        if same_file or (view.size == other.size and view.sensor == other.sensor):
-            what = "the same file" if same_file else "the same size and the same RPC"
-            raise InputError(f"{view.path}: is {what} as {other.path}; give each image once")

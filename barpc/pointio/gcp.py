@@ -6,8 +6,9 @@ them; GDAL leaves the meaning of its tags to the application. Altitudes are elli
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ def read_gcps(
     path : path
         A `.gcp` file, a GeoJSON file, or an image with GCP tags.
     names : sequence of str
-        The views; observations in other images are left out.
+        The views; observations in other images are left out, and these named in `strangers`.
     sigma : float or None
         East, north, up standard deviation [m] instead of the file's.
     image_sigma : float or None
@@ -74,7 +75,7 @@ def read_gcps(
     if not found:
         raise InputError(f"{path}: no GCP of {', '.join(names[:10])}")
     try:
-        return _assembled(found, sigma, image_sigma)
+        return replace(_assembled(found, sigma, image_sigma), strangers=tuple(views.strangers))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -89,14 +90,16 @@ def _reader(head: bytes) -> Callable[[Path, ViewNames], Iterator[_Point]]:
 
 def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
     """Lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
-    for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
-        words = raw.split("#", 1)[0].replace(",", " ").split()
+    for number, raw in enumerate(read_text(path, TABLE).split("\n"), start=1):
+        words = re.split(r"(?:^|\s)#", raw, maxsplit=1)[0].replace(",", " ").split()
         if not words:
             continue
         try:
             lat, lon, alt, *sigma = (float(word) for word in words[1:7])
             images = [words[i : i + 5] for i in range(7, len(words), 5)]
             east, north, up = sigma
+            if not images:
+                raise ValueError("no image")
             for image, *numbers in images:
                 col, row, sigma_col, sigma_row = (float(word) for word in numbers)
                 view = views.find(image)

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from barpc.errors import InputError
 from barpc.geodesy import Array
-from barpc.pointio.names import ViewNames
+from barpc.pointio.names import ViewNames, cell, from_cell
 from barpc.record import load_npz
 from barpc.scene import IntArray, Tracks
 from barpc.sidefile import TABLE, opened_text, read_text
@@ -100,11 +100,11 @@ def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> Non
     if path.suffix.lower() != ".csv":
         raise InputError(f"{path}: tie points are written as .csv or .npz")
     with path.open("w", encoding="utf-8", newline="") as text:
-        writer = csv.writer(text)
-        writer.writerow([*_COLUMNS, "sigma"])
+        text.write(",".join([*_COLUMNS, "sigma"]) + "\r\n")
+        cells = [cell(name) for name in names]
         columns = (tracks.view.tolist(), tracks.point.tolist(), tracks.xy.tolist(), tracks.sigma.tolist())
         for view, point, (col, row), sigma in zip(*columns, strict=True):
-            writer.writerow([names[view], repr(col), repr(row), point, repr(sigma)])
+            text.write(f"{cells[view]},{col!r},{row!r},{point},{sigma!r}\r\n")
 
 
 def asp_text(first: Array, second: Array) -> str:
@@ -150,7 +150,7 @@ def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
         rows, tracks = [], []
         for line in lines:
             try:
-                view = views.find(line[image])
+                view = views.find(from_cell(line[image]))
                 col, row = (float(line[i]) for i in numbers[:2])
                 own = sigma if spread is None else float(line[spread])
                 track = line[numbers[2]].strip()
@@ -216,10 +216,16 @@ def _read_asp(paths: Sequence[Path], views: ViewNames, sigma: float) -> Columns:
 def _asp_images(path: Path, views: ViewNames) -> tuple[str, str]:
     """The two images that a match file's name means, a run's prefix before the first one left out."""
     stem = path.name.removesuffix(".txt").removesuffix(".match")
-    left, right = stem.split("__", 1)
-    while views.find(left) is None and "-" in left:
-        left = left.split("-", 1)[1]
-    return left, right
+    cuts = [(stem[:i], stem[i + 2 :]) for i in range(len(stem) - 1) if stem.startswith("__", i)]
+    for left, right in cuts:  # either name may hold the two lines, too
+        if views.exact(left) is not None and views.exact(right) is not None:
+            return left, right
+    for left, right in cuts:
+        while views.find(left) is None and "-" in left:
+            left = left.split("-", 1)[1]
+        if views.find(left) is not None and views.find(right) is not None:
+            return left, right
+    return cuts[0]
 
 
 def _asp_points(path: Path) -> tuple[Array, Array]:

@@ -1,11 +1,132 @@
-"""Which view a file means by a name: its own name, its file's name, or that without the ending."""
+"""What an image may be called, and which view a file means by a name.
+
+Views get their names here, before any work, so that every file that a run writes carries them and reads back to the
+same image.
+"""
 
 from __future__ import annotations
 
+import os
+import unicodedata
+from bisect import bisect_left
+from collections import Counter
 from collections.abc import Sequence
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 from barpc.errors import InputError
+
+MAX_NAME = 120
+"""Bytes of a view's name: the file of a pair's matches carries two, and 255 are what a file system takes."""
+_FORMULA = frozenset("=+-@＝＋－＠\t\r")
+_LISTED = 10  # names in a message
+
+
+def unique_names(files: Sequence[Path]) -> list[str]:
+    """A name for each file: its stem, with as many folders before it as it takes to tell them apart.
+
+    Names that differ in case or composition only are taken for one, as file systems and GDAL do; two files of one
+    folder that differ in their ending alone keep it.
+
+    Raises
+    ------
+    InputError
+        A name is longer than `MAX_NAME`, or two files cannot be told apart.
+
+    Examples
+    --------
+    >>> unique_names([Path("a/img.tif"), Path("b/img.tif"), Path("b/other.tif")])
+    ['a_img', 'b_img', 'other']
+    >>> unique_names([Path("a/img.tif"), Path("a/img.jp2")])
+    ['img.tif', 'img.jp2']
+    """
+    places = list(dict.fromkeys(files))
+    stems = Counter((file.parent, _folded(file.stem)) for file in places)
+    ends = [file.stem if stems[file.parent, _folded(file.stem)] == 1 else file.name for file in places]
+    depth = [1] * len(places)
+    while True:
+        names = [
+            "_".join([*file.parts[-n:-1], end]) for file, end, n in zip(places, ends, depth, strict=True)
+        ]
+        count = Counter(map(_folded, names))
+        again = [i for i, name in enumerate(names) if count[_folded(name)] > 1]
+        deeper = [i for i in again if depth[i] < len(places[i].relative_to(places[i].anchor).parts)]
+        if not deeper:
+            break
+        for i in deeper:
+            depth[i] += 1
+    if again:
+        twin = next(i for i in again[1:] if _folded(names[i]) == _folded(names[again[0]]))
+        raise InputError(
+            f"{places[again[0]]} and {places[twin]}: their names cannot be told apart; rename one, or give a link to it"
+        )
+    for name, file in zip(names, places, strict=True):
+        if len(os.fsencode(name)) > MAX_NAME:
+            raise InputError(
+                f"{file}: its name in this run has more than {MAX_NAME} bytes, too long for the files that carry it;"
+                " rename it, or give a link with a shorter name"
+            )
+    found = dict(zip(places, names, strict=True))
+    return [found[file] for file in files]
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def pair_name(first: str, second: str) -> str:
+    """Name of the match file of two views, without its ending."""
+    return f"{first}__{second}"
+
+
+def require_pair_names(names: Sequence[str]) -> None:
+    """Raise unless every `pair_name` of two of the views means these two alone.
+
+    Raises
+    ------
+    InputError
+        Names the views that are in each other's way.
+    """
+    known, ordered = set(names), sorted(names)
+    for long in names:
+        for size in range(1, len(long)):
+            short, rest = long[:size], f"{long[size:]}__"
+            if short not in known or not rest.startswith("__"):
+                continue
+            start = rest[2:]  # long__x is short__(start + x)
+            for other in ordered[bisect_left(ordered, start) :]:
+                if not other.startswith(start):
+                    break
+                second = other.removeprefix(start)
+                if second in known and second != long and other != short:
+                    raise InputError(
+                        f"{short}, {long}, {second} and {other}: a match file {pair_name(short, other)}.txt would mean"
+                        " two pairs; rename an image"
+                    )
+
+
+def cell(text: str) -> str:
+    r"""A text as a cell of a CSV table: quoted where it must be, and never a formula for a spreadsheet.
+
+    A text that a spreadsheet would compute gets an apostrophe in front, which `from_cell` takes away.
+
+    Examples
+    --------
+    >>> cell("view"), cell("=1+1"), cell('a"b'), cell("#1")
+    ('view', '"\'=1+1"', '"a""b"', '"#1"')
+    """
+    if _computes(text):
+        text = f"'{text}"
+    plain = all(c.isalnum() or c in "_-.'" for c in text)
+    return text if text and plain else '"' + text.replace('"', '""') + '"'
+
+
+def from_cell(text: str) -> str:
+    """The text of a cell, as `csv` gives it, that `cell` wrote."""
+    return text[1:] if text.startswith("'") and _computes(text[1:]) else text
+
+
+def _computes(text: str) -> bool:
+    return text.lstrip(" '")[:1] in _FORMULA
 
 
 class ViewNames:
@@ -21,23 +142,32 @@ class ViewNames:
 
     def __init__(self, names: Sequence[str], source: str) -> None:
         self.names, self.source = tuple(names), source
+        self.strangers: dict[str, int] = {}
         self._index: dict[str, int] = {}
         ambiguous: set[str] = set()
         for i, name in enumerate(names):
-            for key in {PurePath(name).name, PurePath(name).stem}:
+            for key in {PurePath(name).name, PurePath(name).stem} - {""}:
                 if key in self._index:
                     ambiguous.add(key)
                 self._index[key] = i
         for key in ambiguous:
             del self._index[key]
-        self._index.update({name: i for i, name in enumerate(names)})
+        self._exact = {name: i for i, name in enumerate(names)}
+        self._index.update(self._exact)
+
+    def exact(self, name: str) -> int | None:
+        """Index of the view that has this very name."""
+        return self._exact.get(name)
 
     def find(self, name: str) -> int | None:
-        """Index of the view that `name` means; None where it means none."""
-        path = PurePath(name.strip().strip('"'))
-        for key in (str(path), path.name, path.stem):
-            if key in self._index:
-                return self._index[key]
+        """Index of the view that `name` means; None where it means none, which `strangers` counts."""
+        bare = name.strip()
+        for text in dict.fromkeys((name, bare, bare.strip('"'))):
+            path = PurePath(text)
+            for key in (text, path.name, path.stem):
+                if key in self._index:
+                    return self._index[key]
+        self.strangers[name] = self.strangers.get(name, 0) + 1
         return None
 
     def index(self, name: str) -> int:
@@ -50,6 +180,6 @@ class ViewNames:
         """
         found = self.find(name)
         if found is None:
-            listed = ", ".join(self.names[:10])
+            listed = ", ".join(self.names[:_LISTED])
             raise InputError(f"{self.source}: no view is named {name!r}; there are {listed}")
         return found

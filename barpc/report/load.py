@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.geodesy import Array
+from barpc.pointio.names import from_cell
 from barpc.report.summary import SCHEMA
 from barpc.report.tables import OBSERVATIONS, RESIDUALS
 from barpc.scene import BoolArray, IntArray
@@ -139,7 +141,7 @@ def _read(path: Path, kind: Kind, parse: Any) -> Any:
 
 
 def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
-    rows = csv.reader(text.splitlines())
+    rows = csv.reader(io.StringIO(text, newline=""))
     if tuple(next(rows)) != tuple(header):
         raise ValueError(f"its columns are not {', '.join(header)}")
     columns = [list(column) for column in zip(*rows, strict=True)]
@@ -159,7 +161,7 @@ def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
 def _observations(text: str, names: Sequence[str]) -> Observations:
     columns = _columns(text, OBSERVATIONS)
     index = {name: i for i, name in enumerate(names)}
-    view = np.array([index[name] for name in columns[0]], dtype=np.int64)
+    view = np.array([index[from_cell(name)] for name in columns[0]], dtype=np.int64)
     numbers = _floats(columns[2:8], 2)
     used = np.array([cell == "1" for cell in columns[8]], dtype=bool)
     return Observations(view, numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)

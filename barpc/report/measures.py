@@ -15,6 +15,8 @@ from barpc.sensor.geometry import Triangulation, convergence_angle, epipolar_off
 
 MAX_PER_PAIR = 1000
 """Matches of a pair that its epipolar offset is measured on, evenly taken."""
+WHOLE, MOST, LEAST = 0.05, 0.9, 20
+"""A whole shift [px], the share of a pair's matches that must have it, and how many there must be."""
 
 
 def robust_spread(values: Array) -> float:
@@ -111,6 +113,17 @@ def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
         PairTies((int(code[s] // num), int(code[s] % num)), np.sort(a[s:e]), b[s:e][np.argsort(a[s:e])])
         for s, e in zip(starts, ends, strict=True)
     ]
+
+
+def whole_shift(ties: PairTies, tracks: Tracks) -> Array | None:
+    """The shift (2,) [px] by whole pixels that the matches of a pair share; None where there is none.
+
+    Two images of one scene never match so: only one that is a part, or a copy, of the other.
+    """
+    shift = tracks.xy[ties.b] - tracks.xy[ties.a]
+    whole: Array = np.rint(np.median(shift, axis=0))
+    same = np.mean((np.abs(shift - whole) <= WHOLE).all(axis=1))
+    return whole if len(shift) >= LEAST and same >= MOST else None
 
 
 def pair_offset(ties: PairTies, tracks: Tracks, sensors: Sequence[SensorModel], alt: Array) -> PairOffset:

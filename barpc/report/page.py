@@ -7,11 +7,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from barpc.atomic import write_text
 from barpc.errors import BarpcError
+from barpc.plain import visible
 from barpc.report.load import read_summary, read_tables
 from barpc.report.sections import sections
 from barpc.report.verdict import STATUS_WORDS
+from barpc.workspace import Workspace
 
 NAME = "report.html"
 
@@ -52,8 +53,7 @@ def report_html(summary: Mapping[str, Any], folder: Path | str) -> str:
         lstrip_blocks=True,
     )
     template = environment.get_template("template.html.j2")
-    text = template.render(summary=summary, sections=sections(files), words=STATUS_WORDS)
-    return text.encode(errors="backslashreplace").decode()  # a name that is no UTF-8
+    return visible(template.render(summary=summary, sections=sections(files), words=STATUS_WORDS))
 
 
 def remake_report(folder: Path | str) -> Path:
@@ -63,6 +63,8 @@ def remake_report(folder: Path | str) -> Path:
     ------
     InputError
         The folder holds no finished run.
+    OutputError
+        There is a report.html that barpc did not write, or that was changed since.
     BarpcError
         jinja2 is not installed.
     """
@@ -70,5 +72,7 @@ def remake_report(folder: Path | str) -> Path:
     summary = read_summary(folder)
     if not can_render():
         raise BarpcError("the report needs jinja2: pip install 'barpc[report]'")
-    write_text(folder / NAME, report_html(summary, folder), overwrite=True)
+    html = report_html(summary, folder)
+    with Workspace(folder, overwrite=True, names=[NAME], adds=True) as workspace:
+        workspace.write_text(NAME, html)
     return folder / NAME

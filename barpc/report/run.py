@@ -12,7 +12,7 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.fit import RpcFit
 from barpc.geodesy import Array, ground_from_ecef
-from barpc.report.measures import triangulate_tracks
+from barpc.report.measures import PairTies, pair_ties, triangulate_tracks, whole_shift
 from barpc.rpcio import RpcSource
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor import SensorModel
@@ -26,8 +26,8 @@ class Run:
 
     Parameters
     ----------
-    kind : {"adjust", "check"}
-        Whether cameras were adjusted.
+    kind : {"adjust", "check", "match"}
+        Whether cameras were adjusted, looked at, or only tied.
     views : tuple of View
         The images.
     sources : tuple of RpcSource
@@ -91,6 +91,23 @@ class Run:
     def keep(self) -> BoolArray:
         """The observations (K,) that count: all of them, or those that the adjustment kept."""
         return np.ones(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.inlier
+
+    @cached_property
+    def pairs(self) -> list[PairTies]:
+        """The observations that pairs of views have in common."""
+        return pair_ties(self.tracks, self.keep)
+
+    @cached_property
+    def copies(self) -> dict[str, str]:
+        """Views that show the very pixels of another one, and in words whose, and how far moved."""
+        found: dict[str, str] = {}
+        for ties in self.pairs:
+            shift = whole_shift(ties, self.tracks)
+            if shift is not None:
+                names = [self.views[i].name for i in ties.views]
+                for name, other, (col, row) in zip(names, names[::-1], (shift, 0.0 - shift), strict=True):
+                    found.setdefault(name, f"{other}, moved by {col:.0f} columns and {row:.0f} rows")
+        return found
 
     @property
     def start_altitude(self) -> float:

@@ -14,7 +14,7 @@ from barpc.report.load import RunFiles
 from barpc.report.maps import ground_map
 from barpc.report.panels import residual_panels
 from barpc.report.svg import MAX_ROWS, numbered
-from barpc.report.verdict import metres
+from barpc.report.verdict import GOOD, metres
 from barpc.scene import connected_groups
 
 Record = Mapping[str, Any]
@@ -61,7 +61,7 @@ class Section:
 
 def _images(files: RunFiles) -> Section:
     summary = files.summary
-    good = sum(view["status"] in ("adjusted", "consistent") for view in summary["views"])
+    good = sum(view["status"] in GOOD.values() for view in summary["views"])
     answer = f"{good} of {len(summary['views'])} without reservation."
     todo = [view for view in summary["views"] if view["advice"]]
     answer += " What to do about the others stands in the verdict above." if todo else ""

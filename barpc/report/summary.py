@@ -20,13 +20,12 @@ from barpc.report.measures import (
     ground_sampling,
     pair_geometry,
     pair_offset,
-    pair_ties,
     rmse_by_view,
     shift_in_image,
 )
 from barpc.report.run import Run
 from barpc.report.tables import written_tracks
-from barpc.report.verdict import block_verdict, meets_gates, mode_in_words, view_status
+from barpc.report.verdict import block_verdict, mode_in_words, view_status
 from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import CameraCenter, view_angles
@@ -48,11 +47,12 @@ def summarize(run: Run) -> dict[str, Any]:
         "status": block["status"],
         "headline": block["headline"],
         "verdict": block["lines"],
-        "passed": not run.left_out and all(meets_gates(view, run) for view in views),
+        "reasons": block["reasons"],
+        "passed": block["status"] == "good",
         "out_dir": run.out_dir,
         "altitude_m": run.altitude,
         "views": views,
-        "pairs": [_pair(run, ties, reports) for ties in pair_ties(run.tracks, run.keep)],
+        "pairs": [_pair(run, ties, reports) for ties in run.pairs],
         "left_out": [{"path": path, "reason": reason} for path, reason in run.left_out],
         "tracks": _tracks(run.tracks),
         "tables": _tables(run),

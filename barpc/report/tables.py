@@ -14,6 +14,7 @@ import numpy as np
 
 from barpc import __version__
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.pointio.names import cell
 from barpc.report.footprints import footprints_geojson
 from barpc.report.run import Run
 from barpc.scene import IntArray
@@ -54,7 +55,7 @@ def _per_track(run: Run) -> Array:
 def _residuals_csv(run: Run) -> Iterable[str]:
     yield ",".join(RESIDUALS) + "\n"
     for lon, lat, alt, mean, count, before in _per_track(run).tolist():
-        yield f"{lon:.9f},{lat:.9f},{alt:.4f},{mean:.4f},{count:.0f},{_cell(before, 4)}\n"
+        yield f"{lon:.9f},{lat:.9f},{alt:.4f},{mean:.4f},{count:.0f},{_number(before, 4)}\n"
 
 
 def _residuals_geojson(run: Run) -> Iterable[str]:
@@ -68,7 +69,7 @@ def _residuals_geojson(run: Run) -> Iterable[str]:
             f"{alt:.4f}",
             f"{mean:.4f}",
             f"{count:.0f}",
-            _cell(before, 4, "null"),
+            _number(before, 4, "null"),
         )
         properties = ", ".join(f'"{name}": {value}' for name, value in zip(RESIDUALS, values, strict=True))
         yield f'{separator}{{"type": "Feature", "geometry": {place}, "properties": {{{properties}}}}}'
@@ -85,7 +86,7 @@ def _observations_csv(run: Run) -> Iterable[str]:
     before = run.ties_before.residuals[rows]
     after = run.ties_after.residuals[rows] if run.ties_after is not None else np.full((len(rows), 2), np.nan)
     numbers = np.column_stack([tracks.xy[rows], before, after])
-    names = [_quoted(view.name) for view in run.views]
+    names = [cell(view.name) for view in run.views]
     columns = (
         tracks.view[rows],
         tracks.point[rows],
@@ -94,7 +95,7 @@ def _observations_csv(run: Run) -> Iterable[str]:
         np.isfinite(numbers).all(axis=1),
     )
     for view, track, row, used, whole in zip(*(column.tolist() for column in columns), strict=True):
-        text = _NUMBERS(*row) if whole else ",".join(_cell(value, 4) for value in row)
+        text = _NUMBERS(*row) if whole else ",".join(_number(value, 4) for value in row)
         yield f"{names[view]},{track},{text},{used:d}\n"
 
 
@@ -105,16 +106,12 @@ def _pairs_csv(run: Run, pairs: Sequence[Mapping[str, Any]]) -> Iterable[str]:
         values = [pair[name] for name in _PAIR_NUMBERS]
         for when in ("epipolar_before", "epipolar_after"):
             values += [None if pair[when] is None else pair[when][what] for what in _OFFSETS]
-        cells = [str(v) if isinstance(v, int) else _cell(v, 5) for v in values]
-        yield ",".join([_quoted(pair["a"]), _quoted(pair["b"]), *cells]) + "\n"
+        cells = [str(v) if isinstance(v, int) else _number(v, 5) for v in values]
+        yield ",".join([cell(pair["a"]), cell(pair["b"]), *cells]) + "\n"
 
 
-def _cell(value: float | None, digits: int, empty: str = "") -> str:
+def _number(value: float | None, digits: int, empty: str = "") -> str:
     return empty if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
 
 
 def _points_ply(run: Run) -> bytes:

@@ -14,10 +14,8 @@ from barpc.report.run import Run
 
 GOOD_RMSE = 0.5
 """A view whose tie points are left with more than this [px] is called doubtful."""
-LARGEST_RMSE = 1.0
-"""A run with a view that is left with more than this [px] has missed its quality gate."""
 FEW_OBSERVATIONS = 30
-"""A view with fewer is called weakly tied."""
+"""A view with fewer is called weakly tied, unless control points hold it."""
 ENOUGH_GCPS = 3
 """Control points that hold a view without any tie point."""
 MANY_REJECTED = 0.3
@@ -26,11 +24,21 @@ MANY_REJECTED = 0.3
 STATUS_WORDS = {
     "adjusted": "adjusted",
     "consistent": "consistent",
+    "tied": "tied",
     "weak": "weakly tied",
     "doubtful": "doubtful",
     "failed": "not adjusted",
 }
 """Status of a view -> what people read, from good to bad."""
+
+GOOD = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
+"""Kind of a run -> the status of a view without reservation."""
+_ALL_WELL = {
+    "adjust": "All {} images are adjusted",
+    "check": "The cameras of all {} images agree",
+    "match": "All {} images are tied together",
+}
+_LISTED = 10  # names in a sentence
 
 _MODE_WORDS = {
     "east": "the whole scene may lie {0} farther east or west",
@@ -69,13 +77,7 @@ def view_status(view: View, run: Run) -> dict[str, str]:
     for status, advice in (_failure(view, run), _weakness(view), _doubt(view, run)):
         if advice:
             return {"status": status, "advice": advice}
-    return {"status": "adjusted" if run.kind == "adjust" else "consistent", "advice": ""}
-
-
-def meets_gates(view: View, run: Run) -> bool:
-    """Whether a view was adjusted, and its tie points agree afterwards; a check alone has no second gate."""
-    good = run.kind != "adjust" or not view["num_observations"] or view["rmse_after"] <= LARGEST_RMSE
-    return bool(view["status"] != "failed" and good)
+    return {"status": GOOD[run.kind], "advice": ""}
 
 
 def _failure(view: View, run: Run) -> tuple[str, str]:
@@ -92,12 +94,16 @@ def _failure(view: View, run: Run) -> tuple[str, str]:
 
 def _weakness(view: View) -> tuple[str, str]:
     few = view["num_observations"]
-    if few >= FEW_OBSERVATIONS:
+    if few >= FEW_OBSERVATIONS or view["num_gcps"] >= ENOUGH_GCPS:
         return "weak", ""
     return "weak", f"{f'only {few}' if few else 'no'} tie points: check overlap, clouds and dates"
 
 
 def _doubt(view: View, run: Run) -> tuple[str, str]:
+    if run.kind == "match":  # how well cameras agree is not what was asked
+        return "doubtful", ""
+    if view["name"] in run.copies:
+        return "doubtful", f"shows the same pixels as {run.copies[view['name']]}: give each image once"
     error = view["rmse_after"] if run.kind == "adjust" else view["rmse_before"]
     if not error <= GOOD_RMSE and view["num_observations"]:
         if run.kind == "check":
@@ -116,33 +122,59 @@ def _doubt(view: View, run: Run) -> tuple[str, str]:
 
 
 def block_verdict(run: Run, views: Sequence[View]) -> dict[str, Any]:
-    """The verdict on the whole: `status` ("good", "look" or "bad"), a `headline`, and `lines`, sentences."""
+    """The verdict on the whole: `status`, a `headline`, `lines`, and those of them that are `reasons`.
+
+    The one rule of what passes: `status` is "good" when no image, no control point and no file has a reservation;
+    "bad" when an image was not adjusted or a file left out; else "look". What is not good ends with exit code 3.
+    """
     bad = [view for view in views if view["status"] == "failed"]
     look = [view for view in views if view["advice"] and view not in bad]
-    status = "bad" if bad or run.left_out else "look" if look else "good"
-    lines = _adjusted_lines(run, views) if run.kind == "adjust" else _checked_lines(views)
-    lines += [f"{view['name']}: {STATUS_WORDS[view['status']]}: {view['advice']}." for view in bad + look]
-    lines += [f"{path} was left out: {reason}" for path, reason in run.left_out]
+    reasons = [f"{view['name']}: {STATUS_WORDS[view['status']]}: {view['advice']}." for view in bad + look]
+    reasons += [f"{path} was left out: {reason}" for path, reason in run.left_out]
+    control = _control_reasons(run)
+    lines = {"adjust": _adjusted_lines, "check": _checked_lines, "match": _matched_lines}[run.kind](
+        run, views
+    )
+    num_bad = len(bad) + len(run.left_out)
     return {
-        "status": status,
-        "headline": _headline(run, len(views), len(bad) + len(run.left_out), len(look)),
-        "lines": lines,
+        "status": "bad" if num_bad else "look" if look or control else "good",
+        "headline": _headline(run, len(views), num_bad, len(look), bool(control)),
+        "lines": lines + reasons + control,
+        "reasons": reasons + control,
     }
 
 
-def _headline(run: Run, num: int, bad: int, look: int) -> str:
-    all_well = (
-        "All {} images are adjusted." if run.kind == "adjust" else "The cameras of all {} images agree."
-    )
-    if not bad and not look:
-        return all_well.format(num)
-    parts = []
-    if bad:
-        word = "not adjusted" if run.kind == "adjust" else "not usable"
-        parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
-    if look:
-        parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
-    return f"{', '.join(parts)[0].upper()}{', '.join(parts)[1:]} (of {num + len(run.left_out)})."
+def _headline(run: Run, num: int, bad: int, look: int, control: bool) -> str:
+    text = _ALL_WELL[run.kind].format(num)
+    if bad or look:
+        parts = []
+        if bad:
+            word = "not adjusted" if run.kind == "adjust" else "not usable"
+            parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
+        if look:
+            parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
+        text = f"{', '.join(parts)[0].upper()}{', '.join(parts)[1:]} (of {num + len(run.left_out)})"
+    return f"{text}; ground points need a look." if control else f"{text}."
+
+
+def _control_reasons(run: Run) -> list[str]:
+    """Ground points that were cut, and images that their files name and that are not there."""
+    out = []
+    if run.gcps is not None and run.adjustment is not None and not run.adjustment.gcp_inlier.all():
+        cut = np.unique(run.gcps.point[~run.adjustment.gcp_inlier])
+        names = _listed([run.gcps.names[i] for i in cut])
+        out.append(
+            f"The adjustment rejected observations of {len(cut)} GCPs: {names}: check their coordinates."
+        )
+    for points, what in ((run.gcps, "GCPs"), (run.check_points, "Check points")):
+        if points is not None and points.strangers:
+            out.append(f"{what} name images that are not in this run: {_listed(points.strangers)}.")
+    return out
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f"{', '.join(names[:_LISTED])}{more}"
 
 
 def _adjusted_lines(run: Run, views: Sequence[View]) -> list[str]:
@@ -175,9 +207,13 @@ def _enu(shift: Array) -> str:
     return ", ".join(f"{s:+.2f} m {word}" for s, word in zip(shift, ("east", "north", "up"), strict=True))
 
 
-def _checked_lines(views: Sequence[View]) -> list[str]:
+def _checked_lines(run: Run, views: Sequence[View]) -> list[str]:
     rmse = _median([view["rmse_before"] for view in views])
     return [f"Tie points of {len(views)} images agree to {rmse:.3f} px as the cameras are."]
+
+
+def _matched_lines(run: Run, views: Sequence[View]) -> list[str]:
+    return [f"{run.tracks.num_points} tie points of {len(views)} images, {len(run.tracks)} observations."]
 
 
 def _median(values: Sequence[float]) -> float:

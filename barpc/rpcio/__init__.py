@@ -8,8 +8,15 @@ from __future__ import annotations
 
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import FORMATS, Format, write_rpc
-from barpc.rpcio.images import plain_source, write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
-from barpc.rpcio.sources import RpcSource, Sidecar, read_rpc, read_rpc_source, shadows, sidecars
+from barpc.rpcio.images import (
+    plain_source,
+    rpc_vrt,
+    write_crop,
+    write_rpc_copy,
+    write_rpc_nitf,
+    write_rpc_vrt,
+)
+from barpc.rpcio.sources import RpcSource, Sidecar, hidden_by, read_rpc, read_rpc_source, shadows, sidecars
 
 __all__ = [
     "FORMATS",
@@ -17,9 +24,11 @@ __all__ = [
     "ReadOptions",
     "RpcSource",
     "Sidecar",
+    "hidden_by",
     "plain_source",
     "read_rpc",
     "read_rpc_source",
+    "rpc_vrt",
     "shadows",
     "sidecars",
     "write_crop",

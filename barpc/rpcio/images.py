@@ -14,20 +14,24 @@ from xml.sax.saxutils import escape
 
 import rasterio
 from rasterio._err import CPLE_BaseError
+from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.shutil import copy as raster_copy
 from rasterio.windows import Window
 
 from barpc.atomic import replacing, write_text
 from barpc.errors import ImageError, OutputError
+from barpc.mosaic import Mosaic
+from barpc.plain import plain_path
 from barpc.raster import identify, open_raster
 from barpc.rpcio.digits import printable
 from barpc.rpcio.fixed import nitf_record
 from barpc.rpcio.tiff import GEOREFERENCE_TAGS, put_tag
 from barpc.rpcio.xml import rpc_domain
-from barpc.safexml import parse_xml
 from barpc.sensor.rpc import RPC
+from barpc.vrt import GDAL_TYPES
 
+_TIFF = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
 _FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk
 
 
@@ -57,13 +61,17 @@ def write_rpc_vrt(
     OutputError
         The VRT exists or cannot be written.
     """
-    source = plain_source(image_path)
-    target = Path(vrt_path).absolute()
+    write_text(vrt_path, rpc_vrt(rpc, image_path, vrt_path, relative=relative), overwrite=overwrite)
+
+
+def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative: bool = True) -> str:
+    """The text that `write_rpc_vrt` writes."""
+    source = plain_path(plain_source(image_path))
+    target = plain_path(Path(vrt_path).absolute())
     _refuse_same(source, target)
     name = os.path.relpath(source.resolve(), target.parent.resolve()) if relative else str(source)
     with open_raster(source) as dataset:
-        text = _vrt(dataset, rpc, name, relative)
-    write_text(target, text, overwrite=overwrite)
+        return _vrt(dataset, rpc, name, relative)
 
 
 def plain_source(image_path: Path | str) -> Path:
@@ -77,25 +85,14 @@ def plain_source(image_path: Path | str) -> Path:
     source, driver = identify(image_path)
     if driver != "VRT":
         return source
-    root = parse_xml(source)
-    width, height = root.get("rasterXSize"), root.get("rasterYSize")
-    frame = {"xOff": "0", "yOff": "0", "xSize": width, "ySize": height}
-    found = set()
-    for band in root.iter("VRTRasterBand"):
-        for part in band.iter():
-            if part.tag == "ComplexSource" or (part.tag in ("SrcRect", "DstRect") and part.attrib != frame):
-                found.add("")
-            if part.tag == "SourceBand" and part.text not in (band.get("band"), "mask,1"):
-                found.add("")
-            if part.tag == "SourceFilename":
-                relative = part.get("relativeToVRT") == "1"
-                found.add(str((source.parent if relative else Path("/")) / (part.text or "")))
-    if len(found) != 1 or "" in found:
+    with open_raster(source) as mosaic:
+        found: Path | None = mosaic.plain_source()
+    if found is None:
         raise ImageError(
             f"{image_path}: a VRT that is more than one whole image is not pointed at; give the image that it is "
             "made of, or have copies written"
         )
-    return Path(found.pop()).resolve()
+    return found.resolve()
 
 
 def _vrt(dataset: Any, rpc: RPC, source: str, relative: bool) -> str:
@@ -107,7 +104,7 @@ def _vrt(dataset: Any, rpc: RPC, source: str, relative: bool) -> str:
     lines.append(rpc_domain(rpc))
     frame = f'xOff="0" yOff="0" xSize="{width}" ySize="{height}"'
     for index in dataset.indexes:
-        kind = _GDAL_TYPES.get(dataset.dtypes[index - 1], dataset.dtypes[index - 1].capitalize())
+        kind = GDAL_TYPES.get(dataset.dtypes[index - 1], dataset.dtypes[index - 1].capitalize())
         lines.append(f'  <VRTRasterBand dataType="{kind}" band="{index}">')
         if (nodata := dataset.nodatavals[index - 1]) is not None:
             lines.append(f"    <NoDataValue>{nodata!r}</NoDataValue>")
@@ -121,7 +118,7 @@ def _vrt(dataset: Any, rpc: RPC, source: str, relative: bool) -> str:
             "    </SimpleSource>",
             "  </VRTRasterBand>",
         ]
-    if rasterio.enums.MaskFlags.per_dataset in dataset.mask_flag_enums[0] and not _has_alpha(dataset):
+    if MaskFlags.per_dataset in dataset.mask_flag_enums[0] and not _has_alpha(dataset):
         lines += [
             "  <MaskBand>",
             '    <VRTRasterBand dataType="Byte">',
@@ -137,25 +134,8 @@ def _vrt(dataset: Any, rpc: RPC, source: str, relative: bool) -> str:
     return "\n".join([*lines, "</VRTDataset>"]) + "\n"
 
 
-_GDAL_TYPES = {
-    "uint8": "Byte",
-    "int8": "Int8",
-    "uint16": "UInt16",
-    "int16": "Int16",
-    "uint32": "UInt32",
-    "int32": "Int32",
-    "uint64": "UInt64",
-    "int64": "Int64",
-    "float32": "Float32",
-    "float64": "Float64",
-    "complex_int16": "CInt16",
-    "complex64": "CFloat32",
-    "complex128": "CFloat64",
-}
-
-
 def _has_alpha(dataset: Any) -> bool:
-    return rasterio.enums.ColorInterp.alpha in dataset.colorinterp
+    return ColorInterp.alpha in dataset.colorinterp
 
 
 def write_rpc_copy(
@@ -193,7 +173,7 @@ def write_rpc_copy(
                 shutil.copyfile(source, partial)
             else:
                 with _gdal_writes(target):
-                    _convert(dataset, partial)
+                    _convert(dataset, partial, **_TIFF)
                 _require_same(dataset, Window(0, 0, dataset.width, dataset.height), partial, target)
             put_tag(partial, printable(rpc), drop)
 
@@ -205,9 +185,12 @@ def _copying(source: Path) -> Iterator[Any]:
         yield dataset
 
 
-def _convert(dataset: Any, target: Path) -> None:
-    options = {"BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
-    raster_copy(dataset, str(target), driver="GTiff", **options)
+def _convert(dataset: Any, target: Path, **options: str) -> None:
+    """A copy by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
+    if isinstance(dataset, Mosaic):
+        _copy_window(dataset, target, Window(0, 0, dataset.width, dataset.height), **options)
+    else:
+        raster_copy(dataset, str(target), **options)
 
 
 def write_rpc_nitf(
@@ -220,7 +203,7 @@ def write_rpc_nitf(
     record = nitf_record(rpc)
     with _copying(source) as dataset, replacing(target, overwrite=overwrite) as partial:
         with _gdal_writes(target):
-            raster_copy(dataset, str(partial), driver="NITF", TRE=f"RPC00B={record}")
+            _convert(dataset, partial, driver="NITF", TRE=f"RPC00B={record}")
         _require_same(dataset, Window(0, 0, dataset.width, dataset.height), partial, target)
 
 
@@ -269,23 +252,20 @@ def write_crop(
             )
         with replacing(target, overwrite=overwrite) as partial:
             with _gdal_writes(target):
-                _copy_window(dataset, partial, Window(col, row, width, height))
+                _copy_window(dataset, partial, Window(col, row, width, height), **_TIFF)
             _require_same(dataset, Window(col, row, width, height), partial, target)
             put_tag(partial, cropped, () if dataset.crs is not None else GEOREFERENCE_TAGS)
     return cropped
 
 
-def _copy_window(dataset: Any, target: Path, window: Window) -> None:
+def _copy_window(dataset: Any, target: Path, window: Window, **options: str) -> None:
     profile = {
-        "driver": "GTiff",
         "width": window.width,
         "height": window.height,
         "count": dataset.count,
         "dtype": dataset.dtypes[0],
         "nodata": dataset.nodata,
-        "tiled": True,
-        "compress": "deflate",
-        "BIGTIFF": "IF_SAFER",
+        **options,
     }
     if dataset.crs is not None:
         a, b, x, d, e, y = dataset.transform[:6]
@@ -294,13 +274,16 @@ def _copy_window(dataset: Any, target: Path, window: Window) -> None:
         profile |= {"crs": dataset.crs, "transform": moved}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(target, "w", **profile) as crop:
+        masked = MaskFlags.per_dataset in dataset.mask_flag_enums[0] and not _has_alpha(dataset)
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(target, "w", **profile) as crop:
             crop.colorinterp = dataset.colorinterp
             for _, block in crop.block_windows(1):
                 part = Window(
                     window.col_off + block.col_off, window.row_off + block.row_off, block.width, block.height
                 )
                 crop.write(dataset.read(window=part), window=block)
+                if masked and options["driver"] == "GTiff":
+                    crop.write_mask(dataset.read_masks(1, window=part), window=block)
 
 
 @contextmanager

@@ -7,19 +7,21 @@ barpc sees the camera that every other tool sees. What it found, and what it pas
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from barpc.errors import BarpcError, ImageError, RpcError, RpcFormatError
-from barpc.raster import open_raster
+from barpc.raster import identify, open_raster
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.fixed import is_nitf, read_nitf
 from barpc.rpcio.formats import FORMATS, parse
 from barpc.rpcio.text import decode
 from barpc.rpcio.tiff import is_tiff, read_tag
+from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head
+from barpc.vrt import MAGIC, read_vrt
 
 
 @dataclass(frozen=True)
@@ -127,9 +129,37 @@ def shadows(image: Path | str) -> list[Sidecar]:
     """
     image = Path(image)
     head = read_head(image, IMAGE, 64)
-    vrt = head.lstrip().startswith(b"<VRTDataset")
+    vrt = _is_vrt(head)
     own = vrt or _own_rpc(image, head) is not None
     return [s for s in sidecars(image) if s.kind == "geom" or (s.before_tag and not vrt) or not own]
+
+
+def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
+    """Images whose RPC some tool would no longer see if these files were written.
+
+    Yields
+    ------
+    path, image, rpc : Path, Path, RPC
+        The file, an image beside which it would be read, and the RPC that the image has now.
+    """
+    wanted: dict[Path, dict[str, Path]] = {}
+    for path in paths:
+        wanted.setdefault(path.parent, {})[path.name.lower()] = path
+    for folder, files in wanted.items():
+        for image in sorted(folder.iterdir()) if folder.is_dir() else ():
+            beside = (files.get(name.lower()) for _, name, _ in _names(image.name))
+            found = next((path for path in beside if path is not None and path.name != image.name), None)
+            rpc = None if found is None else _rpc_of_image(image)
+            if found is not None and rpc is not None:
+                yield found, image, rpc
+
+
+def _rpc_of_image(path: Path) -> RPC | None:
+    try:
+        identify(path)
+        return read_rpc(path)
+    except (ImageError, RpcError):
+        return None
 
 
 def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:
@@ -169,16 +199,22 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     head = read_head(path, IMAGE, 64)
     if is_tiff(head) or is_nitf(head) or _is_binary(head):
         return _image_source(path, head, options)
-    data = read_bytes(path, RPC_FILE)
-    if re.match(rb"\s*<VRTDataset\b", data) and b'domain="RPC"' not in data:
-        return _image_source(path, head, options)
-    rpc, name = parse(data, str(path), options)
+    if _is_vrt(head):
+        items = read_vrt(path).metadata.get("RPC")
+        if items is None:
+            return _image_source(path, head, options)
+        return RpcSource(rpc_from_domain(items, str(path), options), "gdal", path)
+    rpc, name = parse(read_bytes(path, RPC_FILE), str(path), options)
     return RpcSource(rpc, name, path)
 
 
 def _is_binary(head: bytes) -> bool:
     """No RPC text holds a zero byte near its start, unless it is UTF-16, which none is."""
     return b"\0" in head or head[:3] == b"\xff\xd8\xff" or head[:4] == b"\x89PNG"
+
+
+def _is_vrt(head: bytes) -> bool:
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(MAGIC)
 
 
 def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from barpc.errors import RpcFormatError
+from barpc.errors import ImageError, RpcFormatError
 from barpc.rpcio.fields import (
     COEFFICIENTS,
     ERRORS,
@@ -22,11 +23,14 @@ from barpc.rpcio.fields import (
 )
 from barpc.safexml import parse_xml
 from barpc.sensor.rpc import RPC
+from barpc.vrt import vrt_from_xml
 
 
-def _root(text: str, name: str) -> Element:
+def _root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
     return parse_xml(
-        re.sub(r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1).encode(), name=name, strip_namespaces=True
+        re.sub(r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1).encode(),
+        name=name,
+        strip_namespaces=strip_namespaces,
     )
 
 
@@ -199,17 +203,27 @@ def sniff_gdal(text: str) -> bool:
 
 
 def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
-    """GDAL's RPC metadata domain."""
-    root = _root(text, name)
-    domain = root.find("Metadata[@domain='RPC']")
-    if domain is None:
+    """GDAL's RPC metadata domain; a VRT is read by the grammar by which it is opened (`barpc.vrt`)."""
+    root = _root(text, name, strip_namespaces=False)
+    if root.tag == "VRTDataset":
+        try:
+            domains = vrt_from_xml(root, Path(), name).metadata
+        except ImageError as error:
+            raise RpcFormatError(str(error)) from error
+    else:
+        found = root.find("Metadata[@domain='RPC']")
+        domains = (
+            {} if found is None else {"RPC": {e.get("key", ""): e.text or "" for e in found.iter("MDI")}}
+        )
+    if "RPC" not in domains:
         raise RpcFormatError(f'{name}: no <Metadata domain="RPC">')
+    return rpc_from_domain(domains["RPC"], name, options)
+
+
+def rpc_from_domain(items: Mapping[str, str], name: str, options: ReadOptions) -> RPC:
+    """The RPC in GDAL's metadata domain; other keys are passed over."""
     known = {*OFFSETS, *SCALES, *ERRORS, *COEFFICIENTS}
-    fields = {
-        key: numbers(item.text or "", name, key)
-        for item in domain.iter("MDI")
-        if (key := item.get("key", "")) in known
-    }
+    fields = {key: numbers(value, name, key) for key, value in items.items() if key in known}
     return rpc_from_fields(fields, name, options.first_pixel or 0.0)
 
 

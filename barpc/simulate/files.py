@@ -15,13 +15,12 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc import __version__
-from barpc.atomic import replacing, write_text
-from barpc.errors import OutputError
 from barpc.geodesy import Array
 from barpc.rpcio.tiff import put_tag
 from barpc.scene import BoolArray
 from barpc.sensor.rpc import RPC
 from barpc.simulate.images import ImageOptions, Scene, Shot
+from barpc.workspace import Workspace
 
 Progress = Callable[[str, int, int], None]
 
@@ -49,7 +48,7 @@ def write_scene(
     options : ImageOptions
         The scene.
     overwrite : bool
-        Replace files of these names.
+        Replace what an earlier run wrote here and nobody has changed since.
     progress : callable
         Called with ("simulate", views done, views).
 
@@ -63,21 +62,31 @@ def write_scene(
     InputError
         Options that contradict each other.
     OutputError
-        The folder holds something and `overwrite` was not given.
+        The folder holds something and `overwrite` was not given, or a file that is in the way.
     """
     options = options or ImageOptions()
-    folder = Path(out)
-    if folder.exists() and not overwrite and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(f"{folder}: exists already; choose another folder or give --overwrite")
     scene = Scene(options)
+    names = [
+        *(f"{shot.name}.tif" for shot in scene.shots),
+        "truth.json",
+        *["gcps.geojson"] * (options.gcps > 0),
+    ]
+    with Workspace(out, overwrite=overwrite, names=names) as workspace:
+        _write_scene(workspace, scene, options, progress)
+        workspace.remove_stale()
+    return [Path(out) / f"{shot.name}.tif" for shot in scene.shots]
+
+
+def _write_scene(
+    workspace: Workspace, scene: Scene, options: ImageOptions, progress: Progress | None
+) -> None:
     ground = scene.candidates(4 * (options.checks + options.gcps) + 64)
-    paths, images, in_sight = [], [], []
+    images, in_sight = [], []
     for i, shot in enumerate(scene.shots):
         picture = scene.picture(i)
-        path = folder / f"{shot.name}.tif"
-        _write_image(path, picture.numbers, shot.delivered, overwrite)
+        with workspace.output(f"{shot.name}.tif") as partial:
+            _write_image(partial, picture.numbers, shot.delivered)
         image, visible = scene.shows(i, ground, picture.altitude)
-        paths.append(path)
         images.append(image)
         in_sight.append(visible)
         if progress:
@@ -86,28 +95,26 @@ def write_scene(
     good = np.flatnonzero(seen.sum(axis=0) >= min(2, options.views))
     gcps, checks = good[: options.gcps], good[options.gcps :][: options.checks]
     truth = _truth(scene, ground[checks], xy[:, checks], seen[:, checks])
-    write_text(folder / "truth.json", json.dumps(truth, indent=1) + "\n", overwrite=overwrite)
+    workspace.write_text("truth.json", json.dumps(truth, indent=1) + "\n")
     if options.gcps:
         rng = np.random.default_rng([options.seed, 99])
         noisy = xy[:, gcps] + rng.normal(0, options.gcp_noise, (*seen[:, gcps].shape, 2))
         points = _gcp_collection(scene.shots, ground[gcps], noisy, seen[:, gcps])
-        write_text(folder / "gcps.geojson", json.dumps(points, indent=1) + "\n", overwrite=overwrite)
-    return paths
+        workspace.write_text("gcps.geojson", json.dumps(points, indent=1) + "\n")
 
 
-def _write_image(path: Path, numbers: npt.NDArray[np.uint16], rpc: RPC, overwrite: bool) -> None:
+def _write_image(path: Path, numbers: npt.NDArray[np.uint16], rpc: RPC) -> None:
     """A deflated, tiled GeoTIFF with the RPC in its tag."""
     height, width = numbers.shape
-    with replacing(path, overwrite=overwrite) as partial:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            layout: dict[str, Any] = {"tiled": True, "blockxsize": 256, "blockysize": 256}
-            packing = {"compress": "deflate", "predictor": 2, "zlevel": 9}
-            with rasterio.open(
-                partial, "w", "GTiff", width, height, 1, dtype="uint16", nodata=0, **layout, **packing
-            ) as dataset:
-                dataset.write(numbers, 1)
-        put_tag(partial, rpc)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        layout: dict[str, Any] = {"tiled": True, "blockxsize": 256, "blockysize": 256}
+        packing = {"compress": "deflate", "predictor": 2, "zlevel": 9}
+        with rasterio.open(
+            path, "w", "GTiff", width, height, 1, dtype="uint16", nodata=0, **layout, **packing
+        ) as dataset:
+            dataset.write(numbers, 1)
+    put_tag(path, rpc)
 
 
 def _truth(scene: Scene, ground: Array, xy: Array, seen: BoolArray) -> dict[str, Any]:

@@ -237,7 +237,12 @@ def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Seque
         f"{r.verified} of {r.matches} matches verified)"
         for r in failed[:4]
     )
+    blank = sorted({name for r in failed for name, n in zip(r.names, r.keypoints, strict=True) if not n})
     advice = "look at the images (clouds? dates? band?), or loosen ratio, search or min_matches"
+    if blank:
+        advice = (
+            f"no detail in {', '.join(blank[:4])} (one value? no valid pixels? clouds?): look at the images"
+        )
     if len(views) == 2 and failed:
         raise TiePointError(f"too few tie points: {told}: {advice}")
     links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]

@@ -17,13 +17,17 @@ from barpc.raster import open_raster
 from barpc.scene import BoolArray
 
 FloatImage = npt.NDArray[np.float32]
+Pixels = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+"""float32 where it holds every number of the file's type (integers of up to 16 bits), else float64."""
 ByteImage = npt.NDArray[np.uint8]
 Box = tuple[int, int, int, int]
 """col, row of the first pixel, width, height [px]."""
 
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
 _SAMPLE_SIDE = 128  # px
-_NEGLIGIBLE = 1e-6  # a range below this share of the values is a constant image
+_NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
+_LEVELS = 1000.0  # grey values that most of a window is spread over
+_OUTLIER = 1e6  # grey values beyond which a pixel is cut: it would drown its surroundings
 
 
 @dataclass(frozen=True)
@@ -33,16 +37,45 @@ class Stretch:
     low: float
     high: float
 
-    def apply(self, pixels: FloatImage, valid: BoolArray) -> ByteImage:
+    def apply(self, pixels: Pixels, valid: BoolArray) -> ByteImage:
         """8-bit picture; invalid pixels take the mean of the valid ones, so that they make few edges."""
-        scaled = (pixels - np.float32(self.low)) * np.float32(255.0 / (self.high - self.low))
+        if pixels.dtype == np.float32:
+            scaled = (pixels - np.float32(self.low)) * np.float32(255.0 / (self.high - self.low))
+        else:
+            scaled = _levelled(pixels, self.low, self.high, 255.0)
         if not valid.all():
             scaled = np.where(valid, scaled, scaled[valid].mean() if valid.any() else np.float32(0.0))
         picture: ByteImage = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
         return picture
 
 
-def read_pixels(path: str | os.PathLike[str], box: Box, band: int = 1) -> tuple[FloatImage, BoolArray]:
+def _levelled(pixels: Pixels, low: float, high: float, levels: float) -> FloatImage:
+    """`low` and `high` as 0 and `levels`; whatever the scale, nothing overflows."""
+    with np.errstate(over="ignore"):
+        share = (pixels / 2 - low / 2) / (high / 2 - low / 2)  # halves: a difference may have no number
+    return np.clip(share * levels, -_OUTLIER, _OUTLIER).astype(np.float32)
+
+
+def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
+    """Pixels of a window in float32, as they are or (from float64) on a scale of the window's own.
+
+    Registration does not see offset and scale. In float32 an offset of 2e9 would swallow the picture, and the
+    squares of 1e30 overflow.
+    """
+    if pixels.dtype == np.float32:
+        return pixels.astype(np.float32, copy=False)
+    known = pixels[valid]
+    if not len(known):
+        return np.zeros(pixels.shape, np.float32)
+    low, high = np.percentile(known[:: 1 + len(known) // 100_000], [0.5, 99.5])
+    if not high > low:
+        low, high = known.min(), known.max()
+    if not high > low:
+        return np.zeros(pixels.shape, np.float32)
+    return np.where(valid, _levelled(pixels, float(low), float(high), _LEVELS), np.float32(0.0))
+
+
+def read_pixels(path: str | os.PathLike[str], box: Box, band: int = 1) -> tuple[Pixels, BoolArray]:
     """Pixels of a window and which of them mean something.
 
     Parameters
@@ -79,10 +112,12 @@ def check_band(dataset: Any, path: str | os.PathLike[str], band: int) -> None:
         raise ImageError(f"{os.fspath(path)}: band {band} is complex; give its amplitude as an image")
 
 
-def _read(dataset: Any, box: Box, band: int) -> tuple[FloatImage, BoolArray]:
+def _read(dataset: Any, box: Box, band: int) -> tuple[Pixels, BoolArray]:
     window = Window(*box)
     raw = dataset.read(band, window=window)
-    pixels: FloatImage = raw.astype(np.float32)
+    pixels: Pixels = raw.astype(
+        np.float32 if np.can_cast(raw.dtype, np.float32) and raw.dtype.kind != "f" else np.float64
+    )
     valid: BoolArray = dataset.read_masks(band, window=window) != 0
     valid &= np.isfinite(pixels)
     if np.issubdtype(raw.dtype, np.integer):
@@ -90,7 +125,7 @@ def _read(dataset: Any, box: Box, band: int) -> tuple[FloatImage, BoolArray]:
         if dataset.nodata is None:  # zeros without a name: a border where they stand together
             zeros = cv2.morphologyEx((raw == 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
             valid &= zeros == 0
-    return np.where(valid, pixels, np.float32(0.0)), valid
+    return np.where(valid, pixels, pixels.dtype.type(0.0)), valid
 
 
 def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | None:
@@ -111,6 +146,7 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | Non
     found: list[Array] = []
     with open_raster(path) as dataset:
         check_band(dataset, path, band)
+        kind = np.dtype(dataset.dtypes[band - 1])
         side_x, side_y = (min(_SAMPLE_SIDE, n) for n in (dataset.width, dataset.height))
         for row in np.linspace(0, dataset.height - side_y, _SAMPLES).astype(int):
             for col in np.linspace(0, dataset.width - side_x, _SAMPLES).astype(int):
@@ -120,7 +156,8 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | Non
     if not len(values):
         return None
     low, high = np.percentile(values, [0.5, 99.5])
-    if not high - low > _NEGLIGIBLE * max(abs(low), abs(high)):
+    step = np.finfo(kind).eps if kind.kind == "f" else 0.0
+    if not high / 2 - low / 2 > _NEGLIGIBLE * step * max(abs(low), abs(high)) / 2:
         return None
     return Stretch(float(low), float(high))
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
-from barpc.tie.raster import Box, FloatImage, read_pixels
+from barpc.tie.raster import Box, FloatImage, levelled, read_pixels
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -97,7 +97,7 @@ def register_task(task: Task) -> Registration:
     for path, size, xy in zip(task.paths, task.sizes, (task.reference, task.start), strict=True):
         box = _around(xy, margin, size)
         pixels, valid = read_pixels(path, box, task.band)
-        images.append((pixels, valid, np.array(box[:2], dtype=np.float64)))
+        images.append((levelled(pixels, valid), valid, np.array(box[:2], dtype=np.float64)))
     (first, valid_first, origin_first), (second, valid_second, origin_second) = images
     found = register(
         (first, second),

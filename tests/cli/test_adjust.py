@@ -23,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreference
 def barpc(*args):
     """Run the command in a process of its own: exit code, stdout, stderr."""
     command = [sys.executable, "-m", "barpc", *map(str, args)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=3600)
     return done.returncode, done.stdout, done.stderr
 
 
@@ -86,7 +86,7 @@ def test_the_main_job_writes_what_other_tools_read(crops, tmp_path):
 def test_check_shows_the_same_residuals_and_writes_nothing(crops, tmp_path):
     before = sorted(path.name for path in crops[0].parent.iterdir())
     code, out, _ = barpc("check", *crops, "--json")
-    assert code == 0
+    assert code == 3  # the crops as delivered disagree
     summary = json.loads(out)
     assert summary["kind"] == "check"
     assert abs(summary["pairs"][0]["epipolar_before"]["median"]) > 5

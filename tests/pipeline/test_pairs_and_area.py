@@ -104,7 +104,7 @@ def test_what_tells_how_to_match_contradicts_given_matches(name) -> None:
 
 def run(*args: object) -> tuple[int, str]:
     command = [sys.executable, "-m", "barpc", "-q", *map(str, args)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=3600)
     return done.returncode, done.stderr
 
 

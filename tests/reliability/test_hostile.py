@@ -2,96 +2,56 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
 import pickle
 import shutil
-import socket
-import threading
 import zipfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
 
+from barpc.rpcio import read_rpc, write_rpc
+
 from .conftest import Said, barpc, hashes
+from .hostile_files import CONTENTS, Trap, served, write
+from .test_faults import dem
 
 SECRET = "moon-landing-7391"
 IN_ACCESS, IN_OPEN, IN_DELETE_SELF, IN_MODIFY = 0x1, 0x20, 0x400, 0x2
 
 
-@dataclass
-class Trap:
-    """A server that must hear nothing, and files that nobody may open."""
-
-    url: str
-    canary: Path
-    raster: Path
-    requests: list[bytes] = field(default_factory=list)
-    events: Callable[[], int] = lambda: 0
-
-    def wms(self) -> str:
-        """A web map service as GDAL reads it."""
-        return (
-            f'<GDAL_WMS><Service name="TMS"><ServerUrl>{self.url}/${{z}}/${{x}}/${{y}}.png</ServerUrl></Service>'
-            "<DataWindow><UpperLeftX>0</UpperLeftX><UpperLeftY>0</UpperLeftY><LowerRightX>300</LowerRightX>"
-            "<LowerRightY>300</LowerRightY><TileLevel>0</TileLevel><SizeX>300</SizeX><SizeY>300</SizeY>"
-            "</DataWindow><BandsCount>1</BandsCount></GDAL_WMS>"
-        )
-
-    def vrt(self, source: object, more: str = "", kind: str = "SimpleSource") -> str:
-        """A VRT of the crops' size over any source."""
-        return (
-            f'<VRTDataset rasterXSize="300" rasterYSize="300">{more}<VRTRasterBand dataType="UInt16" band="1">'
-            f'<{kind}><SourceFilename relativeToVRT="0">{source}</SourceFilename><SourceBand>1</SourceBand>'
-            f"</{kind}></VRTRasterBand></VRTDataset>"
-        )
-
-
 @pytest.fixture
 def trap(tmp_path: Path) -> Iterator[Trap]:
-    server = socket.create_server(("127.0.0.1", 0))
     outside = tmp_path / "outside"
     outside.mkdir()
     canary, raster = outside / "canary.txt", outside / "canary.tif"
     canary.write_text(SECRET)
-    with rasterio.open(raster, "w", driver="GTiff", width=300, height=300, count=1, dtype="uint16") as out:
-        out.write(np.full((1, 300, 300), 4242, np.uint16))
-    found = Trap(f"http://127.0.0.1:{server.getsockname()[1]}/x", canary, raster)
+    for path in (raster, outside / "good.tif"):
+        with rasterio.open(path, "w", driver="GTiff", width=300, height=300, count=1, dtype="uint16") as out:
+            out.write(np.full((1, 300, 300), 4242, np.uint16))
+    with served(canary, raster) as found:
+        libc = ctypes.CDLL(None, use_errno=True)
+        watch = libc.inotify_init1(os.O_NONBLOCK) if hasattr(libc, "inotify_init1") else -1
+        if watch >= 0:
+            for path in (canary, raster):
+                libc.inotify_add_watch(watch, bytes(path), IN_ACCESS | IN_OPEN | IN_MODIFY | IN_DELETE_SELF)
 
-    def listen() -> None:
-        while True:
-            try:
-                peer, _ = server.accept()
-            except OSError:
-                return
-            with peer:
-                found.requests.append(b"connected")
-                peer.settimeout(1)
-                peer.sendall(b"HTTP/1.0 404 gone\r\nContent-Length: 0\r\n\r\n")
+            def events() -> int:
+                try:
+                    return len(os.read(watch, 1 << 16)) // 16
+                except BlockingIOError:
+                    return 0
 
-    threading.Thread(target=listen, daemon=True).start()
-    libc = ctypes.CDLL(None, use_errno=True)
-    watch = libc.inotify_init1(os.O_NONBLOCK) if hasattr(libc, "inotify_init1") else -1
-    if watch >= 0:
-        for path in (canary, raster):
-            libc.inotify_add_watch(watch, bytes(path), IN_ACCESS | IN_OPEN | IN_MODIFY | IN_DELETE_SELF)
-
-        def events() -> int:
-            try:
-                return len(os.read(watch, 1 << 16)) // 16
-            except BlockingIOError:
-                return 0
-
-        found.events = events
-    yield found
-    server.close()
-    if watch >= 0:
-        os.close(watch)
+            found.events = events
+        yield found
+        if watch >= 0:
+            os.close(watch)
 
 
 class Evil:
@@ -174,23 +134,6 @@ def option(*words: object) -> Callable[[Trap, list[Path]], list[object]]:
 
 
 HOSTILE: dict[str, Callable[[Trap, list[Path]], list[object]]] = {
-    "a VRT that fetches": lambda t, c: instead(c, t.vrt(f"/vsicurl/{t.url}.tif")),
-    "a VRT that fetches without vsicurl": lambda t, c: instead(c, t.vrt(t.url)),
-    "a VRT of a file without header": lambda t, c: instead(
-        c,
-        t.vrt(t.canary, ' subClass="VRTRawRasterBand"').replace("SimpleSource", "SourceFilename"),
-    ),
-    "a VRT that runs Python": lambda t, c: instead(
-        c, t.vrt(t.raster, "<PixelFunctionLanguage>Python</PixelFunctionLanguage>")
-    ),
-    "a VRT that warps": lambda t, c: instead(
-        c, t.vrt(t.raster).replace("<VRTDataset ", '<VRTDataset subClass="VRTWarpedDataset" ')
-    ),
-    "a VRT whose source is a subdataset": lambda t, c: instead(c, t.vrt(f"GTIFF_DIR:1:{t.raster}")),
-    "a VRT with an entity": lambda t, c: instead(
-        c, f'<!DOCTYPE V [<!ENTITY x SYSTEM "file://{t.canary}">]>' + t.vrt("&x;")
-    ),
-    "a web service called .tif": lambda t, c: instead(c, t.wms()),
     "a web service as overviews": lambda t, c: beside(c, ".ovr", t.wms()),
     "a fetching VRT as overviews": lambda t, c: beside(c, ".ovr", t.vrt(f"/vsicurl/{t.url}.tif")),
     "a web service as mask": lambda t, c: beside(c, ".msk", t.wms()),
@@ -268,9 +211,7 @@ def test_a_link_to_a_secret_file_does_not_show_it(crops, tmp_path, trap, name):
 
 
 @pytest.mark.parametrize("verb", ["info", "footprint", "check", "crop", "apply", "convert"])
-@pytest.mark.parametrize(
-    "name", ["a web service called .tif", "a web service as overviews", "a VRT that fetches"]
-)
+@pytest.mark.parametrize("name", ["a web service as overviews", "overviews on the network"])
 def test_no_verb_fetches_anything(crops, tmp_path, trap, verb, name):
     HOSTILE[name](trap, crops)
     more = {
@@ -285,11 +226,153 @@ def test_no_verb_fetches_anything(crops, tmp_path, trap, verb, name):
     assert "Traceback" not in said.err
 
 
+def commands(image: Path, out: Path, *, slow: bool = False) -> list[list[object]]:
+    """Whatever opens an image."""
+    found: list[list[object]] = [
+        ["info", image],
+        ["footprint", image],
+        ["localize", image, 100, 100],
+        ["crop", image, out / "c.tif", "--window", 0, 0, 60, 60],
+        ["convert", image, out / "x.vrt"],
+        ["convert", image, out / "x.tif"],
+        ["convert", image, out / "x.ntf"],
+        ["apply", image, "--rpc", image, "-o", out / "applied", "--images", "copy"],
+        ["fit", image, "-o", out / "f_RPC.TXT"],
+    ]
+    other = image.with_name("view_00.tif")
+    more: list[list[object]] = [
+        ["check", other, image],
+        ["adjust", other, image, "--gcp", image, "-o", out / "run"],
+    ]
+    return found + more if slow else found
+
+
+def assert_silent(trap: Trap, said: Said, folder: Path) -> None:
+    """Nothing was asked for, opened or repeated, and an error is one line."""
+    assert trap.requests == [], said
+    assert trap.events() == 0, said
+    assert said.code in (0, 1, 2, 3), said
+    assert "Traceback" not in said.err, said
+    assert "unexpected" not in said.err, said
+    if said.code == 1:
+        assert len([line for line in said.err.splitlines() if line.startswith("barpc: ")]) == 1, said
+    assert_says_nothing_of_it(said, folder)
+
+
+@pytest.mark.parametrize("name", CONTENTS)
+def test_a_hostile_image_fetches_nothing(name, crops, tmp_path, trap):
+    """As image, as the pixels of an RPC, and as source of a VRT; every verb that opens images."""
+    write_rpc(read_rpc(crops[1]), crops[1].with_name("view_01_RPC.TXT"))
+    write_rpc(read_rpc(crops[1]), crops[1].with_name("over_RPC.TXT"))
+    write(trap, name, crops[1])
+    (crops[1].with_name("over.vrt")).write_text(trap.vrt(crops[1]))
+    before = hashes([tmp_path / "in", tmp_path / "outside"])
+    trap.events()
+    for args in commands(crops[1], tmp_path / "out", slow=True) + [["info", crops[1].with_name("over.vrt")]]:
+        assert_silent(trap, barpc(*args), tmp_path / "out")
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    assert hashes([tmp_path / "in", tmp_path / "outside"]) == before
+
+
+@pytest.mark.parametrize("name", CONTENTS)
+def test_a_hostile_dem_fetches_nothing(name, crops, tmp_path, trap):
+    path = write(trap, name, crops[0].with_name("dem.tif"))
+    trap.events()
+    for args in (
+        ["localize", crops[0], 100, 100, "--dem", path],
+        ["localize", crops[0], 100, 100, "--dem", path, "--geoid", path],
+        ["fit", crops[0], "-o", tmp_path / "out" / "f_RPC.TXT", "--dem", path],
+        ["adjust", *crops, "--dem", path, "-o", tmp_path / "out"],
+    ):
+        assert_silent(trap, barpc(*args), tmp_path / "out")
+
+
+BESIDE = (
+    ".ovr",
+    ".msk",
+    ".aux.xml",
+    ".msk.ovr",
+    ".aux",
+    ".prj",
+    ".tfw",
+    ".imd",
+    ".rpb",
+    "_RPC.TXT",
+    ".xml",
+    ".geom",
+)
+
+
+def surrounded(trap: Trap, name: str, file: Path, suffixes: Sequence[str] = BESIDE) -> None:
+    """The same hostile content under every name that may belong to a file."""
+    for suffix in suffixes:
+        for stem in (file.name, file.stem):
+            if not file.with_name(stem + suffix).exists():
+                write(trap, name, file.with_name(stem + suffix))
+
+
+@pytest.mark.parametrize("name", CONTENTS)
+def test_a_hostile_file_beside_another_fetches_nothing(name, crops, tmp_path, trap, request):
+    """Beside an image (of which the RPC is readable, else no pixel would be asked for), a DEM and an output."""
+    surrounded(trap, name, crops[1], BESIDE[:8])
+    bounds = read_rpc(crops[0]).ground_offset
+    terrain = dem(crops[0].with_name("dem.tif"), bounds[0] - 0.25, bounds[1] + 0.25, 230.0)
+    surrounded(trap, name, terrain)
+    (tmp_path / "out").mkdir()
+    surrounded(trap, name, tmp_path / "out" / "x.tif", BESIDE[:4])
+    trap.events()
+    for args in [*commands(crops[1], tmp_path / "out"), ["localize", crops[1], 100, 100, "--dem", terrain]]:
+        assert_silent(trap, barpc(*args), tmp_path / "out" / "applied")
+    surrounded(trap, name, crops[0])
+    assert_silent(trap, barpc("info", crops[0]), tmp_path / "out" / "applied")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONTENTS)
+def test_a_hostile_file_beside_another_fetches_nothing_in_a_whole_run(name, crops, tmp_path, trap):
+    for crop in crops:
+        surrounded(trap, name, crop, BESIDE[:8])
+    for path in ("view_00.tif", "view_01.tif", "view_01.vrt"):
+        (tmp_path / "out").mkdir(exist_ok=True)
+        surrounded(trap, name, tmp_path / "out" / path, BESIDE[:4])
+    trap.events()
+    assert_silent(trap, barpc("check", *crops), tmp_path / "in")
+    for images in ("vrt", "copy"):
+        said = barpc("adjust", *crops, "-o", tmp_path / "out", "--images", images, "--overwrite")
+        assert trap.requests == [], said
+        assert trap.events() == 0, said
+
+
+def test_gdal_on_its_own_fetches_what_these_files_name(trap, tmp_path):
+    """The tests above can fail. (Of all of `CONTENTS` GDAL 3.10 goes out for 43 of 60.)"""
+    for name in (
+        "source, element",
+        "source, attribute",
+        "source, attribute, without vsicurl",
+        "source, tags in lower case",
+        "source, raw data",
+        "source, behind a comment that one parser ends",
+        "a mark in front",
+        "a mask, attribute",
+        "a derived band",
+        "a warped raster",
+        "a web service",
+        "a VRT in a NITF",
+    ):
+        before = len(trap.requests)
+        path = write(trap, name, tmp_path / "h.tif")
+        with rasterio.Env(GDAL_HTTP_TIMEOUT=2), contextlib.suppress(rasterio.errors.RasterioError):
+            with rasterio.open(path) as image:
+                image.read(1)
+                image.read_masks(1)
+        assert len(trap.requests) > before, name
+
+
 def test_the_trap_hears_what_gdal_fetches_on_its_own(crops, trap):
     """The tests above can fail: without barpc's defence the same file does go out."""
     beside(crops, ".ovr", trap.wms())
     with rasterio.Env(GDAL_HTTP_TIMEOUT=2), rasterio.open(crops[1]) as image:
-        with pytest.raises(rasterio.errors.RasterioIOError):
+        with contextlib.suppress(rasterio.errors.RasterioIOError):
             image.read(1, out_shape=(20, 20))
     assert trap.requests
     trap.events()

@@ -3,6 +3,7 @@
 ::
 
     python -m tests.reliability.trials 50 --seed 1 --jobs 1
+    python -m tests.reliability.trials --every-output 1        (kill between any two outputs, of every verb)
 
 Everything is imported once; each run is a fork of this process, which itself never works on an image.
 """
@@ -109,12 +110,15 @@ def sweep(trials: int, seed: int, jobs: int, folder: Path) -> dict[str, object]:
         pid = start(command, log)
         time.sleep(rng.uniform(0.0, seconds))
         os.kill(pid, signal.SIGKILL)
-        killed += finish(pid) == -signal.SIGKILL
-        leftovers += any(out.rglob(".barpc-partial-*"))
+        if finish(pid) == -signal.SIGKILL:
+            killed += 1
+        else:  # the machine is less busy than when the first run was timed
+            seconds *= 0.7
+        leftovers += any(out.glob(".barpc/partial/*/*"))
         resumed += len(list(out.glob(".barpc/cache/*/*.npz"))) > 0
         again = finish(start(command, log))  # 1: it had been finished, and is not written over
         state = json.loads((out / ".barpc/state.json").read_text())["status"]
-        clean = not list(out.rglob(".barpc-partial-*"))
+        clean = not any(out.glob(".barpc/partial/*/*"))
         identical += again in (0, 1) and state == "done" and clean and outputs(out) == truth
     unchanged = [sha256(path.read_bytes()).digest() for path in images] == before
     return {
@@ -128,14 +132,95 @@ def sweep(trials: int, seed: int, jobs: int, folder: Path) -> dict[str, object]:
     }
 
 
+def killed_at(number: int, command: list[str], log: Path) -> int:
+    """Run a command that is killed when it is about to rename a file for the `number`-th time, caches apart."""
+    rename, seen = Path.replace, 0
+
+    def counted(self: Path, target: Path) -> Path:
+        nonlocal seen
+        seen += "cache" not in Path(target).parts
+        if seen == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return rename(self, target)
+
+    Path.replace = counted  # type: ignore[method-assign]  # (the child's is a copy)
+    try:
+        return finish(start(command, log))
+    finally:
+        Path.replace = rename  # type: ignore[method-assign]
+
+
+def boundaries(command: list[str], before: Path, folder: Path, step: int = 1) -> dict[str, int]:
+    """Kill a command between any two outputs, and give it again: how often, and how often all was as it should.
+
+    Parameters
+    ----------
+    command : list of str
+        A verb that writes into ``folder/out``.
+    before : Path
+        What is in that folder when the command starts: caches, or a finished run.
+    folder : Path
+        Where to work.
+    step : int
+        Kill at every so many.
+    """
+    out, log = folder / "out", folder / "log.txt"
+    shutil.copytree(before, out)
+    if code := finish(start(command, log)):
+        raise SystemExit(f"the undisturbed run ended with {code}: {log.read_text()}")
+    truth = outputs(out)
+    killed = identical = 0
+    for number in range(1, 1000, step):
+        shutil.rmtree(out)
+        shutil.copytree(before, out)
+        if killed_at(number, command, log) != -signal.SIGKILL:
+            break
+        killed += 1
+        again = finish(start(command, log))
+        state = json.loads((out / ".barpc/state.json").read_text())["status"]
+        identical += again == 0 and state == "done" and outputs(out) == truth
+    return {"killed": killed, "identical": identical, "outputs": len(truth)}
+
+
+def at_every_output(step: int, folder: Path) -> dict[str, dict[str, int]]:
+    """`boundaries` of every verb that writes into a folder."""
+    images = [str(crop(path, folder / path.name)) for path in SAMPLES[:2]]
+    first, cached, empty = folder / "first", folder / "cached", folder / "empty"
+    adjust = ["-q", "adjust", *images]
+    if code := finish(start([*adjust, "-o", str(first), "--rpc-format", "txt,geom"], folder / "log.txt")):
+        raise SystemExit(f"the undisturbed run ended with {code}: {(folder / 'log.txt').read_text()}")
+    shutil.copytree(first / ".barpc/cache", cached / ".barpc/cache")
+    empty.mkdir()
+    commands = {
+        "adjust": ([*adjust, "--rpc-format", "txt,rpb,geom,json,xml"], cached),
+        "adjust --images copy": ([*adjust, "--images", "copy"], cached),
+        "adjust --overwrite": ([*adjust, "--overwrite", "--model", "translation"], first),
+        "match": (["-q", "match", *images], cached),
+        "apply": (["-q", "apply", *images, "--rpc", str(first)], empty),
+        "simulate": (["-q", "simulate", "--size", "64", "64", "--gcps", "3"], empty),
+    }
+    found = {}
+    for name, (command, before) in commands.items():
+        (place := folder / name).mkdir()
+        out = [str(place / "out")] if "simulate" in command else ["-o", str(place / "out")]
+        found[name] = boundaries([*command, *out], before, place, step)
+    return found
+
+
 def main() -> None:
     """Parse, run, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("trials", type=int, nargs="?", default=50)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=1, help="worker processes of the killed runs")
+    parser.add_argument(
+        "--every-output", type=int, metavar="STEP", help="kill at every STEP-th output instead"
+    )
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
+        if given.every_output:
+            print(json.dumps(at_every_output(given.every_output, Path(folder))))
+            return
         print(json.dumps(sweep(given.trials, given.seed, given.jobs, Path(folder))))
 
 

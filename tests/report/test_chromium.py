@@ -56,7 +56,7 @@ def probe(html: str, width: int, folder, dark: bool = False) -> dict:
         f"--user-data-dir={folder / f'profile_{width}_{dark}'}",
         path.as_uri(),
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     body = done.stdout[done.stdout.index("<body>") + 6 : done.stdout.rindex("</body>")]
     return json.loads(unescape(body))
 

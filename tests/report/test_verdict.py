@@ -29,7 +29,7 @@ def test_a_check_of_wrong_cameras_says_to_adjust_them(check_run):
     assert summary["status"] == "look"
     assert summary["headline"] == "9 need a look (of 9)."
     assert all(view["advice"].endswith("adjust the cameras") for view in summary["views"])
-    assert summary["passed"]
+    assert not summary["passed"]
 
 
 def test_a_view_with_few_tie_points_is_weakly_tied(block_run):

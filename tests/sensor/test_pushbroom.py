@@ -181,7 +181,7 @@ def test_a_camera_from_sampled_ephemeris_and_quaternions_is_the_camera_that_was_
     start, stop = sensor.time(np.array([-3000.0, 23000.0]))
     times, ticks = np.arange(start, stop, 0.1), np.arange(start, stop, 1 / 32)
     place, w = sensor.orbit(times)[0].T, sensor.attitude(ticks)[0].T
-    turned = Rotation.from_matrix(sensor.mount) * Rotation.from_rotvec(w)
+    turned = Rotation.from_matrix(np.array(sensor.mount)) * Rotation.from_rotvec(w)
     quaternions = (
         np.roll(turned.as_quat(), 1, axis=1) * np.where(np.arange(len(ticks)) % 3, 2.0, -0.5)[:, None]
     )

@@ -121,7 +121,7 @@ def test_a_layout_without_overlap_is_refused_in_one_line():
 
 
 @pytest.mark.slow
-def test_a_thousand_views_take_seconds():
+def test_a_thousand_views_are_simulated():
     block = simulate_block(1000, 20000)
     assert len(block.views) == 1000
     assert block.tracks.num_points == 20000

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import ImageError
-from barpc.tie.raster import grow, read_pixels, sample_stretch
+from barpc.tie.raster import grow, levelled, read_pixels, sample_stretch
 
 from .conftest import write_image
 
@@ -25,6 +25,49 @@ def test_every_real_type_is_read_and_stretched_over_the_whole_range(tmp_path, dt
     picture = stretch.apply(pixels, valid)
     assert picture.min() < 15
     assert picture.max() > 240
+
+
+@pytest.mark.parametrize(
+    ("dtype", "ratio", "offset"),
+    [
+        ("float64", 1e30, 0.0),
+        ("float64", 1e300, 0.0),
+        ("float64", 1e-300, 0.0),
+        ("float64", 1e-6, -1e3),
+        ("float32", 1e34, 0.0),
+        ("float32", 1e-30, 0.0),
+        ("int32", 1, 2e9),
+        ("uint32", 1, 4e9),
+        ("int64", 10**9, 0),
+        ("int16", 1, -20000),
+    ],
+)
+def test_neither_the_picture_nor_the_registration_sees_scale_and_offset(
+    tmp_path, dtype, ratio, offset
+) -> None:
+    data = RNG.integers(10, 1000, (120, 90))
+    plain = write_image(tmp_path / "plain.tif", data.astype(np.uint16))
+    scaled = write_image(tmp_path / "scaled.tif", (data * ratio + offset).astype(dtype))
+    seen = []
+    for path in (plain, scaled):
+        stretch = sample_stretch(path)
+        assert stretch is not None
+        pixels, valid = read_pixels(path, (0, 0, 90, 120))
+        assert valid.all()
+        patch = levelled(pixels, valid)
+        assert patch.dtype == np.float32
+        seen.append((stretch.apply(pixels, valid).astype(int), (patch - patch.mean()) / patch.std()))
+    assert np.abs(seen[0][0] - seen[1][0]).max() <= 1
+    np.testing.assert_allclose(seen[1][1], seen[0][1], rtol=0, atol=2e-5)
+
+
+def test_a_hot_pixel_does_not_drown_the_others(tmp_path) -> None:
+    data = RNG.uniform(10, 1000, (60, 60))
+    data[30, 30] = 1e300
+    pixels, valid = read_pixels(write_image(tmp_path / "a.tif", data), (0, 0, 60, 60))
+    patch = levelled(pixels, valid)
+    assert np.isfinite(patch).all()
+    assert np.corrcoef(patch[:29].ravel(), data[:29].ravel())[0, 1] > 1 - 1e-9
 
 
 def test_complex_pixels_are_refused_with_advice(tmp_path) -> None:
@@ -59,9 +102,12 @@ def test_nodata_nan_saturated_and_zero_borders_are_invalid_but_a_lone_zero_is_no
     assert (~valid).sum() == 601
 
 
-@pytest.mark.parametrize("value", [0, 7, 65535])
-def test_a_constant_image_has_no_stretch(tmp_path, value: int) -> None:
-    assert sample_stretch(write_image(tmp_path / "a.tif", np.full((90, 90), value, np.uint16))) is None
+@pytest.mark.parametrize(
+    ("value", "dtype"),
+    [(0, "uint16"), (7, "uint16"), (65535, "uint16"), (7e40, "float64"), (np.nan, "float32")],
+)
+def test_a_constant_image_has_no_stretch(tmp_path, value: float, dtype: str) -> None:
+    assert sample_stretch(write_image(tmp_path / "a.tif", np.full((90, 90), value, dtype))) is None
 
 
 def test_an_image_of_one_pixel_has_no_stretch(tmp_path) -> None:

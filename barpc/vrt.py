@@ -1,0 +1,368 @@
+"""Reading a VRT: a closed grammar of tags, attributes and text; what is not in it is refused.
+
+GDAL's own reader takes attributes for elements, tags in any case, and half-closed documents. So GDAL is never
+shown a VRT: what this module reads is all there is, and `barpc.mosaic` puts the pixels together.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+from barpc.errors import ImageError, RpcFormatError
+from barpc.safexml import parse_xml
+
+GDAL_TYPES = {
+    "uint8": "Byte",
+    "int8": "Int8",
+    "uint16": "UInt16",
+    "int16": "Int16",
+    "uint32": "UInt32",
+    "int32": "Int32",
+    "uint64": "UInt64",
+    "int64": "Int64",
+    "float32": "Float32",
+    "float64": "Float64",
+    "complex_int16": "CInt16",
+    "complex64": "CFloat32",
+    "complex128": "CFloat64",
+}
+"""rasterio's names of pixel types -> GDAL's."""
+MAGIC = b"<VRTDataset"
+MAX_BYTES = 1 << 20
+"""Larger files are no VRTs [bytes]; one that carries an RPC takes a few thousand."""
+
+Rect = tuple[int, int, int, int]
+"""col, row of the first pixel, width, height [px]."""
+
+_ANY = r"(?s:.*)"
+_WHOLE = r"\d{1,9}"
+_NUMBER = r"[+-]?(?:\d{1,400}\.?\d{0,400}|\.\d{1,400})(?:[eE][+-]?\d{1,4})?"
+_NODATA = rf"{_NUMBER}|[+-]?nan|[+-]?inf(?:inity)?"
+_SWITCH = "0|1"
+_TYPE = "|".join(GDAL_TYPES.values())
+_RESAMPLING = "nearest|near|bilinear|cubic|cubicspline|lanczos|average|rms|mode|gauss"
+_SRS = r"(?s:[A-Z_]{4,20}\[.*\])|EPSG:\d{1,6}"
+_INDIRECT = re.compile(r"/vsi|[A-Za-z][A-Za-z0-9+._-]+:")
+_SHIFT = 1e-3  # px; a rectangle that lies less beside whole pixels is meant to lie on them
+
+
+class _Tag(NamedTuple):
+    """What may stand in an element: a pattern of its text, of its attributes, and its children."""
+
+    text: str | None = None
+    attributes: Mapping[str, str] = {}
+    children: str = ""
+
+
+_RECT = _Tag(None, dict.fromkeys(("xOff", "yOff", "xSize", "ySize"), _NUMBER))
+_SOURCE = "SourceFilename SourceBand SourceProperties SrcRect DstRect"
+_BAND = "ColorInterp NoDataValue HideNoDataValue SimpleSource ComplexSource"
+_FORGOTTEN = "Description UnitType Offset Scale Metadata CategoryNames ColorTable Histograms"
+_GRAMMAR: dict[str, _Tag] = {
+    "VRTDataset": _Tag(
+        None,
+        {"rasterXSize": _WHOLE, "rasterYSize": _WHOLE},
+        "SRS GeoTransform GCPList Metadata BlockXSize BlockYSize OverviewList VRTRasterBand MaskBand",
+    ),
+    "SRS": _Tag(_SRS, {"dataAxisToSRSAxisMapping": r"-?\d(,-?\d){0,3}", "coordinateEpoch": _NUMBER}),
+    "GeoTransform": _Tag(rf"{_NUMBER}(\s*,\s*{_NUMBER}){{5}}"),
+    "GCPList": _Tag(None, {"Projection": f"{_SRS}|", "dataAxisToSRSAxisMapping": r"-?\d(,-?\d){0,3}"}, "GCP"),
+    "GCP": _Tag(None, {"Id": _ANY, "Info": _ANY, **dict.fromkeys(("Pixel", "Line", "X", "Y", "Z"), _NUMBER)}),
+    "Metadata": _Tag(None, {"domain": _ANY}, "MDI"),
+    "MDI": _Tag(_ANY, {"key": _ANY}),
+    "BlockXSize": _Tag(_WHOLE),
+    "BlockYSize": _Tag(_WHOLE),
+    "OverviewList": _Tag(r"[\d\s]*", {"resampling": r"\w+"}),
+    "VRTRasterBand": _Tag(
+        None,
+        {"dataType": _TYPE, "band": _WHOLE, "blockXSize": _WHOLE, "blockYSize": _WHOLE},
+        f"{_BAND} {_FORGOTTEN}",
+    ),
+    "MaskBand": _Tag(None, {}, "VRTRasterBand"),
+    "ColorInterp": _Tag(r"[\w ]+"),
+    "NoDataValue": _Tag(_NODATA),
+    "HideNoDataValue": _Tag(_SWITCH),
+    "Description": _Tag(_ANY),
+    "UnitType": _Tag(_ANY),
+    "Offset": _Tag(_NUMBER),
+    "Scale": _Tag(_NUMBER),
+    "CategoryNames": _Tag(None, {}, "Category"),
+    "Category": _Tag(_ANY),
+    "ColorTable": _Tag(None, {}, "Entry"),
+    "Entry": _Tag(None, dict.fromkeys(("c1", "c2", "c3", "c4"), _WHOLE)),
+    "Histograms": _Tag(None, {}, "HistItem"),
+    "HistItem": _Tag(None, {}, "HistMin HistMax BucketCount IncludeOutOfRange Approximate HistCounts"),
+    **dict.fromkeys(("HistMin", "HistMax"), _Tag(_NODATA)),
+    **dict.fromkeys(("BucketCount", "IncludeOutOfRange", "Approximate"), _Tag(_WHOLE)),
+    "HistCounts": _Tag(r"[\d|]*"),
+    "SimpleSource": _Tag(None, {"resampling": _RESAMPLING}, _SOURCE),
+    "ComplexSource": _Tag(None, {"resampling": _RESAMPLING}, f"{_SOURCE} NODATA ScaleOffset ScaleRatio"),
+    "SourceFilename": _Tag(_ANY, {"relativeToVRT": _SWITCH, "shared": _SWITCH}),
+    "SourceBand": _Tag(rf"{_WHOLE}|mask,{_WHOLE}"),
+    "SourceProperties": _Tag(
+        None,
+        {
+            **dict.fromkeys(("RasterXSize", "RasterYSize", "BlockXSize", "BlockYSize"), _WHOLE),
+            "DataType": r"\w+",
+        },
+    ),
+    "SrcRect": _RECT,
+    "DstRect": _RECT,
+    "NODATA": _Tag(_NODATA),
+    "ScaleOffset": _Tag(_NUMBER),
+    "ScaleRatio": _Tag(_NUMBER),
+}
+_REPEATED = frozenset(
+    [
+        "Metadata",
+        "MDI",
+        "GCP",
+        "Entry",
+        "Category",
+        "HistItem",
+        "VRTRasterBand",
+        "SimpleSource",
+        "ComplexSource",
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A rectangle of a band of a raster, and where it goes.
+
+    Parameters
+    ----------
+    file : Path
+        The raster.
+    band : int
+        Band, from 1.
+    mask : bool
+        Its mask is meant, not its values.
+    src, dst : Rect or None
+        In the raster and in the VRT, of one size; None for the whole.
+    plain : bool
+        Values are handed on as they are.
+    nodata : float or None
+        Value that is not handed on.
+    scale : (ratio, offset)
+        Applied to the values.
+    """
+
+    file: Path
+    band: int
+    mask: bool = False
+    src: Rect | None = None
+    dst: Rect | None = None
+    plain: bool = True
+    nodata: float | None = None
+    scale: tuple[float, float] = (1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Band:
+    """A band of a VRT: `dtype` by rasterio's name, `fill` where no source reaches."""
+
+    dtype: str
+    nodata: float | None
+    fill: float
+    color: str
+    sources: tuple[Source, ...]
+
+
+@dataclass(frozen=True)
+class Vrt:
+    """What a VRT says.
+
+    Parameters
+    ----------
+    size : (width, height)
+        [px].
+    bands : tuple of Band
+        In order.
+    mask : Band or None
+        Mask of the whole raster.
+    srs : str
+        WKT or EPSG code; empty where there is none.
+    transform : tuple of float or None
+        GDAL's six numbers.
+    metadata : dict
+        Domain -> key -> value.
+    gcp_srs : str
+        As `srs`, of the GCPs.
+    gcps : tuple of dict
+        Attributes of the GCPs, as they stand.
+    """
+
+    size: tuple[int, int]
+    bands: tuple[Band, ...]
+    mask: Band | None = None
+    srs: str = ""
+    transform: tuple[float, ...] | None = None
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    gcp_srs: str = ""
+    gcps: tuple[dict[str, str], ...] = ()
+
+    @property
+    def sources(self) -> list[Source]:
+        """Of all bands and of the mask."""
+        return [s for band in (*self.bands, *([self.mask] if self.mask else [])) for s in band.sources]
+
+
+def read_vrt(path: Path, *, name: str | None = None) -> Vrt:
+    """Read a VRT; its sources are not looked at.
+
+    Parameters
+    ----------
+    path : Path
+        An existing file; sources relative to it are beside what it links to, as in GDAL.
+    name : str, optional
+        What to call it in messages.
+
+    Raises
+    ------
+    ImageError
+        It does not parse, holds anything outside the grammar, or names a source by anything else than a
+        plain path. One line that names it.
+    """
+    name = name or str(path)
+    try:
+        root = parse_xml(path, name=name, max_bytes=MAX_BYTES)
+    except RpcFormatError as error:
+        raise ImageError(str(error)) from error
+    return vrt_from_xml(root, path.resolve().parent, name)
+
+
+def vrt_from_xml(root: Element, folder: Path, name: str) -> Vrt:
+    """As `read_vrt`, from the parsed document and the folder to which its sources are relative."""
+    if root.tag != "VRTDataset":
+        raise ImageError(f"{name}: <{root.tag}> where <VRTDataset> was expected")
+    _check(root, name)
+    return _Reader(folder, name).dataset(root)
+
+
+def _check(element: Element, name: str) -> None:
+    """Raise unless the element and all in it are of the grammar."""
+    tag = _GRAMMAR[element.tag]
+    for key, value in element.attrib.items():
+        if key not in tag.attributes:
+            raise _refused(name, f"<{element.tag} {key}=...>")
+        if not re.fullmatch(tag.attributes[key], value.strip()):
+            raise _refused(name, f"{key}={value[:60]!r} in <{element.tag}>")
+    text = [element.text or "", *(child.tail or "" for child in element)]
+    if not re.fullmatch(tag.text or "", "".join(text).strip()):
+        raise _refused(name, f"{''.join(text).strip()[:60]!r} in <{element.tag}>")
+    seen: set[str] = set()
+    for child in element:
+        if child.tag not in tag.children.split():
+            raise _refused(name, f"<{child.tag}> in <{element.tag}>")
+        if child.tag in seen and child.tag not in _REPEATED:
+            raise _refused(name, f"two <{child.tag}> in <{element.tag}>")
+        seen.add(child.tag)
+        _check(child, name)
+
+
+def _refused(name: str, what: str) -> ImageError:
+    return ImageError(f"{name}: a VRT with {what} is not read; give the images it is made of")
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Values of elements that passed `_check`."""
+
+    folder: Path
+    name: str
+
+    def dataset(self, root: Element) -> Vrt:
+        gcps = root.find("GCPList")
+        numbers = root.findtext("GeoTransform")
+        mask = root.find("MaskBand/VRTRasterBand")
+        width, height = (int(root.get(key, "0")) for key in ("rasterXSize", "rasterYSize"))
+        if not width or not height:
+            raise ImageError(f"{self.name}: a VRT without rasterXSize and rasterYSize")
+        bands = [self.band(e, i) for i, e in enumerate(root.iterfind("VRTRasterBand"), 1)]
+        if not bands:
+            raise ImageError(f"{self.name}: a VRT without bands")
+        return Vrt(
+            size=(width, height),
+            bands=tuple(bands),
+            mask=None if mask is None else self.band(mask, 1),
+            srs=root.findtext("SRS", "").strip(),
+            transform=tuple(map(float, numbers.split(","))) if numbers else None,
+            metadata=self.metadata(root),
+            gcp_srs="" if gcps is None else gcps.get("Projection", "").strip(),
+            gcps=() if gcps is None else tuple(dict(gcp.attrib) for gcp in gcps),
+        )
+
+    def metadata(self, root: Element) -> dict[str, dict[str, str]]:
+        found: dict[str, dict[str, str]] = {}
+        for element in root.iterfind("Metadata"):
+            domain = found.setdefault(element.get("domain", ""), {})
+            for item in element:
+                key = item.get("key", "")
+                if domain.setdefault(key, item.text or "") != (item.text or ""):
+                    raise ImageError(f"{self.name}: two values of {key!r} in the VRT")
+        return found
+
+    def band(self, element: Element, index: int) -> Band:
+        if int(element.get("band", index)) != index:
+            raise ImageError(
+                f"{self.name}: a VRT whose band {index} says that it is band {element.get('band')}"
+            )
+        nodata = element.findtext("NoDataValue")
+        value = None if nodata is None else float(nodata)
+        hidden = element.findtext("HideNoDataValue", "0").strip() == "1"
+        kind = element.get("dataType", "Byte")
+        colour = "Undefined" if element.find("ColorTable") is None else "Palette"
+        return Band(
+            dtype=next(key for key, name in GDAL_TYPES.items() if name == kind),
+            nodata=None if hidden else value,
+            fill=0.0 if value is None else value,
+            color=element.findtext("ColorInterp", colour).strip().lower(),
+            sources=tuple(self.source(e) for e in element if e.tag in ("SimpleSource", "ComplexSource")),
+        )
+
+    def source(self, element: Element) -> Source:
+        kind, _, number = element.findtext("SourceBand", "1").strip().rpartition(",")
+        nodata = element.findtext("NODATA")
+        src, dst = (self.rect(element.find(tag)) for tag in ("SrcRect", "DstRect"))
+        if src and dst and src[2:] != dst[2:]:
+            raise self.resampled()
+        scale = (float(element.findtext("ScaleRatio", "1")), float(element.findtext("ScaleOffset", "0")))
+        return Source(
+            file=self.file(element.find("SourceFilename")),
+            band=int(number),
+            mask=bool(kind),
+            src=src,
+            dst=dst,
+            plain=nodata is None and scale == (1.0, 0.0),
+            nodata=None if nodata is None else float(nodata),
+            scale=scale,
+        )
+
+    def rect(self, element: Element | None) -> Rect | None:
+        if element is None:
+            return None
+        values = [float(element.get(key, "nan")) for key in ("xOff", "yOff", "xSize", "ySize")]
+        if not all(abs(v) < 2**31 and abs(v - round(v)) <= _SHIFT for v in values):
+            raise self.resampled()
+        x, y, width, height = (round(v) for v in values)
+        return x, y, width, height
+
+    def resampled(self) -> ImageError:
+        return ImageError(
+            f"{self.name}: a VRT that resamples (SrcRect and DstRect are not the same whole pixels) is not read; "
+            "write it out as a GeoTIFF"
+        )
+
+    def file(self, element: Element | None) -> Path:
+        text = "" if element is None else element.text or ""
+        relative = element is not None and element.get("relativeToVRT", "0") == "1"
+        if not text or _INDIRECT.match(text) or not (relative or Path(text).is_absolute()):
+            raise ImageError(f"{self.name}: the VRT points at {text[:200]!r}, which is no plain local file")
+        return self.folder / text

@@ -1,0 +1,226 @@
+"""Whose a file is: barpc writes free names and replaces its own files; nothing comes before an input's RPC."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import rasterio
+
+from barpc.rpcio import read_rpc, read_rpc_source, write_rpc
+
+from .conftest import Said, assert_one_line, barpc, hashes
+from .test_interruption import ROOT, posix
+
+OTHERS = ("summary.json", "pairs.csv", "report.html", "footprints.geojson", "view_00_RPC.TXT", "view_00.vrt")
+
+
+def assert_untouched(folder: Path, before: dict[Path, str], said: Said, *words: str) -> None:
+    """One line with the way out, and not a file more or less."""
+    assert_one_line(said, 1, *words)
+    assert hashes([folder]) == before
+    assert not list(folder.rglob(".barpc*"))
+
+
+# -- the folder of the images --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("more", [(), ("--overwrite",)])
+@pytest.mark.parametrize("formats", ["txt", "rpb", "geom"])
+def test_the_folder_of_the_images_is_refused_before_any_work(crops, tmp_path, formats, more):
+    before = hashes([tmp_path])
+    said = barpc("adjust", *crops, "-o", crops[0].parent, "--rpc-format", formats, *more)
+    assert_untouched(tmp_path, before, said, "the input", "view_00.tif", "give another -o")
+
+
+def test_nor_by_another_name_of_folder_or_image(crops, tmp_path):
+    (tmp_path / "alias").symlink_to(crops[0].parent)
+    (tmp_path / "links").mkdir()
+    capitals = crops[0].rename(crops[0].with_name("VIEW_00.TIF"))
+    links = [tmp_path / "links" / f"{name}.tif" for name in ("one", "two")]
+    for link, image in zip(links, (capitals, crops[1]), strict=True):
+        link.symlink_to(image)
+    before = hashes([tmp_path])
+    cases = [
+        ([capitals, crops[1]], tmp_path / "alias"),
+        ([capitals, crops[1]], tmp_path / "in/../in"),
+        ([tmp_path / "alias/VIEW_00.TIF", tmp_path / "alias/view_01.tif"], tmp_path / "in"),
+        (links, tmp_path / "links"),
+    ]
+    for images, out in cases:
+        said = barpc("adjust", *images, "-o", out, "--overwrite")
+        assert_untouched(tmp_path, before, said, "the input", "give another -o")
+
+
+def test_nor_beside_an_image_that_is_no_input(crops, tmp_path):
+    """A product of another day that happens to have a view's name keeps its RPC."""
+    (tmp_path / "out").mkdir()
+    shutil.copy(crops[1], tmp_path / "out/view_00.tif")
+    before = hashes([tmp_path])
+    said = barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite")
+    assert_untouched(tmp_path, before, said, "out/view_00.tif", "give another -o")
+
+
+def test_a_folder_above_or_below_the_images_is_fine(crops, tmp_path):
+    before = hashes(crops)
+    for out, more in ((crops[0].parent / "below/out", ()), (tmp_path, ("--overwrite",))):
+        assert barpc("adjust", *crops, "-o", out, *more).code == 0
+        assert (out / "view_00_RPC.TXT").is_file()
+    assert hashes(crops) == before
+    assert [read_rpc_source(path).format for path in crops] == ["tag", "tag"]
+
+
+# -- files of others in the run folder -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_user_s_file_is_never_replaced_and_refused_by_name(crops, tmp_path, name):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("mine")
+    before = hashes([tmp_path])
+    said = barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite")
+    assert_untouched(tmp_path, before, said, name, "give another -o")
+
+
+@pytest.mark.parametrize("verb", ["adjust", "match"])
+def test_a_file_that_was_edited_is_refused_and_all_others_are_as_they_were(crops, tmp_path, verb):
+    out = tmp_path / "out"
+    assert barpc(verb, *crops, "-o", out).code == 0
+    edited = out / {"adjust": "view_00_RPC.TXT", "match": "asp/view_00__view_01.txt"}[verb]
+    edited.write_text(edited.read_text() + "\n")
+    before = hashes([tmp_path])
+    assert_one_line(barpc(verb, *crops, "-o", out, "--overwrite"), 1, edited.name, "changed since")
+    assert hashes([tmp_path]) == before
+    edited.unlink()
+    assert barpc(verb, *crops, "-o", out, "--overwrite").code == 0
+    assert edited.is_file()
+
+
+def test_a_folder_of_a_release_without_hashes_is_left_as_it_is(crops, tmp_path):
+    out = tmp_path / "out"
+    assert barpc("adjust", *crops, "-o", out).code == 0
+    state = json.loads((out / ".barpc/state.json").read_text())
+    (out / ".barpc/state.json").write_text(json.dumps({**state, "outputs": sorted(state["outputs"])}))
+    before = hashes([tmp_path])
+    assert_one_line(
+        barpc("adjust", *crops, "-o", out, "--overwrite"), 1, "not written by a run", "another -o"
+    )
+    assert hashes([tmp_path]) == before
+
+
+def test_a_prior_is_not_replaced_by_the_run_that_starts_from_it(crops, tmp_path):
+    out = tmp_path / "out"
+    assert barpc("adjust", *crops, "-o", out).code == 0
+    before = hashes([tmp_path])
+    said = barpc("adjust", *crops, "-o", out, "--fixed-run", out, "--overwrite")
+    assert_one_line(said, 1, "block.npz", "input")
+    assert hashes([tmp_path]) == before
+
+
+def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, tmp_path):
+    out = tmp_path / "out"
+    assert barpc("adjust", *crops, "-o", out).code == 0
+    assert barpc("report", out).code == 0
+    assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
+    (out / "report.html").write_text("mine")
+    assert_one_line(barpc("report", out), 1, "report.html", "not written")
+    assert (out / "report.html").read_text() == "mine"
+    (out / "report.html").unlink()
+    assert barpc("report", out).code == 0
+    assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
+
+
+@posix
+@pytest.mark.parametrize("step", [5, pytest.param(1, marks=pytest.mark.slow)])
+def test_killed_between_any_two_outputs_the_same_command_finishes(step):
+    """adjust in all formats, with copies, over a finished run; match, apply, simulate: the same bytes."""
+    command = [sys.executable, "-m", "tests.reliability.trials", "--every-output", str(step)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    for name, found in json.loads(done.stdout).items():
+        assert found["identical"] == found["killed"], name
+        assert found["killed"] >= found["outputs"] // step, name
+
+
+# -- verbs that write one file, or into a folder of images ---------------------------------------------
+
+
+def test_a_converted_rpc_is_written_beside_its_image_and_another_one_only_when_that_is_meant(crops):
+    image, target = crops[0], crops[0].with_name("view_00_RPC.TXT")
+    assert barpc("convert", image, target).code == 0  # the same RPC: nothing changes for the image
+    target.unlink()
+    before = hashes([image.parent])
+    said = barpc("convert", crops[1], target)
+    assert_one_line(said, 1, "view_00_RPC.TXT", "view_00.tif", "--overwrite")
+    assert_one_line(barpc("fit", image, "-o", target), 1, "view_00_RPC.TXT", "view_00.tif", "--overwrite")
+    assert_one_line(barpc("crop", image, target, "--window", 0, 0, 64, 64), 1, "view_00.tif")
+    assert_one_line(barpc("footprint", image, "-o", target), 1, "view_00.tif")
+    assert hashes([image.parent]) == before
+    said = barpc("convert", crops[1], target, "--overwrite")
+    assert said.code == 0
+    assert "is read in place of the RPC that" in said.err
+    assert (
+        read_rpc(image).project([[5.4, 43.3, 100]]).tolist()
+        == read_rpc(crops[1]).project([[5.4, 43.3, 100]]).tolist()
+    )
+
+
+@pytest.mark.parametrize("end", ["_RPC.TXT", ".RPB", ".geom"])
+@pytest.mark.parametrize("verb", ["convert", "fit", "footprint", "crop"])
+def test_the_vendor_s_file_of_an_input_is_never_replaced(crops, verb, end):
+    vendor = crops[0].with_name(f"view_00{end}")
+    write_rpc(read_rpc(crops[0]), vendor)
+    before = hashes([crops[0].parent])
+    more = {"convert": [crops[0], vendor], "crop": [crops[0], vendor, "--window", 0, 0, 64, 64]}
+    for target in (vendor, crops[0]):
+        words = [str(target) if word == vendor else word for word in more.get(verb, [crops[0], "-o", vendor])]
+        said = barpc(verb, *words, "--overwrite")
+        assert_one_line(said, 1, target.name, "never replaced")
+        assert hashes([crops[0].parent]) == before
+
+
+def test_apply_and_simulate_replace_their_own_files_only(crops, tmp_path):
+    out = tmp_path / "out"
+    verbs = {
+        "apply": ("apply", crops[0], "--rpc", crops[1], "-o", out / "apply"),
+        "simulate": ("simulate", out / "simulate", "--size", 64, 64),
+    }
+    for name, command in verbs.items():
+        assert barpc(*command).code == 0
+        assert_one_line(barpc(*command), 1, "--overwrite")
+        assert barpc(*command, "--overwrite").code == 0
+        mine = out / name / ("view_00_RPC.TXT" if name == "apply" else "truth.json")
+        mine.write_text("mine")
+        before = hashes([out])
+        assert_one_line(barpc(*command, "--overwrite"), 1, mine.name, "not replaced")
+        assert hashes([out]) == before
+
+
+def test_apply_adds_to_a_folder_and_hides_no_input(crops, tmp_path):
+    for image in crops:
+        assert barpc("apply", image, "--rpc", image, "-o", tmp_path / "out").code == 0
+    assert len(list((tmp_path / "out").glob("*.vrt"))) == 2
+    shutil.copy(crops[0], tmp_path / "copy.tif")
+    os.link(crops[0], tmp_path / "linked.tif")
+    (tmp_path / "alias").symlink_to(crops[0].parent)
+    before = hashes([tmp_path])
+    said = barpc("apply", tmp_path / "alias/view_00.tif", "--rpc", crops[1], "-o", tmp_path / "in")
+    assert_one_line(said, 1, "in")
+    said = barpc("apply", crops[0], "--rpc", tmp_path / "out", "-o", tmp_path / "out", "--overwrite")
+    assert_one_line(said, 1, "input")
+    assert hashes([tmp_path]) == before
+
+
+def test_gdal_sees_the_input_s_own_rpc_after_every_refusal(crops):
+    """The reason for all of it, by a reader that is not barpc's."""
+    with rasterio.open(crops[0]) as image:
+        own = image.rpcs.to_gdal()
+    barpc("adjust", *crops, "-o", crops[0].parent, "--overwrite")
+    barpc("convert", crops[1], crops[0].with_suffix(".RPB"))
+    with rasterio.open(crops[0]) as image:
+        assert image.rpcs.to_gdal() == own

@@ -1,0 +1,246 @@
+"""The same images give the same result, however they are listed; one image under two names is found."""
+
+from __future__ import annotations
+
+import csv
+import json
+import random
+import shutil
+from dataclasses import replace
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.errors import BarpcWarning, InputError
+from barpc.pipeline import AdjustResult, RunOptions, adjust, load_views, twins
+from barpc.pipeline.views import unique_names
+from barpc.rpcio import read_rpc, write_rpc_vrt
+from barpc.simulate import ImageOptions, write_scene
+
+from .conftest import barpc, rewrite
+from .trials import SAMPLES, crop, outputs
+
+START, SIDE = 150, 400
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """Three images, and everything a run may be given besides."""
+    folder = tmp_path_factory.mktemp("scene")
+    images = [crop(path, folder / path.name, side=SIDE, start=START) for path in SAMPLES]
+    points = json.loads((SAMPLES[0].parent / "gcps.geojson").read_text())
+    for feature in points["features"]:
+        feature["properties"]["ji"] = [value - START for value in feature["properties"]["ji"]]
+    points["features"] = [
+        f for f in points["features"] if all(0 <= value < SIDE for value in f["properties"]["ji"])
+    ]
+    assert len(points["features"]) >= 3
+    (folder / "gcps.geojson").write_text(json.dumps(points))
+    lon, lat = read_rpc(images[0]).localize(np.full(2, SIDE / 2.0), np.array(230.0))[:2]
+    square = [[lon + 6e-4 * x, lat + 6e-4 * y] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+    (folder / "area.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [square]}))
+    (folder / "pairs.txt").write_text("view_02 view_00\nview_01 view_00\n")
+    adjust(images[:2], folder / "earlier")
+    adjust(images, folder / "ties", RunOptions(stop_after="matching"))
+    (folder / "bad.tif").write_text("hello")
+    return folder
+
+
+def ways(scene: Path) -> dict[str, RunOptions]:
+    return {
+        "the defaults": RunOptions(),
+        "two passes": RunOptions(num_passes=2),
+        "given matches": RunOptions(matches=str(scene / "ties/matches.csv")),
+        "control points": RunOptions(gcp=(str(scene / "gcps.geojson"),)),
+        "a list of pairs": RunOptions(overlap_list=str(scene / "pairs.txt")),
+        "an area": RunOptions(aoi=str(scene / "area.geojson")),
+        "an earlier run": RunOptions(fixed_run=str(scene / "earlier")),
+        "a bad file": RunOptions(keep_going=True),
+    }
+
+
+SELDOM = ("two passes", "a list of pairs", "an area", "an earlier run")
+
+
+def images_of(scene: Path, way: str) -> list[Path]:
+    return [*sorted(scene.glob("view_*.tif")), *([scene / "bad.tif"] if way == "a bad file" else [])]
+
+
+@pytest.mark.parametrize(
+    "way", [pytest.param(way, marks=pytest.mark.slow) if way in SELDOM else way for way in ways(Path())]
+)
+def test_the_order_of_the_images_changes_no_byte(scene, tmp_path, way):
+    images = images_of(scene, way)
+    orders = list(permutations(images))
+    if way != "the defaults":
+        orders = [orders[0], random.Random(way).choice(orders[1:])]
+    files = []
+    for number, order in enumerate(orders):
+        result = adjust(order, tmp_path / str(number), ways(scene)[way])
+        files.append(outputs(tmp_path / str(number)))
+        given = [str(path) for path in order if path.name != "bad.tif"]
+        assert [view.path for view in result.views] == given
+    assert {"view_00_RPC.TXT", "view_00.vrt", "summary.json", "block.npz"} <= set(files[0])
+    assert all(other == files[0] for other in files[1:])
+
+
+@pytest.mark.slow
+def test_ten_images_in_ten_orders_give_the_same_bytes(tmp_path):
+    images = write_scene(tmp_path / "scene", ImageOptions(views=10, size=(400, 400), seed=3))
+    adjust(images, tmp_path / "sorted")
+    truth = outputs(tmp_path / "sorted")
+    for seed in range(10):
+        listed = tmp_path / "images.txt"
+        listed.write_text("\n".join(map(str, random.Random(seed).sample(images, 10))))
+        out = tmp_path / str(seed)
+        assert barpc("adjust", "--image-list", listed, "-o", out).code == 0
+        assert outputs(out) == truth
+
+
+def test_names_do_not_depend_on_the_order():
+    files = [Path("/d/a/x.tif"), Path("/d/b/x.tif"), Path("/e/b/x.tif"), Path("/x.tif")]
+    names = [dict(zip(order, unique_names(order), strict=True)) for order in permutations(files)]
+    assert all(other == names[0] for other in names)
+    assert len(set(names[0].values())) == len(files)
+
+
+def distance(first: AdjustResult, second: AdjustResult, names: dict[str, str] | None = None) -> float:
+    """Largest difference of two results on a grid over the images [px]."""
+    others, worst = {view.name: view for view in second.views}, 0.0
+    for view in first.views:
+        grid = np.stack(np.meshgrid(*(np.linspace(0, side - 1, 5) for side in view.size)), axis=-1)
+        ground = view.sensor.localize(grid.reshape(-1, 2), np.array(230.0))
+        other = others[view.name if names is None else names[view.name]].sensor
+        worst = max(worst, float(np.abs(other.project(ground) - grid.reshape(-1, 2)).max()))
+    return worst
+
+
+def test_the_order_of_rows_and_the_names_of_files_change_rounding_alone(scene, tmp_path):
+    images = images_of(scene, "given matches")
+    given = RunOptions(matches=str(scene / "ties/matches.csv"), gcp=(str(scene / "gcps.geojson"),))
+    result = adjust(images, tmp_path / "first", given)
+    head, *rows = csv.reader((scene / "ties/matches.csv").read_text().splitlines())
+    points = json.loads((scene / "gcps.geojson").read_text())
+    new = {"view_00": "z", "view_01": "a", "view_02": "m"}
+    random.Random(2).shuffle(rows)
+    random.Random(3).shuffle(points["features"])
+    renamed = [Path(shutil.copy(path, tmp_path / f"{new[path.stem]}.tif")) for path in images]
+    for feature in points["features"]:
+        feature["properties"]["filename"] = new[Path(feature["properties"]["filename"]).stem]
+    with (tmp_path / "m.csv").open("w") as file:
+        csv.writer(file).writerows([head, *([new[name], *more] for name, *more in rows)])
+    (tmp_path / "g.geojson").write_text(json.dumps(points))
+    other = replace(given, matches=str(tmp_path / "m.csv"), gcp=(str(tmp_path / "g.geojson"),))
+    assert distance(result, adjust(renamed, tmp_path / "second", other), new) < 1e-7
+
+
+# -- the same pixels ----------------------------------------------------------------------------------
+
+
+def other_camera(rpcs: rasterio.rpc.RPC) -> None:
+    rpcs.samp_off += 1.5
+
+
+def copied(source: Path, target: Path, **how: object) -> Path:
+    return rewrite(Path(shutil.copy(source, target)), camera=other_camera, **how)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"blockysize": 7},
+        {"tiled": True, "blockxsize": 64, "blockysize": 64, "compress": "lzw", "predictor": 2},
+        {"dtype": "int32", "compress": "deflate"},
+        {"dtype": "float64", "nodata": -1.0},
+        {"count": 2, "interleave": "pixel"},
+    ],
+    ids=str,
+)
+def test_the_same_pixels_in_other_dress_are_found(scene, tmp_path, how):
+    images = images_of(scene, "")
+    twin = copied(images[1], tmp_path / "twin.tif", **how)
+    for order in ([*images, twin], [twin, *images]):
+        with pytest.raises(
+            InputError, match=r"view_01\.tif: shows the same pixels as .*twin\.tif under another"
+        ):
+            load_views(order)
+
+
+def test_a_vrt_with_an_rpc_of_its_own_is_the_same_image(scene, tmp_path):
+    images = images_of(scene, "")
+    twin = tmp_path / "twin.vrt"
+    write_rpc_vrt(read_rpc(images[1]), images[0], twin)
+    said = barpc("adjust", *images, twin, "-o", tmp_path / "out", "--keep-going", "--json")
+    assert said.code == 3
+    left = json.loads(said.out)["left_out"]
+    assert [Path(entry["path"]).name for entry in left] == ["view_00.tif", "view_01.tif"]
+    assert "same pixels" in left[0]["reason"]
+    assert "the same RPC" in left[1]["reason"]
+
+
+def test_cameras_of_one_image_may_be_compared_with_others(scene, tmp_path):
+    image = images_of(scene, "")[0]
+    twin = tmp_path / "view_00.vrt"
+    write_rpc_vrt(read_rpc(image), image, twin)
+    assert barpc("check", image, twin, "--against", scene).code == 0
+
+
+def test_images_that_are_nearly_empty_are_no_twins(scene, tmp_path, monkeypatch):
+    """Each is read whole once, however many there are."""
+    reads = []
+    whole = twins._whole
+    monkeypatch.setattr(twins, "_whole", lambda image, band: reads.append(image.name) or whole(image, band))
+    images = []
+    for number in range(8):
+
+        def corner(values: np.ndarray, number: int = number) -> np.ndarray:
+            kept = np.zeros_like(values)
+            kept[:40, :40] = values[number : number + 40, :40]
+            return kept if number < 6 else np.zeros_like(values)  # and two that show nothing at all
+
+        def camera(rpcs: rasterio.rpc.RPC, number: int = number) -> None:
+            rpcs.samp_off += number
+
+        target = Path(shutil.copy(scene / "view_00.tif", tmp_path / f"v{number}.tif"))
+        images.append(rewrite(target, pixels=corner, camera=camera, nodata=0))
+    assert len(load_views(images).views) == 8
+    assert sorted(reads) == sorted(map(str, images))
+    twin = copied(images[3], tmp_path / "w.tif")
+    with pytest.raises(InputError, match=r"w\.tif: shows the same pixels as .*v3\.tif"):
+        load_views([*images, twin])
+
+
+def test_an_image_in_which_only_nan_differs_is_no_twin(scene, tmp_path):
+    """NaN compares with itself here, wherever it stands."""
+
+    def holes(at: int):
+        def change(values: np.ndarray) -> np.ndarray:
+            values[at, at] = np.nan
+            return values
+
+        return change
+
+    make = {"dtype": "float32", "camera": other_camera}
+    first = rewrite(
+        Path(shutil.copy(scene / "view_00.tif", tmp_path / "a.tif")), pixels=holes(3), dtype="float32"
+    )
+    second = rewrite(Path(shutil.copy(scene / "view_00.tif", tmp_path / "b.tif")), pixels=holes(4), **make)
+    third = rewrite(Path(shutil.copy(scene / "view_00.tif", tmp_path / "c.tif")), pixels=holes(3), **make)
+    assert len(load_views([first, second]).views) == 2
+    with pytest.raises(InputError, match="same pixels"):
+        load_views([first, third])
+
+
+def test_a_part_of_an_image_is_named_in_the_verdict(scene, tmp_path):
+    images = images_of(scene, "")
+    part = crop(SAMPLES[0], tmp_path / "part.tif", side=300, start=START + 60)
+    with pytest.warns(BarpcWarning, match="held in height"):
+        summary = adjust([*images, part], tmp_path / "out").summary
+    advice = {view["name"]: view["advice"] for view in summary["views"]}
+    assert advice["part"].startswith("shows the same pixels as view_00, moved by 60 columns and 60 rows")
+    assert advice["view_00"].startswith("shows the same pixels as part, moved by -60 columns and -60 rows")
+    assert advice["view_01"] == ""
+    assert advice["view_02"] == ""
