@@ -7,6 +7,7 @@ known, or heights that had to be taken as they are, raise a loud warning.
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Callable
@@ -16,6 +17,8 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from rasterio import Affine
+from rasterio._err import CPLE_BaseError
 from rasterio.errors import CRSError
 from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
@@ -24,11 +27,13 @@ from barpc.errors import BarpcWarning, InputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
 from barpc.sensor import SensorModel
+from barpc.sidefile import GRID, opened, read_head
 
 _HGT_NAME = re.compile(r"([NS])(\d{2})([EW])(\d{3})", re.IGNORECASE)
 _HGT_VOID = -32768
 _GTX_VOID = -88.8888
 _MAX_CELLS = 400_000_000
+_FAR = 1e12  # no coordinate [m or deg] comes near
 _VERTICAL = re.compile(r'(?:VERTCRS|VERT_CS|VERTICALCRS)\s*\[\s*"([^"]+)"')
 
 
@@ -71,8 +76,7 @@ class Grid:
             The raster cannot be read.
         """
         path = Path(path)
-        if not path.is_file():
-            raise InputError(f"{path}: no such file")
+        read_head(path, GRID, 0)  # a regular file
         opener = {".hgt": _open_hgt, ".gtx": _open_gtx}.get(path.suffix.lower(), _open_raster)
         return opener(path)
 
@@ -129,12 +133,13 @@ def _snapped(index: Array) -> Array:
 
 def _open_hgt(path: Path) -> Grid:
     name = _HGT_NAME.match(path.name)
-    side = {2 * 1201**2: 1201, 2 * 3601**2: 3601}.get(path.stat().st_size)
-    if name is None or side is None:
-        raise InputError(f"{path}: no SRTM tile (a name as N44E005.hgt and 1201 or 3601 nodes a side)")
+    with opened(path, GRID) as file:
+        side = {2 * 1201**2: 1201, 2 * 3601**2: 3601}.get(os.fstat(file.fileno()).st_size)
+        if name is None or side is None:
+            raise InputError(f"{path}: no SRTM tile (a name as N44E005.hgt and 1201 or 3601 nodes a side)")
+        data = np.memmap(file, dtype=">i2", mode="r", shape=(side, side))
     south = int(name[2]) * (1 if name[1].upper() == "N" else -1)
     west = int(name[4]) * (1 if name[3].upper() == "E" else -1)
-    data = np.memmap(path, dtype=">i2", mode="r", shape=(side, side))
 
     def read(top: int, bottom: int, left: int, right: int) -> Array:
         part = data[top:bottom, left:right]
@@ -147,18 +152,18 @@ def _open_hgt(path: Path) -> Grid:
 
 
 def _open_gtx(path: Path) -> Grid:
-    with path.open("rb") as file:
+    with opened(path, GRID) as file:
         head = file.read(40)
-    if len(head) < 40:
-        raise InputError(f"{path}: no GTX grid (shorter than its header)")
-    south, west, step_lat, step_lon = np.frombuffer(head, ">f8", 4).tolist()
-    rows, cols = (int(n) for n in np.frombuffer(head, ">i4", 2, 32))
-    if (
-        not (rows > 1 and cols > 1 and step_lat > 0 and step_lon > 0)
-        or path.stat().st_size != 40 + 4 * rows * cols
-    ):
-        raise InputError(f"{path}: no GTX grid (its header does not go with its size)")
-    data = np.memmap(path, dtype=">f4", mode="r", offset=40, shape=(rows, cols))
+        if len(head) < 40:
+            raise InputError(f"{path}: no GTX grid (shorter than its header)")
+        south, west, step_lat, step_lon = np.frombuffer(head, ">f8", 4).tolist()
+        rows, cols = (int(n) for n in np.frombuffer(head, ">i4", 2, 32))
+        places = abs(south) <= 90 and abs(west) <= 360 and 1e-6 <= step_lat <= 180 and 1e-6 <= step_lon <= 360
+        if not (places and rows > 1 and cols > 1):
+            raise InputError(f"{path}: no GTX grid (its header is no grid of longitudes and latitudes)")
+        if os.fstat(file.fileno()).st_size != 40 + 4 * rows * cols:
+            raise InputError(f"{path}: no GTX grid (its header does not go with its size)")
+        data = np.memmap(file, dtype=">f4", mode="r", offset=40, shape=(rows, cols))
     turn = 360.0 / step_lon
     around = round(turn) if cols >= round(turn) - 1e-6 else 0
 
@@ -174,13 +179,13 @@ def _open_gtx(path: Path) -> Grid:
 
 def _open_raster(path: Path) -> Grid:
     with open_raster(path) as dataset:
-        crs, shape, inverse = dataset.crs, dataset.shape, ~dataset.transform
-        extent = dataset.bounds
+        crs, shape, forward, extent = dataset.crs, dataset.shape, dataset.transform, dataset.bounds
         if crs is None:
             raise InputError(f"{path}: a DEM or geoid grid needs a CRS, and this raster has none")
+    inverse = _inverse(forward, path)
     around = 0.0
     geographic = bool(crs.is_geographic)
-    if geographic and extent.right - extent.left >= 360.0 - abs(1.0 / inverse.a) / 2:
+    if geographic and inverse.a and extent.right - extent.left >= 360.0 - abs(1.0 / inverse.a) / 2:
         around = float(round(360.0 * abs(inverse.a)))
 
     def read(top: int, bottom: int, left: int, right: int) -> Array:
@@ -195,7 +200,7 @@ def _open_raster(path: Path) -> Grid:
         else:
             try:
                 found = warp_points("EPSG:4326", crs, lon, lat)
-            except CRSError as error:
+            except (CRSError, CPLE_BaseError) as error:
                 raise InputError(f"{path}: lon, lat cannot be brought into its CRS ({error})") from error
             x, y = np.asarray(found[0]), np.asarray(found[1])
         return (
@@ -204,6 +209,15 @@ def _open_raster(path: Path) -> Grid:
         )
 
     return Grid(path, shape, read, locate, _vertical_reference(crs.to_wkt()), around)
+
+
+def _inverse(forward: Affine, path: Path) -> Affine:
+    """From coordinates to pixels, where the way there has one."""
+    numbers = np.array(forward[:6])
+    area = abs(forward.determinant)
+    if np.isfinite(numbers).all() and np.abs(numbers).max() <= _FAR and area >= _FAR**-2:
+        return ~forward
+    raise InputError(f"{path}: its geotransform {tuple(forward[:6])} maps no grid of nodes")
 
 
 def _vertical_reference(wkt: str) -> str:

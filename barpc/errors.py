@@ -21,9 +21,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+_LONGEST = 1500  # characters of a message
+
 
 class BarpcError(Exception):
     """Base of all errors that barpc raises on purpose."""
+
+    def __str__(self) -> str:
+        """One printable line of bounded length, whatever a damaged file has put into the message."""
+        text = super().__str__()
+        if len(text) > _LONGEST:
+            text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 class RpcError(BarpcError, ValueError):

@@ -8,7 +8,9 @@ reading.
 from __future__ import annotations
 
 import json
+import math
 import sys
+import zipfile
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -16,30 +18,68 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib import format as npy
+
+from barpc.errors import BarpcError
+from barpc.sidefile import ARRAYS, Kind, opened
 
 Record = dict[str, npt.NDArray[Any]]
 """Named plain arrays: what an ``.npz`` file holds."""
 
 _FRAME = "frame"
+_DEFLATE = 1032  # bytes at most that one byte of a deflated stream stands for
+_HEADER = 1 << 12
 
 
-def load_npz(path: Path | str) -> Record:
+def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Record:
     """The arrays of an ``.npz`` file; nothing in it is ever run.
+
+    What the archive claims is added up before anything is unpacked: a file of a few kilobytes can hold gigabytes
+    of zeros.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file.
+    kind : Kind
+        What it should be; the arrays may have as many bytes as it allows, unpacked.
 
     Raises
     ------
-    OSError
-        The file cannot be read.
-    ValueError
-        It is no archive of plain arrays, or damaged.
+    BarpcError
+        Of the class of `kind`: it is missing, no archive of plain arrays, damaged, or too large.
     """
-    try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except OSError:
-        raise
-    except Exception as error:  # zipfile, zlib and numpy have a dozen kinds for a damaged archive
-        raise ValueError(f"{type(error).__name__}: {error}") from error
+    with opened(path, kind) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                members = archive.infolist()
+                kind.check(f"{path}, unpacked", sum(member.file_size for member in members))
+                return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+        except BarpcError:
+            raise
+        except Exception as error:
+            raise kind.error(
+                f"{path}: not {kind.words} (.npz) that can be read ({type(error).__name__}: {error})"
+            ) from error
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
+    """A member, after its header was found to claim as many bytes as the archive does."""
+    packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: _DEFLATE}.get(member.compress_type)
+    if packed is None or member.file_size > packed * member.compress_size + _HEADER:
+        raise ValueError(f"{member.filename} claims more bytes than it can hold")
+    with archive.open(member) as file:
+        version = npy.read_magic(file)
+        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
+        shape, _, dtype = read_header(file)
+        if dtype.hasobject:
+            raise ValueError(f"{member.filename} holds Python objects")
+        if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
+            raise ValueError(
+                f"{member.filename} holds another number of bytes than its shape {shape} asks for"
+            )
+    with archive.open(member) as file:
+        return np.asarray(npy.read_array(file, allow_pickle=False))
 
 
 def to_record(value: Any) -> Record:
@@ -78,7 +118,7 @@ def from_record(record: Mapping[str, npt.NDArray[Any]]) -> Any:
     try:
         frame = json.loads(np.asarray(record[_FRAME], dtype=np.uint8).tobytes())
         return _decode(frame, record)
-    except (KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
+    except (KeyError, TypeError, AttributeError, IndexError, RecursionError, UnicodeDecodeError) as error:
         raise ValueError(f"not a stage result: {error!r}") from error
 
 

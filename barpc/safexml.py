@@ -10,15 +10,32 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from barpc.errors import RpcFormatError
+from barpc.sidefile import Kind, read_bytes
 
 MAX_BYTES = 32 << 20
-"""Largest XML read by default [bytes]; the largest in use, a day of precise orbits, has 5 MB."""
+"""Largest XML read [bytes]; the largest in use, a day of precise orbits, has 5 MB."""
 
-_CHUNK = 1 << 16
+
+_MAX_DEPTH = 100
+_MAX_ELEMENTS = 2_000_000
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """Refuses a document type also where the encoding hides it from a search of the bytes."""
+    """Refuses trees that are too large, and a document type that the encoding hides from a search of the bytes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._depth = self._count = 0
+
+    def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
+        self._depth, self._count = self._depth + 1, self._count + 1
+        if self._depth > _MAX_DEPTH or self._count > _MAX_ELEMENTS:
+            raise ElementTree.ParseError(f"{self._count} elements, {self._depth} deep: too many")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str) -> ElementTree.Element:
+        self._depth -= 1
+        return super().end(tag)
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         raise ElementTree.ParseError("it declares a DOCTYPE")
@@ -54,15 +71,18 @@ def parse_xml(
         Not a readable file, too large, a DOCTYPE, or not well-formed XML. The message names the file.
     """
     name = name or (str(source) if isinstance(source, Path) else "XML document")
-    data = _read(source, name, max_bytes) if isinstance(source, Path) else source
+    data = (
+        read_bytes(source, Kind("an XML file", max_bytes, RpcFormatError))
+        if isinstance(source, Path)
+        else source
+    )
     if len(data) > max_bytes:
         raise RpcFormatError(f"{name}: {len(data)} bytes of XML, at most {max_bytes} are read")
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise RpcFormatError(f"{name}: refused, it declares a DOCTYPE; remove the declaration")
     parser = ElementTree.XMLParser(target=_Builder())  # noqa: S314 - no DOCTYPE, so no entities
     try:
-        for start in range(0, len(data), _CHUNK):
-            parser.feed(data[start : start + _CHUNK])
+        parser.feed(data)  # at once: expat before 2.6 looks at an unfinished token again with every part
         root: ElementTree.Element = parser.close()
     except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise RpcFormatError(f"{name}: not an XML document that can be read ({error})") from error
@@ -70,14 +90,3 @@ def parse_xml(
         for element in root.iter():
             element.tag = element.tag.rpartition("}")[2]
     return root
-
-
-def _read(path: Path, name: str, max_bytes: int) -> bytes:
-    """The bytes of a regular file, one more than `max_bytes` at most."""
-    try:
-        if not path.is_file():
-            raise RpcFormatError(f"{name}: no such file")
-        with path.open("rb") as file:
-            return file.read(max_bytes + 1)
-    except OSError as error:
-        raise RpcFormatError(f"{name}: cannot be read ({error.strerror})") from error

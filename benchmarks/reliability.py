@@ -1,12 +1,11 @@
 """The longer sweeps behind docs/reliability.md: kills, damaged input, what a task costs on its way, memory.
 
     python benchmarks/reliability.py kill --trials 200 --jobs 1     # SIGKILL, the same command, same bytes
-    python benchmarks/reliability.py fuzz --runs 1000000            # damaged options, GCPs, tie points
+    python benchmarks/reliability.py fuzz --runs 1000000            # damaged files of every kind
     python benchmarks/reliability.py task                           # a task in a pool and over dask, by batch
     python benchmarks/reliability.py memory IMAGE IMAGE --jobs 4    # peak memory of a run with its workers
 
-Under atheris, with coverage, the fuzzers run as `python -m tests.reliability.fuzzing --atheris FOLDER
--atheris_runs=1000000 -max_len=4000` and `python -m tests.fuzz.run_atheris FOLDER -atheris_runs=1000000`.
+Under atheris, with coverage, the fuzzer runs as `python -m tests.fuzz --atheris FOLDER -atheris_runs=1000000`.
 """
 
 from __future__ import annotations
@@ -111,7 +110,7 @@ def main() -> None:
     if given.verb == "kill":
         run_module("tests.reliability.trials", given.trials, "--jobs", given.jobs)
     elif given.verb == "fuzz":
-        run_module("tests.reliability.fuzzing", given.runs)
+        run_module("tests.fuzz", given.runs)
     elif given.verb == "task":
         cost_of_a_task()
     else:

@@ -48,6 +48,6 @@ def test_a_hostile_or_broken_document_is_refused_by_name(document: bytes) -> Non
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "no.xml", tmp_path):
-        with pytest.raises(RpcFormatError, match="no such file"):
+    for path, words in ((tmp_path / "no.xml", "no such file"), (tmp_path, "a folder")):
+        with pytest.raises(RpcFormatError, match=words):
             parse_xml(path)

@@ -18,10 +18,12 @@ from barpc.ba.solve import free_part
 from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.record import load_npz
+from barpc.sidefile import ARRAYS
 
 if TYPE_CHECKING:
     from barpc.ba.result import Adjustment
 
+PRIOR = replace(ARRAYS, words="the prior of an adjusted block")
 _FIELDS = ("params", "information", "center")
 
 
@@ -67,12 +69,28 @@ class BlockPrior:
         InputError
             The file is missing or holds something else.
         """
+        file = load_npz(path, PRIOR)
         try:
-            file = load_npz(path)
             names = tuple(str(name) for name in file["names"])
-            return cls(names, str(file["model"]), int(file["drift"]), *(file[name] for name in _FIELDS))
-        except (OSError, KeyError, ValueError, TypeError) as error:
+            prior = cls(names, str(file["model"]), int(file["drift"]), *(file[name] for name in _FIELDS))
+        except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
+        if not prior._is_whole():
+            raise InputError(f"{path}: not the prior of an adjusted block (its arrays do not go together)")
+        return prior
+
+    def _is_whole(self) -> bool:
+        """Whether the arrays have the shapes that the names ask for, and hold numbers that a prior can."""
+        n, q = len(self.names), self.params.shape[-1] if self.params.ndim else 0
+        shapes = {"params": (n, q), "information": (n * q, n * q), "center": (n, 3)}
+        arrays = [getattr(self, name) for name in shapes]
+        return (
+            n * q > 0
+            and len(set(self.names)) == n
+            and all(array.shape == shape for array, shape in zip(arrays, shapes.values(), strict=True))
+            and all(array.dtype == np.float64 and np.isfinite(array).all() for array in arrays)
+            and bool((np.diag(self.information) > 0).all())
+        )
 
 
 def block_prior(adjustment: Adjustment) -> BlockPrior:
@@ -118,11 +136,16 @@ def apply_prior(
     missing = sorted(set(prior.names) - set(names))
     if missing:
         raise InputError(f"views of the earlier block are missing: {', '.join(missing[:10])}")
+    size = prior.params.shape[1]
+    if size != cameras.mean.shape[1]:
+        raise InputError(f"the earlier block has {size} unknowns a view, not {cameras.mean.shape[1]}")
+    try:
+        root = la.cholesky(prior.information)
+    except la.LinAlgError as error:
+        raise InputError(f"the earlier block's information is damaged ({error})") from error
     place = {name: i for i, name in enumerate(names)}
     views = np.array([place[name] for name in prior.names])
-    size = prior.params.shape[1]
     mean, sigma = cameras.mean.copy(), cameras.sigma.copy()
     mean[views], sigma[views] = prior.params, np.inf
     index = (views[:, None] * size + np.arange(size)).ravel()
-    root = la.cholesky(prior.information)
     return replace(cameras, mean=mean, sigma=sigma), JointPrior(index, prior.params.ravel(), root)

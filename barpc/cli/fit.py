@@ -193,8 +193,9 @@ def _is_sentinel1(source: Path) -> bool:
         return True
     if source.suffix.lower() != ".xml" or not source.is_file():
         return False
-    with source.open("rb") as file:
-        return b"<adsHeader>" in file.read(4096)
+    from barpc.sidefile import IMAGE, read_head
+
+    return b"<adsHeader>" in read_head(source, IMAGE, 4096)
 
 
 def _camera(source: Path, flags: dict[str, Any]) -> tuple[SensorModel, tuple[int, int], tuple[float, float]]:

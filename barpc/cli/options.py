@@ -153,15 +153,11 @@ _RUN_OPTIONS = (
 
 def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
     """Images of the command line, then those of a list file (blank lines and # comments are skipped)."""
-    from barpc.errors import InputError
+    from barpc.sidefile import read_names
 
     paths = list(images)
     if image_list is not None:
-        try:
-            lines = Path(image_list).read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{image_list}: not a list of images: {error}") from error
-        folder = Path(image_list).parent
+        folder, lines = Path(image_list).parent, read_names(image_list, "a list of images")
         paths += [str(folder / line.strip()) for line in lines if line.strip() and not line.startswith("#")]
     return paths
 

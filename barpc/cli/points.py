@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +21,7 @@ from barpc.geodesy import Array
 from barpc.raster import open_raster
 from barpc.rpcio import FORMATS, RpcSource, hidden_by, read_rpc_source, sidecars
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import TABLE, opened_text
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -135,8 +137,7 @@ def read_points(
     points : (N, len(names))
     """
     if file is not None:
-        stream = sys.stdin if file == "-" else _open(file)
-        with stream:
+        with nullcontext(sys.stdin) if file == "-" else opened_text(file, TABLE, newline="") as stream:
             return _table(stream, file, names, fill)
     width = len(names) if fill is None else len(names) - 1
     if not numbers or len(numbers) % width:
@@ -144,13 +145,6 @@ def read_points(
         raise click.UsageError(f"{len(numbers)} numbers; give {wanted} of each point, or --points FILE")
     points = np.array(numbers, dtype=np.float64).reshape(-1, width)
     return points if fill is None else np.column_stack([points, np.full(len(points), fill)])
-
-
-def _open(file: str) -> Any:
-    try:
-        return Path(file).open(encoding="utf-8-sig", newline="")
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror})") from error
 
 
 def _table(lines: Iterable[str], file: str, names: Sequence[str], fill: float | None) -> Array:

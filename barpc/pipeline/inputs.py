@@ -17,6 +17,7 @@ from barpc.pointio.gcp import read_gcps
 from barpc.pointio.names import ViewNames
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint
+from barpc.sidefile import read_names
 
 PRIOR = "block.npz"
 """The file in a run folder that a later run starts from."""
@@ -116,10 +117,7 @@ def read_pairs(
     InputError
         The file cannot be read, a line is not two images of the run, or none is left; the message names it.
     """
-    try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a list of pairs: {error}") from error
+    lines = read_names(path, "a list of pairs")
     find = _ViewFinder(Path(path).parent, views, left_out)
     pairs = []
     for number, line in enumerate(lines, start=1):

@@ -10,9 +10,12 @@ from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from barpc.ba import AdjustOptions
-from barpc.errors import InputError
+from barpc.errors import FitError, InputError
 from barpc.fit import FitOptions
+from barpc.sidefile import OPTIONS, read_text
 from barpc.tie import TieOptions
+
+_MOST = 1 << 53
 
 IMAGES = ("vrt", "copy", "none")
 STAGES = ("matching", "adjustment", "all")
@@ -129,7 +132,7 @@ def with_values(options: Any, values: Mapping[str, Any], where: str = "options")
             changed[name] = _as(kinds[name], value, f"{where}: {name}")
     try:
         return replace(options, **changed)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, FitError) as error:
         raise InputError(f"{where}: {error}") from error
 
 
@@ -148,6 +151,8 @@ def _as(kind: Any, value: Any, where: str) -> Any:
         if not isinstance(value, Mapping):
             raise InputError(f"{where} must be a table, found {value!r}")
         return {str(key): _as(parts[1], item, f"{where}.{key}") for key, item in value.items()}
+    if type(value) is int and abs(value) >= _MOST:
+        raise InputError(f"{where} is a whole number beyond {_MOST}")
     if kind is float and type(value) is int:
         value = float(value)
     if type(value) is not kind or value != value:  # NaN
@@ -173,9 +178,10 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
     InputError
         The file does not exist or parse, or names an option that does not exist.
     """
+    text = read_text(path, OPTIONS)
     try:
-        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # a date or a number that is none is not its own class
         raise InputError(f"{path}: not an options file (TOML): {error}") from error
     result: RunOptions = with_values(options or RunOptions(), data, str(path))
     return result

@@ -150,6 +150,7 @@ def adjust(
             with workspace.output(PRIOR) as partial:
                 block_prior(run.adjustment).save(partial)
         run = replace(run, stages=workspace.stages, out_dir=str(out_dir))
+        logger.info("summary, tables and report ...")
         summary = summarize(run)
         write_tables(workspace, run, summary)
         workspace.remove_stale()

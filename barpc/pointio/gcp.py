@@ -6,7 +6,6 @@ them; GDAL leaves the meaning of its tags to the application. Altitudes are elli
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from barpc.errors import InputError
 from barpc.pointio.names import ViewNames
 from barpc.raster import open_raster
 from barpc.scene import GroundPoints
+from barpc.sidefile import GEOJSON, TABLE, read_head, read_json, read_text
 
 GROUND_SIGMA = 1.0
 """East, north, up standard deviation [m] of a GCP whose file states none."""
@@ -69,16 +69,9 @@ def read_gcps(
         The file does not parse, or holds no point of these views.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    head = read_head(path, TABLE, _HEAD)
     views = ViewNames(names, str(path))
-    try:
-        found = list(_reader(head)(path, views))
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text of GCPs ({error})") from error
+    found = list(_reader(head)(path, views))
     if not found:
         raise InputError(f"{path}: no GCP of {', '.join(names[:10])}")
     try:
@@ -97,7 +90,7 @@ def _reader(head: bytes) -> Callable[[Path, ViewNames], Iterator[_Point]]:
 
 def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
     """Lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
-    for number, raw in enumerate(path.read_text(encoding="utf-8-sig").split("\n"), start=1):
+    for number, raw in enumerate(read_text(path, TABLE).split("\n"), start=1):
         words = re.split(r"(?:^|\s)#", raw, maxsplit=1)[0].replace(",", " ").split()
         if not words:
             continue
@@ -121,8 +114,9 @@ def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
 
 def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
     """Features with a 3-D point and the properties `ji` (col, row), `filename` and `id`."""
+    document = read_json(path, GEOJSON)
     try:
-        features = json.loads(path.read_text(encoding="utf-8-sig"))["features"]
+        features = document["features"]
         for n, feature in enumerate(features):
             lon, lat, alt = (float(value) for value in feature["geometry"]["coordinates"])
             properties = feature["properties"]
@@ -131,7 +125,7 @@ def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
             if view is not None:
                 name = str(properties.get("id") or f"gcp_{n + 1}")
                 yield _Point(name, (lon, lat, alt), (GROUND_SIGMA,) * 3, view, (col, row), IMAGE_SIGMA)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path}: not a GeoJSON of GCPs with ji, filename and 3-D points ({error!r})"
         ) from error

@@ -20,6 +20,7 @@ from barpc.geodesy import Array
 from barpc.pointio.names import ViewNames, cell, from_cell
 from barpc.record import load_npz
 from barpc.scene import IntArray, Tracks
+from barpc.sidefile import TABLE, opened_text, read_text
 
 SIGMA = 0.5
 """Standard deviation of each coordinate [px] where the file states none."""
@@ -60,7 +61,7 @@ def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA
             view, point, xy, spread = _read_asp([path], views, sigma)
         else:
             view, point, xy, spread = _read_csv(path, views, sigma)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as tie points ({error})") from error
     if not (np.isfinite(xy).all() and np.isfinite(spread).all() and (spread > 0).all()):
         raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
@@ -136,7 +137,7 @@ Columns = tuple[IntArray, IntArray, Array, Array]
 
 
 def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
-    with path.open(encoding="utf-8-sig", newline="") as text:
+    with opened_text(path, TABLE, newline="") as text:
         lines = csv.reader(line for line in text if line.strip() and not line.startswith("#"))
         header = [word.strip().lower() for word in next(lines, [])]
         missing = [name for name in _COLUMNS if name not in header]
@@ -170,10 +171,19 @@ def _read_npz(path: Path, views: ViewNames, sigma: float) -> Columns:
     try:
         file = load_npz(path)
         own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
-        view, point = own[file["view"].astype(np.int64)], file["track"].astype(np.int64)
-        xy = np.asarray(file["xy"], dtype=np.float64).reshape(len(view), 2)
-        spread = np.asarray(file["sigma"], dtype=np.float64) if "sigma" in file else np.full(len(view), sigma)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
+        index, point = (np.asarray(file[key], dtype=np.int64) for key in ("view", "track"))
+        xy = np.asarray(file["xy"], dtype=np.float64)
+        spread = (
+            np.asarray(file["sigma"], dtype=np.float64) if "sigma" in file else np.full(len(index), sigma)
+        )
+        if {(*index.shape, 2), (*point.shape, 2), (*spread.shape, 2), xy.shape} != {(len(xy), 2)}:
+            raise ValueError(f"shapes {index.shape}, {point.shape}, {xy.shape}, {spread.shape}")
+        if len(index) and not 0 <= index.min() <= index.max() < len(own):
+            raise ValueError("a view that has no name")
+        view = own[index]
+    except (KeyError, ValueError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({error})") from error
     keep = view >= 0
     return view[keep], point[keep], xy[keep], spread[keep]
@@ -221,7 +231,7 @@ def _asp_images(path: Path, views: ViewNames) -> tuple[str, str]:
 def _asp_points(path: Path) -> tuple[Array, Array]:
     """Points (M, 2) of both images: counts on the first line, then one keypoint a line, col and row first."""
     try:
-        lines = path.read_text(encoding="utf-8").split("\n")
+        lines = read_text(path, TABLE).split("\n")
         left, right = (int(word) for word in lines[0].split()[:2])
         rows = [line.split()[:2] for line in lines[1:] if line.strip()]
         points = np.array(rows, dtype=np.float64).reshape(-1, 2)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,9 +17,10 @@ from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
 from barpc.record import load_npz
+from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
 
-MAX_BYTES = 512 << 20
-"""Larger tables are refused [bytes]."""
+_FAR = 1e9  # px and m: no node comes near
+GRID_POINTS = Kind("a localisation grid", TABLE.most)
 
 _COLUMNS = {
     "lon": ("lon", "long", "longitude", "lng"),
@@ -74,17 +74,12 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
         raise InputError(f"{path}: neither a table of points (CSV, npz, GeoJSON) nor a localisation grid")
     if kind == "grid":
         return read_grid(path, altitudes)
-    if path.stat().st_size > MAX_BYTES:
-        raise InputError(f"{path}: more than {MAX_BYTES >> 20} MB, too large for a table of points")
     return READERS[kind](path)
 
 
 def correspondence_kind(path: Path, altitudes: Sequence[float] | None = None) -> str | None:
     """What a file is: a row of `READERS`, "grid", or None for neither (an image or an RPC file)."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    with path.open("rb") as file:
-        head = file.read(65536)
+    head = read_head(path, TABLE, 65536)
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         with open_raster(path) as dataset:
             return "grid" if altitudes is not None or "ALTITUDE_B0" in dataset.tags() else None
@@ -129,7 +124,7 @@ def read_csv(path: Path) -> Correspondences:
     """A text table: separated by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
     rows: list[list[float]] = []
     columns: dict[str, int] = {}
-    for number, raw in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+    for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
         words = _split(raw.split("#", 1)[0])
         if not words:
             continue
@@ -149,35 +144,48 @@ def read_csv(path: Path) -> Correspondences:
     if not rows:
         raise InputError(f"{path}: no points in it")
     table = np.array(rows)
-    return _assembled({name: table[:, i] for i, name in enumerate(columns)})
+    return _assembled(path, {name: table[:, i] for i, name in enumerate(columns)})
 
 
 def read_npz(path: Path) -> Correspondences:
     """Arrays ``ground`` (N, 3) and ``image`` (N, 2), or one array a column; ``sigma`` (N,) if known."""
     try:
         arrays = {name: np.asarray(value, dtype=np.float64) for name, value in load_npz(path).items()}
-    except (OSError, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: not an npz of numbers ({error})") from error
     if "ground" in arrays and "image" in arrays:
-        return Correspondences(arrays["ground"], arrays["image"], arrays.get("sigma"))
+        return _checked(path, arrays["ground"], arrays["image"], arrays.get("sigma"))
     columns = {key: arrays[list(arrays)[i]] for key, i in _header(list(arrays)).items()}
     missing = [name for name in _COLUMNS if name not in columns]
     if missing:
         raise InputError(
             f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}"
         )
-    return _assembled(columns)
+    return _assembled(path, columns)
 
 
-def _assembled(columns: dict[str, Array]) -> Correspondences:
+def _assembled(path: Path, columns: dict[str, Array]) -> Correspondences:
+    if len({column.shape for column in columns.values()}) > 1:
+        raise InputError(f"{path}: columns of different lengths")
     ground = np.stack([columns[name] for name in ("lon", "lat", "alt")], axis=-1)
-    return Correspondences(ground, np.stack([columns["col"], columns["row"]], axis=-1), columns.get("sigma"))
+    return _checked(path, ground, np.stack([columns["col"], columns["row"]], axis=-1), columns.get("sigma"))
+
+
+def _checked(path: Path, ground: Array, image: Array, sigma: Array | None) -> Correspondences:
+    """The points, whose arrays must have one length."""
+    shapes = [array.shape for array in (ground, image, sigma) if array is not None]
+    n = len(ground) if ground.ndim else 0
+    if shapes != [(n, 3), (n, 2), (n,)][: len(shapes)]:
+        raise InputError(f"{path}: arrays of shapes {shapes}, not (N, 3), (N, 2), (N,)")
+    return Correspondences(ground, image, sigma)
 
 
 def read_geojson(path: Path) -> Correspondences:
     """GCPs as points lon, lat, alt with their image position in the property ``ji`` or ``col``, ``row``."""
+    document = read_json(path, GEOJSON)
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
         points = [_feature(feature) for feature in document["features"]]
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise InputError(f"{path}: not a GeoJSON of 3-D points with a property ji ({error!r})") from error
@@ -207,11 +215,13 @@ def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspon
         Of the layers [m]; by default from the tags ``ALTITUDE_B0``, ``ALTITUDE_B2``, ...
     """
     with open_raster(path) as dataset:
-        bands = dataset.read().astype(np.float64)
+        GRID_POINTS.check(f"{path}, read", 8 * dataset.count * dataset.width * dataset.height)
+        bands = np.real(dataset.read()).astype(np.float64)
         to_image, tags = dataset.transform, dataset.tags()
     layers = len(bands) // 2
     if altitudes is None:
-        altitudes = [float(tags.get(f"ALTITUDE_B{2 * i}", "nan")) for i in range(layers)]
+        stated = [_numbers([tags.get(f"ALTITUDE_B{2 * i}", "nan")]) for i in range(layers)]
+        altitudes = [np.nan if value is None else value[0] for value in stated]
     if len(bands) % 2 or len(altitudes) != layers or not np.isfinite(altitudes).all():
         raise InputError(
             f"{path}: {len(bands)} bands are {layers} layers of lon and lat, but {len(altitudes)} altitudes "
@@ -224,6 +234,8 @@ def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspon
     alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
     ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)
     ok = np.isfinite(ground).all(axis=1)
+    if (np.abs(ground[ok]) > (540.0, 90.0, _FAR)).any() or not (np.abs(image) <= _FAR).all():
+        raise InputError(f"{path}: a node of it is no longitude, latitude and altitude, or no image point")
     return Correspondences(ground[ok], image[ok])
 
 

@@ -92,8 +92,9 @@ def _rpc_difference(
     low, high = views[0]["alt_range_m"]
     share = np.stack(np.meshgrid(t, t, t, indexing="ij"), axis=-1).reshape(-1, 3)
     size = np.array(views[0]["size"], dtype=np.float64)
-    ground = first.localize(share[:, :2] * (size - 1), low + share[:, 2] * (high - low))
-    difference = second.project(ground) - first.project(ground)
+    with np.errstate(all="ignore"):  # where the second has no value there is no difference
+        ground = first.localize(share[:, :2] * (size - 1), low + share[:, 2] * (high - low))
+        difference = second.project(ground) - first.project(ground)
     difference = difference[np.isfinite(difference).all(axis=1)]
     if not len(difference):
         return None, None
@@ -102,11 +103,16 @@ def _rpc_difference(
 
 
 def _written_rpc(folder: Path, view: Record) -> RPC | None:
-    """The RPC that a run wrote for a view, from the first of its files that can be read."""
+    """The RPC that a run wrote for a view, from the first of its files that can be read.
+
+    Only what lies in the folder itself is opened, whatever the summary names.
+    """
     for name in view["outputs"]:
         try:
-            return read_rpc(folder / name)
-        except (BarpcError, OSError):
+            path = (folder / name).resolve()
+            if path.parent == folder.resolve() and path.is_file():
+                return read_rpc(path)
+        except (BarpcError, OSError, ValueError):  # ValueError: a zero byte in the name
             continue
     return None
 

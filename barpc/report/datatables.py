@@ -74,6 +74,12 @@ def figure(value: float | None, form: str = ".3f") -> Cell:
     return Cell(format(value, form) if value else "0", float(f"{value:.6g}"))
 
 
+def largest(values: Sequence[float | None]) -> float | None:
+    """The largest number; None where one is missing, which may be larger."""
+    known = [value for value in values if value is not None]
+    return max(known) if known and len(known) == len(values) else None
+
+
 def name(text: str) -> Cell:
     """A name."""
     return Cell(text, text, "name")
@@ -89,14 +95,14 @@ def views_table(summary: Record) -> DataTable:
     for k, view in enumerate(summary["views"]):
         every = view["num_observations"] + view["num_rejected"]
         row = [
-            figure(k + 1, "d"),
+            figure(k + 1, ".0f"),
             name(view["name"]),
             Cell(
                 STATUS_WORDS[view["status"]],
                 list(STATUS_WORDS).index(view["status"]),
                 f"status {view['status']}",
             ),
-            figure(view["num_observations"], "d"),
+            figure(view["num_observations"], ".0f"),
             figure(100 * view["num_rejected"] / every if every else None, ".1f"),
             figure(100 * view["tie_coverage"], ".0f"),
             figure(view["rmse_before"]),
@@ -110,7 +116,7 @@ def views_table(summary: Record) -> DataTable:
 
 def _shift(view: Record) -> Cell:
     shift = None if view["correction"] is None else view["correction"]["center_shift_px"]
-    if shift is None:
+    if shift is None or None in shift:
         return figure(None)
     return Cell(f"{shift[0]:+.2f}, {shift[1]:+.2f}", float(f"{max(map(abs, shift)):.6g}"))
 
@@ -129,14 +135,15 @@ def corrections_table(summary: Record) -> DataTable:
     rows = []
     for view in summary["views"]:
         correction, center = view["correction"], view["camera_center"]
+        altitude = None if center is None else center["altitude_m"]
         moves = zip(correction["center_shift_px"], correction["center_sigma_px"], strict=True)
         rows.append(
             [
                 name(view["name"]),
                 *(Cell(f"{shift:+.3f} ± {sigma:.2f}", shift) for shift, sigma in moves),
-                figure(correction["angle_urad"], ".2f"),
-                figure(correction["translation_norm_m"], ".2f"),
-                figure(None if center is None else center["altitude_m"] / 1e3, ".0f"),
+                figure(correction.get("angle_urad"), ".2f"),
+                figure(correction.get("translation_norm_m"), ".2f"),
+                figure(altitude and altitude / 1e3, ".0f"),
                 name("-" if center is None else center["method"]),
             ]
         )
@@ -156,7 +163,7 @@ def pairs_table(summary: Record) -> DataTable:
         row = [
             Cell(f"{first}-{second}", first + second / 1e6),
             name(f"{pair['a']} - {pair['b']}"),
-            figure(pair["num_matches"], "d"),
+            figure(pair["num_matches"], ".0f"),
             figure(pair["convergence_deg"], ".1f"),
             figure(pair["base_to_height"], ".2f"),
             figure(pair["height_m_per_px"], ".3g"),
@@ -181,16 +188,18 @@ def fits_table(summary: Record) -> DataTable:
     rows = []
     for view in summary["views"]:
         fit = view["fit"]
-        rmse = Cell(", ".join(f"{value:.1e}" for value in fit["rmse_px"]), max(fit["rmse_px"]))
+        rmse = figure(None)
+        if None not in fit["rmse_px"]:
+            rmse = Cell(", ".join(f"{value:.1e}" for value in fit["rmse_px"]), max(fit["rmse_px"]))
         rows.append(
             [
                 name(view["name"]),
                 rmse,
-                figure(max(fit["max_px"]), ".1e"),
+                figure(largest(fit["max_px"]), ".1e"),
                 figure(fit["min_denominator"]),
                 figure(fit["roundtrip_px"], ".1e"),
-                figure(100 * fit["coverage"], ".0f"),
-                figure(fit["num_check_points"], "d"),
+                figure(None if fit["coverage"] is None else 100 * fit["coverage"], ".0f"),
+                figure(fit["num_check_points"], ".0f"),
                 name(fit["method"]),
             ]
         )
@@ -229,7 +238,7 @@ def check_points_table(summary: Record) -> DataTable:
         seen = [o["residual_px"] for o in point["observations"] if None not in o["residual_px"]]
         rms = float(np.sqrt(np.mean(np.square(seen).sum(axis=1)))) if seen else None
         left = [figure(value, "+.3f") for value in point["residual_enu_m"]]
-        rows.append([name(point["name"]), figure(len(seen), "d"), figure(rms), *left])
+        rows.append([name(point["name"]), figure(len(seen), ".0f"), figure(rms), *left])
     return DataTable("check-points", "Check points: found minus given place", columns, rows)
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,9 @@ from barpc.pointio.names import from_cell
 from barpc.report.summary import SCHEMA
 from barpc.report.tables import OBSERVATIONS, RESIDUALS
 from barpc.scene import BoolArray, IntArray
+from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
+
+_FAR = 1e12  # px, deg and m: no number of a table comes near
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,16 +79,41 @@ def read_summary(folder: Path) -> dict[str, Any]:
         There is none, it does not parse, or another release's schema.
     """
     path = folder / "summary.json"
-    try:
-        summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{folder}: no summary.json, so no finished run") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from error
+    if not path.exists():
+        raise InputError(f"{folder}: no summary.json, so no finished run")
+    summary = read_json(path, SUMMARY)
     found = summary.get("schema") if isinstance(summary, dict) else None
     if found != SCHEMA:
-        raise InputError(f"{path}: schema {found}, this release reads {SCHEMA}: run the adjustment again")
-    return summary
+        raise InputError(f"{path}: schema {found!r}, this release reads {SCHEMA}: run the adjustment again")
+    wrong = _wrong(summary)
+    if wrong:
+        raise InputError(f"{path}: damaged, {wrong}: run the adjustment again")
+    checked: dict[str, Any] = summary
+    return checked
+
+
+@cache
+def _validate() -> Callable[[Any], Any]:
+    import fastjsonschema
+
+    text = files("barpc.report").joinpath("summary.schema.json").read_bytes()
+    found: Callable[[Any], Any] = fastjsonschema.compile(json.loads(text))
+    return found
+
+
+def _wrong(summary: Any) -> str | None:
+    """What a summary has that its schema, or a name in it that another part does not know, forbids."""
+    try:
+        _validate()(summary)
+    except ValueError as error:  # fastjsonschema's own are some
+        return str(error).replace("data", "summary", 1)
+    names = {view["name"] for view in summary["views"]}
+    if len(names) < len(summary["views"]):
+        return "two images have one name"
+    for pair in summary["pairs"]:
+        if pair["a"] == pair["b"] or not {pair["a"], pair["b"]} <= names:
+            return f"no pair of its images is {pair['a']} - {pair['b']}"
+    return None
 
 
 def read_tables(summary: Mapping[str, Any], folder: Path) -> RunFiles:
@@ -95,18 +125,19 @@ def read_tables(summary: Mapping[str, Any], folder: Path) -> RunFiles:
         A table is missing or damaged; the message names it.
     """
     names = [view["name"] for view in summary["views"]]
-    outlines = _read(folder / "footprints.geojson", _outlines)
+    outlines = _read(folder / "footprints.geojson", GEOJSON, _outlines)
     if len(outlines) != len(names):
         raise InputError(f"{folder / 'footprints.geojson'}: {len(outlines)} outlines of {len(names)} images")
-    observations = _read(folder / "observations.csv", lambda text: _observations(text, names))
-    return RunFiles(summary, observations, _read(folder / "residuals.csv", _points), outlines)
+    observations = _read(folder / "observations.csv", TABLE, lambda text: _observations(text, names))
+    return RunFiles(summary, observations, _read(folder / "residuals.csv", TABLE, _points), outlines)
 
 
-def _read(path: Path, parse: Any) -> Any:
+def _read(path: Path, kind: Kind, parse: Any) -> Any:
+    text = read_text(path, kind)
     try:
-        return parse(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read ({error!r}); run the adjustment again") from error
+        return parse(text)
+    except (ValueError, LookupError, TypeError, AttributeError, StopIteration, csv.Error) as error:
+        raise InputError(f"{path}: damaged ({error!r}); run the adjustment again") from error
 
 
 def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
@@ -114,32 +145,53 @@ def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
     if tuple(next(rows)) != tuple(header):
         raise ValueError(f"its columns are not {', '.join(header)}")
     columns = [list(column) for column in zip(*rows, strict=True)]
+    if columns and len(columns) != len(header):
+        raise ValueError(f"rows of {len(columns)} cells")
     return columns or [[] for _ in header]
 
 
-def _floats(columns: Sequence[Sequence[str]]) -> Array:
-    """Columns (n, len(columns)) of numbers; an empty cell is NaN."""
-    return np.array([[float(cell or "nan") for cell in column] for column in columns], dtype=np.float64).T
+def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
+    """Columns (n, len(columns)) of numbers, of which only those after the first `known` may be empty (NaN)."""
+    table = np.array([[float(cell or "nan") for cell in column] for column in columns], dtype=np.float64).T
+    if np.isnan(table[:, :known]).any() or (np.abs(table) > _FAR).any():
+        raise ValueError("a number is missing or absurdly large")
+    return table
 
 
 def _observations(text: str, names: Sequence[str]) -> Observations:
     columns = _columns(text, OBSERVATIONS)
     index = {name: i for i, name in enumerate(names)}
     view = np.array([index[from_cell(name)] for name in columns[0]], dtype=np.int64)
-    numbers = _floats(columns[2:8])
+    numbers = _floats(columns[2:8], 2)
     used = np.array([cell == "1" for cell in columns[8]], dtype=bool)
     return Observations(view, numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
 
 
 def _points(text: str) -> Array:
-    return _floats(_columns(text, RESIDUALS)[:4])
+    points = _floats(_columns(text, RESIDUALS)[:4], 3)
+    _require_degrees(points)
+    return points
+
+
+def _require_degrees(lonlat: Array) -> None:
+    if not (np.abs(lonlat[:, :2]) <= (540.0, 90.0)).all():
+        raise ValueError("a place is no longitude and latitude")
 
 
 def _outlines(text: str) -> list[list[Array]]:
     outlines = []
-    for feature in json.loads(text)["features"]:
+    for feature in parse_json(text)["features"]:
         geometry = feature["geometry"] or {"type": "MultiPolygon", "coordinates": []}
         parts = geometry["coordinates"]
         parts = [parts] if geometry["type"] == "Polygon" else parts
-        outlines.append([np.array(part[0], dtype=np.float64) for part in parts])
+        outlines.append([_ring(part[0]) for part in parts])
     return outlines
+
+
+def _ring(positions: Any) -> Array:
+    """A closed outline (m, 2) [deg]."""
+    ring = np.array(positions, dtype=np.float64)
+    if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 4:
+        raise ValueError(f"an outline of shape {ring.shape}")
+    _require_degrees(ring)
+    return ring

@@ -19,6 +19,8 @@ from barpc.scene import connected_groups
 
 Record = Mapping[str, Any]
 
+_NO_FIT: Record = {"max_px": [None]}
+
 
 @dataclass(frozen=True)
 class Section:
@@ -184,7 +186,7 @@ def _pairs(files: RunFiles) -> Section | None:
     axis = "RMS distance from the epipolar line [px], logarithmic"
     chart = charts.dumbbells("epipolar", "Epipolar offset of each pair", axis, rows)
     shown = [(chart, f"{_which(rows, 'pairs', 'offset')} Numbers are those of the images.")]
-    seen = [pair for pair in pairs if pair["convergence_deg"] is not None]
+    seen = [pair for pair in pairs if None not in (pair["convergence_deg"], pair["base_to_height"])]
     if seen:
         caption = "One dot a pair. Small angles give weak heights; beyond about 35 degrees images look too different."
         shown.append((charts.convergence(seen), caption))
@@ -211,9 +213,10 @@ def _heights(pairs: Sequence[Record]) -> str:
 
 def _corrections(files: RunFiles) -> Section | None:
     views = files.summary["views"]
-    if not all(view["correction"] and view["correction"]["center_shift_px"] for view in views):
+    moves = [view["correction"] or {} for view in views]
+    keys = ("center_shift_px", "center_sigma_px")
+    if any(move.get(key) is None or None in move[key] for move in moves for key in keys):
         return None
-    moves = [view["correction"] for view in views]
     largest = max(float(np.hypot(*move["center_shift_px"])) for move in moves)
     sigma = max(float(np.hypot(*move["center_sigma_px"])) for move in moves)
     answer = (
@@ -280,10 +283,17 @@ def _files(files: RunFiles) -> Section | None:
         tables.append(datatables.files_table(summary))
     if not tables:
         return None
-    worst = max(max(view["fit"]["max_px"]) for view in summary["views"])
+    worst = datatables.largest(
+        [value for view in summary["views"] for value in (view["fit"] or _NO_FIT)["max_px"]]
+    )
     answer = (
-        f"Yes, to {worst:.1e} px at worst, on check points over each image and its altitudes. Every file was reopened"
-        " and compared before it counted as written. Give other tools these files, never the old image alone."
+        "Not known for every image."
+        if worst is None
+        else f"Yes, to {worst:.1e} px at worst, on check points over each image and its altitudes."
+    )
+    answer += (
+        " Every file was reopened and compared before it counted as written. Give other tools these files, never the"
+        " old image alone."
     )
     return Section("files", "Do the new RPC files hold the corrected cameras?", answer, tables=tables)
 

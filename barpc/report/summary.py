@@ -32,7 +32,7 @@ from barpc.sensor.geometry import CameraCenter, view_angles
 from barpc.tie import PairReport
 
 SCHEMA = 2
-"""Version of summary.json; docs/summary.schema.json describes it."""
+"""Version of summary.json; `summary.schema.json` beside this module describes it."""
 
 
 def summarize(run: Run) -> dict[str, Any]:

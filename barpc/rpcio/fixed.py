@@ -18,6 +18,7 @@ from barpc.rpcio.fields import (
     rpc_from_fields,
 )
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import IMAGE, read_head
 
 Columns = tuple[tuple[str, int], ...]
 
@@ -65,8 +66,7 @@ def read_nitf(path: Path) -> RPC | None:
     RpcFormatError
         The extension is there and does not parse, or says of itself that it is not valid.
     """
-    with path.open("rb") as file:
-        data = file.read(_SCAN_LIMIT)
+    data = read_head(path, IMAGE, _SCAN_LIMIT)
     match = re.search(rb"RPC00([AB])01041", data)
     if match is None:
         return None

@@ -11,9 +11,7 @@ from barpc.errors import RpcFormatError
 from barpc.rpcio import fixed, structured, text, xml
 from barpc.rpcio.fields import ReadOptions
 from barpc.sensor.rpc import RPC
-
-MAX_BYTES = 32 << 20
-"""Larger files are no RPC files [bytes]."""
+from barpc.sidefile import RPC_FILE
 
 
 @dataclass(frozen=True)
@@ -81,8 +79,7 @@ def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[R
     """
     if not data.strip():
         raise RpcFormatError(f"{name}: the file is empty, expected an RPC")
-    if len(data) > MAX_BYTES:
-        raise RpcFormatError(f"{name}: more than {MAX_BYTES} bytes, too large for an RPC file")
+    RPC_FILE.check(name, len(data))
     content = text.decode(data)
     for row in FORMATS.values():
         if row.sniff(content):

@@ -11,15 +11,16 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from barpc.errors import ImageError, RpcError, RpcFormatError
+from barpc.errors import BarpcError, ImageError, RpcError, RpcFormatError
 from barpc.raster import identify, open_raster
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.fixed import is_nitf, read_nitf
-from barpc.rpcio.formats import FORMATS, MAX_BYTES, parse
+from barpc.rpcio.formats import FORMATS, parse
 from barpc.rpcio.text import decode
 from barpc.rpcio.tiff import is_tiff, read_tag
 from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head
 from barpc.vrt import MAGIC, read_vrt
 
 
@@ -108,10 +109,8 @@ def _names(name: str) -> Iterator[tuple[str, str, bool]]:
 def _holds_rpc(path: Path, kind: str) -> bool:
     row = FORMATS["gdal" if kind == "pam" else kind]
     try:
-        if path.stat().st_size > MAX_BYTES:
-            return False
-        return row.sniff(decode(path.read_bytes()))
-    except OSError:
+        return row.sniff(decode(read_bytes(path, RPC_FILE)))
+    except BarpcError:
         return False
 
 
@@ -129,7 +128,7 @@ def shadows(image: Path | str) -> list[Sidecar]:
         No such file.
     """
     image = Path(image)
-    head = _head(image)
+    head = read_head(image, IMAGE, 64)
     vrt = _is_vrt(head)
     own = vrt or _own_rpc(image, head) is not None
     return [s for s in sidecars(image) if s.kind == "geom" or (s.before_tag and not vrt) or not own]
@@ -197,7 +196,7 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     """
     path = Path(path)
     options = ReadOptions(first_pixel, band)
-    head = _head(path)
+    head = read_head(path, IMAGE, 64)
     if is_tiff(head) or is_nitf(head) or _is_binary(head):
         return _image_source(path, head, options)
     if _is_vrt(head):
@@ -205,18 +204,8 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
         if items is None:
             return _image_source(path, head, options)
         return RpcSource(rpc_from_domain(items, str(path), options), "gdal", path)
-    rpc, name = parse(_content(path), str(path), options)
+    rpc, name = parse(read_bytes(path, RPC_FILE), str(path), options)
     return RpcSource(rpc, name, path)
-
-
-def _head(path: Path) -> bytes:
-    if not path.is_file():
-        raise ImageError(f"{path}: {'a folder, not a file' if path.is_dir() else 'no such file'}")
-    try:
-        with path.open("rb") as file:
-            return file.read(64)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def _is_binary(head: bytes) -> bool:
@@ -226,14 +215,6 @@ def _is_binary(head: bytes) -> bool:
 
 def _is_vrt(head: bytes) -> bool:
     return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(MAGIC)
-
-
-def _content(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:
@@ -274,7 +255,7 @@ def _passed_over(names: list[str]) -> tuple[str, ...]:
 
 
 def _sidecar_source(image: Path, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
-    rpc, name = parse(_content(sidecar.path), str(sidecar.path), options)
+    rpc, name = parse(read_bytes(sidecar.path, RPC_FILE), str(sidecar.path), options)
     if sidecar.kind == "geom":
         return _geom_source(image, sidecar.path, rpc)
     if sidecar.kind == "dimap":
@@ -307,8 +288,10 @@ def _tile_source(image: Path, path: Path, rpc: RPC) -> RpcSource:
     product = path.name[4:]
     names = {entry.name.lower(): entry for entry in image.parent.iterdir()}
     dim = names.get(f"dim_{product}".lower())
-    text = decode(_content(dim)) if dim else ""
-    width, height = (re.search(rf"<NTILES_SIZE[^>]*\b{key}=\"(\d+)\"", text) for key in ("ncols", "nrows"))
+    text = decode(read_bytes(dim, RPC_FILE)) if dim else ""
+    width, height = (
+        re.search(rf"<NTILES_SIZE\b[^<>]*\b{key}=\"(\d{{1,9}})\"", text) for key in ("ncols", "nrows")
+    )
     if width is None or height is None:
         raise RpcFormatError(
             f"{path}: the tile size of {image.name} is unknown (no DIM_{product} with NTILES_SIZE)"

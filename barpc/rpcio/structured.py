@@ -19,6 +19,7 @@ from barpc.rpcio.fields import (
     rpc_from_fields,
 )
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import parse_json
 
 _RPCM = {
     "LINE_OFF": "row_offset",
@@ -49,8 +50,8 @@ def sniff_json(text: str) -> bool:
 def read_json(text: str, name: str, options: ReadOptions) -> RPC:
     """``{"rpc": {"row_offset": ...}}`` (rpcm, s2p) or ``{"line_off": ...}`` (rasterio), nested or not."""
     try:
-        document = json.loads(text, parse_constant=_refuse)
-    except (ValueError, RecursionError) as error:
+        document = parse_json(text)
+    except ValueError as error:
         raise RpcFormatError(f"{name}: not JSON ({error})") from error
     for dialect, mark in ((_RPCM, "row_num"), (_PLAIN, "line_num_coeff")):
         found = _find(document, mark)
@@ -62,10 +63,6 @@ def read_json(text: str, name: str, options: ReadOptions) -> RPC:
             }
             return rpc_from_fields(fields, name, options.first_pixel or 0.0)
     raise RpcFormatError(f"{name}: no RPC in this JSON (looked for row_num and line_num_coeff)")
-
-
-def _refuse(constant: str) -> float:
-    raise ValueError(f"{constant} is no finite number")
 
 
 def _find(document: Any, mark: str, depth: int = 3) -> dict[str, Any] | None:
@@ -101,17 +98,17 @@ def write_json(rpc: RPC) -> str:
 
 # --- YAML -------------------------------------------------------------------------------------------------
 
-_PAIR = re.compile(r"^[ \t-]*(\w+):[ \t]*(\[[^\]]*\]|[^\n\[{]*)", re.MULTILINE)
+_PAIR = re.compile(r"^[ \t-]*+(\w++):[ \t]*+(\[[^\[\]]*+\]|[^\n\[{]*+)", re.MULTILINE)
 
 
 def sniff_yaml(text: str) -> bool:
     """``line_num_coeff: [...]`` or the same list in dashes."""
-    return re.search(r"^\s+line_num_coeff:", text, re.MULTILINE) is not None
+    return re.search(r"^[ \t]++line_num_coeff:", text, re.MULTILINE) is not None
 
 
 def read_yaml(text: str, name: str, options: ReadOptions) -> RPC:
     """A parameter file of orthority with one image: names as rasterio's, lists in brackets or as dashes."""
-    text = re.sub(r"\n[ \t]*-[ \t]+(?=[+-.\d])", ", ", text)  # a block list into one line
+    text = re.sub(r"\n[ \t]*+-[ \t]++(?=[+-.\d])", ", ", text)  # a block list into one line
     aliases = {alias: key for key, alias in _PLAIN.items()}
     fields: Fields = {}
     for alias, value in _PAIR.findall(text):

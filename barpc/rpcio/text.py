@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
 from barpc.errors import RpcFormatError
 from barpc.rpcio.fields import (
@@ -21,7 +22,9 @@ from barpc.rpcio.fields import (
 )
 from barpc.sensor.rpc import RPC
 
-_LINE = re.compile(r"^[ \t]*([A-Za-z][\w.]*)[ \t]*[:=][ \t]*(.*?)[ \t]*;?[ \t]*$", re.MULTILINE)
+_LINE = re.compile(r"^[ \t]*+([A-Za-z][\w.]*+)[ \t]*+[:=](.*)$", re.MULTILINE)
+# Patterns here take time in proportion to the text, whatever it holds: no two repetitions can share a character,
+# and one that may run far begins where a line or a word begins.
 _KEYS = {*OFFSETS, *SCALES, *ERRORS}
 
 
@@ -39,13 +42,19 @@ def decode(data: bytes) -> str:
 
 def sniff_txt(text: str) -> bool:
     """``LINE_OFF: ...`` and ``LINE_NUM_COEFF_1: ...``, one a line."""
-    return re.search(r"^\s*LINE_NUM_COEFF_1\s*[:=]", text, re.MULTILINE | re.IGNORECASE) is not None
+    return re.search(r"^[ \t]*+LINE_NUM_COEFF_1[ \t]*+[:=]", text, re.MULTILINE | re.IGNORECASE) is not None
+
+
+def _pairs(text: str) -> Iterator[tuple[str, str]]:
+    """Key and value of every line that has both."""
+    for match in _LINE.finditer(text):
+        yield match[1], match[2].strip().removesuffix(";").rstrip()
 
 
 def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
     """``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT)."""
     pairs = []
-    for key, value in _LINE.findall(text):
+    for key, value in _pairs(text):
         key = key.upper()
         if key in _KEYS or key.rpartition("_")[0] in COEFFICIENTS:
             pairs.append((key, number(value, name, key)))
@@ -84,12 +93,12 @@ _RPB_NAMES = {
     "sampDenCoef": "SAMP_DEN_COEFF",
 }
 _RPB_LOWER = {key.lower(): value for key, value in _RPB_NAMES.items()}
-_RPB_PAIR = re.compile(r"(\w+)\s*=\s*(\([^()]*\)|[^;\n()]*);?")
+_RPB_PAIR = re.compile(r"\b(\w++)\s*+=\s*+(\([^()]*+\)|[^;\n()]*+);?")
 
 
 def sniff_rpb(text: str) -> bool:
     """``lineNumCoef = ( ...``."""
-    return re.search(r"lineNumCoef\s*=", text, re.IGNORECASE) is not None
+    return re.search(r"lineNumCoef\s*+=", text, re.IGNORECASE) is not None
 
 
 def read_rpb(text: str, name: str, options: ReadOptions) -> RPC:
@@ -99,7 +108,7 @@ def read_rpb(text: str, name: str, options: ReadOptions) -> RPC:
         field = _RPB_LOWER.get(key.lower())
         if field is not None:
             fields[field] = numbers(value.strip("()"), name, key)
-    if re.search(r'SpecId\s*=\s*"RPC00A"', text, re.IGNORECASE):
+    if re.search(r'SpecId\s*+=\s*+"RPC00A"', text, re.IGNORECASE):
         raise RpcFormatError(f"{name}: coefficients in RPC00A order; only RPC00B is written to .RPB files")
     return rpc_from_fields(fields, name, options.first_pixel or 0.0)
 
@@ -125,16 +134,16 @@ _GEOM_COEFF = re.compile(r"(line|samp)_(num|den)_coeff_(\d\d)")
 
 def sniff_geom(text: str) -> bool:
     """``line_num_coeff_00: ...``."""
-    return re.search(r"^\s*(\w+\.)?line_num_coeff_00\s*:", text, re.MULTILINE) is not None
+    return re.search(r"^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:", text, re.MULTILINE) is not None
 
 
 def read_geom(text: str, name: str, options: ReadOptions) -> RPC:
     """OSSIM's keyword list, as OTB and CARS use it; the RPC of the FULL image."""
     pairs = []
-    kind = re.search(r"^\s*polynomial_format:\s*(\w*)", text, re.MULTILINE)
+    kind = re.search(r"^[ \t]*+polynomial_format:[ \t]*+(\w*+)", text, re.MULTILINE)
     if kind and kind.group(1) != "B":
         raise RpcFormatError(f"{name}: polynomial_format {kind.group(1)!r}, only B (RPC00B) is read")
-    for key, value in _LINE.findall(text):
+    for key, value in _pairs(text):
         field = _GEOM_ERRORS.get(key, key.upper())
         if field in _KEYS or _GEOM_COEFF.fullmatch(key):
             pairs.append((field, number(value, name, key)))
@@ -158,12 +167,12 @@ def write_geom(rpc: RPC) -> str:
 
 # --- ENVI -------------------------------------------------------------------------------------------------
 
-_ENVI = re.compile(r"^\s*rpc info\s*=\s*\{([^{}]*)\}", re.MULTILINE | re.IGNORECASE)
+_ENVI = re.compile(r"^[ \t]*+rpc info\s*+=\s*+\{([^{}]*+)\}", re.MULTILINE | re.IGNORECASE)
 
 
 def sniff_envi(text: str) -> bool:
     """``rpc info = {`` in a header."""
-    return re.search(r"^\s*rpc info\s*=\s*\{", text, re.MULTILINE | re.IGNORECASE) is not None
+    return re.search(r"^[ \t]*+rpc info\s*+=\s*+\{", text, re.MULTILINE | re.IGNORECASE) is not None
 
 
 def read_envi(text: str, name: str, options: ReadOptions) -> RPC:

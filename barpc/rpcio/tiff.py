@@ -16,6 +16,7 @@ from typing import BinaryIO
 from barpc.errors import ImageError, RpcFormatError
 from barpc.rpcio.fields import COEFFICIENTS, ERRORS, OFFSETS, SCALES, fields_from_rpc, rpc_from_fields
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import IMAGE, opened
 
 RPC_TAG = 50844
 GEOREFERENCE_TAGS = (33550, 33922, 34264)
@@ -132,7 +133,7 @@ def read_tag(path: Path) -> RPC | None:
     RpcFormatError
         The tag is there and does not hold 92 usable doubles.
     """
-    with path.open("rb") as file:
+    with opened(path, IMAGE) as file:
         directory = read_directory(file, str(path))
         entry = directory.find(RPC_TAG)
         if entry is None:
@@ -176,7 +177,7 @@ def put_tag(path: Path, rpc: RPC, drop: tuple[int, ...] = ()) -> None:
     ImageError
         The file would pass 4 GB, which only BigTIFF can hold.
     """
-    with path.open("rb") as file:
+    with opened(path, IMAGE) as file:
         directory = read_directory(file, str(path))
     entries = [e for e in directory.entries if e.tag != RPC_TAG and e.tag not in drop]
     size = path.stat().st_size

@@ -28,7 +28,7 @@ from barpc.vrt import vrt_from_xml
 
 def _root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
     return parse_xml(
-        re.sub(r"^\s*<\?xml[^>]*\?>", "", text, count=1).encode(),
+        re.sub(r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1).encode(),
         name=name,
         strip_namespaces=strip_namespaces,
     )

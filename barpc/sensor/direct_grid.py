@@ -20,6 +20,7 @@ CHUNK = 2048
 
 Basis = tuple[npt.NDArray[np.int64], Array, Array]
 
+_FAR = 1e9  # px and m: beyond it no node lies
 _STEPS = 8
 _SETTLED = 1e-5  # px: Newton is quadratic, what is left after a step of this size is below rounding
 
@@ -68,9 +69,9 @@ class DirectGrid:
         shape = (*(len(np.atleast_1d(axis)) for axis in axes), 2)
         if self.lonlat.shape != shape or min(shape) < 2:
             raise RpcError(f"localisation grid: lon, lat {self.lonlat.shape} on {shape[:3]} nodes")
-        if not all(np.isfinite(axis).all() and (np.diff(axis) > 0).all() for axis in axes):
+        if not all((np.abs(axis) <= _FAR).all() and (np.diff(axis) > 0).all() for axis in axes):
             raise RpcError("localisation grid: columns, rows and altitudes must ascend")
-        if not np.isfinite(self.lonlat).all():
+        if not (np.abs(self.lonlat) <= (540.0, 90.0)).all():  # NaN neither
             raise RpcError("localisation grid: a node has no ground point")
         center = float(self.lonlat[shape[0] // 2, shape[1] // 2, shape[2] // 2, 0])
         coeffs = self.lonlat.copy()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from shapely import affinity
 from barpc.errors import InputError
 from barpc.geodesy import Array, wrap_longitude
 from barpc.scene import BoolArray
+from barpc.sidefile import GEOJSON, read_json
 
 _MALFORMED = (
     ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, shapely.GEOSException,
@@ -66,12 +66,10 @@ def read_area(path: str | os.PathLike[str]) -> Area:
     InputError
         The file cannot be read, or holds no polygon in degrees; the message names it.
     """
+    data = read_json(Path(path), GEOJSON)
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8-sig"))
         _refuse_projection(data)
         polygons = [shapely.make_valid(polygon) for polygon in _polygons(data)]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except _MALFORMED as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"{path}: not an area of interest, GeoJSON polygons in degrees ({said})") from error

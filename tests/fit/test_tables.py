@@ -83,7 +83,7 @@ def test_a_localisation_grid_counts_from_the_corner_of_the_first_pixel(tmp_path:
         ("a.csv", b"lon,lat,alt,col,row\n1,2,3,4,x\n", "line 2"),
         ("a.csv", b"lon,lat,alt,col,row\n1,2,3\n", "line 2"),
         ("a.csv", b"lon,lat,alt,col,row\n", "no points"),
-        ("a.npz", b"PK\x03\x04 nothing", "not an npz"),
+        ("a.npz", b"PK\x03\x04 nothing", "not an archive of arrays"),
         ("a.json", b'{"type": "FeatureCollection", "features": [{}]}', "not a GeoJSON"),
         ("a.txt", b"LINE_OFF: 5\n", "neither a table"),
         ("a.bin", bytes(range(256)), "neither a table"),

@@ -1,14 +1,140 @@
-"""A valid file of every format, to start mutations from."""
+"""A valid file of every kind that barpc reads, its reader, and the damage that suits it."""
 
 from __future__ import annotations
 
+import io
+import json
 import tempfile
+import warnings
+import zipfile
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
-from barpc.rpcio import FORMATS, write_rpc_copy
+import numpy as np
+import rasterio
+
+from barpc.ba import BlockPrior
+from barpc.ba.blocks import CameraPrior
+from barpc.ba.incremental import apply_prior
+from barpc.cli.options import image_paths
+from barpc.cli.points import read_points
+from barpc.cli.tables import print_comparison
+from barpc.dem import Dem
+from barpc.errors import RpcError
+from barpc.pipeline.inputs import read_pairs
+from barpc.pipeline.options import read_options
+from barpc.pointio.gcp import read_gcps
+from barpc.pointio.matches import read_matches
+from barpc.pointio.tables import read_correspondences
+from barpc.record import from_record, load_npz, to_record
+from barpc.report.compare import compare_runs
+from barpc.report.page import remake_report
+from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
+from barpc.rpcio.fields import ReadOptions
+from barpc.rpcio.text import decode
+from barpc.scene import View
+from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.sentinel1 import open_product
+from barpc.tie.area import read_area
+from barpc.workspace import Workspace
+from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
+from tests.sensor.s1_product import Product
+
+from .mutate import (
+    Mutate,
+    mutate_header,
+    mutate_json,
+    mutate_npz,
+    mutate_text,
+    mutate_values,
+    mutate_xml,
+)  # fmt: skip
+
+NAMES = ("left", "right")
 
 
+@dataclass(frozen=True)
+class Sample:
+    """A kind of file.
+
+    Parameters
+    ----------
+    name : str
+        What the file is called, which its errors must name.
+    read : callable
+        Its reader, and whatever meets the values first.
+    data : callable
+        The bytes of a good file.
+    mutations : tuple of callable
+        Beside damage to bytes.
+    beside : callable
+        Puts what the file needs beside it into a folder, once.
+    share : float
+        Part of a sample's usual runs, for slow readers.
+    """
+
+    name: str
+    read: Callable[[Path], object]
+    data: Callable[[], bytes]
+    mutations: tuple[Mutate, ...] = ()
+    beside: Callable[[Path], object] = lambda folder: None
+    share: float = 1.0
+
+
+# --- RPC files --------------------------------------------------------------------------------------------
+
+
+def _alos() -> str:
+    offsets = ["006500", "03550", " 35.6812", " 139.7671", " 0500"]
+    cells = [f"{f'{1 + i / 100:+.5f}E-{i % 8}':>12}" for i in range(80)]
+    return "".join([*offsets, *offsets, *cells])
+
+
+def _read_format(path: Path, kind: str) -> object:
+    """As whoever is sent this file reads it, and past the sniffing."""
+    FORMATS[kind].read(decode(path.read_bytes()), str(path), ReadOptions())
+    return read_rpc(path)
+
+
+def _pam() -> str:
+    from barpc.rpcio.xml import rpc_domain
+
+    return f"<PAMDataset>\n{rpc_domain(make_rpc())}\n</PAMDataset>\n"
+
+
+TEXTS: dict[str, Callable[[], str]] = {
+    row.name: partial(row.write, make_rpc()) for row in FORMATS.values() if row.write is not None
+} | {
+    "dimap": lambda: dimap_v2(make_rpc()),
+    "dimap v1": lambda: dimap_v1(make_rpc()),
+    "dimap v3": lambda: dimap_v3(make_rpc()),
+    "enmap": lambda: enmap(make_rpc()),
+    "yaml": lambda: yaml(make_rpc()),
+    "envi": lambda: envi(make_rpc()),
+    "alos": _alos,
+    "gdal": _pam,
+}
+_XML = ("xml", "dimap", "enmap", "gdal")
+
+
+def _rpc_sample(kind: str) -> Sample:
+    row = kind.split(" ", maxsplit=1)[0]
+    mutations = (
+        (mutate_xml, mutate_text)
+        if row in _XML
+        else (mutate_json, mutate_text)
+        if row == "json"
+        else (mutate_text,)
+    )
+    name = f"scene.{row}"
+    return Sample(name, partial(_read_format, kind=row), lambda: TEXTS[kind]().encode(), mutations)
+
+
+@cache
 def _tiff() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         image = write_image(Path(folder) / "a.tif", shape=(1, 2, 2))
@@ -16,28 +142,318 @@ def _tiff() -> bytes:
         return (Path(folder) / "b.tif").read_bytes()
 
 
-def _alos() -> bytes:
-    offsets = ["006500", "03550", " 35.6812", " 139.7671", " 0500"]
-    cells = [f"{f'{1 + i / 100:+.5f}E-{i % 8}':>12}" for i in range(80)]
-    return "".join([*offsets, *offsets, *cells]).encode()
+def _nitf() -> bytes:
+    from barpc.fit import FitOptions, fit_rpc
+    from barpc.rpcio.fixed import nitf_record
+
+    fitted = fit_rpc(
+        make_rpc(), (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf"), strict=False
+    ).rpc
+    return b"NITF02.10" + b" " * 100 + b"RPC00B01041" + nitf_record(fitted).encode() + b" " * 50
 
 
-SAMPLES: dict[str, bytes] = {
-    row.name: row.write(make_rpc()).encode() for row in FORMATS.values() if row.write is not None
-} | {
-    "dimap": dimap_v2(make_rpc()).encode(),
-    "dimap v1": dimap_v1(make_rpc()).encode(),
-    "dimap v3": dimap_v3(make_rpc()).encode(),
-    "enmap": enmap(make_rpc()).encode(),
-    "yaml": yaml(make_rpc()).encode(),
-    "envi": envi(make_rpc()).encode(),
-    "alos": _alos(),
-    "tiff": _tiff(),
+# --- rasters ----------------------------------------------------------------------------------------------
+
+
+def _raster(
+    bands: np.ndarray, transform: rasterio.Affine, tags: dict[str, str] | None = None, **profile: object
+) -> bytes:
+    count, height, width = bands.shape
+    shape = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": bands.dtype.name}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with rasterio.MemoryFile() as memory:
+            with memory.open(**shape, transform=transform, **profile) as out:
+                out.write(bands)
+                out.update_tags(**(tags or {}))
+            return memory.read()
+
+
+PLACE = rasterio.Affine(0.01, 0, 5, 0, -0.01, 44)
+BENT = (0.0, -1.0, 1e-320, 1e308, np.nan, np.inf, 0.01, 1.0)
+
+
+def _mutate_transform(make: Callable[..., bytes]) -> Mutate:
+    def mutate(_: bytes, rng: np.random.Generator) -> bytes:
+        numbers = list(PLACE[:6])
+        for _ in range(rng.integers(1, 4)):
+            numbers[int(rng.integers(6))] = float(rng.choice(BENT))
+        return make(rasterio.Affine(*numbers), rng)
+
+    return mutate
+
+
+def _dem(transform: rasterio.Affine = PLACE, rng: np.random.Generator | None = None) -> bytes:
+    kind, crs = ("float32", "EPSG:4326") if rng is None else (
+        str(rng.choice(["int16", "float32", "float64", "complex64", "uint8"])),
+        rng.choice(["EPSG:4326", "EPSG:32631", "EPSG:4979", "EPSG:4978", ""]),
+    )  # fmt: skip
+    with np.errstate(all="ignore"):
+        heights = np.full((1, 20, 20), 100.0).astype(kind)
+    return _raster(heights, transform, **({"crs": str(crs)} if crs else {}))
+
+
+def _localisation(transform: rasterio.Affine | None = None, rng: np.random.Generator | None = None) -> bytes:
+    row, col = np.mgrid[:4, :4].astype(np.float64)
+    bands = np.stack([f for alt in (0, 1) for f in (5 + 0.01 * col + 1e-3 * alt, 44 - 0.01 * row)])
+    tags = {"ALTITUDE_B0": "0", "ALTITUDE_B2": "500"}
+    if rng is not None:
+        tags[str(rng.choice(list(tags)))] = str(rng.choice(["nan", "0", "x", "1e308", "-1", "9" * 400]))
+        bands.flat[int(rng.integers(bands.size))] = rng.choice(BENT)
+    return _raster(bands, transform or rasterio.Affine(100, 0, 0, 0, 100, 0), tags)
+
+
+def _use_dem(path: Path) -> object:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Dem.open(path)([5.05, 5.051, -170.0, np.nan], [43.95, 43.951, 80.0, 44.0])
+
+
+def _use_grid(path: Path) -> object:
+    points = read_correspondences(path)
+    try:
+        return DirectGrid.from_points(points.ground, points.image).project(points.ground[:5])
+    except RpcError:  # points that are no full grid are a table still
+        return None
+
+
+def _gtx() -> bytes:
+    head = np.array([-90.0, -180.0, 10.0, 10.0], ">f8").tobytes() + np.array([19, 36], ">i4").tobytes()
+    return head + np.full((19, 36), 50.0, ">f4").tobytes()
+
+
+# --- arrays -----------------------------------------------------------------------------------------------
+
+
+def _npz(**arrays: object) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def _prior() -> bytes:
+    return _npz(
+        names=np.array(NAMES), model="rotation", drift=0, params=np.zeros((2, 3)), information=np.eye(6),
+        center=np.full((2, 3), 7e6),
+    )  # fmt: skip
+
+
+def _use_prior(path: Path) -> object:
+    prior = BlockPrior.load(path)
+    cameras = CameraPrior(np.zeros((2, 3)), np.ones((2, 3)))
+    try:
+        return apply_prior(prior, NAMES, "rotation", 0, cameras)
+    except Exception as error:
+        if "earlier block" in str(error):  # what does not go with the run, not with itself
+            return None
+        raise
+
+
+def _use_record(path: Path) -> object:
+    record = load_npz(path)
+    try:
+        return from_record(record)
+    except ValueError:  # its documented class: the kept result is made again
+        return None
+
+
+# --- runs -------------------------------------------------------------------------------------------------
+
+
+@cache
+def _run() -> Path:
+    """A finished run, made once a process."""
+    folder = Path(tempfile.mkdtemp(prefix="barpc-fuzz-"))
+    written(run_of_block(3, 90, gcps=True), folder / "run")
+    return folder / "run"
+
+
+def _beside_run(folder: Path) -> None:
+    for path in _run().iterdir():
+        if path.is_file():
+            (folder / path.name).write_bytes(path.read_bytes())
+
+
+def _compare(path: Path) -> object:
+    with redirect_stdout(io.StringIO()):
+        for pair in ((path.parent, _run()), (_run(), path.parent)):
+            print_comparison(compare_runs(*pair))
+    return None
+
+
+def _use_state(path: Path) -> object:
+    with Workspace(path.parent.parent, overwrite=True) as workspace:
+        workspace.remove_stale()
+    return None
+
+
+def _in_state(folder: Path) -> None:
+    (folder / ".barpc").mkdir()
+
+
+def _run_sample(name: str, read: Callable[[Path], object], *mutations: Mutate, share: float = 1.0) -> Sample:
+    return Sample(name, read, lambda: (_run() / name).read_bytes(), mutations, _beside_run, share)
+
+
+def _report(path: Path) -> object:
+    return remake_report(path.parent)
+
+
+# --- Sentinel-1 -------------------------------------------------------------------------------------------
+
+_BURSTS = Product(num_bursts=2, lines_per_burst=60, burst_cycle=50, num_states=17)
+_GROUND = Product(swath="IW", product_type="GRD", num_bursts=9, lines_per_burst=60)
+
+
+@cache
+def _annotation(product: Product) -> bytes:
+    return product.xml()
+
+
+def _safe() -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(f"S1A.SAFE/annotation/{_BURSTS.name}", _annotation(_BURSTS))
+    return file.getvalue()
+
+
+def _use_product(path: Path, **options: object) -> object:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        radar = open_product(path, **options)
+        return radar.project(radar.localize(np.array([[100.0, 20.0]]), np.array([100.0])))
+
+
+def _use_orbit(path: Path) -> object:
+    return _use_product(path.parent / _BURSTS.name, orbit=path)
+
+
+def _beside_orbit(folder: Path) -> None:
+    (folder / _BURSTS.name).write_bytes(_annotation(_BURSTS))
+
+
+# --- lists and tables -------------------------------------------------------------------------------------
+
+
+def _views() -> list[View]:
+    return [View(name, f"/images/{name}.tif", (100, 100), make_rpc(), (0.0, 100.0)) for name in NAMES]
+
+
+GCPS = (
+    b'{"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": {"type": "Point",'
+    b' "coordinates": [5.4, 43.2, 120.5]}, "properties": {"ji": [10.5, 20.25], "filename": "left.tif", "id": "one"}}]}'
+)
+AREA = (
+    b'{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry":'
+    b' {"type": "MultiPolygon", "coordinates": [[[[5, 44], [6, 44], [6, 45], [5, 44]],'
+    b" [[5.4, 44.1], [5.5, 44.1], [5.5, 44.2], [5.4, 44.1]]]]}},"
+    b' {"type": "Feature", "properties": {}, "geometry": {"type": "GeometryCollection", "geometries":'
+    b' [{"type": "Polygon", "coordinates": [[[179, 0], [-179, 0], [-179, 1], [179, 0]]]}]}}]}'
+)
+OPTIONS = (
+    b'images = "none"\nrpc_formats = ["txt", "rpb"]\nnum_passes = 2\nkeep_going = true\ngcp = ["a.gcp"]\n'
+    b'[tie]\nband = 2\nmin_overlap = 0.1\ndetector = "sift"\n[adjust]\nmodel = "rotation"\nfixed = ["left"]\n'
+    b"sigma_attitude = 3.0\nview_weights = {left = 0.5}\n[fit]\ngrid = [12, 12, 7]\ntolerance = 1e-3\n"
+)
+ASP_GCPS = (
+    b"# WGS84\n1 43.2 5.4 120.5 1 1 1 left.tif 10.5 20.25 0.5 0.5 right.tif 30 40 0.5 0.5\n"
+    b"2, 43.3, 5.5, 99, 0.1, 0.1, 0.2, left, 5, 6, 1, 1\n"
+)
+MATCHES = (
+    b"image,col,row,track,sigma\nleft,1.5,2.5,0,0.5\nright,3,4,0,0.5\nleft,7,8,b,1\nright.tif,9,1e1,b,1\n"
+)
+POINTS = (
+    b'{"type": "FeatureCollection", "features": [{"geometry": {"coordinates": [5.4, 43.2, 1]},'
+    b' "properties": {"ji": [1, 2]}}]}'
+)
+
+
+SAMPLES: dict[str, Sample] = {
+    **{f"rpc {kind}": _rpc_sample(kind) for kind in TEXTS},
+    "rpc tag": Sample("b.tif", read_rpc, _tiff, (mutate_header,)),
+    "rpc nitf": Sample("b.ntf", read_rpc, cache(_nitf), (mutate_text,)),
+    "options": Sample("run.toml", read_options, lambda: OPTIONS, (mutate_text,)),
+    "gcps": Sample("a.gcp", lambda path: read_gcps(path, NAMES), lambda: ASP_GCPS, (mutate_text,)),
+    "gcps json": Sample("a.geojson", lambda path: read_gcps(path, NAMES), lambda: GCPS, (mutate_json,)),
+    "matches csv": Sample("t.csv", lambda path: read_matches(path, NAMES), lambda: MATCHES, (mutate_text,)),
+    "matches npz": Sample(
+        "t.npz",
+        lambda path: read_matches(path, NAMES),
+        lambda: _npz(
+            names=np.array(NAMES), view=np.array([0, 1]), track=np.array([0, 0]), xy=np.ones((2, 2))
+        ),
+        (mutate_npz,),
+    ),
+    "matches asp": Sample(
+        "run-left__right.txt",
+        lambda path: read_matches(path, NAMES),
+        lambda: b"2 2\n1 2 0 0\n3 4 0 0\n5 6 0 0\n7 8 0 0\n",
+        (mutate_text,),
+    ),
+    "points csv": Sample(
+        "p.csv",
+        read_correspondences,
+        lambda: b"lon,lat,alt,col,row\n5.4,43.2,100,1,2\n5.5;43.3;101;3;4\n",
+        (mutate_text,),
+    ),
+    "points json": Sample("p.json", read_correspondences, lambda: POINTS, (mutate_json,)),
+    "points npz": Sample(
+        "p.npz",
+        read_correspondences,
+        lambda: _npz(ground=np.ones((3, 3)), image=np.ones((3, 2))),
+        (mutate_npz,),
+    ),
+    "points of a verb": Sample(
+        "p.txt",
+        lambda path: read_points((), str(path), ("lon", "lat", "alt"), 0.0),
+        lambda: b"lon,lat,alt\n5.4,43.2,100\n5.5,43.3\n",
+        (mutate_text,),
+    ),
+    "pairs": Sample(
+        "pairs.txt",
+        lambda path: read_pairs(path, _views()),
+        lambda: b"# two\nleft right\n'left.tif' \"right.tif\"\n",
+        (mutate_text,),
+    ),
+    "images": Sample(
+        "list.txt",
+        lambda path: image_paths((), str(path)),
+        lambda: b"left.tif\n# x\nright.tif\n",
+        (mutate_text,),
+    ),
+    "area": Sample("aoi.geojson", read_area, lambda: AREA, (mutate_json,)),
+    "dem": Sample("dem.tif", _use_dem, _dem, (_mutate_transform(_dem), mutate_header), share=0.2),
+    "dem hgt": Sample("N43E005.hgt", _use_dem, cache(lambda: bytes(2 * 1201**2)), (), share=0.02),
+    "geoid gtx": Sample("geoid.gtx", _use_dem, _gtx, (mutate_header,)),
+    "grid": Sample(
+        "nodes.tif", _use_grid, _localisation, (_mutate_transform(_localisation), mutate_header), share=0.2
+    ),
+    "prior": Sample("block.npz", _use_prior, _prior, (mutate_npz,)),
+    "record": Sample(
+        "kept.npz",
+        _use_record,
+        lambda: _npz(**to_record((make_rpc(), {"a": [1.5, None]}, np.arange(3)))),
+        (mutate_npz,),
+    ),
+    "summary": _run_sample("summary.json", _report, mutate_json, mutate_values, mutate_values, share=0.6),
+    "comparison": _run_sample("summary.json", _compare, mutate_json, mutate_values, mutate_values, share=0.6),
+    "observations": _run_sample("observations.csv", _report, mutate_text, share=0.1),
+    "residuals": _run_sample("residuals.csv", _report, mutate_text, share=0.1),
+    "footprints": _run_sample("footprints.geojson", _report, mutate_json, mutate_values, share=0.2),
+    "compared RPC": _run_sample("view_0000_RPC.TXT", _compare, mutate_text, share=0.1),
+    "state": Sample(
+        ".barpc/state.json",
+        _use_state,
+        lambda: json.dumps({"barpc": "0", "status": "running", "stages": [], "outputs": ["a.txt"]}).encode(),
+        (mutate_json,),
+        _in_state,
+        share=0.2,
+    ),
+    "annotation": Sample(_BURSTS.name, _use_product, lambda: _annotation(_BURSTS), (mutate_xml,), share=0.2),
+    "annotation grd": Sample(
+        _GROUND.name, _use_product, lambda: _annotation(_GROUND), (mutate_xml,), share=0.2
+    ),
+    "product zip": Sample("S1A.zip", _use_product, _safe, (), share=0.2),
+    "orbit": Sample("S1A.EOF", _use_orbit, _BURSTS.eof, (mutate_xml,), _beside_orbit, share=0.2),
 }
-
-
-def seed(name: str) -> bytes:
-    """A sample with the byte in front by which `targets.check_all` chooses its reader."""
-    names = list(FORMATS)
-    kind = name.split(" ", maxsplit=1)[0]
-    return bytes([len(names) if kind == "tiff" else names.index(kind)]) + SAMPLES[name]
+"""Kind -> sample."""

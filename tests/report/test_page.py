@@ -156,7 +156,7 @@ def test_a_folder_without_a_finished_run_is_refused_with_a_reason(block_run, tmp
     with pytest.raises(InputError, match="no finished run"):
         page.remake_report(tmp_path)
     (tmp_path / "summary.json").write_text("{")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="not JSON that can be read"):
         page.remake_report(tmp_path)
     (tmp_path / "summary.json").write_text(json.dumps({"schema": 1}))
     with pytest.raises(InputError, match="schema 1"):

@@ -15,7 +15,7 @@ from barpc.report.measures import pair_ties, shift_in_image, triangulate_tracks
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import epipolar_offset, view_angles
 
-SCHEMA = json.loads((Path(__file__).parents[2] / "docs/summary.schema.json").read_text())
+SCHEMA = json.loads((Path(__file__).parents[2] / "barpc/report/summary.schema.json").read_text())
 TYPES = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None)}
 
 

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from barpc.errors import BarpcError, ImageError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
-from barpc.rpcio.formats import MAX_BYTES, parse
+from barpc.rpcio.formats import parse
 from barpc.rpcio.tiff import RPC_TAG, read_directory, tag_values
+from barpc.sidefile import RPC_FILE
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 
 RPC = make_rpc()
@@ -135,7 +136,7 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path):
         file.truncate(1 << 40)
     with pytest.raises(BarpcError):  # zeros: no text
         read_rpc(path)
-    assert "too large" in outcome(b"x" * (MAX_BYTES + 1))
+    assert "too large" in outcome(b"x" * (RPC_FILE.most + 1))
 
 
 def test_json_that_nests_without_end_is_refused():
@@ -224,5 +225,5 @@ def test_a_tag_with_the_wrong_count_is_refused(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(ImageError, match="no such file"):
+    with pytest.raises(ImageError, match="a pipe"):
         read_rpc(tmp_path / "pipe")

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import re
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from barpc.errors import InputError, RpcFormatError
+from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError
 from barpc.safexml import MAX_BYTES
 from barpc.sensor.sentinel1.annotation import Annotation, read_annotation
 from barpc.sensor.sentinel1.build import from_annotation, mosaic
 from barpc.sensor.sentinel1.corrections import Bistatic
 from barpc.sensor.sentinel1.range_doppler import RangeDoppler
+from barpc.sidefile import PRODUCT, opened, read_head
 
 MOSAIC = "mosaic"
 """The swath of all swaths."""
@@ -64,7 +64,25 @@ def open_product(
     RpcFormatError
         Not a Sentinel-1 product.
     """
-    found = _choose(Path(path), polarisation)
+    try:
+        return _open(Path(path), swath, polarisation, orbit, burst, atmosphere, bistatic)
+    except RpcError as error:
+        guilty = Path(path if orbit is None else orbit)
+        if guilty.name in str(error):
+            raise
+        raise type(error)(f"{guilty}: {error}") from error
+
+
+def _open(
+    path: Path,
+    swath: str | None,
+    polarisation: str | None,
+    orbit: str | Path | None,
+    burst: int | None,
+    atmosphere: bool,
+    bistatic: Bistatic | None,
+) -> RangeDoppler:
+    found = _choose(path, polarisation)
     precise = None if orbit is None else Path(orbit)
     name = None if swath is None else swath.lower()
     if name == MOSAIC:
@@ -96,10 +114,13 @@ class _File:
             return read_annotation(self.path)
         name = PurePosixPath(self.member).name
         try:
-            with zipfile.ZipFile(self.path) as archive, archive.open(self.member) as file:
-                return read_annotation(file.read(MAX_BYTES + 1), name=name)
-        except (OSError, zipfile.BadZipFile, RuntimeError, NotImplementedError, zlib.error) as error:
+            with opened(self.path, PRODUCT) as archive, zipfile.ZipFile(archive).open(self.member) as file:
+                data = file.read(MAX_BYTES + 1)
+        except BarpcError:
+            raise
+        except Exception as error:
             raise RpcFormatError(f"{self.path}: {name} cannot be read from it ({error})") from error
+        return read_annotation(data, name=name)
 
 
 def _annotations(path: Path) -> list[_File]:
@@ -109,17 +130,23 @@ def _annotations(path: Path) -> list[_File]:
     if path.is_dir():
         names = [str(p.relative_to(path)) for p in path.glob("annotation/*.xml")]
         files = [_named(path / name, None) for name in names]
-    elif zipfile.is_zipfile(path):
-        try:
-            with zipfile.ZipFile(path) as archive:
-                names = [n for n in archive.namelist() if PurePosixPath(n).parent.name == "annotation"]
-        except (OSError, zipfile.BadZipFile) as error:
-            raise RpcFormatError(f"{path}: a zip file that cannot be read ({error})") from error
+    elif read_head(path, PRODUCT, 4) in (b"PK\3\4", b"PK\5\6"):
+        names = [name for name in _members(path) if PurePosixPath(name).parent.name == "annotation"]
         files = [_named(path, name) for name in names]
     else:
         annotation = read_annotation(path)
         files = [_File(annotation.swath.lower(), annotation.polarisation.lower(), path)]
     return sorted(file for file in files if file is not None)
+
+
+def _members(path: Path) -> list[str]:
+    try:
+        with opened(path, PRODUCT) as file, zipfile.ZipFile(file) as archive:
+            return archive.namelist()
+    except BarpcError:
+        raise
+    except Exception as error:
+        raise RpcFormatError(f"{path}: a zip file that cannot be read ({error})") from error
 
 
 def _named(path: Path, member: str | None) -> _File | None:

@@ -1,0 +1,106 @@
+"""One damaged file to its reader: a value, or one error of barpc in one printable line that names the file."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from barpc.errors import BarpcError
+
+from .mutate import mutate_bytes
+from .samples import SAMPLES
+
+LONGEST = 10.0
+"""No file of a sample's size takes so many CPU seconds."""
+
+
+class Unexpected(AssertionError):
+    """A reader did what none may."""
+
+
+def check(kind: str, data: bytes, folder: Path) -> bool:
+    """Whether the reader takes the bytes.
+
+    `folder` is a place of the kind's own, as `prepared` makes it.
+    """
+    sample = SAMPLES[kind]
+    path = folder / sample.name
+    path.write_bytes(data)
+    began = time.process_time()
+    refused: BaseException | None = None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            sample.read(path)
+    except BarpcError as error:
+        refused = error
+    except Exception as error:
+        raise Unexpected(f"{kind}: {error!r}") from error
+    if time.process_time() - began > LONGEST:
+        raise Unexpected(f"{kind}: {time.process_time() - began:.0f} CPU s for {len(data)} bytes")
+    if refused is not None and not _is_one_line(str(refused), path):
+        raise Unexpected(f"{kind}: says {str(refused)!r}")
+    return refused is None
+
+
+def _is_one_line(message: str, path: Path) -> bool:
+    return message.isprintable() and len(message) < 2000 and (path.name in message or path.stem in message)
+
+
+def prepared(kind: str, place: str) -> Path:
+    """A folder for the files of a kind."""
+    folder = Path(place) / kind.replace(" ", "_")
+    folder.mkdir(exist_ok=True)
+    SAMPLES[kind].beside(folder)
+    return folder
+
+
+def scratch() -> tempfile.TemporaryDirectory[str]:
+    """A folder in memory where there is one: a million files are written."""
+    shm = Path("/dev/shm")
+    return tempfile.TemporaryDirectory(dir=shm if shm.is_dir() else None)
+
+
+def sweep(kind: str, runs: int, seed: int, found: dict[str, bytes] | None = None) -> int:
+    """So many damaged files of a kind, every third in its bytes alone; how many were accepted.
+
+    Parameters
+    ----------
+    kind : str
+        A row of `SAMPLES`.
+    runs, seed : int
+        How many, and where the damage starts from.
+    found : dict, optional
+        Gathers what was unexpected, with a file that shows it, where given; raised otherwise.
+    """
+    rng = np.random.default_rng([seed, *kind.encode()])
+    data, mutations, accepted = SAMPLES[kind].data(), SAMPLES[kind].mutations, 0
+    with scratch() as place:
+        folder = prepared(kind, place)
+        for k in range(runs):
+            by_structure = mutations and k % 3
+            mutate = mutations[int(rng.integers(len(mutations)))] if by_structure else mutate_bytes
+            mutant = mutate(data, rng)
+            try:
+                accepted += check(kind, mutant, folder)
+            except Unexpected as error:
+                if found is None:
+                    raise
+                found.setdefault(_place(error), mutant)
+    return accepted
+
+
+def _place(error: Unexpected) -> str:
+    """Where in barpc it happened."""
+    trace = error.__cause__.__traceback__ if error.__cause__ else None
+    where = ""
+    while trace is not None:
+        code = trace.tb_frame.f_code
+        if "barpc/" in code.co_filename.replace("\\", "/") and "/tests/" not in code.co_filename:
+            where = f"{code.co_filename.rpartition('barpc/')[2]}:{trace.tb_lineno}"
+        trace = trace.tb_next
+    return f"{where} {str(error)[:220]}" if where else str(error)[:220]

@@ -1,0 +1,118 @@
+"""A damaged summary.json is one line: every field missing or of another kind; it names no file elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+from collections.abc import Iterator
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from barpc.cli.main import cli
+from barpc.errors import InputError
+from barpc.report.compare import compare_runs
+from barpc.report.load import read_summary
+from barpc.report.page import remake_report, report_html
+from barpc.rpcio import write_rpc
+from tests.rpcio.conftest import make_rpc
+
+DEEP = {"a": {"a": {"a": {}}}}
+VALUES: tuple[Any, ...] = (None, True, 0, 1.0, -1, 1e99, 10**400, float("nan"), "", "x", [], [None], {}, DEEP)
+
+
+def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The path of every field, of the first item of a list."""
+    if at:
+        yield at
+    items = (
+        value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    )
+    for key, item in items:
+        yield from places(item, (*at, key))
+
+
+def changed(summary: dict[str, Any], at: tuple[Any, ...], *value: Any) -> dict[str, Any]:
+    """A copy with the field at a place replaced, or taken out."""
+    out = deepcopy(summary)
+    holder: Any = out
+    for key in at[:-1]:
+        holder = holder[key]
+    if value:
+        holder[at[-1]] = value[0]
+    else:
+        del holder[at[-1]]
+    return out
+
+
+def look(folder: Path, summary: dict[str, Any]) -> bool:
+    """Whether report and compare take a summary; what they refuse they refuse in one line."""
+    (folder / "summary.json").write_text(json.dumps(summary))
+    try:
+        read = read_summary(folder)
+    except InputError as error:
+        message = str(error)
+    else:
+        message = ""
+    if message:
+        assert message.isprintable()
+        assert str(folder) in message
+        return False
+    with contextlib.suppress(InputError):  # tables that do not go with it
+        report_html(read, folder)
+    with contextlib.suppress(InputError):  # no image in common
+        compare_runs(folder, folder)
+    return True
+
+
+@pytest.mark.parametrize("fixture", ["check_run", pytest.param("block_run", marks=pytest.mark.slow)])
+def test_every_field_may_be_anything(fixture, request, tmp_path):
+    run = request.getfixturevalue(fixture)
+    folder = tmp_path / "run"
+    shutil.copytree(run.folder, folder)
+    assert look(folder, run.summary)
+    taken = 0
+    for at in places(run.summary):
+        for value in ((), *((value,) for value in VALUES)):
+            taken += look(folder, changed(run.summary, at, *value))
+    assert taken
+
+
+@pytest.mark.parametrize("key", ["views", "pairs", "scene", "tracks", "tables", "versions", "stages"])
+def test_what_is_missing_is_named(block_run, tmp_path, key):
+    (tmp_path / "summary.json").write_text(json.dumps(changed(block_run.summary, (key,))))
+    for verb in (["report", tmp_path], ["compare", tmp_path, tmp_path]):
+        result = CliRunner().invoke(cli, [str(word) for word in verb])
+        assert isinstance(result.exception, InputError)
+        assert f"{tmp_path}/summary.json: damaged" in str(result.exception)
+        assert key in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    "name", ["../outside.json", "/outside.json", "inside/../../outside.json", "..", "link.json"]
+)
+def test_compare_opens_nothing_outside_the_folder(block_run, tmp_path, name, monkeypatch):
+    folder = tmp_path / "run"
+    shutil.copytree(block_run.folder, folder)
+    write_rpc(make_rpc(), tmp_path / "outside.json")
+    (folder / "link.json").symlink_to(tmp_path / "outside.json")
+    summary = deepcopy(block_run.summary)
+    summary["views"][0]["outputs"] = {name.replace("/outside", f"{tmp_path}/outside", name[0] == "/"): {}}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    opened: list[Path] = []
+    monkeypatch.setattr("barpc.report.compare.read_rpc", opened.append)
+    with contextlib.suppress(InputError):
+        compare_runs(folder, folder)
+    assert [path for path in opened if path.name not in {f"{v.name}_RPC.TXT" for v in block_run.views}] == []
+
+
+def test_a_name_that_is_no_text_does_not_keep_the_report_away(block_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(block_run.folder, folder)
+    summary = {**block_run.summary, "headline": "of \udce9t\udce9"}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    assert "of \\udce9t\\udce9" in remake_report(folder).read_text()

@@ -1,0 +1,268 @@
+"""Files from elsewhere are opened in one place, in time that grows as they do, and no reader goes around it."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import io
+import os
+import time
+import zipfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import barpc
+from barpc.errors import BarpcError, InputError
+from barpc.record import load_npz
+from barpc.rpcio import FORMATS
+from barpc.rpcio.fields import ReadOptions
+from barpc.rpcio.formats import parse
+from barpc.sidefile import (
+    ARRAYS,
+    NAMES,
+    Kind,
+    opened,
+    parse_json,
+    read_bytes,
+    read_head,
+    read_json,
+    read_text,
+)
+from tests.fuzz.samples import SAMPLES
+
+SMALL = Kind("a list of names", 100)
+READERS: dict[str, Callable[[Path], object]] = {
+    "read_bytes": lambda path: read_bytes(path, SMALL),
+    "read_text": lambda path: read_text(path, SMALL),
+    "read_json": lambda path: read_json(path, SMALL),
+    "read_head": lambda path: read_head(path, SMALL, 10),
+    "load_npz": lambda path: load_npz(path, SMALL),
+}
+
+
+@pytest.mark.parametrize("read", READERS.values(), ids=READERS)
+def test_only_a_regular_file_is_read(read, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for path, words in (
+        (tmp_path / "pipe", "a pipe"),
+        (tmp_path / "link", "a pipe"),
+        (Path("/dev/zero"), "a device"),
+        (tmp_path, "a folder"),
+        (tmp_path / "none", "no such file"),
+        (tmp_path / "zero\0byte", "cannot be read"),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            read(path)
+        assert str(caught.value).startswith(str(path).split("\0")[0])
+        assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("kind", [NAMES, ARRAYS])
+def test_a_file_that_is_too_large_is_refused_with_its_size_before_it_is_read(kind, tmp_path):
+    path = tmp_path / "huge"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(InputError, match=rf"huge: {1 << 40} bytes.*at most {kind.most}"):
+        read_bytes(path, kind)
+
+
+def test_a_file_without_a_size_is_not_read_beyond_the_bound():
+    path = Path("/proc/self/smaps")
+    if not path.exists():
+        pytest.skip("no /proc here")
+    with pytest.raises(InputError, match="101 bytes"):
+        read_bytes(path, SMALL)
+
+
+def test_no_descriptor_is_left_open(tmp_path):
+    folder = Path("/proc/self/fd")
+    if not folder.is_dir():
+        pytest.skip("no /proc here")
+    before = len(list(folder.iterdir()))
+    for path in (tmp_path, Path("/dev/zero"), tmp_path / "none"):
+        with pytest.raises(InputError), opened(path, SMALL):
+            pass
+    assert len(list(folder.iterdir())) == before
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["NaN", "[Infinity]", "1e999", "-1e101", "9" * 19, "9" * 5000, "[" * 100_000, '{"a":' * 100_000, "{", ""],
+)
+def test_json_holds_finite_numbers_and_is_not_endlessly_deep(text):
+    with pytest.raises(ValueError) as caught:
+        parse_json(text)
+    assert len(str(caught.value)) < 200
+
+
+def bomb(path: Path, claimed: int, stored: bytes, compression: int = zipfile.ZIP_DEFLATED) -> Path:
+    """An archive whose array claims so many bytes."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "|u1", "fortran_order": False, "shape": (claimed,)}
+    )
+    with zipfile.ZipFile(path, "w", compression) as archive, archive.open("names.npy", "w") as file:
+        file.write(header.getvalue() + stored)
+    return path
+
+
+def test_an_archive_that_claims_more_than_it_holds_is_refused_before_anything_is_allocated(tmp_path):
+    path = bomb(tmp_path / "liar.npz", 10**15, b"\0" * 100)  # 1 PB: an allocation would fail otherwise
+    with pytest.raises(InputError, match=r"liar\.npz.*another number of bytes"):
+        load_npz(path)
+    data = bytearray(bomb(tmp_path / "zip.npz", 10**6, b"\0" * 10**6).read_bytes())
+    directory = data.rindex(b"PK\1\2")
+    data[directory + 24 : directory + 28] = (10**9).to_bytes(4, "little")  # the directory's claim
+    (tmp_path / "zip.npz").write_bytes(data)
+    with pytest.raises(InputError, match=r"zip\.npz.*claims more bytes than it can hold"):
+        load_npz(tmp_path / "zip.npz")
+
+
+def test_an_archive_that_holds_too_much_is_refused_unpacked(tmp_path):
+    path = bomb(tmp_path / "bomb.npz", 10**6, b"\0" * 10**6)
+    assert path.stat().st_size < 5000
+    with pytest.raises(InputError, match=r"bomb\.npz, unpacked: 1000\d* bytes.*at most 100000"):
+        load_npz(path, Kind("a small archive", 100_000))
+
+
+# --- time -------------------------------------------------------------------------------------------------
+
+FILLS: dict[str, str] = {
+    "blank lines": "\n",
+    "blanks": " ",
+    "tabs and lines": "\t\n",
+    "opening brackets": "(",
+    "opening lists": "a: [\n",
+    "pairs of nothing": "a=(",
+    "digits": "7",
+    "letters": "a",
+    "angles": "<",
+    "tags": "<a>",
+    "tiles": "<NTILES_SIZE ",
+    "declarations": "<?xml ?",
+    "quotes": '"',
+    "values in blanks": "x   ",
+    "dashes": "\n - 1",
+    "keys": "LINE_OFF: 1 \n",
+}
+
+
+def cpu(work: Callable[[], object]) -> float:
+    began = time.process_time()
+    with contextlib.suppress(BarpcError, ValueError):
+        work()
+    return time.process_time() - began
+
+
+def sniff_and_read(name: str, text: str) -> None:
+    row = FORMATS[name]
+    row.sniff(text)
+    row.read(text, "x", ReadOptions())
+
+
+@pytest.mark.parametrize(
+    "prefix", ["", "LINE_OFF: ", "lineNumCoef = (", "rpc info = {", "<?xml ", "line_num_coeff: ["]
+)
+@pytest.mark.parametrize("fill", FILLS)
+def test_sniffers_and_readers_take_time_in_proportion_to_the_text(fill, prefix):
+    small, large = (prefix + FILLS[fill] * n for n in (10_000, 40_000))
+    for name in FORMATS:
+        first = min(cpu(partial(sniff_and_read, name, small)) for _ in range(2))
+        # a square takes 16 times as long, a cube 64; below some milliseconds it is the clock that is measured
+        assert cpu(partial(sniff_and_read, name, large)) < max(8 * first, 0.1), name
+
+
+def test_twenty_thousand_blank_lines_are_nothing():
+    assert cpu(lambda: parse(b"\n" * 20_000 + b"x", "x")) < 0.1
+    for row in FORMATS.values():
+        assert cpu(partial(row.sniff, "\n" * 20_000)) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fill", ["\n", " ", "(", "7", "<", "<a>", "a"])
+def test_the_largest_rpc_file_that_is_read_ends_in_sensible_time(fill):
+    data = (fill * (32 << 20))[: 32 << 20].encode()
+    assert cpu(lambda: parse(b"x" + data[1:], "x")) < 20
+    for name in ("txt", "rpb", "xml", "json"):
+        assert cpu(partial(sniff_and_read, name, data.decode())) < 60
+
+
+@pytest.mark.parametrize(
+    "kind", [kind for kind in SAMPLES if not kind.startswith(("rpc", "dem", "state", "grid"))]
+)
+@pytest.mark.parametrize("fill", ["\n", " ", "7", "(", "[", ","])
+def test_readers_take_time_in_proportion_to_the_file(kind, fill, tmp_path):
+    sample = SAMPLES[kind]
+    sample.beside(tmp_path)
+    path = tmp_path / sample.name
+
+    def read(n: int) -> float:
+        path.write_bytes(sample.data()[:20] + fill.encode() * n)
+        return cpu(lambda: sample.read(path))
+
+    first = read(20_000)
+    assert read(80_000) < max(8 * first, 0.2)
+
+
+# --- no way around ----------------------------------------------------------------------------------------
+
+DIRECT = {
+    "sidefile.py": "the one place",
+    "atomic.py": "syncs what was written",
+    "handoff.py": "reopens what barpc has just written, as its consumers do",
+    "raster.py": "images, checked there",
+    "workspace.py": "barpc's own source, images' fingerprints, the state",
+    "owned.py": "the state",
+    "pipeline/parcel.py": "arrays that the caller has put down for its workers",
+    "report/load.py": "the schema, which is part of the package",
+    "cli/main.py": "the null device",
+}
+"""Modules that may open a file for reading by themselves, and what they open."""
+ARRAYS_OF_A_PATH = ("load", "fromfile", "genfromtxt", "loadtxt")
+OF_A_FILE = ("memmap", "ZipFile", "is_zipfile")  # taken of a file that `opened` has opened
+
+
+def direct_opens(source: str) -> list[int]:
+    """Lines with a call that opens a path for reading by itself."""
+    return [
+        node.lineno for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call) and _opens(node)
+    ]
+
+
+def _opens(call: ast.Call) -> bool:
+    name = getattr(call.func, "attr", getattr(call.func, "id", ""))
+    words = {getattr(a, "value", None) for a in (*call.args, *(k.value for k in call.keywords))}
+    if name in OF_A_FILE:
+        return getattr(call.args[0], "id", "") not in ("file", "archive")
+    if not isinstance(call.func, ast.Attribute):
+        return name == "open"
+    owner = getattr(call.func.value, "id", getattr(getattr(call.func.value, "func", None), "attr", ""))
+    if name in ARRAYS_OF_A_PATH:
+        return owner == "np"
+    writes = bool(words & {"w", "wb", "r+b"})
+    members = owner in ("archive", "ZipFile", "Dem", "Grid")
+    return name in ("open", "read_text", "read_bytes") and not writes and not members
+
+
+def test_no_module_opens_a_file_by_itself():
+    root = Path(barpc.__file__).parent
+    around = {}
+    for path in root.rglob("*.py"):
+        name = path.relative_to(root).as_posix()
+        if name not in DIRECT and (found := direct_opens(path.read_text())):
+            around[name] = found
+    assert around == {}
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["Path(p).read_text()", "open(p)", "p.open('rb')", "np.load(p)", "os.open(p, 0)", "zipfile.ZipFile(p)",
+     "np.memmap(p, mode='r')", "rasterio.open(p)", "p.read_bytes()"],
+)  # fmt: skip
+def test_a_new_reader_that_goes_around_is_found(line):
+    assert direct_opens(line)
