@@ -14,7 +14,7 @@ from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
 from barpc.ba.smooth import SPLINES, Smooth, SmoothTest
 from barpc.ba.solve import Minimum, State, gauss_newton, minimise
-from barpc.ba.variances import PriorTest, Variances
+from barpc.ba.variances import PriorTest, Variances, same_prior
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
@@ -223,7 +223,7 @@ def run_rounds(
             noise = observations.noise(residual, use, problem)
         _LOG.info("pass %d: %d of %d observations, noise %.3f", passes, use.sum(), len(use), noise)
         settled = not options.estimate_noise or abs(noise / before - 1.0) < _SAME_NOISE
-        settled &= bool(np.all(np.abs(np.log(prior.sigma / problem.camera_prior.sigma)) < _SAME_PRIOR))
+        settled &= same_prior(prior, problem.camera_prior, _SAME_PRIOR)
         if passes > options.num_passes or (settled and (same or not robust)):
             minimum = replace(found, state=state)
             return Outcome(problem, minimum, residual, use, noise, passes, tested, smooth.test(residual, use))

@@ -309,7 +309,7 @@ def _scipy(
         x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # no first step cut short
         ftol=tolerance,
         xtol=_XTOL,
-        gtol=None,
+        gtol=np.sqrt(tolerance),  # of whitened unknowns: a thousandth of a standard deviation for a millionth
         max_nfev=max_steps,
     )
     if not found.success:

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from barpc.ba.blocks import CameraPrior
 from barpc.ba.covariance import Covariance
-from barpc.ba.linear import factorize
+from barpc.ba.linear import Matrix, factorize
 from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
 from barpc.ba.solve import Minimum, free_part
@@ -75,21 +75,21 @@ class _Around:
     @property
     def small(self) -> bool:
         """Whether it can be solved many times."""
-        return len(self.problem.free) <= _SMALL and isinstance(self.minimum.reduced.matrix, np.ndarray)
+        return len(self.problem.free) <= _SMALL
 
     def under(self, prior: CameraPrior) -> tuple[float, Array, Covariance]:
         """Evidence (logarithm, but for a constant), unknowns (N, q) and covariance under other priors."""
         now, reduced, start = self.problem.camera_prior, self.minimum.reduced, self.minimum.state.params
         free = self.problem.free
         change = np.where(free, (1.0 / prior.sigma**2 - 1.0 / now.sigma**2).ravel(), 0.0)
-        assert isinstance(reduced.matrix, np.ndarray)
-        matrix = reduced.matrix + np.diag(change)
-        part = free_part(free, matrix)
+        matrix = dense(reduced.matrix)
+        matrix[np.diag_indices(len(free))] += change
+        part = dense(free_part(free, matrix))
         covariance = Covariance(replace(reduced, matrix=matrix), factorize(part), free)
         offset = (start - now.mean).ravel()
         step = -covariance.solve(change * offset)
         moved = offset + step
-        cost = float(step @ reduced.matrix @ step + change @ moved**2)
+        cost = float(step @ (reduced.matrix @ step) + change @ moved**2)
         held = free & np.isfinite(prior.sigma.ravel())
         volume = float(np.linalg.slogdet(part)[1]) + 2.0 * float(np.log(prior.sigma.ravel()[held]).sum())
         return -0.5 * (cost + volume), start + step.reshape(start.shape), covariance
@@ -156,7 +156,7 @@ class Variances:
             before = prior
             wide = self._drift(params, known) if self.learn_drift else wide
             prior = self._prior(scale, wide)
-            if not around.small or np.all(np.abs(np.log(prior.sigma / before.sigma)) < _STANDS):
+            if not around.small or same_prior(prior, before, _STANDS):
                 break
             _, params, covariance = around.under(prior)
             known = self._known(covariance, prior)
@@ -266,6 +266,17 @@ class Variances:
             total = float((use * ((params - self.given.mean)[:, part] / self.given.sigma[:, part]) ** 2).sum())
             factors[degree] = np.sqrt((_STRENGTH + total) / (_STRENGTH + float(known[:, part].sum())))
         return factors
+
+
+def dense(matrix: Matrix) -> Array:
+    """A copy of a matrix as a plain array."""
+    return matrix.copy() if isinstance(matrix, np.ndarray) else np.asarray(matrix.toarray())
+
+
+def same_prior(a: CameraPrior, b: CameraPrior, share: float) -> bool:
+    """Whether the standard deviations of two priors differ by less than a share; infinite ones are infinite in both."""
+    finite = np.isfinite(a.sigma) & np.isfinite(b.sigma)
+    return bool((np.abs(np.log(a.sigma[finite] / b.sigma[finite])) < share).all())
 
 
 def posterior_variance(covariance: Covariance, shape: tuple[int, ...]) -> Array:

@@ -25,7 +25,8 @@ from barpc.sensor import SensorModel
 
 IntArray = npt.NDArray[np.int64]
 
-_ROW_STEPS = 3  # a drift turns by a ten-thousandth of a pixel a row or less: each step gains four digits
+_ROW_STEPS = 8  # a drift moves an image point by some thousandths of a pixel a row: each step gains three digits
+_ROW_SETTLED = 1e-6  # px: what is left is a thousandth of it
 
 
 def skew(vector: Array) -> Array:
@@ -254,7 +255,11 @@ class Corrected:
             return self.sensor.project(ground_from_ecef(self.correction.apply(ecef)))
         image = self.sensor.project(ground)
         for _ in range(_ROW_STEPS):
-            image = self.sensor.project(ground_from_ecef(self.correction.apply(ecef, image[..., 1])))
+            row = image[..., 1]
+            image = self.sensor.project(ground_from_ecef(self.correction.apply(ecef, row)))
+            change = np.abs(image[..., 1] - row)
+            if not (change.max(initial=0.0, where=np.isfinite(change)) > _ROW_SETTLED):
+                break
         return image
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:

@@ -9,10 +9,10 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, pair_heights
 from barpc.ba.incremental import BlockPrior
+from barpc.ba.options import DRIFT_SIGMA
 from barpc.errors import InputError
 from barpc.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import Tracks
-from barpc.sensor.corrected import Corrected, Correction
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve
 
@@ -24,7 +24,13 @@ OPTIONS = AdjustOptions(
     loss="linear",
     estimate_noise=False,
     min_convergence=0.01,
+    drift=0,
+    learn_priors=False,
 )
+DEFAULTS = AdjustOptions(
+    sigma_attitude=SIGMA_ATTITUDE, sigma_position=SIGMA_POSITION, noise_floor=0.0, min_convergence=0.01
+)
+"""All that is on by default: robust rounds, estimated noise, drift, priors that learn; noise that averages away."""
 
 
 @dataclass(frozen=True)
@@ -37,30 +43,31 @@ class Trials:
     unknowns: int
 
 
-def run_trials(block: Block, count: int) -> Trials:
+def run_trials(block: Block, count: int, options: AdjustOptions = OPTIONS) -> Trials:
     """Draw corrections from the prior and noise, adjust, compare."""
     rng = np.random.default_rng(5)
     centers = centers_of(block)
     tracks, n = block.tracks, len(block.views)
     truth = ecef_from_ground(block.truth.ground)
     enu = enu_basis(block.truth.ground[0])
-    first = adjust_tracks(block.views, tracks, OPTIONS, centers=centers)
-    distance = first.cameras.unknowns.distance
-    nees, scene = [], []
+    first = adjust_tracks(block.views, tracks, options, centers=centers)
+    unknowns = first.cameras.unknowns
+    sigma = [SIGMA_ATTITUDE] * 3 + [SIGMA_POSITION] * 3 + [DRIFT_SIGMA] * 3 * unknowns.drift
+    nees, scene, stated = [], [], []
     for _ in range(count):
-        params = rng.normal(0, np.repeat([SIGMA_ATTITUDE, SIGMA_POSITION], 3), (n, 6))
+        params = rng.normal(0, sigma, (n, len(sigma)))
         xy = np.empty_like(tracks.xy)
-        for v, view in enumerate(block.views):
+        for v, sensor in enumerate(unknowns.corrected(params, block.views)):
             rows = tracks.view == v
-            correction = Correction(params[v, :3] / distance[v], params[v, 3:], centers[v])
-            xy[rows] = Corrected(view.sensor, correction).project(block.truth.ground[tracks.point[rows]])
+            xy[rows] = sensor.project(block.truth.ground[tracks.point[rows]])
         xy += rng.normal(0, NOISE, xy.shape)
         noisy = Tracks(tracks.view, tracks.point, xy, tracks.sigma)
-        found = adjust_tracks(block.views, noisy, OPTIONS, centers=centers)
+        found = adjust_tracks(block.views, noisy, options, centers=centers)
         error = (found.params - params).ravel()
         nees.append(error @ (found.covariance.reduced.matrix @ error))
-        scene.append(enu @ (found.points - truth).mean(axis=0))
-    return Trials(np.array(nees), np.array(scene), first.gauge.sigma, 6 * n)
+        scene.append(enu @ np.nanmean(found.points - truth, axis=0))
+        stated.append(found.gauge.sigma)
+    return Trials(np.array(nees), np.array(scene), np.sqrt(np.mean(np.square(stated), axis=0)), len(sigma) * n)
 
 
 @pytest.mark.slow
@@ -78,6 +85,14 @@ def test_a_hundred_trials_agree_with_the_prediction():
     trials = run_trials(simulate_block(3, 100, seed=2, noise=NOISE), 100)
     spread = np.sqrt(2 / (trials.unknowns * 100))
     assert trials.nees.mean() / trials.unknowns == pytest.approx(1.0, abs=4 * spread)
+
+
+@pytest.mark.parametrize(("views", "tracks", "count"), [(3, 200, 150), (10, 300, 40)])
+def test_with_every_default_on_errors_are_as_large_as_predicted(views, tracks, count):
+    trials = run_trials(simulate_block(views, tracks, seed=4, noise=NOISE), count, DEFAULTS)
+    assert trials.nees.mean() / trials.unknowns == pytest.approx(1.0, abs=0.1)
+    ratio = trials.scene.std(axis=0) / trials.scene_sigma
+    np.testing.assert_allclose(ratio, 1.0, atol=4 / np.sqrt(2 * count))
 
 
 def test_points_and_relative_heights_err_as_predicted():
@@ -99,7 +114,8 @@ def test_points_and_relative_heights_err_as_predicted():
 def test_covariance_of_single_views_is_the_whole_matrix_cut_up(adjusted):
     view = adjusted.covariance.view(3)
     full = adjusted.covariance.full
-    np.testing.assert_allclose(view, full[18:24, 18:24], rtol=1e-6, atol=1e-9)
+    q = adjusted.covariance.num_unknowns
+    np.testing.assert_allclose(view, full[3 * q : 4 * q, 3 * q : 4 * q], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(adjusted.covariance.joint(np.array([3])), view, rtol=1e-6, atol=1e-9)
     product = full @ adjusted.covariance.reduced.matrix
     np.testing.assert_allclose(product, np.eye(len(full)), atol=1e-5)
