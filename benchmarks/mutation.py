@@ -1,0 +1,293 @@
+"""Small errors put into the numerical core on purpose: how many do the fast tests catch?
+
+    python benchmarks/mutation.py --sample 200 --seed 1 --json score.json
+    python benchmarks/mutation.py --chosen
+    python benchmarks/mutation.py --sample 10 --bar 0.7
+
+Every mutant changes one place of one module in a copy of the tree; the fast tests of the module's folder are
+run there and stop at the first failure. Texts, messages, annotations, logging and sizes of chunks are left
+alone. Mutants that no test can tell from the original are named in mutation.toml, with the reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import difflib
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+
+ROOT = Path(__file__).resolve().parents[1]
+TOML = Path(__file__).with_suffix(".toml")
+GATE = ("barpc/pipeline/outputs.py", "barpc/handoff.py")
+TESTS = {
+    **{name: (f"tests/{name}",) for name in ("ba", "fit", "sensor", "rpcio")},
+    "tie": ("tests/tie/test_[!sr]*.py", "tests/tie/test_r[!e]*.py", "tests/tie/test_re[!a]*.py", "tests/tie"),
+    "gate": ("tests/pipeline/test_outputs.py", "tests/test_handoff.py"),
+}
+"""Part of the core -> its tests, the quick ones first."""
+
+COMPARISONS = {
+    ast.Lt: ("<", "<=", ">"), ast.LtE: ("<=", "<", ">="), ast.Gt: (">", ">=", "<"), ast.GtE: (">=", ">", "<="),
+    ast.Eq: ("==", "!="), ast.NotEq: ("!=", "=="), ast.Is: ("is", "is not"), ast.IsNot: ("is not", "is"),
+    ast.In: ("in", "not in"), ast.NotIn: ("not in", "in"),
+}  # fmt: skip
+ARITHMETIC = {
+    ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"), ast.FloorDiv: ("//", "/"),
+    ast.Mod: ("%", "*"), ast.Pow: ("**", "*"), ast.BitAnd: ("&", "|"), ast.BitOr: ("|", "&"),
+}  # fmt: skip
+SILENT = ("_LOG.", "warnings.", "np.errstate", "field(", "TypeVar", "_LISTED", "CHUNK", "logging.")
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change: bytes start to stop of a file become `new`."""
+
+    file: str
+    start: int
+    stop: int
+    new: str
+
+    @property
+    def part(self) -> str:
+        """Which tests are to catch it."""
+        return "gate" if self.file in GATE else self.file.split("/")[1]
+
+    def source(self) -> tuple[str, str]:
+        """The file before and after."""
+        raw = (ROOT / self.file).read_bytes()
+        return raw.decode(), (raw[: self.start] + self.new.encode() + raw[self.stop :]).decode()
+
+    def diff(self) -> str:
+        """The changed lines."""
+        before, after = (text.splitlines() for text in self.source())
+        changed = difflib.unified_diff(before, after, lineterm="", n=0)
+        rows = [row for row in changed if not row.startswith(("---", "+++"))]
+        return "\n".join([f"{self.file} {rows[0]}", *rows[1:]])
+
+
+class Places:
+    """Walks a module and yields (start, stop, new text) of every small error that could be made in it."""
+
+    def __init__(self, raw: bytes) -> None:
+        self.raw = raw
+        self.lines = [0]
+        for line in raw.splitlines(keepends=True):
+            self.lines.append(self.lines[-1] + len(line))
+
+    def span(self, node: ast.AST) -> tuple[int, int]:
+        """Bytes of a node."""
+        ends = (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)  # type: ignore[attr-defined]
+        return tuple(self.lines[line - 1] + col for line, col in ends)  # type: ignore[return-value]
+
+    def text(self, node: ast.AST) -> str:
+        """Source of a node."""
+        start, stop = self.span(node)
+        return self.raw[start:stop].decode()
+
+    def walk(self, node: ast.AST) -> Iterator[tuple[int, int, str]]:
+        """All changes below a node, outside of texts, annotations and messages."""
+        if isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom | ast.Assert):
+            return
+        if isinstance(node, ast.stmt | ast.Call) and self.text(node).startswith(SILENT):
+            return
+        yield from self.here(node)
+        skipped = {"annotation", "returns", "decorator_list", "type_params", "msg"}
+        for name, value in ast.iter_fields(node):
+            if name in skipped or isinstance(node, ast.Raise):
+                continue
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST):
+                    yield from self.walk(child)
+
+    def here(self, node: ast.AST) -> Iterator[tuple[int, int, str]]:
+        """Changes of one node."""
+        if isinstance(node, ast.Compare) and len(node.ops) == 1:
+            old, *new = COMPARISONS[type(node.ops[0])]
+            yield from (self.between(node.left, node.comparators[0], old, other) for other in new)
+        elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
+            if not isinstance(node.left, ast.Constant | ast.JoinedStr) or not isinstance(node.left.value, str):  # type: ignore[union-attr]
+                yield self.between(node.left, node.right, *ARITHMETIC[type(node.op)])
+        elif isinstance(node, ast.AugAssign) and type(node.op) in ARITHMETIC:
+            old, new = ARITHMETIC[type(node.op)]
+            yield self.between(node.target, node.value, old + "=", new + "=")
+        elif isinstance(node, ast.BoolOp):
+            old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
+            yield self.between(node.values[0], node.values[1], old, new)
+        elif isinstance(node, ast.UnaryOp):
+            yield (*self.span(node), f"({self.text(node.operand)})")
+        elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float):
+            number = node.value
+            new = not number if isinstance(number, bool) else number + 1 if isinstance(number, int) else 2 * number
+            yield (*self.span(node), f"{new or 1.0!r}" if isinstance(number, float) else f"{new!r}")
+        elif isinstance(node, ast.IfExp):
+            test, one, two = map(self.text, (node.test, node.body, node.orelse))
+            yield (*self.span(node), f"{two} if {test} else {one}")
+        elif isinstance(node, ast.If) and isinstance(node.body[-1], ast.Raise | ast.Return | ast.Continue):
+            yield (*self.span(node.test), "False")
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+            yield (*self.span(node), "pass")
+        elif isinstance(node, ast.Call) and len(node.args) > 1 and not isinstance(node.func, ast.Attribute):
+            yield from self.swapped(*node.args[:2])
+
+    def between(self, left: ast.AST, right: ast.AST, old: str, new: str) -> tuple[int, int, str]:
+        """The operator between two nodes, exchanged."""
+        start = self.raw.index(old.encode(), self.span(left)[1], self.span(right)[0])
+        return start, start + len(old), new
+
+    def swapped(self, one: ast.AST, two: ast.AST) -> Iterator[tuple[int, int, str]]:
+        """The first two arguments of a call, exchanged."""
+        if not isinstance(one, ast.Starred) and not isinstance(two, ast.Starred) and self.text(one) != self.text(two):
+            (start, _), (_, stop) = self.span(one), self.span(two)
+            yield start, stop, f"{self.text(two)}, {self.text(one)}"
+
+
+def mutants(parts: list[str]) -> list[Mutant]:
+    """All mutants of the core's modules, in the order of their places."""
+    folders = [path for part in parts if part != "gate" for path in sorted((ROOT / "barpc" / part).rglob("*.py"))]
+    found = []
+    for path in [*folders, *(ROOT / name for name in GATE if "gate" in parts)]:
+        raw = path.read_bytes()
+        for start, stop, new in Places(raw).walk(ast.parse(raw)):
+            found.append(Mutant(str(path.relative_to(ROOT)), start, stop, new))
+    return found
+
+
+def chosen() -> list[Mutant]:
+    """The mutants that mutation.toml lists by hand."""
+    return [_listed(row) for row in tomllib.loads(TOML.read_text())["chosen"]]
+
+
+def _listed(row: dict[str, str]) -> Mutant:
+    raw = (ROOT / row["file"]).read_bytes()
+    if raw.count(row["old"].encode()) != 1:
+        raise SystemExit(f"{TOML.name}: {row['old']!r} stands {raw.count(row['old'].encode())} times in {row['file']}")
+    start = raw.index(row["old"].encode())
+    return Mutant(row["file"], start, start + len(row["old"].encode()), row["new"])
+
+
+def equivalents() -> dict[tuple[str, str], str]:
+    """(file, changed line) -> why no test can tell it from the original."""
+    rows = tomllib.loads(TOML.read_text()).get("equivalent", [])
+    return {(row["file"], row["line"]): row["why"] for row in rows}
+
+
+def reason(mutant: Mutant) -> str | None:
+    """Why the mutant is equivalent; None where it is not listed so."""
+    changed = [row[1:].strip() for row in mutant.diff().splitlines()[1:] if row.startswith("+")]
+    return equivalents().get((mutant.file, " ".join(changed)))
+
+
+def caught(tree: Path, mutant: Mutant, limit: float) -> tuple[bool, str, float]:
+    """Whether the tests fail with the mutant in a tree; the test that did; seconds."""
+    target = tree / mutant.file
+    before, after = mutant.source()
+    target.write_text(after)
+    try:
+        return _failing(tree, mutant.part, limit)
+    finally:
+        target.write_text(before)
+
+
+def _failing(tree: Path, part: str, limit: float) -> tuple[bool, str, float]:
+    paths = [str(p.relative_to(tree)) for pattern in TESTS[part] for p in sorted(tree.glob(pattern))]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *paths]
+    shared = os.environ.get("BARPC_SHARED", str(ROOT.parent / "shared"))
+    places = {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1", "BARPC_SHARED": shared}
+    start = time.monotonic()
+    with subprocess.Popen(
+        command, cwd=tree, env={**os.environ, **places}, stdout=-1, stderr=-2, text=True, start_new_session=True
+    ) as run:
+        try:
+            output, _ = run.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            os.killpg(run.pid, 9)
+            return True, "too slow", time.monotonic() - start
+    named = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return run.returncode != 0, named[0][:160] if named else "", time.monotonic() - start
+
+
+def copy_tree(folder: Path) -> Path:
+    """The working tree, without its history, in a folder."""
+    names = ("barpc", "tests", "data_samples", "benchmarks", "docs", "pyproject.toml", "README.md", "LICENSE")
+    for name in names:
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        copy(ROOT / name, folder / name)
+    return folder
+
+
+def run(picked: list[Mutant], jobs: int, limit: float) -> list[dict[str, object]]:
+    """Every mutant's fate, as rows of the score."""
+    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
+        trees: SimpleQueue[Path] = SimpleQueue()
+        for i in range(jobs):
+            (Path(temporary) / str(i)).mkdir()
+            trees.put(copy_tree(Path(temporary) / str(i)))
+
+        def one(mutant: Mutant) -> dict[str, object]:
+            why = reason(mutant)
+            tree = trees.get()
+            found, test, seconds = (False, "", 0.0) if why else caught(tree, mutant, limit)
+            trees.put(tree)
+            fate = "equivalent" if why else "caught" if found else "SURVIVED"
+            print(f"{fate} {seconds:.0f} s {test or why or ''}\n{mutant.diff()}", flush=True)
+            return {"part": mutant.part, "fate": fate, "test": test, "why": why, "diff": mutant.diff()}
+
+        return list(pool.map(one, picked))
+
+
+def score(rows: list[dict[str, object]]) -> dict[str, object]:
+    """Counts by part, and the share of what is not equivalent that was caught."""
+    parts = {}
+    for part in [*TESTS, "all"]:
+        fates = [row["fate"] for row in rows if part in ("all", row["part"])]
+        counts = {fate: fates.count(fate) for fate in ("caught", "SURVIVED", "equivalent")}
+        if fates:
+            real = len(fates) - counts["equivalent"]
+            parts[part] = {**counts, "share": round(counts["caught"] / real, 3) if real else None}
+    return {"score": parts, "survivors": [row["diff"] for row in rows if row["fate"] == "SURVIVED"], "rows": rows}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sample", type=int, default=60, help="mutants drawn at random")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--part", action="append", choices=[*TESTS], help="part of the core; all by default")
+    parser.add_argument("--chosen", action="store_true", help="the listed mutants instead of a sample")
+    parser.add_argument("--survivors", type=Path, help="only the survivors of this score, again")
+    parser.add_argument("--skip", type=int, default=0, help="leave out so many of the sample's first mutants")
+    parser.add_argument("--json", type=Path, help="where the score is written")
+    parser.add_argument("--bar", type=float, default=0.0, help="least share that must be caught")
+    parser.add_argument("--limit", type=float, default=600.0, help="seconds after which a mutant counts as caught")
+    parser.add_argument("-j", type=int, default=1, dest="jobs")
+    args = parser.parse_args()
+    parts = args.part or [*TESTS]
+    picked = chosen() if args.chosen else mutants(parts)
+    if args.survivors:
+        again = set(json.loads(args.survivors.read_text())["survivors"])
+        picked = [mutant for mutant in picked if mutant.diff() in again]
+    elif not args.chosen:
+        picked = random.Random(args.seed).sample(picked, min(args.sample, len(picked)))[args.skip :]
+    found = score(run([m for m in picked if m.part in parts], args.jobs, args.limit))
+    print(json.dumps(found["score"], indent=1))
+    if args.json:
+        args.json.write_text(json.dumps(found, indent=1) + "\n")
+    share = found["score"].get("all", {}).get("share")  # type: ignore[attr-defined]
+    if share is not None and share < args.bar:
+        raise SystemExit(f"{share:.0%} caught, {args.bar:.0%} wanted")
+
+
+if __name__ == "__main__":
+    main()
