@@ -245,8 +245,8 @@ def copy_tree(folder: Path) -> Path:
     return folder
 
 
-def run(picked: list[Mutant], jobs: int, limit: float, sound: bool = True) -> list[dict[str, object]]:
-    """Every mutant's fate, as rows of the score."""
+def run(picked: list[Mutant], jobs: int, limit: float, sound: bool = True) -> Iterator[dict[str, object]]:
+    """Every mutant's fate, one after the other, as rows of the score."""
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
         trees: SimpleQueue[Path] = SimpleQueue()
         for i in range(jobs):
@@ -267,7 +267,7 @@ def run(picked: list[Mutant], jobs: int, limit: float, sound: bool = True) -> li
             print(f"{fate} {seconds:.0f} s {test or why or ''}\n{mutant.diff()}", flush=True)
             return {"part": mutant.part, "fate": fate, "test": test, "why": why, "diff": mutant.diff()}
 
-        return list(pool.map(one, picked))
+        yield from pool.map(one, picked)
 
 
 def score(rows: list[dict[str, object]]) -> dict[str, object]:
@@ -303,10 +303,14 @@ def main() -> None:
         picked = [mutant for mutant in picked if mutant.diff() in again]
     elif not args.chosen:
         picked = random.Random(args.seed).sample(picked, min(args.sample, len(picked)))[args.skip :]
-    found = score(run([m for m in picked if m.part in parts], args.jobs, args.limit, not args.trust))
+    rows: list[dict[str, object]] = []
+    found = score(rows)
+    for row in run([m for m in picked if m.part in parts], args.jobs, args.limit, not args.trust):
+        rows.append(row)
+        found = score(rows)
+        if args.json:
+            args.json.write_text(json.dumps(found, indent=1) + "\n")
     print(json.dumps(found["score"], indent=1))
-    if args.json:
-        args.json.write_text(json.dumps(found, indent=1) + "\n")
     share = found["score"].get("all", {}).get("share")  # type: ignore[attr-defined]
     if share is not None and share < args.bar:
         raise SystemExit(f"{share:.0%} caught, {args.bar:.0%} wanted")

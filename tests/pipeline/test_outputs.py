@@ -80,7 +80,7 @@ def test_a_loose_fit_may_miss_by_its_own_error_and_no_more(tmp_path, view, fit) 
     with Workspace(tmp_path / "a") as run:
         written = write_view(run, view, loose, Elsewhere(make_rpc(), 0.98), "none", ("txt",))
     assert written["scene_RPC.TXT"]["barpc"] == pytest.approx(0.98, abs=1e-6)
-    with pytest.raises(OutputError, match="1.02 px off"), Workspace(tmp_path / "b") as run:
+    with pytest.raises(OutputError, match=r"1\.02 px off"), Workspace(tmp_path / "b") as run:
         write_view(run, view, loose, Elsewhere(make_rpc(), 1.02), "none", ("txt",))
 
 
