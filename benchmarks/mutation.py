@@ -27,8 +27,10 @@ import tomllib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 import cv2  # noqa: F401 - imported once, before the tests are forked: each would take seconds to do so
 import pyproj  # noqa: F401
@@ -56,7 +58,10 @@ ARITHMETIC = {
     ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"), ast.FloorDiv: ("//", "/"),
     ast.Mod: ("%", "*"), ast.Pow: ("**", "*"), ast.BitAnd: ("&", "|"), ast.BitOr: ("|", "&"),
 }  # fmt: skip
+NO_CODE = {"annotation", "returns", "decorator_list", "type_params", "msg"}
 SILENT = ("_LOG.", "warnings.", "np.errstate", "field(", "TypeVar", "_LISTED", "CHUNK", "logging.")
+
+Change = tuple[int, int, str]
 
 
 @dataclass(frozen=True)
@@ -91,80 +96,87 @@ class Places:
 
     def __init__(self, raw: bytes) -> None:
         self.raw = raw
-        self.lines = [0]
-        for line in raw.splitlines(keepends=True):
-            self.lines.append(self.lines[-1] + len(line))
+        self.lines = [0, *accumulate(map(len, raw.splitlines(keepends=True)))]
 
-    def span(self, node: ast.AST) -> tuple[int, int]:
-        """Bytes of a node."""
-        ends = (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)  # type: ignore[attr-defined]
-        return tuple(self.lines[line - 1] + col for line, col in ends)  # type: ignore[return-value]
+    def _span(self, node: Any) -> tuple[int, int]:
+        start = self.lines[node.lineno - 1] + node.col_offset
+        return start, self.lines[node.end_lineno - 1] + node.end_col_offset
 
-    def text(self, node: ast.AST) -> str:
-        """Source of a node."""
-        start, stop = self.span(node)
-        return self.raw[start:stop].decode()
+    def _text(self, node: ast.AST) -> str:
+        return self.raw[slice(*self._span(node))].decode()
 
-    def walk(self, node: ast.AST) -> Iterator[tuple[int, int, str]]:
-        """All changes below a node, outside of texts, annotations and messages."""
+    def walk(self, node: ast.AST) -> Iterator[Change]:
+        """All changes below a node, outside of texts, annotations, messages and logging."""
         if isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom | ast.Assert):
             return
-        if isinstance(node, ast.stmt | ast.Call) and self.text(node).startswith(SILENT):
+        if isinstance(node, ast.stmt | ast.Call) and self._text(node).startswith(SILENT):
             return
-        yield from self.here(node)
-        skipped = {"annotation", "returns", "decorator_list", "type_params", "msg"}
+        yield from getattr(self, f"_{type(node).__name__.lower()}", lambda _: ())(node)
         for name, value in ast.iter_fields(node):
-            if name in skipped or isinstance(node, ast.Raise):
+            if name in NO_CODE or isinstance(node, ast.Raise):
                 continue
             for child in value if isinstance(value, list) else [value]:
                 if isinstance(child, ast.AST):
                     yield from self.walk(child)
 
-    def here(self, node: ast.AST) -> Iterator[tuple[int, int, str]]:
-        """Changes of one node."""
-        if isinstance(node, ast.Compare) and len(node.ops) == 1:
-            old, *new = COMPARISONS[type(node.ops[0])]
-            yield from (self.between(node.left, node.comparators[0], old, other) for other in new)
-        elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
-            if not isinstance(node.left, ast.Constant | ast.JoinedStr) or not isinstance(node.left.value, str):  # type: ignore[union-attr]
-                yield self.between(node.left, node.right, *ARITHMETIC[type(node.op)])
-        elif isinstance(node, ast.AugAssign) and type(node.op) in ARITHMETIC:
-            old, new = ARITHMETIC[type(node.op)]
-            yield self.between(node.target, node.value, old + "=", new + "=")
-        elif isinstance(node, ast.BoolOp):
-            old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
-            yield self.between(node.values[0], node.values[1], old, new)
-        elif isinstance(node, ast.UnaryOp):
-            yield (*self.span(node), f"({self.text(node.operand)})")
-        elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float):
-            number = node.value
-            new = not number if isinstance(number, bool) else number + 1 if isinstance(number, int) else 2 * number
-            yield (*self.span(node), f"{new or 1.0!r}" if isinstance(number, float) else f"{new!r}")
-        elif isinstance(node, ast.IfExp):
-            test, one, two = map(self.text, (node.test, node.body, node.orelse))
-            yield (*self.span(node), f"{two} if {test} else {one}")
-        elif isinstance(node, ast.If) and isinstance(node.body[-1], ast.Raise | ast.Return | ast.Continue):
-            yield (*self.span(node.test), "False")
-        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
-            yield (*self.span(node), "pass")
-        elif isinstance(node, ast.Call) and len(node.args) > 1 and not isinstance(node.func, ast.Attribute):
-            yield from self.swapped(*node.args[:2])
-
-    def between(self, left: ast.AST, right: ast.AST, old: str, new: str) -> tuple[int, int, str]:
-        """The operator between two nodes, exchanged."""
-        start = self.raw.index(old.encode(), self.span(left)[1], self.span(right)[0])
+    def _between(self, left: ast.AST, right: ast.AST, old: str, new: str) -> Change:
+        start = self.raw.index(old.encode(), self._span(left)[1], self._span(right)[0])
         return start, start + len(old), new
 
-    def swapped(self, one: ast.AST, two: ast.AST) -> Iterator[tuple[int, int, str]]:
-        """The first two arguments of a call, exchanged."""
-        if not isinstance(one, ast.Starred) and not isinstance(two, ast.Starred) and self.text(one) != self.text(two):
-            (start, _), (_, stop) = self.span(one), self.span(two)
-            yield start, stop, f"{self.text(two)}, {self.text(one)}"
+    def _compare(self, node: ast.Compare) -> Iterator[Change]:
+        if len(node.ops) == 1:
+            old, *new = COMPARISONS[type(node.ops[0])]
+            yield from (self._between(node.left, node.comparators[0], old, other) for other in new)
+
+    def _binop(self, node: ast.BinOp) -> Iterator[Change]:
+        text = isinstance(node.left, ast.JoinedStr) or isinstance(getattr(node.left, "value", None), str)
+        if type(node.op) in ARITHMETIC and not text:
+            yield self._between(node.left, node.right, *ARITHMETIC[type(node.op)])
+
+    def _augassign(self, node: ast.AugAssign) -> Iterator[Change]:
+        if type(node.op) in ARITHMETIC:
+            old, new = ARITHMETIC[type(node.op)]
+            yield self._between(node.target, node.value, old + "=", new + "=")
+
+    def _boolop(self, node: ast.BoolOp) -> Iterator[Change]:
+        old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
+        yield self._between(node.values[0], node.values[1], old, new)
+
+    def _unaryop(self, node: ast.UnaryOp) -> Iterator[Change]:
+        yield (*self._span(node), f"({self._text(node.operand)})")
+
+    def _constant(self, node: ast.Constant) -> Iterator[Change]:
+        number = node.value
+        if isinstance(number, bool | int | float):
+            other = not number if isinstance(number, bool) else number + 1
+            if isinstance(number, float):
+                other = 2 * number or 1.0
+            yield (*self._span(node), repr(other))
+
+    def _ifexp(self, node: ast.IfExp) -> Iterator[Change]:
+        test, one, two = map(self._text, (node.test, node.body, node.orelse))
+        yield (*self._span(node), f"{two} if {test} else {one}")
+
+    def _if(self, node: ast.If) -> Iterator[Change]:
+        if isinstance(node.body[-1], ast.Raise | ast.Return | ast.Continue):
+            yield (*self._span(node.test), "False")
+
+    def _expr(self, node: ast.Expr) -> Iterator[Change]:
+        if isinstance(node.value, ast.Call):
+            yield (*self._span(node), "pass")
+
+    def _call(self, node: ast.Call) -> Iterator[Change]:
+        if len(node.args) > 1 and self._text(node.func) not in ("min", "max"):
+            one, two = node.args[:2]
+            if not {type(one), type(two)} & {ast.Starred} and self._text(one) != self._text(two):
+                yield self._span(one)[0], self._span(two)[1], f"{self._text(two)}, {self._text(one)}"
 
 
 def mutants(parts: list[str]) -> list[Mutant]:
     """All mutants of the core's modules, in the order of their places."""
-    folders = [path for part in parts if part != "gate" for path in sorted((ROOT / "barpc" / part).rglob("*.py"))]
+    folders = [
+        path for part in parts if part != "gate" for path in sorted((ROOT / "barpc" / part).rglob("*.py"))
+    ]
     found = []
     for path in [*folders, *(ROOT / name for name in GATE if "gate" in parts)]:
         raw = path.read_bytes()
@@ -181,7 +193,9 @@ def chosen() -> list[Mutant]:
 def _listed(row: dict[str, str]) -> Mutant:
     raw = (ROOT / row["file"]).read_bytes()
     if raw.count(row["old"].encode()) != 1:
-        raise SystemExit(f"{TOML.name}: {row['old']!r} stands {raw.count(row['old'].encode())} times in {row['file']}")
+        raise SystemExit(
+            f"{TOML.name}: {row['old']!r} stands {raw.count(row['old'].encode())} times in {row['file']}"
+        )
     start = raw.index(row["old"].encode())
     return Mutant(row["file"], start, start + len(row["old"].encode()), row["new"])
 
@@ -192,10 +206,9 @@ def equivalents() -> dict[tuple[str, str], str]:
     return {(row["file"], row["line"]): row["why"] for row in rows}
 
 
-def reason(mutant: Mutant) -> str | None:
-    """Why the mutant is equivalent; None where it is not listed so."""
-    changed = [row[1:].strip() for row in mutant.diff().splitlines()[1:] if row.startswith("+")]
-    return equivalents().get((mutant.file, " ".join(changed)))
+def changed(mutant: Mutant) -> str:
+    """The lines that a mutant puts in, as one."""
+    return " ".join(row[1:].strip() for row in mutant.diff().splitlines()[1:] if row.startswith("+"))
 
 
 def caught(tree: Path, mutant: Mutant, limit: float) -> tuple[bool, str, float]:
@@ -214,7 +227,9 @@ def _failing(tree: Path, part: str, stem: str, limit: float) -> tuple[bool, str,
     found = (path for path in sorted(tree.glob(TESTS[part])) if path.name not in SLOW)
     paths = sorted(found, key=lambda path: stem.removeprefix("_") not in path.name)
     start, log = time.monotonic(), tree / "log.txt"
-    child = multiprocessing.get_context("fork").Process(target=_tests, args=(tree, log, list(map(str, paths))))
+    child = multiprocessing.get_context("fork").Process(
+        target=_tests, args=(tree, log, list(map(str, paths)))
+    )
     child.start()
     child.join(limit)
     if child.is_alive():
@@ -229,7 +244,9 @@ def _tests(tree: Path, log: Path, paths: list[str]) -> None:
     os.setsid()
     os.chdir(tree)
     sys.path.insert(0, str(tree))
-    os.environ.update(PYTHONPATH=str(tree), BARPC_SHARED=os.environ.get("BARPC_SHARED", str(ROOT.parent / "shared")))
+    os.environ.update(
+        PYTHONPATH=str(tree), BARPC_SHARED=os.environ.get("BARPC_SHARED", str(ROOT.parent / "shared"))
+    )
     with log.open("w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -238,8 +255,7 @@ def _tests(tree: Path, log: Path, paths: list[str]) -> None:
 
 def copy_tree(folder: Path) -> Path:
     """The working tree, without its history, in a folder."""
-    names = ("barpc", "tests", "data_samples", "benchmarks", "docs", "examples", "pyproject.toml", "README.md", "LICENSE")
-    for name in names:
+    for name in ("barpc", "tests", "data_samples", "docs", "examples", "pyproject.toml", "README.md"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, folder / name)
     return folder
@@ -259,7 +275,7 @@ def run(picked: list[Mutant], jobs: int, limit: float, sound: bool = True) -> It
                 raise SystemExit(f"{part}: the tests fail without a mutant: {test}")
 
         def one(mutant: Mutant) -> dict[str, object]:
-            why = reason(mutant)
+            why = equivalents().get((mutant.file, changed(mutant)))
             tree = trees.get()
             found, test, seconds = (False, "", 0.0) if why else caught(tree, mutant, limit)
             trees.put(tree)
@@ -279,11 +295,17 @@ def score(rows: list[dict[str, object]]) -> dict[str, object]:
         if fates:
             real = len(fates) - counts["equivalent"]
             parts[part] = {**counts, "share": round(counts["caught"] / real, 3) if real else None}
-    return {"score": parts, "survivors": [row["diff"] for row in rows if row["fate"] == "SURVIVED"], "rows": rows}
+    return {
+        "score": parts,
+        "survivors": [row["diff"] for row in rows if row["fate"] == "SURVIVED"],
+        "rows": rows,
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sample", type=int, default=60, help="mutants drawn at random")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--part", action="append", choices=[*TESTS], help="part of the core; all by default")
@@ -292,7 +314,9 @@ def main() -> None:
     parser.add_argument("--skip", type=int, default=0, help="leave out so many of the sample's first mutants")
     parser.add_argument("--json", type=Path, help="where the score is written")
     parser.add_argument("--bar", type=float, default=0.0, help="least share that must be caught")
-    parser.add_argument("--limit", type=float, default=600.0, help="seconds after which a mutant counts as caught")
+    parser.add_argument(
+        "--limit", type=float, default=600.0, help="seconds after which a mutant counts as caught"
+    )
     parser.add_argument("--trust", action="store_true", help="do not run the tests without a mutant first")
     parser.add_argument("-j", type=int, default=1, dest="jobs")
     args = parser.parse_args()
