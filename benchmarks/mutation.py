@@ -166,7 +166,8 @@ class Places:
             yield (*self._span(node), "pass")
 
     def _call(self, node: ast.Call) -> Iterator[Change]:
-        if len(node.args) > 1 and self._text(node.func) not in ("min", "max"):
+        symmetric = isinstance(node.func, ast.Attribute) or self._text(node.func) in ("min", "max")
+        if len(node.args) > 1 and not symmetric:
             one, two = node.args[:2]
             if not {type(one), type(two)} & {ast.Starred} and self._text(one) != self._text(two):
                 yield self._span(one)[0], self._span(two)[1], f"{self._text(two)}, {self._text(one)}"

@@ -155,6 +155,11 @@ def test_the_epipolar_offset_is_the_shift_across_the_epipolar_line():
     offset, alt = epipolar_offset(a, b, xa, xb)
     np.testing.assert_allclose(offset, 0, atol=1e-6)
     np.testing.assert_allclose(alt, truth[:, 2], atol=1e-5)
+    start = np.full(50, 480.0)
+    np.testing.assert_array_equal(epipolar_offset(a, b, xa, xb, start, steps=0)[1], start)
+    once, twice = (epipolar_offset(a, b, xa, xb, start, steps=steps)[1] for steps in (1, 2))
+    assert (np.abs(once - truth[:, 2]) < 0.2 * np.abs(start - truth[:, 2])).all()
+    assert (np.abs(twice - truth[:, 2]) <= np.abs(once - truth[:, 2])).all()
     # b moves by (-0.9, 0.6) px per metre against a: along it nothing shows, across it all does
     along = b.project(a.localize(xa, truth[:, 2] + 1)) - xb
     along /= np.linalg.norm(along, axis=1)[:, None]
