@@ -15,7 +15,7 @@ from barpc.fit import rpc as fit_module
 from barpc.fit.certificate import Errors, coverage, roundtrip, smallest_denominator
 from barpc.fit.grid import check_points, control_points, spaced, terrain_range, widened
 from barpc.fit.lcurve import _curvature
-from barpc.fit.points import screened
+from barpc.fit.points import _check_order, screened
 from barpc.fit.ridge import expected_size, noise_scaled, solution
 from barpc.fit.rpc import relative_weight, underlying_rpc
 from barpc.fit.system import ALL, Problem
@@ -179,6 +179,24 @@ def test_mirrored_points_are_taken_where_allowed(camera: Camera) -> None:
         screened(ground, mirrored, False)
     screened(ground, mirrored, True)
     screened(ground, image, False)
+
+
+@pytest.mark.parametrize(
+    ("jacobian", "refused"),
+    [
+        ([[2, 0], [0, 2]], True), ([[2, 0], [0, -2]], False),  # mirrored; as seen from above
+        ([[2, 0], [0, 1.02]], True), ([[2, 0], [0, 0.98]], False), ([[0.98, 0], [0, 2]], False),
+        ([[1.02, 0], [0, 2]], True), ([[2, 0.9], [0, 2]], True), ([[2, 2.4], [0, 2]], False),
+        ([[2, -2.4], [0, 2]], False), ([[0, 2], [2, 0]], False), ([[0, 2], [-2, 0]], True),
+    ],
+)  # fmt: skip
+def test_only_an_upright_square_image_is_suspected_of_swapped_columns(jacobian: Any, refused: bool) -> None:
+    """Rows run down: a view from above has a negative determinant. Oblong by two, or askew by 60 degrees: left be."""
+    if refused:
+        with pytest.raises(FitError, match="mirrored"):
+            _check_order(np.array(jacobian, dtype=float))
+    else:
+        _check_order(np.array(jacobian, dtype=float))
 
 
 @pytest.mark.parametrize(

@@ -205,7 +205,9 @@ def test_outlines_and_the_area_grow_by_as_much_as_the_cameras_may_be_wrong(tmp_p
             np.testing.assert_allclose(part.bounds[0], edge[0], atol=0.1)
             np.testing.assert_allclose(part.bounds[2:], corner + metres, rtol=0.01)
             assert part.bounds[3] - part.bounds[1] == pytest.approx(height, rel=0.01)
-            assert part.bounds[2] - part.bounds[0] == pytest.approx(0.6 * (width - 2 * metres) + 2 * metres, rel=0.03)
+            assert part.bounds[2] - part.bounds[0] == pytest.approx(
+                0.6 * (width - 2 * metres) + 2 * metres, rel=0.03
+            )
 
 
 def test_views_that_do_not_see_the_area_are_named(tmp_path) -> None:
