@@ -466,6 +466,10 @@ def test_vendors_denominators_are_kept_to_the_digit() -> None:
     np.testing.assert_array_equal(fit.rpc.coeffs[1::2], camera.rpc.coeffs[1::2])
     np.testing.assert_array_equal(fit.rpc.ground_offset, camera.rpc.ground_offset)
     assert fit.method == "vendor-denominators"
+    doubled = replace(camera.rpc, coeffs=2.0 * camera.rpc.coeffs)  # the same camera
+    ground, image = random_points(camera, 300, np.random.default_rng(0))
+    kept = fit_rpc_points(ground, image, vendor=doubled, options=options)
+    np.testing.assert_allclose(kept.rpc.coeffs[1::2], camera.rpc.coeffs[1::2], rtol=1e-14)
     with pytest.raises(FitError, match="not built on an RPC"):
         fit_rpc_points(*random_points(camera, 200, np.random.default_rng(0)), options=options)
 
