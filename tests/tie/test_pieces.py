@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
@@ -14,10 +15,12 @@ from barpc.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import TieOptions, TieResult, find_tracks, select_pairs
 from barpc.tie import find as find_module
-from barpc.tie.epipolar import Affine, agreeing, frame, linear_map, mad, robust_affine
-from barpc.tie.features import detect_tile, tiles
+from barpc.tie.epipolar import Affine, Frame, agreeing, frame, linear_map, mad, robust_affine
+from barpc.tie.features import Keypoints, detect_tile, tiles
 from barpc.tie.find import require_known
-from barpc.tie.matching import common_range
+from barpc.tie.guided import Band, Candidates
+from barpc.tie.link import thin
+from barpc.tie.matching import _Search, common_range
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import sample_stretch
 from barpc.tie.refine import _grouped, _shared, references
@@ -370,3 +373,97 @@ def test_tracks_must_tie_every_pair_after_registration() -> None:
     find_module.require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=12))
     with pytest.raises(Exception, match="only 12 tracks after registration"):
         find_module.require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=13))
+
+
+# --- matching ----------------------------------------------------------------------------------------------
+
+
+class Scripted:
+    """A matcher that knows its answers: distances in the true band, and in the bands to either side."""
+
+    def __init__(self, true: list[float], aside: tuple[list[float], list[float]]) -> None:
+        self.true, self.aside, self.asked = np.array(true), aside, []
+
+    def match(self, a: Any, b: Any, where: Any, band: Band) -> Candidates:
+        shift = float(where.across[0])
+        self.asked.append(shift)
+        distance = self.true if shift == 0 else np.array(self.aside[int(shift > 0)])
+        index = np.stack([np.arange(len(distance))] * 2, axis=1)
+        return Candidates(index, distance, np.full(len(distance), 0.5))
+
+
+@pytest.mark.parametrize(
+    ("aside", "share", "count", "stated"),
+    [
+        (([], []), 0.01, 100, 0.0),
+        (([0.505], [0.505]), 0.01, 100, 0.01),  # two bands: half of two false ones in a hundred
+        (([0.505], [0.505]), 0.0099, 50, 0.0),
+        (([0.105], [0.205, 0.805]), 0.02, 100, 0.015),
+        (([0.105], [0.205, 0.805]), 0.0149, 80, 0.0125),
+        (([0.001] * 9, []), 0.04, 0, 0.0),
+    ],
+)
+def test_as_many_matches_are_trusted_as_the_bands_aside_allow(aside, share, count, stated) -> None:
+    """A hundred matches at distances 0.01 to 1; what lies in a shifted band is half of what is false."""
+    rng = np.random.default_rng(0)
+    points = Keypoints(rng.uniform(0, 999, (100, 2)), *(np.ones(100),) * 3, np.ones((100, 128), np.uint8))
+    where = Frame(np.array([1.0, 0.0]), *(np.zeros(100),) * 4, np.eye(2))
+    matcher = Scripted([0.01 * k for k in range(1, 101)], aside)
+    search = _Search(points, points, matcher, TieOptions())
+    found, control = search.trusted(where, Band(np.zeros(100), np.zeros(100), 3.0), share)
+    assert len(found) == count
+    assert control == pytest.approx(stated)
+    assert matcher.asked == [0.0, -12.0, 12.0]  # twice the band's half width and six pixels more
+
+
+def test_only_unambiguous_matches_count_and_each_place_once() -> None:
+    xy = np.array([[0.0, 0.0], [0.3, 0.2], [50.0, 0.0], [90.0, 0.0]])
+    points = Keypoints(xy, *(np.ones(4),) * 3, np.ones((4, 128), np.uint8))
+
+    class Answers:
+        def match(self, *_: Any) -> Candidates:
+            index = np.array([[0, 0], [1, 1], [2, 2], [3, 3]])
+            return Candidates(index, np.array([0.4, 0.3, 0.2, 0.1]), np.array([0.85, 0.8, 0.851, 0.1]))
+
+    search = _Search(points, points, Answers(), TieOptions(ratio=0.85))
+    where = Frame(np.array([1.0, 0.0]), *(np.zeros(4),) * 4, np.eye(2))
+    index, distance = search.unambiguous(where, Band(np.zeros(4), np.zeros(4), 1.0))
+    assert index.tolist() == [[3, 3], [1, 1]]  # 0 and 1 are one place, the better stays
+    assert distance.tolist() == [0.1, 0.3]
+
+
+def test_a_frames_linear_map_is_that_of_the_middle_of_the_points_that_are_seen(scene: Rendered) -> None:
+    one, two = (view.sensor for view in scene.views)
+    xy = np.random.default_rng(0).uniform(100, 5000, (51, 2))
+    limits = common_range(*scene.views)
+    xy[:3] = np.nan
+    with np.errstate(all="ignore"):
+        where = frame(one, two, xy, limits)
+    expected = linear_map(one, two, np.median(xy[3:], axis=0), 0.5 * sum(limits))
+    np.testing.assert_array_equal(where.linear, expected)
+    assert np.abs(linear_map(one, two, np.zeros(2), 0.5 * sum(limits)) - expected).max() > 1e-7
+    assert np.isnan(where.slope[:3]).all()
+    assert np.isfinite(where.slope[3:]).all()
+
+
+def test_cells_hold_the_first_quota_of_as_many_observations_as_are_kept(monkeypatch) -> None:
+    seen = []
+
+    def fill(tracks: Tracks, cell: list[int], cells: int, most: int, views: int) -> np.ndarray:
+        seen.append((cell, cells))
+        return np.ones(tracks.num_points, dtype=bool)
+
+    monkeypatch.setattr(sys.modules["barpc.tie.link"], "_fill", fill)
+    tracks = _tracks(*[(v, p) for p in range(30) for v in (0, 1)])
+    thin(tracks, [(1000, 800), (700, 700)], 20)
+    ((cell, count),) = seen
+    sides = [np.sqrt(4 * 1000 * 800 / 20), np.sqrt(4 * 700 * 700 / 20)]
+    columns, rows = (
+        [int(1000 / sides[0]) + 2, int(700 / sides[1]) + 2],
+        [int(800 / sides[0]) + 2, int(700 / sides[1]) + 2],
+    )
+    assert count == columns[0] * rows[0] + columns[1] * rows[1]
+    for k, found in enumerate(cell):
+        v = int(tracks.view[k])
+        col, row = ((tracks.xy[k] + 0.5) // sides[v]).astype(int)
+        assert found == v * columns[0] * rows[0] + row * columns[v] + col
