@@ -77,3 +77,14 @@ def test_a_track_without_an_observation_has_no_point() -> None:
     assert np.flatnonzero(~found.ok).tolist() == [5]
     assert np.isnan(found.points[5]).all()
     assert np.isfinite(found.residuals).all()
+
+
+def test_it_stops_where_the_step_is_below_a_millimetre(monkeypatch) -> None:
+    truth, view, point, xy, _ = scene(noise=0.0)
+    calls = []
+    project = type(SENSORS[0]).project_jacobian
+    monkeypatch.setattr(
+        type(SENSORS[0]), "project_jacobian", lambda self, ground: calls.append(1) or project(self, ground)
+    )
+    triangulate(SENSORS, view, point, xy, alt=truth[:, 2] + 1.0)
+    assert len(calls) in (3 * 2, 3 * 3)

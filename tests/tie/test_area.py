@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -208,6 +209,13 @@ def test_outlines_and_the_area_grow_by_as_much_as_the_cameras_may_be_wrong(tmp_p
             assert part.bounds[2] - part.bounds[0] == pytest.approx(
                 0.6 * (width - 2 * metres) + 2 * metres, rel=0.03
             )
+
+
+def test_outlines_of_an_oblong_image_grow_by_whole_pixels_too() -> None:
+    (square,) = views(camera(0.0, lean=0.0))
+    oblong = replace(square, size=(1000, 250))
+    plain, grown = (footprints([oblong], [square.sensor], 100.0, reach).outlines[0] for reach in (0.0, 40.0))
+    np.testing.assert_allclose(np.subtract(grown.bounds, plain.bounds), [-20, -20, 20, 20], atol=0.1)
 
 
 def test_views_that_do_not_see_the_area_are_named(tmp_path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.tie.register import _upsampled, register
+from barpc.tie.register import _Template, _upsampled, register
 
 SIZE = 400
 
@@ -152,3 +152,13 @@ def test_sigma_grows_with_the_noise_and_shrinks_with_the_patch(texture, referenc
         sigma[times, patch] = np.median(found.sigma[found.ok])
     assert sigma[2, 21] / sigma[1, 21] == pytest.approx(2.0, rel=0.1)
     assert sigma[1, 21] / sigma[1, 41] == pytest.approx(2.0, rel=0.15)
+
+
+def test_the_derivative_of_a_ramp_is_its_slope() -> None:
+    row, col = np.mgrid[:60, :80].astype(np.float32)
+    template = _Template(3.0 * col - 5.0 * row, 21)
+    np.testing.assert_allclose(template._by_col[5:-5, 5:-5], 3.0, rtol=1e-5)
+    np.testing.assert_allclose(template._by_row[5:-5, 5:-5], -5.0, rtol=1e-5)
+    assert template._weight.sum() == pytest.approx(1.0, rel=1e-5)
+    middle, edge = template._weight[220], template._weight[210]
+    assert edge / middle == pytest.approx(np.exp(-0.5 / 0.7**2), rel=1e-5)
