@@ -14,7 +14,7 @@ from barpc.errors import OutputError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.handoff import Consumer, Reading, control_grid, difference, verify
 from barpc.pipeline import outputs
-from barpc.pipeline.outputs import REOPENED, SUFFIXES, file_names, refuse_shadows, unknown_formats, write_view
+from barpc.pipeline.outputs import REOPENED, file_names, refuse_shadows, write_view
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
@@ -209,20 +209,15 @@ def test_a_keyword_list_of_another_kind_is_not_read(tmp_path, old, new) -> None:
     ],
 )  # fmt: skip
 def test_a_foreign_file_that_would_be_read_first_is_refused(tmp_path, view, beside, images, refused) -> None:
-    with Workspace(tmp_path / "out") as run:
-        write_rpc(make_rpc(), run.folder / beside)
-        names = file_names(view, images, ())
-        if refused:
-            with pytest.raises(OutputError, match=f"{beside}: lies beside"):
-                refuse_shadows(run, names)
-        else:
-            refuse_shadows(run, names)
-        refuse_shadows(run, [*names, beside])  # written by this run itself
-
-
-def test_formats_are_known_by_their_names() -> None:
-    assert unknown_formats(["txt", "dimap", "nothing", "xml"]) == ["dimap", "nothing"]
-    assert unknown_formats(list(SUFFIXES)) == []
+    write_rpc(make_rpc(), tmp_path / beside)
+    names = file_names(view, images, ())
+    if refused:
+        with pytest.raises(OutputError, match=f"{beside}: lies beside"):
+            refuse_shadows(tmp_path, names)
+    else:
+        refuse_shadows(tmp_path, names)
+    refuse_shadows(tmp_path, [*names, beside])  # written by this run itself
+    refuse_shadows(tmp_path / "not yet", names)
 
 
 def test_json_is_what_rpcm_reads(tmp_path, view, fit) -> None:
