@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks, block_prior, normal
+from barpc.ba import AdjustOptions, adjust_tracks, block_prior, normal, rounds
 from barpc.ba.adjustment import make_problem
 from barpc.ba.block import join
 from barpc.ba.blocks import ground_control
@@ -389,3 +389,34 @@ def test_residuals_of_gcps_point_from_the_given_to_the_adjusted_place():
     options = AdjustOptions(noise_floor=0.0, sigma_attitude=0.01, sigma_position=0.01, min_convergence=0.01)
     found = adjust_tracks(made.views, made.tracks, options, gcps, centers=centers_of(made))
     np.testing.assert_allclose(found.gcp_residuals, np.tile(-offset, (4, 1)), atol=1.0)
+
+
+def test_robust_rounds_end_where_the_losss_scale_is_three_sigmas_of_the_noise(monkeypatch):
+    made = simulate_block(4, 150, seed=21, noise=0.1, outliers=0.4)
+    scales, noises = [], []
+    loss, robust, squared = rounds.LOSSES["geman_mcclure"], rounds._robust, Observations.squared
+    last = {}
+
+    def seen(self, residual, counted):
+        last["s"] = squared(self, residual, counted)
+        return last["s"]
+
+    def watched(scaled):
+        k = int(np.argmax(np.where(np.isfinite(last["s"]), last["s"], 0)))
+        scales.append(float(np.sqrt(last["s"][k] / scaled[k])))
+        return loss(scaled)
+
+    def ended(*given):
+        found = robust(*given)
+        noises.append(found[2])
+        return found
+
+    monkeypatch.setattr(Observations, "squared", seen)
+    monkeypatch.setitem(rounds.LOSSES, "geman_mcclure", watched)
+    monkeypatch.setattr(rounds, "_robust", ended)
+    options = AdjustOptions(noise_floor=0.0, min_convergence=0.01)
+    adjust_tracks(made.views, made.tracks, options, centers=centers_of(made))
+    assert scales[0] > 5 * scales[-1]
+    assert 3.0 * noises[0] <= scales[-1] * 1.0001 <= 3.6001 * noises[0]
+    shrink = np.array(scales[1::2][1:]) / np.array(scales[1::2][:-1])
+    assert (shrink >= 0.2499).all()
