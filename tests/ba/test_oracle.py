@@ -420,3 +420,26 @@ def test_robust_rounds_end_where_the_losss_scale_is_three_sigmas_of_the_noise(mo
     assert 3.0 * noises[0] <= scales[-1] * 1.0001 <= 3.6001 * noises[0]
     shrink = np.array(scales[1::2][1:]) / np.array(scales[1::2][:-1])
     assert (shrink >= 0.2499).all()
+
+
+@pytest.mark.parametrize(
+    ("strong", "spread", "alt", "sigma"),
+    [
+        (0, 0.0, 300.0, 200.0),  # none other tells: the middle of the range 100 to 500, its half
+        (9, 400.0, 300.0, 200.0),
+        (10, 0.0, 700.0, 50.0),  # the others' median, and never less than 50 m
+        (10, 400.0, 700.0, 360.0),  # from their 5th to their 95th percentile
+    ],
+)
+def test_weak_tracks_are_held_to_the_altitude_of_the_others(strong, spread, alt, sigma):
+    lon, lat = np.linspace(5.0, 5.01, strong + 2), np.full(strong + 2, 43.0)
+    altitudes = np.r_[700.0 + np.linspace(-0.5, 0.5, strong) * spread, -50.0, 2000.0]
+    points = ecef_of(np.column_stack([lon, lat, altitudes]))
+    weak = np.arange(strong + 2) >= strong
+    heights = Heights((), weak, np.arange(strong + 2), (100.0, 500.0), AdjustOptions(), None)
+    prior = heights._held(points)
+    assert prior is not None
+    assert prior.index.tolist() == [strong, strong + 1]
+    np.testing.assert_allclose(prior.residual(points)[:, 0] * sigma, altitudes[-2:] - alt, atol=1e-6)
+    assert not prior.residual(points)[:, 1:].any()
+    assert replace(heights, weak=np.zeros(strong + 2, dtype=bool))._held(points) is None

@@ -14,7 +14,7 @@ from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import rpc as fit_module
 from barpc.fit.certificate import Errors, coverage, roundtrip, smallest_denominator
 from barpc.fit.grid import check_points, control_points, spaced, terrain_range, widened
-from barpc.fit.lcurve import _curvature
+from barpc.fit.lcurve import _curvature, solve_lcurve
 from barpc.fit.points import _check_order, screened
 from barpc.fit.ridge import expected_size, noise_scaled, solution
 from barpc.fit.rpc import relative_weight, underlying_rpc
@@ -480,3 +480,18 @@ def test_too_few_points_are_refused_to_the_point(camera: Camera) -> None:
     with pytest.raises(FitError, match="39 points are too few: each coordinate has 39 unknowns, give 40"):
         fit_rpc_points(ground[:39], image[:39], options=options)
     fit_rpc_points(ground[:40], image[:40], options=options, strict=False)
+
+
+def test_the_papers_solver_counts_its_passes_over_the_points(camera: Camera, monkeypatch: Any) -> None:
+    ground, image = random_points(camera, 300, np.random.default_rng(2))
+    image = image + np.random.default_rng(3).normal(0, 0.2, image.shape)
+    rpc = camera.rpc
+    norm = Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+    calls = []
+    compressed = Problem.compressed
+    monkeypatch.setattr(
+        Problem, "compressed", lambda self, *given: calls.append(1) or compressed(self, *given)
+    )
+    *_, passes = solve_lcurve(Problem(ground, image, norm), [1])
+    assert passes == len(calls)
+    assert passes >= 5
