@@ -189,11 +189,10 @@ def test_the_stretch_lies_between_the_percentiles_of_the_valid_pixels(tmp_path) 
     assert stretch is not None
     assert stretch.low == pytest.approx(300, rel=0.15)
     assert stretch.high == pytest.approx(59_700, rel=0.003)
-    flat = np.full((50, 50), 1e7, np.float64)
-    flat[20:30] += 5.0
-    assert sample_stretch(write_image(tmp_path / "b.tif", flat)) is None
-    flat[20:30] += 45.0
-    assert sample_stretch(write_image(tmp_path / "c.tif", flat)) is not None
+    flat = np.full((50, 50), 2.0**23, np.float32)  # one step of the type is 1
+    for range_, varies in ((6.0, False), (10.0, True)):
+        flat[20:30] = 2.0**23 + range_
+        assert (sample_stretch(write_image(tmp_path / f"{varies}.tif", flat)) is not None) == varies
 
 
 def test_zero_borders_of_five_pixels_are_invalid_and_smaller_ones_are_not(tmp_path) -> None:
