@@ -86,8 +86,8 @@ def adjust_tracks(
     options = AdjustOptions() if options is None else options
     views = tuple(views)
     block = join(views, tracks, gcps, options)
-    drift = _first_drift(options, prior)
-    problem = make_problem(block, options, centers, prior, drift)
+    problem = make_problem(block, options, centers, prior)
+    drift = problem.cameras.unknowns.drift
     state, heights = _start(problem, block, options, gcps, dem)
     heights.warn()
     before = problem.residuals(state.params, state.points)
@@ -169,10 +169,15 @@ def _rounds(
 
 
 def make_problem(
-    block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior | None, drift: int = 0
+    block: Block,
+    options: AdjustOptions,
+    centers: Array | None,
+    prior: BlockPrior | None,
+    drift: int | None = None,
 ) -> Problem:
-    """Observations, cameras and priors, before anything is known about points."""
+    """Observations, cameras and priors, before anything is known about points; `drift` instead of the options'."""
     views = block.views
+    drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
         centers = _known_centers(block, options, centers, prior)
     unknowns = make_unknowns(views, options.model, drift, centers, options.center_method)

@@ -31,8 +31,9 @@ _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each v
 _BACKFITTING = 6
 _LEAST_FREEDOM = 20
 _ROBUST_ROUNDS = 20
+_AS_STATED = 1.5  # times the noise stated, and
 _CLEAN = 5.0  # sigmas
-_FEW = 0.002  # of the observations farther away than that
+_FEW = 0.002  # of the observations farther away than that: there is nothing to be careful about
 _NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
 _SHRINK = 0.25  # of the loss's scale in one round, at most
 _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
@@ -203,7 +204,7 @@ def run_rounds(
             problem,
             state,
             weight,
-            options.solver if passes > 1 or not robust else "sparse",  # the second pass, which follows always, is exact
+            "sparse" if options.solver == "auto" and passes == 1 else options.solver,  # a second pass follows always
             options.max_steps,
             options.tolerance if passes > 1 or not robust else _FIRST_TOLERANCE,
             projected,
@@ -257,7 +258,7 @@ def _robust(
         noise = max(float(np.sqrt(_median(s, counted) / _MEDIAN)), least, _LEAST_NOISE)
         if scale <= 3.6 * noise:
             break
-        clean = float((s[use] > (_CLEAN * noise) ** 2).mean()) < _FEW  # nothing to be careful about
+        clean = noise < _AS_STATED and float((s[use] > (_CLEAN * noise) ** 2).mean()) < _FEW
         scale = 3.0 * noise if np.isinf(scale) or clean else max(3.0 * noise, _SHRINK * scale)
         counted = use * loss(s / scale**2)[1]
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)

@@ -9,6 +9,7 @@ sum is larger than chance allows, some prior was too narrow: that of one view, i
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +24,8 @@ from barpc.ba.solve import Minimum, free_part
 from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
+
+_LOG = logging.getLogger(__name__)
 
 _STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside what the block shows
 _LEVEL = 1e-3  # a sum of squares less probable than this is too large
@@ -139,6 +142,15 @@ class Variances:
         minimum : Minimum
             What `minimise` found.
         """
+        try:
+            return self._learnt(problem, minimum)
+        except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
+            _LOG.warning("the priors of the cameras are left as they are: %s", error)
+            n = len(minimum.state.params)
+            nothing = PriorTest(float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), ())
+            return problem.camera_prior, nothing
+
+    def _learnt(self, problem: Problem, minimum: Minimum) -> tuple[CameraPrior, PriorTest]:
         around = _Around(problem, minimum)
         now, params = problem.camera_prior, minimum.state.params
         covariance = minimum.covariance(problem.free)
@@ -250,7 +262,10 @@ class Variances:
         trial = scale.copy()
         trial[v] = _FREE
         prior = self._prior(trial, wide)
-        _, params, covariance = around.under(prior)
+        try:
+            _, params, covariance = around.under(prior)
+        except np.linalg.LinAlgError:
+            return -np.inf, 1.0
         known = self._known(covariance, prior)
         total, freedom = self._squares(params, known)[v], known[v, : self.constants].sum()
         trial[v] = max(np.sqrt((_STRENGTH + total) / (_STRENGTH + freedom)), 1.0)

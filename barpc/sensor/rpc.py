@@ -86,11 +86,6 @@ class RPC:
         arrays = (self.coeffs, self.ground_offset, self.ground_scale, self.image_offset, self.image_scale)
         return (*(tuple(a.ravel().tolist()) for a in arrays), self.err_bias, self.err_rand)
 
-    @property
-    def _gradient(self) -> Array:
-        """Derivatives of the four polynomials by (lon, lat, alt), normalised, on ten monomials: (12, 10)."""
-        return np.asarray(self._map.gradients.reshape(3, 4, 10).swapaxes(0, 1).reshape(12, 10))
-
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
         """Normalised longitude, latitude, altitude, one row each.
 

@@ -8,7 +8,6 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from barpc.ba import linear, normal, solve
-from barpc.ba.solve import State
 from barpc.ba.structure import counting_sort
 from barpc.errors import AdjustError
 from tests.ba.conftest import solve as adjust
@@ -62,21 +61,6 @@ def test_a_failing_decomposition_inside_scipy_is_survived(block, adjusted, monke
     monkeypatch.setattr(solve, "least_squares", fails)
     found = adjust(block, solver="scipy")
     np.testing.assert_allclose(found.params, adjusted.params, atol=1e-4)
-
-
-def test_the_reduced_system_is_the_schur_complement_of_the_whole(block):
-    """Against a dense solve of the full normal equations of a few points."""
-    found = adjust(block, loss="linear", estimate_noise=False)
-    reduced = found.covariance.reduced
-    structure = reduced.structure
-    factor = reduced.lower[:, :1]
-    rows = np.flatnonzero(structure.point == 0)
-    matrix = np.zeros((3, 3))
-    matrix[np.tril_indices(3)] = factor[[0, 1, 3, 2, 4, 5], 0]
-    projected = found.cameras.project(found.params, found.points.T[:, structure.point], structure.bounds)
-    stacked = np.moveaxis(projected.by_point[..., rows], -1, 0).reshape(-1, 3) / 0.1
-    np.testing.assert_allclose(matrix @ matrix.T, stacked.T @ stacked, rtol=1e-5, atol=1e-3)
-    assert isinstance(State(found.params, found.points), State)
 
 
 def test_counting_sorts_as_a_stable_sort_does():

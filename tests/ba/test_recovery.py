@@ -146,6 +146,7 @@ def test_three_gcps_bring_the_scene_to_its_place():
         assert (found.gauge.sigma < [1.0, 1.0, 2.0]).all()
     assert (np.array(errors) < 2 * np.array(sigmas)).mean() > 0.8
     assert (np.array(errors) < 3.5 * np.array(sigmas)).all()
+    assert 0.6 < np.sqrt(((np.array(errors) / np.array(sigmas)) ** 2).mean()) < 1.3
 
 
 def test_check_points_stay_out_of_the_solve_and_measure_it():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import re
 import struct
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from barpc.errors import BarpcError, ImageError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.formats import parse
-from barpc.rpcio.tiff import RPC_TAG, read_directory, tag_values
+from barpc.rpcio.tiff import RPC_TAG, Directory, Entry, read_directory, read_values, tag_values
 from barpc.sidefile import RPC_FILE
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 
@@ -227,3 +228,16 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ImageError, match="a pipe"):
         read_rpc(tmp_path / "pipe")
+
+
+def test_values_of_a_tag_stand_in_the_entry_or_wholly_in_the_file():
+    directory = Directory("<", False, (), b"\0" * 4)
+    file = io.BytesIO(bytes(range(100)))
+    assert read_values(file, directory, Entry(1, 3, 2, b"abcd"), "f") == b"abcd"
+    assert read_values(file, directory, Entry(1, 1, 3, b"abcd"), "f") == b"abc"
+    at = (90).to_bytes(4, "little")
+    assert read_values(file, directory, Entry(1, 1, 10, at), "f") == bytes(range(90, 100))
+    with pytest.raises(RpcFormatError, match="beyond the end"):
+        read_values(file, directory, Entry(1, 1, 11, at), "f")
+    with pytest.raises(RpcFormatError, match="claims"):
+        read_values(file, directory, Entry(1, 12, 1 << 30, at), "f")

@@ -121,6 +121,20 @@ def test_a_cloud_optimised_image_is_copied_and_no_longer_claims_its_layout(rpc, 
     np.testing.assert_array_equal(pixels(tmp_path / "copy.tif"), pixels(image))
 
 
+def test_a_copy_has_the_bytes_of_its_source_but_for_one_offset_and_one_line(rpc, tmp_path):
+    """Before its new directory: the directory's offset, and in a cloud-optimised file what says that it moved."""
+    for driver in ("GTiff", "COG"):
+        source = write_image(tmp_path / f"{driver}.tif", (1, 300, 300), driver=driver)
+        write_rpc_copy(rpc, source, tmp_path / f"{driver}_copy.tif")
+        before, after = source.read_bytes(), (tmp_path / f"{driver}_copy.tif").read_bytes()
+        expected = before.replace(b"KNOWN_INCOMPATIBLE_EDITION=NO\n ", b"KNOWN_INCOMPATIBLE_EDITION=YES\n")
+        assert (expected != before) == (driver == "COG")
+        changed = [i for i in range(len(before)) if after[i] != expected[i]]
+        assert changed
+        assert set(changed) <= {4, 5, 6, 7}
+        assert len(before) < len(after) < len(before) + 2000
+
+
 def test_a_geotransform_without_crs_is_left_out_and_one_with_crs_is_kept(rpc, tmp_path):
     """Without CRS it is the origin of a crop, which the RPC that is written has already."""
     origin = rasterio.Affine(1.0, 0, 5000, 0, -1, -5000)

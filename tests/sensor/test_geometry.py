@@ -155,9 +155,26 @@ def test_the_epipolar_offset_is_the_shift_across_the_epipolar_line():
     offset, alt = epipolar_offset(a, b, xa, xb)
     np.testing.assert_allclose(offset, 0, atol=1e-6)
     np.testing.assert_allclose(alt, truth[:, 2], atol=1e-5)
+    start = np.full(50, 480.0)
+    np.testing.assert_array_equal(epipolar_offset(a, b, xa, xb, start, steps=0)[1], start)
+    once, twice = (epipolar_offset(a, b, xa, xb, start, steps=steps)[1] for steps in (1, 2))
+    assert (np.abs(once - truth[:, 2]) < 0.2 * np.abs(start - truth[:, 2])).all()
+    assert (np.abs(twice - truth[:, 2]) <= np.abs(once - truth[:, 2])).all()
     # b moves by (-0.9, 0.6) px per metre against a: along it nothing shows, across it all does
     along = b.project(a.localize(xa, truth[:, 2] + 1)) - xb
     along /= np.linalg.norm(along, axis=1)[:, None]
     across = np.column_stack([-along[:, 1], along[:, 0]])
     offset, _ = epipolar_offset(a, b, xa, xb + 3 * along + 2 * across)
     np.testing.assert_allclose(offset, 2, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("given", "taken"), [((300.0, 300.0), 400.0), ((300.0, 350.0), 400.0), ((300.0, 900.0), 900.0)]
+)
+def test_lines_of_sight_run_between_altitudes_a_hundred_metres_apart_or_more(given, taken):
+    rpc, image = tilted_rpc((0.6, -0.4)), np.array([[3000.0, 9000.0], [12000.0, 500.0]])
+    origin, direction = lines_of_sight(rpc, image, given)
+    low, high = (ecef_from_ground(rpc.localize(image, np.full(2, alt))) for alt in (300.0, taken))
+    np.testing.assert_allclose(origin, low, atol=1e-6)
+    apart = high - low
+    np.testing.assert_allclose(direction, apart / np.linalg.norm(apart, axis=1)[:, None], atol=1e-9)

@@ -268,3 +268,23 @@ def test_any_satellite_anywhere_sees_its_target_in_the_middle(
     )
     image = np.array([[0.0, 0.0], [1999.0, 1499.0], [0.0, 1499.0]])
     assert np.abs(sensor.project(sensor.localize(image, np.array(2000.0))) - image).max() < 2e-8
+
+
+@pytest.mark.parametrize(
+    ("samples", "asked", "degree"),
+    [(2, 5, 1), (3, 5, 1), (4, 5, 3), (5, 5, 3), (6, 5, 5), (12, 5, 5), (4, 3, 3), (3, 3, 1), (9, 3, 3)],
+)
+def test_a_spline_has_the_highest_odd_degree_that_its_samples_determine(samples, asked, degree) -> None:
+    rng = np.random.default_rng(0)
+    times, values = np.cumsum(rng.uniform(1, 2, samples)), rng.normal(size=(samples, 3))
+    curve = Curve.through(times, values, asked)
+    assert curve.coeffs.shape[1] == degree + 1
+    np.testing.assert_allclose(curve(times)[0].T, values, atol=1e-9)
+    high, low = (curve(times[:-1] + 0.3 + step)[0] for step in (1e-5, -1e-5))
+    np.testing.assert_allclose(curve(times[:-1] + 0.3)[1], (high - low) / 2e-5, atol=1e-5)
+
+
+def test_a_curve_needs_two_samples_in_order() -> None:
+    for times in ([1.0], [1.0, 1.0], [2.0, 1.0], [1.0, np.nan]):
+        with pytest.raises(RpcError, match="curve"):
+            Curve.through(times, np.zeros((len(times), 3)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from barpc.geodesy import ground_from_ecef
 from barpc.sensor.geometry import triangulate
 from barpc.tie import TieOptions, find, find_tracks, read_area, select_pairs
 from barpc.tie.features import tiles
-from barpc.tie.pairs import shared_boxes
+from barpc.tie.pairs import footprints, shared_boxes
 
 from .test_pairs import METRE, camera, views
 
@@ -186,6 +187,35 @@ def test_only_windows_in_the_area_are_read(tmp_path, lon) -> None:
     boxes = [tiles((1000, 1000), options)] * 2
     for mask in shared_boxes(two, [pair], boxes, options, area=area):
         assert mask.reshape(4, 4).tolist() == [[True, False, False, False]] * 4
+
+
+def test_outlines_and_the_area_grow_by_as_much_as_the_cameras_may_be_wrong(tmp_path) -> None:
+    two = views(camera(0.0, lean=0.0), camera(0.0, lean=0.0))  # half a metre a pixel
+    west, south, east, north = METRE * np.array([-400, -100, 50, 100])
+    area = read_area(written(tmp_path / "a.json", box(west, south, east, north)))
+    cameras = [view.sensor for view in two]
+    plain = footprints(two, cameras, 100.0)
+    for reach, metres in ((0.0, 0.0), (40.0, 20.0)):
+        grown = footprints(two, cameras, 100.0, reach)
+        inside = footprints(two, cameras, 100.0, reach, area)
+        for outline, grew, part in zip(plain.outlines, grown.outlines, inside.outlines, strict=True):
+            edge = np.array(outline.bounds) + metres * np.array([-1, -1, 1, 1])
+            np.testing.assert_allclose(grew.bounds, edge, atol=0.1)
+            corner = plain.plane(np.array([east, north]))
+            width, height = edge[2] - edge[0], 200.0 + 2 * metres
+            np.testing.assert_allclose(part.bounds[0], edge[0], atol=0.1)
+            np.testing.assert_allclose(part.bounds[2:], corner + metres, rtol=0.01)
+            assert part.bounds[3] - part.bounds[1] == pytest.approx(height, rel=0.01)
+            assert part.bounds[2] - part.bounds[0] == pytest.approx(
+                0.6 * (width - 2 * metres) + 2 * metres, rel=0.03
+            )
+
+
+def test_outlines_of_an_oblong_image_grow_by_whole_pixels_too() -> None:
+    (square,) = views(camera(0.0, lean=0.0))
+    oblong = replace(square, size=(1000, 250))
+    plain, grown = (footprints([oblong], [square.sensor], 100.0, reach).outlines[0] for reach in (0.0, 40.0))
+    np.testing.assert_allclose(np.subtract(grown.bounds, plain.bounds), [-20, -20, 20, 20], atol=0.1)
 
 
 def test_views_that_do_not_see_the_area_are_named(tmp_path) -> None:

@@ -1,0 +1,345 @@
+"""Small errors put into the numerical core on purpose: how many do the fast tests catch?
+
+    python benchmarks/mutation.py --sample 200 --seed 1 --json score.json
+    python benchmarks/mutation.py --chosen
+    python benchmarks/mutation.py --sample 10 --bar 0.7
+
+Every mutant changes one place of one module in a copy of the tree; the fast tests of the module's folder are
+run there and stop at the first failure. Texts, messages, annotations, logging and sizes of chunks are left
+alone. Mutants that no test can tell from the original are named in mutation.toml, with the reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import difflib
+import json
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import cv2  # noqa: F401 - imported once, before the tests are forked: each would take seconds to do so
+import pyproj  # noqa: F401
+import pytest
+import rasterio  # noqa: F401
+import shapely  # noqa: F401
+
+ROOT = Path(__file__).resolve().parents[1]
+TOML = Path(__file__).with_suffix(".toml")
+GATE = ("barpc/pipeline/outputs.py", "barpc/handoff.py")
+TESTS = {
+    **{name: f"tests/{name}/test_*.py" for name in ("ba", "fit", "tie", "sensor", "rpcio")},
+    "gate": "tests/*/test_outputs.py",
+}
+"""Part of the core -> its tests."""
+SLOW = ("test_real_images.py", "test_simulated.py", "test_sentinel1_example.py")
+"""Left out: full runs over images, minutes each."""
+
+COMPARISONS = {
+    ast.Lt: ("<", "<=", ">"), ast.LtE: ("<=", "<", ">="), ast.Gt: (">", ">=", "<"), ast.GtE: (">=", ">", "<="),
+    ast.Eq: ("==", "!="), ast.NotEq: ("!=", "=="), ast.Is: ("is", "is not"), ast.IsNot: ("is not", "is"),
+    ast.In: ("in", "not in"), ast.NotIn: ("not in", "in"),
+}  # fmt: skip
+ARITHMETIC = {
+    ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"), ast.FloorDiv: ("//", "/"),
+    ast.Mod: ("%", "*"), ast.Pow: ("**", "*"), ast.BitAnd: ("&", "|"), ast.BitOr: ("|", "&"),
+}  # fmt: skip
+NO_CODE = {"annotation", "returns", "decorator_list", "type_params", "msg"}
+SILENT = ("_LOG.", "warnings.", "np.errstate", "field(", "TypeVar", "_LISTED", "CHUNK", "logging.")
+
+Change = tuple[int, int, str]
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change: bytes start to stop of a file become `new`."""
+
+    file: str
+    start: int
+    stop: int
+    new: str
+
+    @property
+    def part(self) -> str:
+        """Which tests are to catch it."""
+        return "gate" if self.file in GATE else self.file.split("/")[1]
+
+    def source(self) -> tuple[str, str]:
+        """The file before and after."""
+        raw = (ROOT / self.file).read_bytes()
+        return raw.decode(), (raw[: self.start] + self.new.encode() + raw[self.stop :]).decode()
+
+    def diff(self) -> str:
+        """The changed lines."""
+        before, after = (text.splitlines() for text in self.source())
+        changed = difflib.unified_diff(before, after, lineterm="", n=0)
+        rows = [row for row in changed if not row.startswith(("---", "+++"))]
+        return "\n".join([f"{self.file} {rows[0]}", *rows[1:]])
+
+
+class Places:
+    """Walks a module and yields (start, stop, new text) of every small error that could be made in it."""
+
+    def __init__(self, raw: bytes) -> None:
+        self.raw = raw
+        self.lines = [0, *accumulate(map(len, raw.splitlines(keepends=True)))]
+
+    def _span(self, node: Any) -> tuple[int, int]:
+        start = self.lines[node.lineno - 1] + node.col_offset
+        return start, self.lines[node.end_lineno - 1] + node.end_col_offset
+
+    def _text(self, node: ast.AST) -> str:
+        return self.raw[slice(*self._span(node))].decode()
+
+    def walk(self, node: ast.AST) -> Iterator[Change]:
+        """All changes below a node, outside of texts, annotations, messages and logging."""
+        if isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom | ast.Assert):
+            return
+        if isinstance(node, ast.stmt | ast.Call) and self._text(node).startswith(SILENT):
+            return
+        yield from getattr(self, f"_{type(node).__name__.lower()}", lambda _: ())(node)
+        for name, value in ast.iter_fields(node):
+            if name in NO_CODE or isinstance(node, ast.Raise):
+                continue
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST):
+                    yield from self.walk(child)
+
+    def _between(self, left: ast.AST, right: ast.AST, old: str, new: str) -> Change:
+        start = self.raw.index(old.encode(), self._span(left)[1], self._span(right)[0])
+        return start, start + len(old), new
+
+    def _compare(self, node: ast.Compare) -> Iterator[Change]:
+        if len(node.ops) == 1:
+            old, *new = COMPARISONS[type(node.ops[0])]
+            yield from (self._between(node.left, node.comparators[0], old, other) for other in new)
+
+    def _binop(self, node: ast.BinOp) -> Iterator[Change]:
+        text = isinstance(node.left, ast.JoinedStr) or isinstance(getattr(node.left, "value", None), str)
+        if type(node.op) in ARITHMETIC and not text:
+            yield self._between(node.left, node.right, *ARITHMETIC[type(node.op)])
+
+    def _augassign(self, node: ast.AugAssign) -> Iterator[Change]:
+        if type(node.op) in ARITHMETIC:
+            old, new = ARITHMETIC[type(node.op)]
+            yield self._between(node.target, node.value, old + "=", new + "=")
+
+    def _boolop(self, node: ast.BoolOp) -> Iterator[Change]:
+        old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
+        yield self._between(node.values[0], node.values[1], old, new)
+
+    def _unaryop(self, node: ast.UnaryOp) -> Iterator[Change]:
+        yield (*self._span(node), f"({self._text(node.operand)})")
+
+    def _constant(self, node: ast.Constant) -> Iterator[Change]:
+        number = node.value
+        if isinstance(number, bool | int | float):
+            other = not number if isinstance(number, bool) else number + 1
+            if isinstance(number, float):
+                other = 2 * number or 1.0
+            yield (*self._span(node), repr(other))
+
+    def _ifexp(self, node: ast.IfExp) -> Iterator[Change]:
+        test, one, two = map(self._text, (node.test, node.body, node.orelse))
+        yield (*self._span(node), f"{two} if {test} else {one}")
+
+    def _if(self, node: ast.If) -> Iterator[Change]:
+        if isinstance(node.body[-1], ast.Raise | ast.Return | ast.Continue):
+            yield (*self._span(node.test), "False")
+
+    def _expr(self, node: ast.Expr) -> Iterator[Change]:
+        if isinstance(node.value, ast.Call):
+            yield (*self._span(node), "pass")
+
+    def _call(self, node: ast.Call) -> Iterator[Change]:
+        symmetric = isinstance(node.func, ast.Attribute) or self._text(node.func) in ("min", "max")
+        if len(node.args) > 1 and not symmetric:
+            one, two = node.args[:2]
+            if not {type(one), type(two)} & {ast.Starred} and self._text(one) != self._text(two):
+                yield self._span(one)[0], self._span(two)[1], f"{self._text(two)}, {self._text(one)}"
+
+
+def mutants(parts: list[str]) -> list[Mutant]:
+    """All mutants of the core's modules, in the order of their places."""
+    folders = [
+        path for part in parts if part != "gate" for path in sorted((ROOT / "barpc" / part).rglob("*.py"))
+    ]
+    found = []
+    for path in [*folders, *(ROOT / name for name in GATE if "gate" in parts)]:
+        raw = path.read_bytes()
+        for start, stop, new in Places(raw).walk(ast.parse(raw)):
+            found.append(Mutant(str(path.relative_to(ROOT)), start, stop, new))
+    return found
+
+
+def chosen() -> list[Mutant]:
+    """The mutants that mutation.toml lists by hand."""
+    return [_listed(row) for row in tomllib.loads(TOML.read_text())["chosen"]]
+
+
+def _listed(row: dict[str, str]) -> Mutant:
+    raw = (ROOT / row["file"]).read_bytes()
+    if raw.count(row["old"].encode()) != 1:
+        raise SystemExit(
+            f"{TOML.name}: {row['old']!r} stands {raw.count(row['old'].encode())} times in {row['file']}"
+        )
+    start = raw.index(row["old"].encode())
+    return Mutant(row["file"], start, start + len(row["old"].encode()), row["new"])
+
+
+def equivalents() -> dict[tuple[str, str], str]:
+    """(file, changed line) -> why no test can tell it from the original."""
+    rows = tomllib.loads(TOML.read_text()).get("equivalent", [])
+    return {(row["file"], row["line"]): row["why"] for row in rows}
+
+
+def changed(mutant: Mutant) -> str:
+    """The lines that a mutant puts in, as one."""
+    return " ".join(row[1:].strip() for row in mutant.diff().splitlines()[1:] if row.startswith("+"))
+
+
+def caught(tree: Path, mutant: Mutant, limit: float) -> tuple[bool, str, float]:
+    """Whether the tests fail with the mutant in a tree; the test that did; seconds."""
+    target = tree / mutant.file
+    before, after = mutant.source()
+    target.write_text(after)
+    try:
+        return _failing(tree, mutant.part, target.stem, limit)
+    finally:
+        target.write_text(before)
+
+
+def _failing(tree: Path, part: str, stem: str, limit: float) -> tuple[bool, str, float]:
+    """Run a part's tests in a forked process, those that are named after the module first."""
+    found = (path for path in sorted(tree.glob(TESTS[part])) if path.name not in SLOW)
+    paths = sorted(found, key=lambda path: stem.removeprefix("_") not in path.name)
+    start, log = time.monotonic(), tree / "log.txt"
+    child = multiprocessing.get_context("fork").Process(
+        target=_tests, args=(tree, log, list(map(str, paths)))
+    )
+    child.start()
+    child.join(limit)
+    if child.is_alive():
+        os.killpg(child.pid or 0, signal.SIGKILL)
+        return True, "too slow", limit
+    named = [line for line in log.read_text().splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return child.exitcode != 0, named[0][:160] if named else "", time.monotonic() - start
+
+
+def _tests(tree: Path, log: Path, paths: list[str]) -> None:
+    """The forked process: pytest on the tree's own modules, none of which is imported yet."""
+    os.setsid()
+    os.chdir(tree)
+    sys.path.insert(0, str(tree))
+    os.environ.update(
+        PYTHONPATH=str(tree), BARPC_SHARED=os.environ.get("BARPC_SHARED", str(ROOT.parent / "shared"))
+    )
+    with log.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os._exit(int(pytest.main(["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *paths])))
+
+
+def copy_tree(folder: Path) -> Path:
+    """The working tree, without its history, in a folder."""
+    for name in ("barpc", "tests", "data_samples", "docs", "examples", "pyproject.toml", "README.md"):
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        copy(ROOT / name, folder / name)
+    return folder
+
+
+def run(picked: list[Mutant], jobs: int, limit: float, sound: bool = True) -> Iterator[dict[str, object]]:
+    """Every mutant's fate, one after the other, as rows of the score."""
+    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
+        trees: SimpleQueue[Path] = SimpleQueue()
+        for i in range(jobs):
+            (Path(temporary) / str(i)).mkdir()
+            trees.put(copy_tree(Path(temporary) / str(i)))
+        for part in dict.fromkeys(mutant.part for mutant in picked if sound):
+            failed, test, seconds = _failing(Path(temporary) / "0", part, "", limit)
+            print(f"{part}: {seconds:.0f} s without a mutant", flush=True)
+            if failed:
+                raise SystemExit(f"{part}: the tests fail without a mutant: {test}")
+
+        def one(mutant: Mutant) -> dict[str, object]:
+            why = equivalents().get((mutant.file, changed(mutant)))
+            tree = trees.get()
+            found, test, seconds = (False, "", 0.0) if why else caught(tree, mutant, limit)
+            trees.put(tree)
+            fate = "equivalent" if why else "caught" if found else "SURVIVED"
+            print(f"{fate} {seconds:.0f} s {test or why or ''}\n{mutant.diff()}", flush=True)
+            return {"part": mutant.part, "fate": fate, "test": test, "why": why, "diff": mutant.diff()}
+
+        yield from pool.map(one, picked)
+
+
+def score(rows: list[dict[str, object]]) -> dict[str, object]:
+    """Counts by part, and the share of what is not equivalent that was caught."""
+    parts = {}
+    for part in [*TESTS, "all"]:
+        fates = [row["fate"] for row in rows if part in ("all", row["part"])]
+        counts = {fate: fates.count(fate) for fate in ("caught", "SURVIVED", "equivalent")}
+        if fates:
+            real = len(fates) - counts["equivalent"]
+            parts[part] = {**counts, "share": round(counts["caught"] / real, 3) if real else None}
+    return {
+        "score": parts,
+        "survivors": [row["diff"] for row in rows if row["fate"] == "SURVIVED"],
+        "rows": rows,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sample", type=int, default=60, help="mutants drawn at random")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--part", action="append", choices=[*TESTS], help="part of the core; all by default")
+    parser.add_argument("--chosen", action="store_true", help="the listed mutants instead of a sample")
+    parser.add_argument("--survivors", type=Path, help="only the survivors of this score, again")
+    parser.add_argument("--skip", type=int, default=0, help="leave out so many of the sample's first mutants")
+    parser.add_argument("--json", type=Path, help="where the score is written")
+    parser.add_argument("--bar", type=float, default=0.0, help="least share that must be caught")
+    parser.add_argument(
+        "--limit", type=float, default=600.0, help="seconds after which a mutant counts as caught"
+    )
+    parser.add_argument("--trust", action="store_true", help="do not run the tests without a mutant first")
+    parser.add_argument("-j", type=int, default=1, dest="jobs")
+    args = parser.parse_args()
+    parts = args.part or [*TESTS]
+    picked = chosen() if args.chosen else mutants(parts)
+    if args.survivors:
+        again = set(json.loads(args.survivors.read_text())["survivors"])
+        picked = [mutant for mutant in picked if mutant.diff() in again]
+    elif not args.chosen:
+        picked = random.Random(args.seed).sample(picked, min(args.sample, len(picked)))[args.skip :]
+    rows: list[dict[str, object]] = []
+    found = score(rows)
+    for row in run([m for m in picked if m.part in parts], args.jobs, args.limit, not args.trust):
+        rows.append(row)
+        found = score(rows)
+        if args.json:
+            args.json.write_text(json.dumps(found, indent=1) + "\n")
+    print(json.dumps(found["score"], indent=1))
+    share = found["score"].get("all", {}).get("share")  # type: ignore[attr-defined]
+    if share is not None and share < args.bar:
+        raise SystemExit(f"{share:.0%} caught, {args.bar:.0%} wanted")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""The adjustment written a second time, plainly: one residual vector, differenced, solved densely.
+
+Nothing of `barpc.ba` or `barpc.sensor` is called here: pyproj turns coordinates, scipy turns vectors, the
+rational functions are spelled out. What the solver reduces and whitens must agree with this.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyproj
+from scipy.spatial.transform import Rotation
+
+_TO_GROUND = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+_TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+
+
+def ecef_of(ground: Any) -> np.ndarray:
+    """lon, lat, alt (..., 3) -> ECEF [m]."""
+    return np.stack(_TO_ECEF.transform(*np.moveaxis(np.asarray(ground, dtype=float), -1, 0)), axis=-1)
+
+
+def ground_of(ecef: Any) -> np.ndarray:
+    """ECEF (..., 3) [m] -> lon, lat, alt."""
+    return np.stack(_TO_GROUND.transform(*np.moveaxis(np.asarray(ecef, dtype=float), -1, 0)), axis=-1)
+
+
+def enu_of(lon: float, lat: float) -> np.ndarray:
+    """Rows east, north, up."""
+    a, b = np.radians([lon, lat])
+    up = [np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)]
+    east = [-np.sin(a), np.cos(a), 0.0]
+    return np.array([east, np.cross(up, east), up])
+
+
+def project_rpc(rpc: Any, ground: np.ndarray) -> np.ndarray:
+    """Col, row of one ground point, the twenty terms of RPC00B spelled out."""
+    L, P, H = (ground - rpc.ground_offset) / rpc.ground_scale
+    terms = np.array([
+        1, L, P, H, L * P, L * H, P * H, L * L, P * P, H * H, P * L * H, L**3, L * P**2, L * H**2, L**2 * P,
+        P**3, P * H**2, L**2 * H, P**2 * H, H**3,
+    ])  # fmt: skip
+    col, col_den, row, row_den = (float(c @ terms) for c in rpc.coeffs)
+    return np.array([col / col_den, row / row_den]) * rpc.image_scale + rpc.image_offset
+
+
+@dataclass
+class Plain:
+    """A block of RPC views: rotation and translation each, drift of a degree, GCPs, a sloping terrain."""
+
+    views: Any
+    centers: np.ndarray
+    drift: int
+    view: np.ndarray
+    point: np.ndarray
+    xy: np.ndarray
+    sigma: np.ndarray
+    camera_sigma: np.ndarray
+    gcps: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list)  # point, lonlatalt, sigma
+    planes: list[tuple[int, Any, float]] = field(default_factory=list)  # point, lon lat -> alt, sigma
+
+    def __post_init__(self) -> None:
+        middle = [
+            ecef_of(view.sensor.localize((np.array(view.size) - 1) / 2, sum(view.alt_range) / 2))
+            for view in self.views
+        ]
+        self.distance = np.linalg.norm(self.centers - middle, axis=1)
+
+    def image(self, v: int, params: np.ndarray, ecef: np.ndarray, row: float) -> np.ndarray:
+        """Where view v sees a point through its correction, the drift being that of a row."""
+        view, distance = self.views[v], self.distance[v]
+        turned = Rotation.from_rotvec(params[:3] / distance).apply(ecef - params[3:6] - self.centers[v])
+        t = (row - (view.size[1] - 1) / 2) / (view.size[1] / 2)
+        omega = np.zeros(3)
+        for k in range(self.drift):
+            omega = omega + t ** (k + 1) * params[6 + 3 * k : 9 + 3 * k] / distance
+        turned = Rotation.from_rotvec(omega).apply(turned)
+        return project_rpc(view.sensor, ground_of(turned + self.centers[v]))
+
+    def residual(self, params: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Every whitened residual: ties, camera priors, GCPs, heights."""
+        rows = [
+            (self.image(v, params[v], points[p], xy[1]) - xy) / sigma
+            for v, p, xy, sigma in zip(self.view, self.point, self.xy, self.sigma, strict=True)
+        ]
+        rows.append((params / self.camera_sigma).ravel())
+        for p, lonlatalt, sigma in self.gcps:
+            rows.append(enu_of(*lonlatalt[:2]) @ (points[p] - ecef_of(lonlatalt)) / sigma)
+        for p, plane, sigma in self.planes:
+            rows.append([plane(points[p]) / sigma])
+        return np.concatenate(rows)
+
+    def jacobian(self, params: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Central differences, cameras first, then points."""
+        flat = np.concatenate([params.ravel(), points.ravel()])
+        split = params.size
+
+        def at(x: np.ndarray) -> np.ndarray:
+            return self.residual(x[:split].reshape(params.shape), x[split:].reshape(points.shape))
+
+        columns = []
+        for i in range(len(flat)):
+            step = np.zeros(len(flat))
+            step[i] = 1.0
+            columns.append((at(flat + step) - at(flat - step)) / 2.0)
+        return np.array(columns).T

@@ -1,0 +1,226 @@
+"""Every option of the adjustment changes the result, and in the direction that its description says."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable
+from dataclasses import MISSING, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.ba.block import join
+from barpc.ba.options import prior_sigmas, stated_accuracy
+from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.geodesy import ground_from_ecef
+from barpc.scene import Tracks
+from barpc.simulate import Block, simulate_block
+from tests.ba.conftest import centers_of
+
+BASE: dict[str, Any] = {"noise_floor": 0.0, "min_convergence": 0.01}
+
+
+class Row(NamedTuple):
+    """An option from one value to another, and what grows (1) or shrinks (-1) by it, at least by a factor."""
+
+    field: str
+    low: Any
+    high: Any
+    observable: Callable[[Adjustment], float]
+    sign: int
+    factor: float = 1.2
+    rest: dict[str, Any] = {}  # noqa: RUF012 - never changed
+    dem: float | None = None
+
+
+def unknowns(found: Adjustment) -> float:
+    return found.params.shape[1]
+
+
+def rotation(found: Adjustment) -> float:
+    return float(np.abs(found.params[:, :3]).mean())
+
+
+def last(found: Adjustment) -> float:
+    return float(np.abs(found.params[:, -3:]).mean())
+
+
+def kept(found: Adjustment) -> float:
+    return float(found.inlier.sum())
+
+
+def variance(found: Adjustment) -> float:
+    return float(np.linalg.eigvalsh(found.covariance.full)[0])  # of what is known best: the noise alone
+
+
+def off_dem(found: Adjustment) -> float:
+    return float(np.abs(ground_from_ecef(found.points[np.isfinite(found.points[:, 0])])[:, 2] - 400.0).mean())
+
+
+def first_residual(found: Adjustment) -> float:
+    return float(found.rmse()[0])
+
+
+def steps(found: Adjustment) -> float:
+    return float(found.steps)
+
+
+ROWS = [
+    Row("model", "rotation", "rotation+translation", unknowns, 1),
+    Row("model", "shift", "affine", unknowns, 1),
+    Row("drift", 0, 2, unknowns, 1),
+    Row("sigma_attitude", 0.2, 20.0, rotation, 1),
+    Row("sigma_position", 0.2, 20.0, last, 1, rest={"drift": 0}),
+    Row("sigma_drift", 0.01, 10.0, last, 1, rest={"drift": 1}),
+    Row("learn_priors", False, True, lambda found: found.gauge.sigma[2], 1, rest={"sigma_attitude": 0.5}),
+    Row("sigma_shift", 0.1, 50.0, rotation, 1, rest={"model": "affine"}),
+    Row("noise_floor", 0.0, 0.5, variance, 1),
+    Row("loss", "linear", "geman_mcclure", kept, -1, 1.05),
+    Row("robust_threshold", 1.5, 6.0, kept, 1, 1.02),
+    Row("num_passes", 1, 6, lambda found: len(found.cost_history), 1, rest={"robust_threshold": 1.2, "drift": 0}),
+    Row("estimate_noise", False, True, variance, 1, 1.5, rest={"robust_threshold": 9.0}),
+    Row("fixed", (), ("view_0000",), lambda found: 1e-9 + np.abs(found.params[0]).max(), -1, 1e6),
+    Row("view_weights", {}, {"view_0000": 20.0}, first_residual, -1, 1.05, rest={"loss": "linear"}),
+    Row("dem_sigma", 0.5, 500.0, off_dem, 1, rest={"dem_for_all": True}, dem=400.0),
+    Row("dem_for_all", False, True, off_dem, -1, rest={"dem_sigma": 0.5}, dem=400.0),
+    Row("min_convergence", 0.01, 90.0, lambda found: 1 + found.held.sum(), 1, 10.0),
+    Row("max_steps", 1, 30, steps, 1, rest={"loss": "linear", "tolerance": 1e-15, "solver": "sparse"}),
+    Row("tolerance", 1e-14, 0.9, steps, -1, rest={"loss": "linear", "solver": "sparse"}),
+]
+ELSEWHERE = {
+    "min_observations": "test_a_view_needs_as_many_observations_as_asked_for",
+    "keep_largest": "test_the_largest_group_goes_on_alone_where_asked",
+    "solver": "test_the_solver_that_is_asked_for_is_the_one_that_runs",
+    "center_method": "test_the_centre_is_found_by_the_method_that_is_asked_for",
+}
+
+
+@pytest.fixture(scope="module")
+def dirty() -> Block:
+    """Four views, tie points with twice the stated noise and a tenth of them wrong."""
+    made = simulate_block(4, 150, seed=21, noise=0.2, outliers=0.1)
+    tracks = made.tracks
+    told = Tracks(tracks.view, tracks.point, tracks.xy, np.full(len(tracks), 0.1))
+    return replace(made, tracks=told)
+
+
+def run(block: Block, dem: float | None = None, **options: Any) -> Adjustment:
+    terrain = None if dem is None else lambda lon, lat: np.full(len(lon), dem)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", BarpcWarning)
+        chosen = AdjustOptions(**{**BASE, **options})
+        return adjust_tracks(block.views, block.tracks, chosen, dem=terrain, centers=centers_of(block))
+
+
+def test_every_option_has_a_row():
+    assert {row.field for row in ROWS} | set(ELSEWHERE) == {field.name for field in fields(AdjustOptions)}
+    assert set(ELSEWHERE.values()) <= set(globals())
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.field}: {row.low} to {row.high}")
+def test_an_option_changes_the_result_in_its_direction(dirty, row):
+    few, many = (
+        row.observable(run(dirty, row.dem, **{**row.rest, row.field: value})) for value in (row.low, row.high)
+    )
+    ratio = many / few if row.sign > 0 else few / many
+    assert ratio > row.factor, (few, many)
+
+
+def test_a_view_needs_as_many_observations_as_asked_for(dirty):
+    count = np.bincount(dirty.tracks.view)
+    least = int(count.min())
+    assert run(dirty, min_observations=least).params.any()
+    with pytest.raises(TiePointError, match=f"view_000{count.argmin()} \\({least}\\)"):
+        run(dirty, min_observations=least + 1)
+
+
+def test_the_largest_group_goes_on_alone_where_asked(dirty):
+    tracks = dirty.tracks
+    # no track of the fourth view is seen by another: its observations become tracks of their own
+    alone = tracks.view == 3
+    point = np.where(alone, 150 + np.arange(len(tracks)), tracks.point)
+    _, point = np.unique(point, return_inverse=True)
+    apart = replace(dirty, tracks=Tracks(tracks.view, point, tracks.xy, tracks.sigma))
+    with pytest.raises(DisconnectedError):
+        run(apart)
+    found = run(apart, keep_largest=True)
+    assert found.left_out == ("view_0003",)
+    assert not found.inlier[alone].any()
+    assert np.abs(found.params[:3]).max() > 0.1
+
+
+def test_the_solver_that_is_asked_for_is_the_one_that_runs(dirty, caplog):
+    for asked, runs in (("scipy", ["scipy"]), ("sparse", ["sparse"]), ("auto", ["scipy", "sparse"])):
+        caplog.clear()
+        with caplog.at_level(logging.INFO, logger="barpc.ba.solve"):
+            found = run(dirty, solver=asked)
+        names = [record.getMessage().split(":")[0] for record in caplog.records]
+        assert sorted(set(names)) == runs
+        assert names[-1] == ("sparse" if asked == "sparse" else "scipy")  # the last word
+        assert ("scipy least_squares" in found.status) == (names[-1] == "scipy")
+
+
+def test_auto_leaves_scipy_where_unknowns_are_many(dirty, caplog, monkeypatch):
+    for most, runs in ((35, "sparse"), (36, "scipy")):
+        monkeypatch.setattr("barpc.ba.solve.SCIPY_UNKNOWNS", most)
+        caplog.clear()
+        with caplog.at_level(logging.INFO, logger="barpc.ba.solve"):
+            run(dirty)
+        assert caplog.records[-1].getMessage().split(":")[0] == runs
+
+
+def test_the_centre_is_found_by_the_method_that_is_asked_for(dirty):
+    centers = {}
+    for method in ("line", "projective"):
+        options = AdjustOptions(**BASE, center_method=method)
+        centers[method] = adjust_tracks(dirty.views, dirty.tracks, options).cameras.unknowns.center
+    assert np.linalg.norm(centers["line"] - centers["projective"], axis=1).min() > 1.0
+
+
+@pytest.mark.parametrize(
+    "name", ["sigma_attitude", "sigma_position", "sigma_drift", "sigma_shift", "dem_sigma"]
+)
+def test_a_sigma_must_be_positive(name):
+    AdjustOptions(**{name: 1e-9})
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match=name):
+            AdjustOptions(**{name: wrong})
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"), [("loss", "l3"), ("solver", "ceres"), ("drift", 3), ("model", "")]
+)
+def test_a_choice_must_be_one_of_its_list(name, wrong):
+    with pytest.raises(InputError, match=name):
+        AdjustOptions(**{name: wrong})
+
+
+def test_every_option_has_a_default():
+    assert all(f.default is not MISSING or f.default_factory is not MISSING for f in fields(AdjustOptions))
+
+
+def test_prior_sigmas_stand_at_their_unknowns(dirty):
+    options = AdjustOptions(drift=2, sigma_attitude=2.0, sigma_position=3.0, sigma_drift=5.0)
+    np.testing.assert_array_equal(prior_sigmas(dirty.views, options, 2), [np.repeat([2, 3, 5, 5], 3)] * 4)
+    for model, size in (("shift", 2), ("shift-drift", 4), ("affine", 6)):
+        sigma = prior_sigmas(dirty.views, AdjustOptions(model=model, sigma_shift=7.0), 0)
+        np.testing.assert_array_equal(sigma, np.full((4, size), 7.0))
+
+
+@pytest.mark.parametrize(
+    ("stated", "taken"), [(None, 5.0), (0.1, 5.0), (0.11, 0.11), (8.0, 8.0), (0.02, 5.0)]
+)
+def test_a_camera_is_as_accurate_as_it_states_in_metres(dirty, stated, taken):
+    view = dirty.views[0]
+    told = replace(view, sensor=replace(view.sensor, err_bias=stated))
+    assert stated_accuracy(told) == taken
+    np.testing.assert_array_equal(prior_sigmas((told,), AdjustOptions(), 0), np.full((1, 6), taken))
+
+
+def test_a_view_that_counts_more_has_smaller_sigmas(dirty):
+    block = join(dirty.views, dirty.tracks, None, AdjustOptions(view_weights={"view_0002": 4.0}))
+    np.testing.assert_allclose(block.sigma[block.view == 2], 0.025)
+    np.testing.assert_allclose(block.sigma[block.view != 2], 0.1)

@@ -1,0 +1,449 @@
+"""The solver's reduced system, covariance and gauge against the whole problem written plainly and solved densely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks, block_prior, normal, rounds
+from barpc.ba.adjustment import make_problem
+from barpc.ba.block import join
+from barpc.ba.blocks import ground_control
+from barpc.ba.gauge import gauge_report
+from barpc.ba.heights import Heights, convergence_angles
+from barpc.ba.problem import Problem
+from barpc.ba.rounds import Observations
+from barpc.ba.solve import Minimum, State, camera_step, gauss_newton
+from barpc.scene import GroundPoints
+from barpc.simulate import simulate_block
+from tests.ba.conftest import centers_of
+from tests.ba.oracle import Plain, ecef_of, enu_of, ground_of
+
+SIGMAS = {"sigma_attitude": 7.0, "sigma_position": 2.0, "sigma_drift": 3.0}
+EAST, NORTH = 0.3, -0.2  # slopes of the terrain
+
+
+@dataclass
+class Case:
+    """One block twice: as the solver holds it, and plainly; and a state that is not the minimum."""
+
+    problem: Problem
+    plain: Plain
+    params: np.ndarray
+    points: np.ndarray
+    weight: np.ndarray
+
+    @property
+    def reduced(self) -> Any:
+        return self.problem.reduce(self.params, self.points, self.weight)
+
+    @cached_property
+    def dense(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Normal matrix, gradient and cost of the whole."""
+        jacobian, residual = (f(self.params, self.points) for f in (self.plain.jacobian, self.plain.residual))
+        return jacobian.T @ jacobian, jacobian.T @ residual, float(residual @ residual)
+
+
+def _terrain(origin: np.ndarray, alt: float):
+    """A plane of constant slope east and north [m/m] through an origin, as a function of lon, lat."""
+    frame = enu_of(*origin[:2])
+    unit = [frame @ (ecef_of(origin + step) - ecef_of(origin - step)) / 2e-4
+            for step in np.eye(3)[:2] * 1e-4]  # fmt: skip
+    east, north = unit[0][0], unit[1][1]  # m a degree
+    return lambda lon, lat: alt + EAST * east * (lon - origin[0]) + NORTH * north * (lat - origin[1])
+
+
+def make_case(drift: int = 0, fixed: tuple[str, ...] = ()) -> Case:
+    made = simulate_block(4, 10, seed=7, num_gcps=2, noise=0.3)
+    gcps = replace(made.gcps, sigma=np.array([[0.1, 0.5, 2.0], [3.0, 0.2, 0.7]]))
+    weights = {made.views[1].name: 3.0}
+    options = AdjustOptions(drift=drift, view_weights=weights, min_observations=1, fixed=fixed, **SIGMAS)
+    centers, tracks = centers_of(made), made.tracks
+    block = join(made.views, tracks, gcps, options)
+    problem = make_problem(block, options, centers, None)
+    rng = np.random.default_rng(1)
+    params = rng.normal(0, 3, (4, problem.cameras.unknowns.size))
+    points = ecef_of(np.vstack([made.truth.ground, gcps.lonlatalt])) + rng.normal(0, 2, (12, 3))
+    origin = made.truth.ground.mean(axis=0)
+    terrain = _terrain(origin, 180.0)
+    weak = np.zeros(12, dtype=bool)
+    weak[[2, 5]] = True
+    control = ground_control(gcps, np.array([10, 11]))
+    heights = Heights((control,), weak, np.arange(10), (0.0, 500.0), replace(options, dem_sigma=4.0), terrain)
+    problem = heights.hold(problem, points)
+
+    def plane(p: int):
+        """Height above the tangent plane of the terrain below where the point stands now."""
+        lon, lat, _ = ground_of(points[p])
+        foot = np.array([lon, lat, terrain(lon, lat)])
+        return lambda x: np.array([-EAST, -NORTH, 1.0]) @ enu_of(lon, lat) @ (x - ecef_of(foot))
+
+    order = np.argsort(np.concatenate([tracks.view, gcps.view]), kind="stable")
+    view = np.concatenate([tracks.view, gcps.view])[order]
+    sigma = np.concatenate([tracks.sigma, gcps.xy_sigma])[order] / np.where(view == 1, 3.0, 1.0)
+    camera_sigma = np.repeat([7.0, 2.0, *[3.0] * drift], 3) * np.ones((4, 1))
+    plain = Plain(
+        made.views,
+        centers,
+        drift,
+        view,
+        np.concatenate([tracks.point, 10 + gcps.point])[order],
+        np.concatenate([tracks.xy, gcps.xy])[order],
+        sigma,
+        camera_sigma,
+        [(10 + i, gcps.lonlatalt[i], gcps.sigma[i]) for i in range(2)],
+        [(p, plane(p), 4.0) for p in (2, 5)],
+    )
+    return Case(problem, plain, params, points, 1.0 / block.sigma)
+
+
+@pytest.fixture(scope="module", params=[0, 2])
+def case(request) -> Case:
+    return make_case(request.param)
+
+
+def _schur(matrix: np.ndarray, gradient: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points eliminated densely."""
+    pull = np.linalg.solve(matrix[size:, size:], matrix[size:, :size]).T
+    return matrix[:size, :size] - pull @ matrix[size:, :size], gradient[:size] - pull @ gradient[size:]
+
+
+def _close(found: np.ndarray, expected: np.ndarray, rtol: float = 1e-5) -> None:
+    np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("dense_unknowns", [900, 0])
+def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(
+    case, monkeypatch, dense_unknowns
+):
+    monkeypatch.setattr(normal, "DENSE_UNKNOWNS", dense_unknowns)
+    matrix, gradient, cost = case.dense
+    size = case.params.size
+    reduced = case.reduced
+    expected, slope = _schur(matrix, gradient, size)
+    found = reduced.matrix if isinstance(reduced.matrix, np.ndarray) else reduced.matrix.toarray()
+    _close(found, expected, 3e-5)
+    _close(reduced.gradient, slope, 3e-5)
+    assert reduced.cost == pytest.approx(cost, rel=1e-7)
+    moved = np.linalg.solve(matrix[size:, size:], gradient[size:])
+    assert reduced.gain == pytest.approx(gradient[size:] @ moved, rel=1e-5)
+
+
+def test_pieces_of_any_size_make_the_same_system(case, monkeypatch):
+    whole = case.reduced
+    monkeypatch.setattr(normal, "CHUNK", 3)
+    monkeypatch.setattr("barpc.ba.cameras.CHUNK", 5)
+    pieces = case.reduced
+    _close(pieces.matrix, whole.matrix, 1e-12)
+    _close(pieces.gradient, whole.gradient, 1e-9)
+
+
+def test_one_step_is_the_gauss_newton_step_of_the_whole(case):
+    matrix, gradient, cost = case.dense
+    whole = -np.linalg.solve(matrix, gradient)
+    step, gain, _ = camera_step(case.problem, case.reduced)
+    size = case.params.size
+    _close(step.ravel(), whole[:size], 1e-4)
+    _close(case.reduced.point_step(step).ravel(), whole[size:], 1e-4)
+    assert gain == pytest.approx(-gradient @ whole, rel=1e-5)
+    projected = case.problem.linearise(case.params, case.points)
+    state = Minimum(_state(case), case.reduced).state
+    moved = gauss_newton(case.problem, state, case.weight, case.problem.linearise(case.params, case.points))
+    assert projected.image.shape == (2, len(case.plain.view))
+    _close(moved.params - case.params, whole[:size].reshape(case.params.shape), 1e-4)
+    assert moved.cost == pytest.approx(cost + gradient @ whole, rel=1e-5)
+
+
+def _state(case: Case) -> State:
+    return State(case.params, case.points)
+
+
+def test_damping_adds_its_part_of_the_diagonal(case):
+    matrix, gradient, _ = case.dense
+    size = case.params.size
+    expected, slope = _schur(matrix, gradient, size)
+    step, _, _ = camera_step(case.problem, case.reduced, damping=0.4)
+    wanted = -np.linalg.solve(expected + 0.4 * np.diag(np.diag(expected)), slope)
+    _close(step.ravel(), wanted, 1e-4)
+
+
+def test_fixed_views_do_not_move_and_have_no_variance():
+    held = make_case(0, fixed=("view_0002",))
+    matrix, gradient, _ = held.dense
+    free = np.ones(len(matrix), dtype=bool)
+    free[12:18] = False
+    whole = np.zeros(len(matrix))
+    whole[free] = -np.linalg.solve(matrix[np.ix_(free, free)], gradient[free])
+    step, _, _ = camera_step(held.problem, held.reduced)
+    _close(step.ravel(), whole[:24], 1e-4)
+    covariance = Minimum(_state(held), held.reduced).covariance(held.problem.free)
+    inverse = np.zeros_like(matrix)
+    inverse[np.ix_(free, free)] = np.linalg.inv(matrix[np.ix_(free, free)])
+    _close(covariance.full, inverse[:24, :24], 1e-4)
+    assert not covariance.full[12:18].any()
+
+
+def test_points_alone_take_the_gauss_newton_step_of_their_own_blocks(case):
+    matrix, gradient, _ = case.dense
+    size = case.params.size
+    projected = case.problem.project_points(case.params, case.points)
+    moved = case.problem.triangulate(case.points, projected, case.weight) - case.points
+    _close(moved.ravel(), -np.linalg.solve(matrix[size:, size:], gradient[size:]), 1e-5)
+
+
+def test_covariances_are_blocks_of_the_inverse_of_the_whole(case):
+    matrix, _, _ = case.dense
+    inverse = np.linalg.inv(matrix)
+    size, q = case.params.size, case.params.shape[1]
+    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    _close(covariance.view(1, 3), inverse[q : 2 * q, 3 * q : 4 * q], 1e-4)
+    _close(covariance.view(2), inverse[2 * q : 3 * q, 2 * q : 3 * q], 1e-4)
+    _close(covariance.full, inverse[:size, :size], 1e-4)
+    _close(covariance.view(0, 2), inverse[:q, 2 * q : 3 * q], 1e-4)
+    index = np.array([1, 5, 7, 10])
+    of_points = covariance.points(index)
+    for p, found in zip(index, of_points, strict=True):
+        place = size + 3 * p + np.arange(3)
+        _close(found, inverse[np.ix_(place, place)], 1e-4)
+    pair = np.r_[q : 2 * q, 3 * q : 4 * q]
+    _close(covariance.joint(np.array([1, 3])), inverse[np.ix_(pair, pair)], 1e-4)
+
+
+def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(case):
+    matrix, _, _ = case.dense
+    size = case.params.size
+    before = case.points + np.random.default_rng(2).normal(0, 1, case.points.shape)
+    use = np.ones(len(case.points), dtype=bool)
+    use[4] = False
+    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    report = gauge_report(covariance, case.points, before, use)
+    index = np.flatnonzero(use)
+    middle = case.points[index].mean(axis=0)
+    lon, lat, _ = ground_of(middle)
+    enu = enu_of(lon, lat)
+    local = (case.points[index] - middle) @ enu.T
+    radius = np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())
+    e, n = local[:, 0] / radius, local[:, 1] / radius
+    zero, one = np.zeros(len(e)), np.ones(len(e))
+    moves = np.stack([  # of every point, by one metre of each motion: counterclockwise turn, growth
+        np.stack([one, zero, zero], 1), np.stack([zero, one, zero], 1), np.stack([zero, zero, one], 1),
+        np.stack([zero, zero, e], 1), np.stack([zero, zero, n], 1), np.stack([-n, e, zero], 1),
+        np.stack([e, n, zero], 1),
+    ]).reshape(7, -1).T  # fmt: skip
+    pull = -np.linalg.solve(matrix[size:, size:], matrix[size:, :size]).reshape(-1, 3, size)[index]
+    by_unknown = np.linalg.pinv(moves) @ np.einsum("ij,njk->nik", enu, pull).reshape(-1, size)
+    expected = by_unknown @ np.linalg.inv(_schur(matrix, np.zeros(len(matrix)), size)[0]) @ by_unknown.T
+    np.testing.assert_allclose(report.motion_sigma, np.sqrt(np.diag(expected)), rtol=1e-4)
+    np.testing.assert_allclose(report.sigma, report.motion_sigma[:3])
+    assert report.radius == pytest.approx(radius, rel=1e-9)
+    _close(report.shift, enu @ (case.points - before)[index].mean(axis=0), 1e-6)
+    rebuilt = sum(np.outer(mode.motion, mode.motion) for mode in report.modes)
+    _close(rebuilt, expected, 1e-4)
+    sigmas = [mode.sigma for mode in report.modes]
+    np.testing.assert_allclose(sigmas, np.sqrt(np.linalg.eigvalsh(expected)[::-1]), rtol=1e-3)
+    for mode in report.modes:
+        largest = np.abs(mode.motion).argmax()
+        assert mode.motion[largest] > 0
+        assert mode.meaning == ("east", "north", "up", "tilt east", "tilt north", "turn", "scale")[largest]
+
+
+def test_a_joint_prior_of_an_earlier_block_adds_its_information():
+    made = simulate_block(4, 60, seed=3)
+    options = AdjustOptions(
+        noise_floor=0.0, min_convergence=0.01, estimate_noise=False, loss="linear", drift=0, learn_priors=False
+    )
+    centers = centers_of(made)
+    old = made.tracks.select(made.tracks.view < 3)
+    first = adjust_tracks(made.views[:3], old, options, centers=centers[:3])
+    prior = block_prior(first)
+    block = join(made.views, made.tracks, None, options)
+    with_prior = make_problem(block, options, centers, prior)
+    without = make_problem(block, options, centers, None)
+    rng = np.random.default_rng(0)
+    params = rng.normal(0, 2, (4, 6))
+    points = ecef_of(made.truth.ground)
+    weight = 1.0 / block.sigma
+    a, b = (p.reduce(params, points, weight) for p in (with_prior, without))
+    old_sigma = without.camera_prior.sigma[:3].ravel()
+    offset = params[:3].ravel() - first.params.ravel()
+    information = np.asarray(first.covariance.reduced.matrix)
+    expected = np.zeros((24, 24))
+    expected[:18, :18] = information - np.diag(1.0 / old_sigma**2)
+    _close(a.matrix - b.matrix, expected, 1e-8)
+    slope = np.r_[information @ offset - params[:3].ravel() / old_sigma**2, np.zeros(6)]
+    _close(a.gradient - b.gradient, slope, 1e-8)
+    cost = offset @ information @ offset - ((params[:3].ravel() / old_sigma) ** 2).sum()
+    assert a.cost - b.cost == pytest.approx(cost, rel=1e-8)
+
+
+def test_the_convergence_angle_of_two_views_is_the_angle_of_their_rays():
+    made = simulate_block(3, 40, seed=1)
+    options = AdjustOptions(drift=0)
+    block = join(made.views, made.tracks, None, options)
+    centers = centers_of(made)
+    problem = make_problem(block, options, centers, None)
+    points = ecef_of(made.truth.ground)
+    projected = problem.project_points(np.zeros((3, 6)), points)
+    found = convergence_angles(problem.structure, projected, points)
+    for p in range(40):
+        seen = made.tracks.view[made.tracks.point == p]
+        ray = centers[seen] - points[p]
+        ray /= np.linalg.norm(ray, axis=1)[:, None]
+        if len(seen) == 2:
+            assert found[p] == pytest.approx(np.arccos(ray[0] @ ray[1]), rel=0.03)
+        else:
+            mean = ray.mean(axis=0) / np.linalg.norm(ray.mean(axis=0))
+            away = np.arccos(np.clip(ray @ mean, -1, 1)).max()
+            assert found[p] == pytest.approx(2 * away, rel=0.06)
+
+
+@pytest.fixture(scope="module")
+def observations() -> tuple[Observations, Any]:
+    """Ten tracks and two GCPs, a noise floor."""
+    made = simulate_block(3, 10, seed=4, num_gcps=2, visible=0.8)
+    options = AdjustOptions(min_observations=1)
+    block = join(made.views, made.tracks, made.gcps, options)
+    problem = make_problem(block, options, centers_of(made), None)
+    problem = problem.with_point_prior(ground_control(made.gcps, np.array([10, 11])))
+    return Observations(problem, block.sigma, 0.05, block.point < 10), block, problem
+
+
+def test_a_track_has_three_degrees_of_freedom_less_than_coordinates(observations):
+    counts, block, _ = observations
+    freedom = counts.freedom(np.ones(len(block.view)))
+    seen = np.bincount(block.point, minlength=12)
+    assert {2, 3} <= set(seen[:10])
+    for k, p in enumerate(block.point):
+        expected = 2.0 if p >= 10 else (2 * seen[p] - 3) / seen[p]
+        assert freedom[k] == pytest.approx(expected)
+    # an observation that counts for nothing leaves a track of the others
+    three = int(np.flatnonzero(seen[:10] == 3)[0])
+    counted = np.ones(len(block.view))
+    counted[np.flatnonzero(block.point == three)[0]] = 0.0
+    np.testing.assert_allclose(counts.freedom(counted)[block.point == three], 0.5)
+
+
+def test_squares_are_taken_of_residuals_in_sigmas_over_their_freedom(observations):
+    counts, block, _ = observations
+    residual = np.full((2, len(block.view)), 0.3)
+    residual[:, 0] = np.nan
+    s = counts.squared(residual, np.ones(len(block.view)))
+    assert np.isinf(s[0])
+    freedom = counts.freedom(np.ones(len(block.view)))
+    np.testing.assert_allclose(s[1:], (0.18 / block.sigma**2 / freedom)[1:])
+
+
+def test_the_noise_is_the_sum_of_squares_over_what_is_left_of_freedom(observations):
+    counts, block, problem = observations
+    use = np.ones(len(block.view), dtype=bool)
+    residual = np.random.default_rng(0).normal(0, 1.0, (2, len(use)))
+    freedom = 2 * len(use) - 3 * 10 - 18
+    assert freedom < 20
+    assert counts.noise(residual, use, problem) == 1.0  # too few to tell
+    free = replace(problem, free=np.zeros(18, dtype=bool))
+    freedom = 2 * len(use) - 3 * 10
+    expected = np.sqrt(((residual / block.sigma) ** 2).sum() / freedom)
+    assert freedom >= 20
+    assert counts.noise(residual, use, free) == pytest.approx(expected, rel=1e-12)
+
+
+def test_tie_points_of_a_view_count_together_at_most_as_the_floor_says(observations):
+    counts, block, _ = observations
+    use = np.ones(len(block.view), dtype=bool)
+    use[3] = False
+    weight = counts.weight(use, 2.0)
+    assert weight[3] == 0.0
+    for v in range(3):
+        mine = (block.view == v) & use
+        ties, control = mine & (block.point < 10), mine & (block.point >= 10)
+        np.testing.assert_allclose(weight[control], 1 / (2.0 * block.sigma[control]))
+        free = (1 / (2.0 * block.sigma[ties])) ** 2
+        assert (weight[ties] ** 2).sum() == pytest.approx(min(free.sum(), 1 / 0.05**2), rel=1e-12)
+
+
+def test_an_observation_without_a_second_one_is_left_out_unless_a_prior_holds_its_point(observations):
+    counts, block, _ = observations
+    pair = int(np.flatnonzero(np.bincount(block.point)[:10] == 2)[0])
+    use = np.ones(len(block.view), dtype=bool)
+    one, other = np.flatnonzero(block.point == pair)
+    use[one] = False
+    gcp = np.flatnonzero(block.point == 10)
+    use[gcp[1:]] = False
+    tied = counts.tied(use)
+    assert not tied[[one, other]].any()
+    assert tied[gcp[0]]
+    assert tied.sum() == use.sum() - 1
+
+
+def test_residuals_of_gcps_point_from_the_given_to_the_adjusted_place():
+    """A GCP given 5 m too far east, 3 m too far south and 8 m too low, loosely: it is found west, north, up."""
+    made = simulate_block(3, 100, seed=2, num_gcps=4, attitude=0.0, position=0.0)
+    true = made.gcps
+    offset = np.array([5.0, -3.0, -8.0])
+    wrong = np.array([ground_of(ecef_of(g) + enu_of(*g[:2]).T @ offset) for g in true.lonlatalt])
+    gcps = GroundPoints(
+        true.names, wrong, np.full((4, 3), 1e3), true.point, true.view, true.xy, true.xy_sigma
+    )
+    options = AdjustOptions(noise_floor=0.0, sigma_attitude=0.01, sigma_position=0.01, min_convergence=0.01)
+    found = adjust_tracks(made.views, made.tracks, options, gcps, centers=centers_of(made))
+    np.testing.assert_allclose(found.gcp_residuals, np.tile(-offset, (4, 1)), atol=1.0)
+
+
+def test_robust_rounds_end_where_the_losss_scale_is_three_sigmas_of_the_noise(monkeypatch):
+    made = simulate_block(4, 150, seed=21, noise=0.1, outliers=0.4)
+    scales, noises = [], []
+    loss, robust, squared = rounds.LOSSES["geman_mcclure"], rounds._robust, Observations.squared
+    last = {}
+
+    def seen(self, residual, counted):
+        last["s"] = squared(self, residual, counted)
+        return last["s"]
+
+    def watched(scaled):
+        k = int(np.argmax(np.where(np.isfinite(last["s"]), last["s"], 0)))
+        scales.append(float(np.sqrt(last["s"][k] / scaled[k])))
+        return loss(scaled)
+
+    def ended(*given):
+        found = robust(*given)
+        noises.append(found[3])
+        monkeypatch.setattr(rounds, "_robust", robust)  # of the first run of rounds
+        monkeypatch.setitem(rounds.LOSSES, "geman_mcclure", loss)
+        return found
+
+    monkeypatch.setattr(Observations, "squared", seen)
+    monkeypatch.setitem(rounds.LOSSES, "geman_mcclure", watched)
+    monkeypatch.setattr(rounds, "_robust", ended)
+    options = AdjustOptions(noise_floor=0.0, min_convergence=0.01, drift=0)
+    adjust_tracks(made.views, made.tracks, options, centers=centers_of(made))
+    assert scales[0] > 5 * scales[-1]
+    assert 3.0 * noises[0] <= scales[-1] * 1.0001 <= 3.6001 * noises[0]
+    shrink = np.array(scales[1::2][1:]) / np.array(scales[1::2][:-1])
+    assert (shrink >= 0.2499).all()
+
+
+@pytest.mark.parametrize(
+    ("strong", "spread", "alt", "sigma"),
+    [
+        (0, 0.0, 300.0, 200.0),  # none other tells: the middle of the range 100 to 500, its half
+        (9, 400.0, 300.0, 200.0),
+        (10, 0.0, 700.0, 50.0),  # the others' median, and never less than 50 m
+        (10, 400.0, 700.0, 360.0),  # from their 5th to their 95th percentile
+    ],
+)
+def test_weak_tracks_are_held_to_the_altitude_of_the_others(strong, spread, alt, sigma):
+    lon, lat = np.linspace(5.0, 5.01, strong + 2), np.full(strong + 2, 43.0)
+    altitudes = np.r_[700.0 + np.linspace(-0.5, 0.5, strong) * spread, -50.0, 2000.0]
+    points = ecef_of(np.column_stack([lon, lat, altitudes]))
+    weak = np.arange(strong + 2) >= strong
+    heights = Heights((), weak, np.arange(strong + 2), (100.0, 500.0), AdjustOptions(), None)
+    prior = heights._held(points)
+    assert prior is not None
+    assert prior.index.tolist() == [strong, strong + 1]
+    np.testing.assert_allclose(prior.residual(points)[:, 0] * sigma, altitudes[-2:] - alt, atol=1e-6)
+    assert not prior.residual(points)[:, 1:].any()
+    assert replace(heights, weak=np.zeros(strong + 2, dtype=bool))._held(points) is None

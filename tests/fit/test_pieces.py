@@ -1,0 +1,497 @@
+"""Certificate, weights, poles, corner and every option of the fit, each against its plain definition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from barpc.errors import FitError
+from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
+from barpc.fit import rpc as fit_module
+from barpc.fit.certificate import Errors, coverage, roundtrip, smallest_denominator
+from barpc.fit.grid import check_points, control_points, spaced, terrain_range, widened
+from barpc.fit.lcurve import _curvature, solve_lcurve
+from barpc.fit.points import _check_order, screened
+from barpc.fit.ridge import expected_size, noise_scaled, solution
+from barpc.fit.rpc import relative_weight, underlying_rpc
+from barpc.fit.system import ALL, Problem
+from barpc.sensor.rpc import RPC
+from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
+
+# --- every option ------------------------------------------------------------------------------------------
+
+
+class Row(NamedTuple):
+    """An option from one value to another, and what grows (1) or shrinks (-1) by it."""
+
+    field: str
+    low: Any
+    high: Any
+    observable: Callable[[RpcFit], float]
+    sign: int
+    rest: dict[str, Any] = {}  # noqa: RUF012 - never changed
+    noise: float = 0.0
+
+
+def denominators(fit: RpcFit) -> float:
+    return float(np.abs(fit.rpc.coeffs[1::2, 1:]).sum())
+
+
+def beyond_seven_digits(fit: RpcFit) -> float:
+    return max(abs(c - float(f"{c:.6e}")) for c in fit.rpc.coeffs.ravel())
+
+
+ROWS = [
+    Row("method", "ridge", "lcurve", lambda fit: fit.iterations, 1, {"grid": (6, 6, 5)}, 0.3),
+    Row("grid", (5, 5, 4), (8, 7, 6), lambda fit: fit.num_cnp, 1),
+    Row("tau", 1e-5, 1e-1, denominators, 1, {"method": "ridge"}, 0.3),
+    Row("precision", "nitf", None, beyond_seven_digits, 1),
+]
+ELSEWHERE = {
+    "weighted": "test_weighted_passes_are_made_where_the_denominator_varies",
+    "space": "test_the_grid_is_regular_where_it_is_asked_for",
+    "nodes": "test_nodes_are_where_they_are_asked_for",
+    "tolerance": "test_the_tolerance_decides_whether_a_fit_is_accepted",
+    "joint": "test_joint_fits_share_one_regularisation",
+    "normalization": "test_offsets_and_scales_are_those_that_are_given",
+    "allow_mirrored": "test_mirrored_points_are_taken_where_allowed",
+}
+
+
+def test_every_option_has_a_row() -> None:
+    assert {row.field for row in ROWS} | set(ELSEWHERE) == {field.name for field in fields(FitOptions)}
+    assert set(ELSEWHERE.values()) <= set(globals())
+
+
+class Shaking:
+    """A camera whose image points are noisy, the same at every call."""
+
+    def __init__(self, camera: Camera, noise: float) -> None:
+        self.camera, self.noise = camera, noise
+
+    def project(self, ground: Any) -> Any:
+        image = self.camera.model.project(ground)
+        phase = np.sum(np.asarray(ground) * [1e6, 1.7e6, 13.0], axis=-1)[..., None]
+        return image + self.noise * np.sin(phase + [0.0, 1.0])
+
+    def localize(self, image: Any, alt: Any) -> Any:
+        return self.camera.model.localize(image, alt)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.camera.model, name)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.field)
+def test_an_option_changes_the_result_in_its_direction(camera: Camera, row: Row) -> None:
+    found = []
+    for value in (row.low, row.high):
+        options = FitOptions(**{"space": "ground", **row.rest, row.field: value})
+        model = Shaking(camera, row.noise) if row.noise else camera.model
+        fit = fit_rpc(model, camera.size, camera.alt_range, options=options, strict=False)  # type: ignore[arg-type]
+        found.append(row.observable(fit))
+    assert (found[1] - found[0]) * row.sign > 0.05 * abs(found[0]), found
+
+
+def test_weighted_passes_are_made_where_the_denominator_varies(camera: Camera) -> None:
+    """Residuals count by 1 / b: a table whose b runs from 0.6 to 1.4 is met better with it, pass by pass."""
+    rpc = _with_denominator(0, 0.4)
+    ground = camera.model.localize(*_image_points(camera, 600))
+    exact = rpc.project(ground)
+    noisy = exact + np.random.default_rng(1).normal(0, 0.3, exact.shape)
+    for passes in (0, 1, 3):
+        options = FitOptions(method="ridge", weighted=passes, tolerance=5.0, tau=1.0)
+        fit = fit_rpc_points(ground, noisy, options=options, strict=False)
+        assert fit.iterations == 1 + passes
+    flat = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(weighted=3))
+    assert flat.iterations == 1  # within 5 %
+
+
+def _image_points(camera: Camera, count: int) -> tuple[Any, Any]:
+    rng = np.random.default_rng(6)
+    return rng.uniform(0, 1, (count, 2)) * camera.size, rng.uniform(*camera.alt_range, count)
+
+
+def test_the_grid_is_regular_where_it_is_asked_for(camera: Camera) -> None:
+    for space in ("image", "ground"):
+        options = FitOptions(grid=(5, 6, 4), space=space, nodes="uniform")
+        ground, image = control_points(camera.model, camera.size, (100.0, 400.0), options)
+        assert ground.shape == (5, 6, 4, 3)
+        np.testing.assert_allclose(camera.model.project(ground), image, atol=1e-6)
+        regular = image if space == "image" else ground
+        np.testing.assert_allclose(np.diff(regular[..., 0], 2, axis=0), 0, atol=1e-6)
+        np.testing.assert_allclose(np.diff(regular[..., 1], 2, axis=1), 0, atol=1e-6)
+        np.testing.assert_allclose(ground[0, 0, :, 2], [100, 200, 300, 400])
+        if space == "image":
+            assert image[0, 0, 0].tolist() == [-0.5, -0.5]
+            assert image[-1, -1, -1].tolist() == [camera.size[0] - 0.5, camera.size[1] - 0.5]
+
+
+def test_nodes_are_where_they_are_asked_for() -> None:
+    np.testing.assert_allclose(spaced(2.0, 10.0, 5, "uniform"), [2, 4, 6, 8, 10])
+    expected = 6.0 - 4.0 * np.cos(np.pi * np.arange(5) / 4)
+    np.testing.assert_allclose(spaced(2.0, 10.0, 5, "chebyshev"), expected)
+
+
+def test_the_tolerance_decides_whether_a_fit_is_accepted(camera: Camera) -> None:
+    model: Any = Shaking(camera, 0.3)
+    worst = fit_rpc(model, camera.size, camera.alt_range, options=FitOptions(method="ridge"), strict=False)
+    most = float(worst.max_ckp.max())
+    assert 0.1 < most < 1.0
+    loose = FitOptions(method="ridge", tolerance=most * 1.01)
+    assert fit_rpc(model, camera.size, camera.alt_range, options=loose).verdict(loose.tolerance) == ""
+    with pytest.raises(FitError, match="misses its check points"):
+        fit_rpc(
+            model, camera.size, camera.alt_range, options=FitOptions(method="ridge", tolerance=most * 0.99)
+        )
+
+
+def test_joint_fits_share_one_regularisation(camera: Camera) -> None:
+    model: Any = Shaking(camera, 0.3)
+    h = [
+        fit_rpc(model, camera.size, (0.0, 900.0), options=options, strict=False).h
+        for options in (FitOptions(method="lcurve", joint=joint, grid=(6, 6, 4)) for joint in (False, True))
+    ]
+    assert h[0][0] != h[0][1]
+    assert h[1][0] == h[1][1]
+    assert min(h[0]) * 0.2 < h[1][0] < max(h[0]) * 5
+
+
+def test_offsets_and_scales_are_those_that_are_given(camera: Camera) -> None:
+    given = Normalization([5.0, 43.0, 600.0], [0.5, 0.4, 800.0], [9000.0, 9000.0], [-12000.0, 12000.0])
+    rpc = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(normalization=given)).rpc
+    for name in ("ground_offset", "ground_scale", "image_offset", "image_scale"):
+        np.testing.assert_array_equal(getattr(rpc, name), getattr(given, name))
+    own = fit_rpc(camera.model, camera.size, camera.alt_range).rpc
+    assert own.image_offset == pytest.approx([9999.5, 9499.5])
+    assert own.image_scale == pytest.approx([10000.0, 9500.0])
+    assert own.ground_offset[2] == 500.0
+    assert own.ground_scale[2] == 500.0
+
+
+def test_mirrored_points_are_taken_where_allowed(camera: Camera) -> None:
+    ground, image = random_points(camera, 300, np.random.default_rng(0))
+    mirrored = image * [-1.0, 1.0] + [camera.size[0], 0]
+    with pytest.raises(FitError, match="mirrored"):
+        screened(ground, mirrored, False)
+    screened(ground, mirrored, True)
+    screened(ground, image, False)
+
+
+@pytest.mark.parametrize(
+    ("jacobian", "refused"),
+    [
+        ([[2, 0], [0, 2]], True), ([[2, 0], [0, -2]], False),  # mirrored; as seen from above
+        ([[2, 0], [0, 1.02]], True), ([[2, 0], [0, 0.98]], False), ([[0.98, 0], [0, 2]], False),
+        ([[1.02, 0], [0, 2]], True), ([[2, 0.9], [0, 2]], True), ([[2, 2.4], [0, 2]], False),
+        ([[2, -2.4], [0, 2]], False), ([[0, 2], [2, 0]], False), ([[0, 2], [-2, 0]], True),
+    ],
+)  # fmt: skip
+def test_only_an_upright_square_image_is_suspected_of_swapped_columns(jacobian: Any, refused: bool) -> None:
+    """Rows run down: a view from above has a negative determinant. Oblong by two, or askew by 60 degrees: left be."""
+    if refused:
+        with pytest.raises(FitError, match="mirrored"):
+            _check_order(np.array(jacobian, dtype=float))
+    else:
+        _check_order(np.array(jacobian, dtype=float))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"grid": (3, 4, 4)}, {"grid": (4, 4, 3)}, {"tolerance": 0.0}, {"tau": 0.0}, {"weighted": -1}],
+)
+def test_options_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(FitError):
+        FitOptions(**wrong)
+    FitOptions(grid=(4, 4, 4), weighted=0)
+
+
+# --- certificate -------------------------------------------------------------------------------------------
+
+
+def test_errors_are_root_mean_square_and_largest() -> None:
+    rng = np.random.default_rng(0)
+    residual = rng.normal(size=(50, 2)) * [1.0, 3.0]
+    errors = Errors()
+    assert np.isnan(errors.rmse).all()
+    errors.add(residual[:20])
+    errors.add(residual[:0])
+    errors.add(residual[20:])
+    assert errors.count == 50
+    np.testing.assert_allclose(errors.rmse, np.sqrt((residual**2).mean(axis=0)))
+    np.testing.assert_allclose(errors.largest, np.abs(residual).max(axis=0))
+
+
+def _with_denominator(axis: int, slope: float, sides: str = "lon") -> RPC:
+    """An RPC one of whose denominators is 1 + slope x along a ground axis, the box of which is [-1, 1]."""
+    plain = synthetic_rpc()
+    coeffs = plain.coeffs.copy()
+    coeffs[1::2] = 0.0
+    coeffs[1::2, 0] = 1.0
+    coeffs[2 * axis + 1, {"lon": 1, "lat": 2, "alt": 3}[sides]] = slope
+    return replace(plain, coeffs=coeffs)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sides", ["lon", "lat", "alt"])
+@pytest.mark.parametrize("slope", [0.5, -0.5, 0.79, 0.81, -0.9, 1.2])
+def test_poles_are_looked_for_in_the_box_and_a_quarter_around_it(axis: int, sides: str, slope: float) -> None:
+    """1 + slope x over x in [-1.25, 1.25]: a pole beyond the box is found where it lies within a quarter."""
+    rpc = _with_denominator(axis, slope, sides)
+    low, high = rpc.ground_offset - rpc.ground_scale, rpc.ground_offset + rpc.ground_scale
+    assert smallest_denominator(rpc, low, high) == pytest.approx(1 - 1.25 * abs(slope))
+    # of half the box, and off its centre: relative to the value at its own centre
+    middle = rpc.ground_offset + 0.5 * rpc.ground_scale
+    half = smallest_denominator(rpc, rpc.ground_offset, high)
+    center = 1 + 0.5 * slope
+    assert half == pytest.approx((center - 0.625 * abs(slope)) / center)
+    assert np.isfinite(middle).all()
+
+
+def _fit(**changes: Any) -> RpcFit:
+    one = np.ones(2)
+    values: dict[str, Any] = {
+        "rpc": synthetic_rpc(), "rmse_cnp": one * 1e-3, "max_cnp": one * 2e-3, "rmse_ckp": one * 3e-3,
+        "max_ckp": one * 5e-3, "min_denominator": 0.9, "roundtrip": 1e-9, "coverage": 1.0, "h": one,
+        "iterations": 1, "num_cnp": 100, "num_ckp": 50, "method": "ridge",
+    }  # fmt: skip
+    return RpcFit(**{**values, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "tolerance", "message"),
+    [
+        ({}, 0.0051, ""),
+        ({}, 0.0049, "misses"),
+        ({"max_ckp": np.array([1e-4, 0.006])}, 0.0055, "misses"),
+        ({"max_ckp": np.array([np.nan, 0.006])}, 1.0, "misses"),
+        ({"min_denominator": 0.0}, 0.1, "pole"),
+        ({"min_denominator": -0.3}, 0.1, "pole"),
+        ({"min_denominator": 1e-3}, 0.1, ""),
+        ({"roundtrip": 0.11}, 0.1, "inverted"),
+        ({"roundtrip": 0.09}, 0.1, ""),
+        ({"roundtrip": 5e-7, "max_ckp": np.zeros(2)}, 1e-9, ""),
+        ({"roundtrip": np.inf}, 0.1, "inverted"),
+    ],
+)
+def test_a_verdict_names_what_is_wrong(changes: dict[str, Any], tolerance: float, message: str) -> None:
+    verdict = _fit(**changes).verdict(tolerance)
+    assert message in verdict
+    assert bool(verdict) == bool(message)
+
+
+def test_a_fit_with_a_pole_gives_way_to_one_without(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+    fits = {
+        "ridge": _fit(min_denominator=-0.1, max_ckp=np.full(2, 0.02)),
+        "lcurve": _fit(max_ckp=np.full(2, 0.03), method="lcurve"),
+        "vendor-denominators": _fit(max_ckp=np.full(2, 0.05), method="vendor-denominators"),
+    }
+    choose = fit_module._first_accepted
+    vendor = camera.rpc
+    assert choose(fits.__getitem__, FitOptions(tolerance=0.1), vendor, True).method == "lcurve"
+    assert choose(fits.__getitem__, FitOptions(tolerance=0.01), vendor, False).method == "lcurve"
+    with pytest.raises(FitError, match=r"0\.03 px"):
+        choose(fits.__getitem__, FitOptions(tolerance=0.01), vendor, True)
+    fits["ridge"] = _fit(max_ckp=np.full(2, 0.02))
+    assert choose(fits.__getitem__, FitOptions(tolerance=0.01), vendor, False).method == "ridge"
+    fits = {name: replace(fit, max_ckp=np.full(2, 0.2)) for name, fit in fits.items()}
+    fits["vendor-denominators"] = _fit(method="vendor-denominators")
+    assert choose(fits.__getitem__, FitOptions(), vendor, True).method == "vendor-denominators"
+    with pytest.raises(FitError):
+        choose(fits.__getitem__, FitOptions(), None, True)
+    with pytest.raises(FitError):
+        choose(fits.__getitem__, FitOptions(method="ridge"), vendor, True)
+
+
+def test_the_round_trip_is_measured_in_pixels() -> None:
+    class Off:
+        """Localises 2 m too high up north."""
+
+        def __init__(self, rpc: RPC) -> None:
+            self.rpc = rpc
+
+        def project_jacobian(self, ground: Any) -> Any:
+            return self.rpc.project_jacobian(ground)
+
+        def localize(self, image: Any, alt: Any) -> Any:
+            return self.rpc.localize(image, alt) + [360.0, 1e-4, 0.0]
+
+    rpc = synthetic_rpc()
+    ground = rpc.localize(np.array([[3000.0, 4000.0], [12000.0, 9000.0]]), np.array([100.0, 400.0]))
+    _, jacobian = rpc.project_jacobian(ground)
+    expected = np.abs(jacobian[..., 1]).max() * 1e-4
+    assert roundtrip(Off(rpc), ground) == pytest.approx(expected, rel=1e-4)  # type: ignore[arg-type]
+    assert roundtrip(rpc, ground) < 1e-6
+    assert roundtrip(rpc, np.array([[5.4, 43.2, np.nan]])) == float("inf")
+
+
+def test_coverage_is_the_share_of_the_image_inside_the_hull() -> None:
+    low, high = np.array([-0.5, -0.5]), np.array([999.5, 499.5])
+    corners = np.array([[-0.5, -0.5], [999.5, -0.5], [999.5, 499.5], [-0.5, 499.5]])
+    assert coverage(corners, low, high) == 1.0
+    assert coverage(corners * [0.5, 1.0], low, high) == pytest.approx(0.5, abs=0.03)
+    assert coverage(corners[:3], low, high) == pytest.approx(0.5, abs=0.06)
+    many = np.random.default_rng(0).uniform(low, low + 0.5 * (high - low), (3000, 2))
+    assert coverage(many, low, high) == pytest.approx(0.25, abs=0.03)
+
+
+# --- grid --------------------------------------------------------------------------------------------------
+
+
+def test_a_flat_scene_gets_fifty_metres_either_side() -> None:
+    assert widened((100.0, 100.0)) == (50.0, 150.0)
+    assert widened((100.0, 140.0)) == (70.0, 170.0)
+    assert widened((0.0, 100.0)) == (0.0, 100.0)
+    assert widened((0.0, 1000.0)) == (0.0, 1000.0)
+    for wrong in ((2.0, 1.0), (np.nan, 1.0), (0.0, np.inf)):
+        with pytest.raises(FitError, match="not an interval"):
+            widened(wrong)
+
+
+def test_check_points_of_large_grids_are_all_middles(monkeypatch: pytest.MonkeyPatch) -> None:
+    axes = np.arange(7.0), np.arange(5.0), np.arange(4.0)
+    ground = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    middles = np.stack(np.meshgrid(*(a[:-1] + 0.5 for a in axes), indexing="ij"), axis=-1).reshape(-1, 3)
+    for slab in (8192, 24, 1):
+        monkeypatch.setattr("barpc.fit.grid._SLAB", slab)
+        np.testing.assert_array_equal(np.concatenate(list(check_points(ground))), middles)
+    ground[0, 0, 0] = np.nan
+    assert len(np.concatenate(list(check_points(ground)))) == len(middles) - 1
+
+
+def test_the_terrains_range_is_that_under_the_image(camera: Camera) -> None:
+    ring = camera.model.localize(np.array([[0.0, 0.0], [19999.0, 18999.0]]), np.array([0.0, 1000.0]))
+    inside = ring[:, 1].mean()
+
+    def dem(lon: Any, lat: Any) -> Any:
+        return np.where(np.abs(lat - inside) < 0.02, 700.0, np.where(lon > ring[:, 0].mean(), np.nan, 50.0))
+
+    assert terrain_range(camera.model, camera.size, (0.0, 1000.0), dem, 30.0) == (20.0, 730.0)
+    with pytest.raises(FitError, match="no altitude"):
+        terrain_range(camera.model, camera.size, (0.0, 1.0), lambda lon, lat: np.full(len(lon), np.nan), 1.0)
+
+
+# --- solvers -----------------------------------------------------------------------------------------------
+
+
+def test_points_count_by_the_inverse_of_their_sigma(camera: Camera) -> None:
+    """Against numpy's weighted least squares of the linearised system."""
+    rng = np.random.default_rng(2)
+    ground, image = random_points(camera, 200, rng)
+    image = image + rng.normal(0, 0.5, image.shape)
+    sigma = rng.uniform(0.5, 4.0, 200)
+    weight = relative_weight(sigma, 200)
+    np.testing.assert_allclose(weight, sigma.min() / sigma)
+    assert relative_weight(None, 3) is None
+    for wrong in (np.ones(199), np.r_[0.0, np.ones(199)], np.r_[np.nan, np.ones(199)]):
+        with pytest.raises(FitError, match="positive"):
+            relative_weight(wrong, 200)
+    rpc = camera.rpc
+    norm = Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+    equal, weighted = Problem(ground, image, norm), Problem(ground, image, norm, weight=weight)
+    for axis in (0, 1):
+        whole = np.concatenate([rows for _, rows in equal.rows(axis)])
+        expected = np.linalg.lstsq(whole[:, :-1] / sigma[:, None], whole[:, -1] / sigma, rcond=None)[0]
+        found = solution(weighted.compressed(axis))
+        np.testing.assert_allclose(whole[:, :-1] @ found, whole[:, :-1] @ expected, atol=1e-9)
+
+
+def test_weights_reach_the_fit(camera: Camera) -> None:
+    """One of two equal halves shifted by a pixel: the fit lies where the weights balance them."""
+    rng = np.random.default_rng(3)
+    ground, image = random_points(camera, 400, rng)
+    both = np.vstack([ground, ground])
+    shifted = np.vstack([image, image + [1.0, 0.0]])
+    sigma = np.r_[np.ones(400), np.full(400, 2.0)]
+    options = FitOptions(method="ridge", tolerance=2.0)
+    fit = fit_rpc_points(both, shifted, sigma=sigma, options=options, strict=False)
+    shift = (fit.rpc.project(ground) - image).mean(axis=0)
+    assert shift == pytest.approx([1 / 5, 0.0], abs=0.01)  # weights 1 and 1/4
+
+
+def test_the_noise_is_found_whatever_the_number_of_points(camera: Camera) -> None:
+    rng = np.random.default_rng(4)
+    rpc = camera.rpc
+    norm = Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+    for count in (80, 2500):
+        sigmas = []
+        for _ in range(5):
+            ground, image = random_points(camera, count, rng)
+            problem = Problem(ground, image + rng.normal(0, 0.4, image.shape), norm)
+            sigmas.append(noise_scaled(problem.compressed(0), expected_size(ALL, 0.003))[1] * 10100.0)
+        assert np.sqrt(np.mean(np.square(sigmas))) == pytest.approx(0.4, rel=0.15)
+
+
+def test_expected_sizes_fall_with_the_degree() -> None:
+    size = expected_size(ALL, 0.003)
+    np.testing.assert_allclose(size[:20], np.r_[[np.inf] * 4, [0.1] * 6, [0.03] * 10])
+    np.testing.assert_allclose(size[20:], np.r_[[0.003] * 3, [0.0003] * 6, [0.00003] * 10])
+
+
+def test_the_curvature_of_the_l_curve_is_that_of_the_sampled_curve() -> None:
+    """(rho' eta'' - rho'' eta') / (rho'^2 + eta'^2)^1.5, numerically, away from the corner too."""
+    rng = np.random.default_rng(5)
+    s, beta, rest = np.geomspace(1, 1e-4, 12), rng.normal(size=12), 0.3
+    h = np.geomspace(1e-4, 1.0, 4001)
+
+    def curve(h: Any) -> Any:
+        f = s**2 / (s**2 + h[:, None] ** 2)
+        eta2 = ((f * beta / s) ** 2).sum(axis=1)
+        rho2 = (((1 - f) * beta) ** 2).sum(axis=1) + rest
+        return 0.5 * np.log(rho2), 0.5 * np.log(eta2)
+
+    rho, eta = curve(h)
+    t = np.log(h)
+    rho1, eta1 = np.gradient(rho, t), np.gradient(eta, t)
+    rho2, eta2 = np.gradient(rho1, t), np.gradient(eta1, t)
+    expected = (rho1 * eta2 - rho2 * eta1) / (rho1**2 + eta1**2) ** 1.5
+    found = _curvature(h[:, None], s, beta, rest)
+    scale = np.abs(expected[50:-50]).max()
+    np.testing.assert_allclose(found[50:-50], expected[50:-50], rtol=1e-3, atol=1e-4 * scale)
+
+
+def test_the_rpc_under_a_model_is_found_through_its_corrections(camera: Camera) -> None:
+    assert underlying_rpc(camera.model) is camera.rpc
+    assert underlying_rpc(camera.rpc) is camera.rpc
+    assert underlying_rpc(object()) is None
+
+
+def test_vendors_denominators_are_kept_to_the_digit() -> None:
+    camera = synthetic()
+    options = FitOptions(method="vendor-denominators", tolerance=5.0)
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
+    np.testing.assert_array_equal(fit.rpc.coeffs[1::2], camera.rpc.coeffs[1::2])
+    np.testing.assert_array_equal(fit.rpc.ground_offset, camera.rpc.ground_offset)
+    assert fit.method == "vendor-denominators"
+    doubled = replace(camera.rpc, coeffs=2.0 * camera.rpc.coeffs)  # the same camera
+    ground, image = random_points(camera, 300, np.random.default_rng(0))
+    kept = fit_rpc_points(ground, image, vendor=doubled, options=options)
+    np.testing.assert_allclose(kept.rpc.coeffs[1::2], camera.rpc.coeffs[1::2], rtol=1e-14)
+    with pytest.raises(FitError, match="not built on an RPC"):
+        fit_rpc_points(*random_points(camera, 200, np.random.default_rng(0)), options=options)
+
+
+def test_too_few_points_are_refused_to_the_point(camera: Camera) -> None:
+    ground, image = random_points(camera, 60, np.random.default_rng(1))
+    options = FitOptions(tolerance=1e3, method="ridge")
+    with pytest.raises(FitError, match="39 points are too few: each coordinate has 39 unknowns, give 40"):
+        fit_rpc_points(ground[:39], image[:39], options=options)
+    fit_rpc_points(ground[:40], image[:40], options=options, strict=False)
+
+
+def test_the_papers_solver_counts_its_passes_over_the_points(camera: Camera, monkeypatch: Any) -> None:
+    ground, image = random_points(camera, 300, np.random.default_rng(2))
+    image = image + np.random.default_rng(3).normal(0, 0.2, image.shape)
+    rpc = camera.rpc
+    norm = Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+    calls = []
+    compressed = Problem.compressed
+    monkeypatch.setattr(
+        Problem, "compressed", lambda self, *given: calls.append(1) or compressed(self, *given)
+    )
+    *_, passes = solve_lcurve(Problem(ground, image, norm), [1])
+    assert passes == len(calls)
+    assert passes >= 5

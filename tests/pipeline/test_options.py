@@ -1,0 +1,237 @@
+"""Every option of a run changes what the run does, and as its description says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rasterio import Affine
+
+from barpc.ba import AdjustOptions
+from barpc.errors import BarpcWarning, FitError, InputError, OutputError
+from barpc.fit import FitOptions
+from barpc.geodesy import ground_from_ecef
+from barpc.pipeline import AdjustResult, RunOptions, adjust
+from barpc.simulate.files import write_scene
+from barpc.simulate.images import ImageOptions
+from barpc.tie import TieOptions
+from tests.test_dem import write_dem, write_geoid
+
+Run = Callable[..., AdjustResult]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three small images, GCPs; a first run's matches; a flat DEM of 300 m and a geoid of 40 m."""
+    folder = tmp_path_factory.mktemp("scene") / "in"
+    write_scene(folder, ImageOptions(size=(260, 260), seed=1, views=3, gcps=4))
+    images = sorted(folder.glob("*.tif"))
+    adjust(images, folder / "first", RunOptions(stop_after="matching"))
+    adjust(images[:2], folder / "earlier", RunOptions(matches=str(folder / "first/matches.csv")))
+    (folder / "dem").mkdir()
+    heights = np.full((200, 200), 300.0, np.float32)
+    write_dem(folder / "dem/a.tif", "EPSG:4326+5773", heights, transform=_around())
+    write_geoid(folder / "dem/g.gtx", 40.0)
+    return folder
+
+
+def _around() -> Any:
+    return Affine(0.001, 0, 5.3, 0, -0.001, 43.4)
+
+
+@pytest.fixture
+def run(scene: Path, tmp_path: Path) -> Run:
+    """`run(gcp=...)`: the three images, matches of the first run unless others are asked for."""
+
+    def make(out: str = "out", matches: str | None = "first/matches.csv", **options: Any) -> AdjustResult:
+        given = None if matches is None else str(scene / matches)
+        images = options.pop("given", sorted(scene.glob("*.tif")))
+        return adjust(images, tmp_path / out, RunOptions(matches=given, **options))
+
+    return make
+
+
+def _names(path: Path) -> set[str]:
+    return {p.suffix if p.name.startswith("view") else p.name for p in path.iterdir()}
+
+
+def images(run: Run, out: Path, scene: Path) -> None:
+    for chosen, suffix in (("vrt", {".vrt"}), ("copy", {".tif"}), ("none", set())):
+        run(chosen, images=chosen)
+        assert _names(out / chosen) & {".vrt", ".tif"} == suffix
+
+
+def rpc_formats(run: Run, out: Path, scene: Path) -> None:
+    run("a", rpc_formats=("rpb", "geom"))
+    assert _names(out / "a") & {".RPB", ".geom", ".TXT"} == {".RPB", ".geom"}
+    with pytest.raises(InputError, match="rpc_formats 'nitf'"):
+        run("b", rpc_formats=("nitf",))
+
+
+def num_passes(run: Run, out: Path, scene: Path) -> None:
+    one, two = (run(str(n), matches=None, num_passes=n) for n in (1, 2))
+    stages = [{stage["stage"] for stage in found.summary["stages"]} for found in (one, two)]
+    assert stages[1] - stages[0] == {"tie points (pass 2)", "adjustment (pass 2)"}
+
+
+def stop_after(run: Run, out: Path, scene: Path) -> None:
+    run("m", stop_after="matching")
+    assert (out / "m/matches.csv").exists()
+    assert not (out / "m/block.npz").exists()
+    run("a", stop_after="adjustment")
+    assert (out / "a/block.npz").exists()
+    assert not list((out / "a").glob("*.vrt"))
+    run("w")
+    assert list((out / "w").glob("*.vrt"))
+
+
+def keep_going(run: Run, out: Path, scene: Path) -> None:
+    (out / "bad.tif").write_bytes(b"no image")
+    given = [*sorted(scene.glob("*.tif")), out / "bad.tif"]
+    with pytest.raises(Exception, match=r"bad\.tif"):
+        run("a", given=given)
+    found = run("b", given=given, keep_going=True)
+    assert [Path(row["path"]).name for row in found.summary["left_out"]] == ["bad.tif"]
+    assert not found.passed
+
+
+def force(run: Run, out: Path, scene: Path) -> None:
+    hard = FitOptions(tolerance=1e-15)
+    with pytest.raises(FitError, match="view_00"):
+        run("a", fit=hard)
+    assert not run("b", fit=hard, force=True).passed
+    assert list((out / "b").glob("*.vrt"))
+
+
+def overwrite(run: Run, out: Path, scene: Path) -> None:
+    run("a")
+    with pytest.raises(OutputError):
+        run("a")
+    run("a", overwrite=True)
+
+
+def matches(run: Run, out: Path, scene: Path) -> None:
+    rows = (scene / "first/matches.csv").read_text().splitlines()
+    (scene / "fewer.csv").write_text("\n".join(rows[: len(rows) // 2]) + "\n")
+    few, many = run("a", "fewer.csv", stop_after="adjustment"), run("b", stop_after="adjustment")
+    assert 0 < len(few.tracks) < len(many.tracks)
+    assert len(few.run.matched) == 0
+
+
+def overlap_list(run: Run, out: Path, scene: Path) -> None:
+    (out / "pairs.txt").write_text("view_00 view_01\nview_01 view_02\n")
+    listed = str(out / "pairs.txt")
+    some = run("a", None, overlap_list=listed, stop_after="matching")
+    every = run("b", None, stop_after="matching")
+    assert (len(some.run.matched), len(every.run.matched)) == (2, 3)
+
+
+def aoi(run: Run, out: Path, scene: Path) -> None:
+    every = run("a", None, stop_after="adjustment")
+    middle = np.median([view.sensor.ground_offset[:2] for view in every.run.views], axis=0)  # type: ignore[attr-defined]
+    w, s, e, n = *(middle - [0.01, 0.01]), *(middle + [0.0, 0.01])
+    ring = [[w, s], [e, s], [e, n], [w, n], [w, s]]
+    (out / "a.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    half = run("b", None, aoi=str(out / "a.geojson"), stop_after="adjustment")
+    assert 0.2 < len(half.tracks) / len(every.tracks) < 0.8
+
+
+def gcp(run: Run, out: Path, scene: Path) -> None:
+    free, held = run("a"), run("b", gcp=(str(scene / "gcps.geojson"),))
+    assert len(held.summary["gcps"]) == 4
+    assert free.summary["gcps"] == []
+    sigmas = [found.summary["scene"]["sigma_enu_m"] for found in (held, free)]
+    assert (np.array(sigmas[0]) < 0.5 * np.array(sigmas[1])).all()
+
+
+def check_points(run: Run, out: Path, scene: Path) -> None:
+    free, checked = run("a"), run("b", check_points=(str(scene / "gcps.geojson"),))
+    assert free.summary["check_points"] in (None, [], {})
+    assert checked.summary["check_points"]
+    np.testing.assert_array_equal(free.adjustment.params, checked.adjustment.params)
+
+
+def fixed_run(run: Run, out: Path, scene: Path) -> None:
+    free, going_on = run("a"), run("b", fixed_run=str(scene / "earlier"))
+    assert 0 < len(going_on.tracks) < len(free.tracks)
+    np.testing.assert_allclose(going_on.adjustment.params, free.adjustment.params, atol=0.2)
+
+
+def _height(found: AdjustResult) -> float:
+    points = found.adjustment.points
+    return float(np.median(ground_from_ecef(points[np.isfinite(points[:, 0])])[:, 2]))
+
+
+def dem(run: Run, out: Path, scene: Path) -> None:
+    tight = AdjustOptions(dem_for_all=True, dem_sigma=0.01)
+    geoid = str(scene / "dem/g.gtx")
+    free = run("a", adjust=tight)
+    held = run("b", adjust=tight, dem=str(scene / "dem/a.tif"), geoid=geoid)
+    assert abs(_height(held) - 340.0) < 0.2 * abs(_height(free) - 340.0)
+    with pytest.raises(InputError):
+        run("c", dem=str(out / "nowhere.tif"))
+
+
+@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+def geoid(run: Run, out: Path, scene: Path) -> None:
+    tight = AdjustOptions(dem_for_all=True, dem_sigma=0.01)
+    dem = str(scene / "dem/a.tif")
+    with_geoid = run("a", adjust=tight, dem=dem, geoid=str(scene / "dem/g.gtx"))
+    with pytest.warns(BarpcWarning, match="geoid"):
+        without = run("b", adjust=tight, dem=dem)
+    assert _height(with_geoid) - _height(without) == pytest.approx(40.0, abs=4.0)
+    with pytest.raises(InputError, match="geoid is given without dem"):
+        RunOptions(geoid="g.gtx")
+
+
+def tie(run: Run, out: Path, scene: Path) -> None:
+    few = run("a", None, stop_after="matching", tie=TieOptions(points_per_image=80))
+    many = run("b", None, stop_after="matching")
+    assert 0 < len(few.tracks) < 0.7 * len(many.tracks)
+
+
+def adjust_(run: Run, out: Path, scene: Path) -> None:
+    found = run("a", adjust=AdjustOptions(model="rotation"), stop_after="adjustment")
+    assert found.adjustment.params.shape[1] == 3
+
+
+def fit(run: Run, out: Path, scene: Path) -> None:
+    found = run("a", fit=FitOptions(grid=(5, 6, 4)))
+    assert {fitted.num_cnp for fitted in found.run.fits} == {120}
+
+
+ROWS = {
+    "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
+    "keep_going": keep_going, "force": force, "overwrite": overwrite, "matches": matches,
+    "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "check_points": check_points,
+    "fixed_run": fixed_run, "dem": dem, "geoid": geoid, "tie": tie, "adjust": adjust_, "fit": fit,
+}  # fmt: skip
+
+
+def test_every_option_has_a_row() -> None:
+    assert set(ROWS) == {field.name for field in fields(RunOptions)}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene: Path) -> None:
+    ROWS[name](run, tmp_path, scene)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"images": "jpeg"}, "images"),
+        ({"stop_after": "lunch"}, "stop_after"),
+        ({"num_passes": 0}, "num_passes"),
+        ({"matches": "a", "aoi": "b"}, "aoi is given with matches"),
+        ({"matches": "a", "overlap_list": "b"}, "overlap_list is given with matches"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        RunOptions(**given)

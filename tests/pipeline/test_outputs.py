@@ -1,0 +1,226 @@
+"""The writing gate: no file of a run counts as written unless what reads it sees the camera that was meant."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc import handoff
+from barpc.errors import OutputError
+from barpc.fit import FitOptions, RpcFit, fit_rpc
+from barpc.handoff import Consumer, Reading, control_grid, difference, verify
+from barpc.pipeline import outputs
+from barpc.pipeline.outputs import REOPENED, file_names, refuse_shadows, write_view
+from barpc.rpcio import read_rpc, write_rpc
+from barpc.scene import View
+from barpc.sensor.rpc import RPC
+from barpc.workspace import Workspace
+from tests.rpcio.conftest import make_rpc, write_image
+
+SIZE, ALTITUDES = (2000, 1900), (30.0, 300.0)
+ALL = ("txt", "rpb", "geom", "json", "xml")
+
+
+@pytest.fixture(scope="module")
+def fit() -> RpcFit:
+    return fit_rpc(make_rpc(), SIZE, ALTITUDES, options=FitOptions(grid=(6, 6, 4)))
+
+
+@pytest.fixture
+def view(tmp_path: Path) -> View:
+    path = write_image(tmp_path / "scene.tif", (1, SIZE[1], SIZE[0]), dtype="uint8")
+    return View("scene", str(path), SIZE, make_rpc(), ALTITUDES)
+
+
+@pytest.mark.parametrize("images", ["vrt", "copy", "none"])
+def test_every_format_is_written_under_its_name_and_read_back(tmp_path, view, fit, images) -> None:
+    with Workspace(tmp_path / "out") as run:
+        written = write_view(run, view, fit, make_rpc(), images, ALL)
+    carrier = {"vrt": ["scene.vrt"], "copy": ["scene.tif"], "none": []}[images]
+    texts = ["scene_RPC.TXT", "scene.RPB", "scene.geom", "scene.rpc.json", "scene.rpc.xml"]
+    assert list(written) == carrier + texts == file_names(view, images, ALL)
+    for name, readings in written.items():
+        assert read_rpc(tmp_path / "out" / name) == fit.rpc
+        assert readings["barpc"] < 1e-5, name
+        assert {type(value) for value in readings.values()} <= {float, str}
+
+
+class Elsewhere:
+    """A camera some pixels beside another."""
+
+    def __init__(self, rpc: RPC, col: float) -> None:
+        self.rpc, self.col = rpc, col
+
+    def project(self, ground):
+        return self.rpc.project(ground) + [self.col, 0.0]
+
+    def localize(self, image, alt):
+        return self.rpc.localize(np.asarray(image) - [self.col, 0.0], alt)
+
+
+@pytest.mark.parametrize("images", ["vrt", "none"])
+def test_a_file_that_does_not_hold_the_model_ends_the_run(tmp_path, view, fit, images) -> None:
+    """Twice the fit's largest error and the printing's: just within passes, just beyond does not."""
+    largest = float(np.linalg.norm(fit.max_ckp)) + REOPENED
+    with Workspace(tmp_path / "near") as run:
+        write_view(run, view, fit, Elsewhere(make_rpc(), 1.9 * largest), images, ("txt",))
+    with (
+        pytest.raises(OutputError, match=r"scene.*reads it .* px off"),
+        Workspace(tmp_path / "far") as run,
+    ):
+        write_view(run, view, fit, Elsewhere(make_rpc(), 2.2 * largest), images, ("txt",))
+
+
+def test_a_loose_fit_may_miss_by_its_own_error_and_no_more(tmp_path, view, fit) -> None:
+    loose = replace(fit, max_ckp=np.array([0.3, 0.4]))
+    with Workspace(tmp_path / "a") as run:
+        written = write_view(run, view, loose, Elsewhere(make_rpc(), 0.98), "none", ("txt",))
+    assert written["scene_RPC.TXT"]["barpc"] == pytest.approx(0.98, abs=1e-6)
+    with pytest.raises(OutputError, match=r"1\.02 px off"), Workspace(tmp_path / "b") as run:
+        write_view(run, view, loose, Elsewhere(make_rpc(), 1.02), "none", ("txt",))
+
+
+def test_a_file_that_cannot_be_read_back_ends_the_run(tmp_path, view, fit, monkeypatch) -> None:
+    def cut_off(rpc, path, *, overwrite):
+        write_rpc(rpc, path, overwrite=overwrite, format="txt")
+        Path(path).write_text(Path(path).read_text()[:400])
+
+    monkeypatch.setattr(outputs, "write_rpc", cut_off)
+    with pytest.raises(OutputError, match="barpc reads it nan px off"), Workspace(tmp_path / "out") as run:
+        write_view(run, view, fit, make_rpc(), "none", ("txt",))
+
+
+@pytest.mark.parametrize(("consumer", "ends"), [("barpc", True), ("gdal", True), ("other", False)])
+def test_only_what_the_tool_itself_and_gdal_say_ends_the_run(
+    tmp_path, view, fit, monkeypatch, consumer, ends
+) -> None:
+    def says(paths, *_):
+        return [Reading(path, name, 9.0 if name == consumer else 0.0) for path in paths for name in
+                ("barpc", "gdal", "other")]  # fmt: skip
+
+    monkeypatch.setattr(outputs, "verify", says)
+    with Workspace(tmp_path / "out") as run:
+        if ends:
+            with pytest.raises(OutputError, match=f"{consumer} reads it 9 px off"):
+                write_view(run, view, fit, make_rpc(), "none", ("txt",))
+        else:
+            written = write_view(run, view, fit, make_rpc(), "none", ("txt",))
+            assert written == {"scene_RPC.TXT": {"barpc": 0.0, "gdal": 0.0, "other": 9.0}}
+
+
+def test_a_reading_passes_up_to_a_millionth_of_a_pixel() -> None:
+    assert Reading(Path("a"), "x", 1e-6).passed
+    assert not Reading(Path("a"), "x", 1.01e-6).passed
+    assert not Reading(Path("a"), "x", float("nan")).passed
+
+
+def test_the_grid_spans_the_image_and_its_altitudes() -> None:
+    rpc = make_rpc()
+    ground, image = control_grid(rpc, SIZE, ALTITUDES)
+    assert len(ground) == 11 * 11 * 5
+    np.testing.assert_allclose(image.min(axis=0), [0, 0], atol=1e-6)
+    np.testing.assert_allclose(image.max(axis=0), [1999, 1899], atol=1e-6)
+    assert sorted(set(ground[:, 2])) == [30.0, 97.5, 165.0, 232.5, 300.0]
+    assert difference(rpc, rpc.crop(3.0, 4.0), SIZE, ALTITUDES) == pytest.approx(5.0, abs=1e-9)
+
+
+class Blind:
+    """Sees no ground but in its first columns."""
+
+    def __init__(self, columns: float) -> None:
+        self.rpc, self.columns = make_rpc(), columns
+
+    def project(self, ground):
+        return self.rpc.project(ground)
+
+    def localize(self, image, alt):
+        ground = self.rpc.localize(image, alt)
+        return np.where(np.asarray(image)[:, :1] <= self.columns, ground, np.nan)
+
+
+def test_points_that_a_model_does_not_see_are_left_out_and_none_at_all_is_an_error(tmp_path) -> None:
+    ground, _ = control_grid(Blind(1000.0), SIZE, ALTITUDES)
+    assert len(ground) == 6 * 11 * 5
+    assert np.isnan(difference(Blind(-1.0), make_rpc(), SIZE, ALTITUDES))
+    write_rpc(make_rpc(), tmp_path / "a_RPC.TXT")
+    assert verify([tmp_path / "a_RPC.TXT"], Blind(1000.0), SIZE, ALTITUDES)[-1].passed
+    with pytest.raises(OutputError, match="no ground point"):
+        verify([tmp_path / "a_RPC.TXT"], Blind(-1.0), SIZE, ALTITUDES)
+
+
+def test_the_largest_error_of_all_points_is_what_counts(tmp_path, monkeypatch) -> None:
+    rpc = make_rpc()
+
+    def one_corner(path):
+        def project(ground):
+            image = rpc.project(ground)
+            image[7] += [3.0, 4.0]
+            return image
+
+        return project
+
+    def no_number(path):
+        return lambda ground: np.full((len(ground), 2), np.nan)
+
+    consumers = {
+        "corner": Consumer((".txt",), "numpy", one_corner),
+        "nan": Consumer((".txt",), "numpy", no_number),
+        "absent": Consumer((".txt",), "no_such_package", no_number),
+        "else": Consumer((".geom",), "numpy", no_number),
+    }
+    monkeypatch.setattr(handoff, "CONSUMERS", consumers)
+    corner, nan = verify([tmp_path / "A_RPC.TXT"], rpc, SIZE, ALTITUDES)
+    assert (corner.consumer, corner.note) == ("corner", "")
+    assert corner.max_error == pytest.approx(5.0)
+    assert not nan.passed
+    assert nan.note == "it projects to no finite point"
+
+
+def test_an_rpc_across_the_antimeridian_is_read_where_it_is(tmp_path) -> None:
+    rpc = make_rpc(lon=179.9999)
+    write_rpc(rpc, tmp_path / "a.geom")
+    for reading in verify([tmp_path / "a.geom"], rpc, SIZE, ALTITUDES):
+        assert reading.passed, reading
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("polynomial_format:  B", "polynomial_format:  A"), ("ossimRpcModel", "ossimRpcProjection")],
+)
+def test_a_keyword_list_of_another_kind_is_not_read(tmp_path, old, new) -> None:
+    path = tmp_path / "a.geom"
+    write_rpc(make_rpc(), path)
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    (keywords,) = (r for r in verify([path], make_rpc(), SIZE, ALTITUDES) if r.consumer == "keywords")
+    assert not keywords.passed
+    assert "not what OSSIM expects" in keywords.note
+
+
+@pytest.mark.parametrize(
+    ("beside", "images", "refused"),
+    [
+        ("scene.geom", "copy", True), ("scene.geom", "vrt", True), ("scene.RPB", "copy", True),
+        ("scene.RPB", "vrt", False), ("scene_RPC.TXT", "copy", True), ("scene.geom", "none", False),
+    ],
+)  # fmt: skip
+def test_a_foreign_file_that_would_be_read_first_is_refused(tmp_path, view, beside, images, refused) -> None:
+    write_rpc(make_rpc(), tmp_path / beside)
+    names = file_names(view, images, ())
+    if refused:
+        with pytest.raises(OutputError, match=f"{beside}: lies beside"):
+            refuse_shadows(tmp_path, names)
+    else:
+        refuse_shadows(tmp_path, names)
+    refuse_shadows(tmp_path, [*names, beside])  # written by this run itself
+    refuse_shadows(tmp_path / "not yet", names)
+
+
+def test_json_is_what_rpcm_reads(tmp_path, view, fit) -> None:
+    with Workspace(tmp_path / "out") as run:
+        write_view(run, view, fit, make_rpc(), "none", ("json",))
+    assert json.loads((tmp_path / "out" / "scene.rpc.json").read_text())["rpc"]

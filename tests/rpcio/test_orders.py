@@ -1,0 +1,66 @@
+"""RPC00A and RPC00B order their twenty terms differently: each is read in its own."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from barpc.rpcio import read_rpc, write_rpc_nitf
+from barpc.rpcio.fixed import nitf_record
+from barpc.sensor.rpc import RPC
+from tests.rpcio.conftest import grid, write_image
+
+A_ORDER = "1 L P H LP LH PH LPH LL PP HH LLL LLP LLH LPP PPP PPH LHH PHH HHH"
+"""STDI-0002, table 8-1 (RPC00A)."""
+
+
+def rpc_of_fitting_numbers() -> RPC:
+    """Every number as the record holds it, every coefficient at work."""
+    coeffs = np.round(np.random.default_rng(9).uniform(-1, 1, (4, 20)) * 0.01, 6)
+    coeffs[1::2] *= 0.1
+    coeffs[:, 0] = [0.01, 1.0, -0.02, 1.0]
+    coeffs[0, 1], coeffs[2, 2] = 0.9, -0.9
+    return RPC(np.round(coeffs, 6), [5.4, 43.2, 500.0], [0.1, 0.2, 500.0], [999.0, 950.0], [1010.0, 980.0])
+
+
+def test_the_terms_of_an_rpc00a_record_stand_in_their_own_order(tmp_path) -> None:
+    """The record's numbers, used in the order of RPC00A (GDAL takes terms 7 to 10 otherwise: no oracle here)."""
+    rpc = rpc_of_fitting_numbers()
+    path = tmp_path / "a.ntf"
+    write_rpc_nitf(rpc, write_image(tmp_path / "scene.tif"), path)
+    data = path.read_bytes()
+    assert data.count(b"RPC00B01041") == 1
+    path.write_bytes(data.replace(b"RPC00B01041", b"RPC00A01041"))
+    found = read_rpc(path)
+    ground = grid(rpc)
+    L, P, H = ((ground - rpc.ground_offset) / rpc.ground_scale).T
+    value = {"1": np.ones(len(ground)), "L": L, "P": P, "H": H}
+    terms = [np.prod([value[letter] for letter in name], axis=0) for name in A_ORDER.split()]
+    col, col_den, row, row_den = rpc.coeffs @ np.array(terms)
+    expected = np.column_stack([col / col_den, row / row_den]) * rpc.image_scale + rpc.image_offset
+    np.testing.assert_allclose(found.project(ground), expected, atol=1e-8)
+    assert np.abs(found.project(ground) - rpc.project(ground)).max() > 1.0
+
+
+def test_a_record_says_of_itself_that_it_is_valid(tmp_path) -> None:
+    path = tmp_path / "a.ntf"
+    write_rpc_nitf(rpc_of_fitting_numbers(), write_image(tmp_path / "scene.tif"), path)
+    path.write_bytes(path.read_bytes().replace(b"RPC00B010411", b"RPC00B010410"))
+    with pytest.raises(Exception, match="SUCCESS flag"):
+        read_rpc(path)
+
+
+def test_a_record_holds_each_field_at_its_place() -> None:
+    """STDI-0002: SUCCESS, two errors of 7, offsets of 6 5 8 9 5, scales alike, four times twenty of 12."""
+    record = nitf_record(rpc_of_fitting_numbers())
+    widths = [1, 7, 7, 6, 5, 8, 9, 5, 6, 5, 8, 9, 5]
+    ends = np.cumsum([0, *widths])
+    cells = [record[start:stop] for start, stop in pairwise(ends)]
+    assert cells == [
+        "1", "0000.00", "0000.00", "000950", "00999", "+43.2000", "+005.4000", "+0500",
+        "000980", "01010", "+00.2000", "+000.1000", "+0500",
+    ]  # fmt: skip
+    assert len(record) == ends[-1] + 80 * 12
+    assert record[ends[-1] :][:12] == "-2.000000E-2"  # the first number of LINE_NUM

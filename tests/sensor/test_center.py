@@ -1,0 +1,87 @@
+"""Camera centres of a camera that has one, and of models that fail over their image."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyproj
+import pytest
+
+from barpc.errors import RpcError
+from barpc.sensor.geometry import NOMINAL_ALTITUDE, PLAUSIBLE_ALTITUDE, camera_center
+from tests.sensor.conftest import make_rpc
+
+TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+TO_GROUND = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+SIZE, ALTITUDES = (4000, 3000), (100.0, 900.0)
+
+
+class Pinhole:
+    """A perspective camera above 5.4 E, 43.2 N that looks aside; half a metre a pixel from 700 km."""
+
+    def __init__(self, altitude: float = 7e5, columns: float = np.inf) -> None:
+        self.center = np.array(TO_ECEF.transform(5.9, 43.4, altitude))
+        target = np.array(TO_ECEF.transform(5.4, 43.2, 500.0))
+        axis = target - self.center
+        z = axis / np.linalg.norm(axis)
+        x = np.cross(z, [0.0, 0.0, 1.0])
+        x /= np.linalg.norm(x)
+        self.frame = np.array([x, np.cross(z, x), z])
+        self.focal = np.linalg.norm(axis) / 0.5
+        self.columns = columns
+
+    def localize(self, image: Any, alt: Any) -> Any:
+        image, alt = np.asarray(image, dtype=float), np.asarray(alt, dtype=float)
+        pixel = image - [(SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2]
+        ray = np.concatenate([pixel / self.focal, np.ones((*pixel.shape[:-1], 1))], axis=-1) @ self.frame
+        distance = np.full(ray.shape[:-1], self.focal * 0.5)
+        for _ in range(30):
+            ground = np.stack(
+                TO_GROUND.transform(*np.moveaxis(self.center + distance[..., None] * ray, -1, 0)), -1
+            )
+            distance = distance + (ground[..., 2] - alt) * 1.1
+        ground[..., 2] = alt
+        return np.where(image[..., :1] <= self.columns, ground, np.nan)
+
+
+@pytest.mark.parametrize("method", ["line", "projective"])
+@pytest.mark.parametrize("altitude", [4e5, 7e5])
+def test_the_centre_of_a_perspective_camera_is_found_by_both_methods(method, altitude) -> None:
+    camera: Any = Pinhole(altitude)
+    found = camera_center(camera, SIZE, ALTITUDES, method)
+    assert found.method == method
+    assert np.linalg.norm(found.ecef - camera.center) < 1e-3 * altitude
+    assert found.altitude == pytest.approx(altitude, rel=1e-3)
+
+
+@pytest.mark.parametrize(("altitude", "method"), [
+    (PLAUSIBLE_ALTITUDE[0] * 0.95, "nominal"), (PLAUSIBLE_ALTITUDE[0] * 1.05, "line"),
+    (PLAUSIBLE_ALTITUDE[1] * 0.95, "line"), (PLAUSIBLE_ALTITUDE[1] * 1.05, "nominal"),
+])  # fmt: skip
+def test_a_centre_where_no_satellite_is_makes_way_for_a_nominal_one(altitude, method) -> None:
+    camera: Any = Pinhole(altitude)
+    found = camera_center(camera, SIZE, ALTITUDES)
+    assert found.method == method
+    expected = altitude if method == "line" else NOMINAL_ALTITUDE
+    assert found.altitude == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_model_that_sees_no_ground_at_its_images_centre_has_no_centre() -> None:
+    half: Any = Pinhole(columns=SIZE[0] / 2 + 1)
+    assert camera_center(half, SIZE, ALTITUDES).method == "nominal"
+    blind: Any = Pinhole(columns=SIZE[0] / 2 - 1)
+    for method in ("line", "projective"):
+        with pytest.raises(RpcError, match="no ground point at its image's centre"):
+            camera_center(blind, SIZE, ALTITUDES, method)  # type: ignore[arg-type]
+
+
+def test_a_flat_altitude_range_still_gives_a_projective_centre() -> None:
+    camera: Any = Pinhole()
+    found = camera_center(camera, SIZE, (300.0, 300.0), "projective")
+    assert np.linalg.norm(found.ecef - camera.center) < 0.02 * 7e5
+
+
+def test_parallel_rays_have_a_nominal_centre_at_the_nominal_altitude() -> None:
+    found = camera_center(make_rpc(), (20000, 19000), (0.0, 1000.0))
+    assert found.altitude == pytest.approx(NOMINAL_ALTITUDE, rel=1e-5)

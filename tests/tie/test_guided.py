@@ -1,0 +1,216 @@
+"""Search, keypoints and stretches against plain loops over all candidates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc.scene import View
+from barpc.tie import TieOptions
+from barpc.tie.epipolar import Frame
+from barpc.tie.features import Keypoints, Sift, bounded, detect_tile, join, quota, tiles
+from barpc.tie.guided import Band, Guided
+from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch
+from tests.tie.conftest import write_image
+
+LINEAR = np.array([[1.1, 0.2], [-0.1, 0.9]])
+
+
+def keypoints(rng: np.random.Generator, xy: np.ndarray, descriptors: np.ndarray) -> Keypoints:
+    n = len(xy)
+    return Keypoints(xy, rng.uniform(2, 5, n), rng.uniform(-0.6, 0.6, n), rng.uniform(0, 1, n), descriptors)
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Keypoints, Keypoints, Frame, Band]:
+    """Five hundred points a side in 300 px; half of B shows what A shows, some twice, a few pixels apart."""
+    rng = np.random.default_rng(3)
+    described = rng.integers(0, 120, (500, 128)).astype(np.uint8)
+    predicted = rng.uniform(0, 300, (500, 2))
+    again = np.clip(described[:250].astype(int) + rng.integers(-25, 25, (250, 128)), 0, 255).astype(np.uint8)
+    place = predicted[:250] + rng.uniform(-12, 12, (250, 2)) * [1.5, 0.4]
+    twin = place[:100] + rng.choice([1.0, 1.9, 2.2, 6.0], (100, 1)) * [1, 0]
+    b = keypoints(
+        rng,
+        np.vstack([place, twin, rng.uniform(0, 300, (150, 2))]),
+        np.vstack([again, again[:100], described[350:]]),
+    )
+    a = keypoints(rng, rng.uniform(0, 300, (500, 2)), described)
+    slope = rng.uniform(-0.05, 0.05, 500)
+    slope[::50] = np.nan
+    where = Frame(np.array([1.0, 0.0]), *predicted.T, slope, np.full(500, 10.0), LINEAR)
+    return a, b, where, Band(rng.uniform(-16, -8, 500), rng.uniform(8, 16, 500), 4.0)
+
+
+def brute(a: Keypoints, b: Keypoints, where: Frame, band: Band) -> dict[tuple[int, int], tuple[float, float]]:
+    """Mutual best pairs: (distance, ambiguity), one pair of points after the other."""
+    unit = [k.descriptors / np.linalg.norm(k.descriptors.astype(float), axis=1)[:, None] for k in (a, b)]
+    likeness = np.full((len(a), len(b)), -np.inf)
+    for i in range(len(a)):
+        sight = LINEAR @ [np.cos(a.angle[i]), np.sin(a.angle[i])]
+        expected = np.arctan2(sight[1], sight[0])
+        for j in range(len(b)):
+            du = b.xy[j, 0] - where.along[i]
+            dw = b.xy[j, 1] - where.across[i] - where.slope[i] * du
+            turn = np.angle(np.exp(1j * (b.angle[j] - expected)))
+            zoom = np.log(b.scale[j] / a.scale[i]) - 0.5 * np.log(np.linalg.det(LINEAR))
+            if (
+                band.before[i] <= du <= band.after[i] and abs(dw) <= band.across
+                and abs(turn) <= np.radians(30) and abs(zoom) <= np.log(1.8)
+            ):  # fmt: skip
+                likeness[i, j] = unit[0][i] @ unit[1][j]
+    found = {}
+    for i in range(len(a)):
+        j = int(likeness[i].argmax())
+        if likeness[i, j] < -1 or likeness[:, j].argmax() != i:
+            continue
+        apart = np.abs(b.xy - b.xy[j])
+        du = b.xy[:, 0] - b.xy[j, 0]
+        apart[:, 1] = np.abs(b.xy[:, 1] - b.xy[j, 1] - where.slope[i] * du)
+        others = np.where((apart <= 2.0).all(axis=1), -np.inf, likeness[i])
+        distance = np.sqrt(max(0.0, 2 - 2 * likeness[i, j]))
+        second = others.max()
+        found[i, j] = (distance, distance / np.sqrt(2 - 2 * second) if second > -1 else distance)
+    return found
+
+
+def test_the_matcher_finds_what_a_loop_over_all_pairs_finds(pair) -> None:
+    a, b, where, band = pair
+    expected = brute(a, b, where, band)
+    found = Guided().match(a, b, where, band)
+    assert len(expected) > 100
+    assert {(int(i), int(j)) for i, j in found.index} == set(expected)
+    for (i, j), distance, ambiguity in zip(found.index, found.distance, found.ambiguity, strict=True):
+        assert (distance, ambiguity) == pytest.approx(expected[int(i), int(j)], abs=2e-3)
+
+
+def test_without_points_there_are_no_matches(pair) -> None:
+    a, b, where, band = pair
+    nobody = np.empty(0, dtype=np.int64)
+    assert not len(Guided().match(a, b.select(nobody), where, band).index)
+    none = Band(band.before[:0], band.after[:0], 4.0)
+    assert not len(Guided().match(a.select(nobody), b, where.select(nobody), none).index)
+
+
+# --- keypoints ---------------------------------------------------------------------------------------------
+
+
+def test_a_cell_keeps_its_strongest_and_cells_begin_at_the_corner_of_a_pixel() -> None:
+    xy = np.array([[-0.4, 0.0], [9.4, 0.0], [9.6, 0.0], [0.0, 9.6], [25.0, 9.6], [5.0, 5.0]])
+    response = np.array([1.0, 3.0, 1.0, 2.0, 9.0, 2.0])
+    assert quota(xy, response, 10.0, 1).tolist() == [1, 2, 3, 4]
+    assert quota(xy, response, 10.0, 2).tolist() == [1, 2, 3, 4, 5]
+    assert quota(xy, response, 10.0, 9).tolist() == [0, 1, 2, 3, 4, 5]
+    assert quota(xy + [1000.0, 2000.0], response, 10.0, 1).tolist() == [1, 2, 3, 4]
+    assert len(quota(xy[:0], response[:0], 10.0, 1)) == 0
+    tied = np.array([[5.0, 7.0], [4.0, 7.0], [6.0, 3.0]])
+    assert quota(tied, np.ones(3), 10.0, 2).tolist() == [1, 2]
+
+
+def test_an_image_holds_at_most_its_bound(pair) -> None:
+    a = pair[0]
+    for most in (400, 120, 30, 3):
+        found = bounded(a, TieOptions(keypoints_per_image=most, cell=64))
+        assert 0.4 * most <= len(found) <= most
+    assert bounded(a, TieOptions(keypoints_per_image=500)) is a
+    few = bounded(a, TieOptions(keypoints_per_image=3, cell=64))  # fewer than there are cells: the strongest
+    assert sorted(few.response) == sorted(np.sort(a.response)[-3:])
+
+
+@pytest.mark.parametrize(
+    ("size", "tile", "cell", "edges"),
+    [
+        ((1000, 500), 512, 64, ([0, 512], [0])), ((1000, 500), 300, 50, ([0, 250, 500, 750], [0, 250])),
+        ((1025, 128), 1024, 64, ([0, 576], [0])), ((100, 100), 128, 64, ([0], [0])),
+    ],
+)  # fmt: skip
+def test_tiles_are_equal_and_cut_at_whole_cells(size, tile, cell, edges) -> None:
+    boxes = tiles(size, TieOptions(tile=tile, cell=cell))
+    assert [(c, r) for c, r, _, _ in boxes] == [(c, r) for r in edges[1] for c in edges[0]]
+    for c, r, w, h in boxes:
+        right = min((e for e in edges[0] if e > c), default=size[0])
+        below = min((e for e in edges[1] if e > r), default=size[1])
+        assert (w, h) == (right - c, below - r)
+
+
+def test_descriptors_are_square_roots_of_shares_and_angles_are_radians(tmp_path) -> None:
+    picture = np.full((200, 200), 40, np.uint8)
+    picture[90:112, 95:107] = 220
+    everything = Sift(TieOptions()).detect(picture, lambda xy, scale, response: np.ones(len(xy), bool))
+    assert len(everything)
+    np.testing.assert_allclose((everything.descriptors.astype(float) ** 2).sum(axis=1), 255.0**2, rtol=0.03)
+    assert (everything.angle >= 0).all()
+    assert (everything.angle < 2 * np.pi + 1e-6).all()
+    assert everything.angle.max() > 1.0
+    nothing = Sift(TieOptions()).detect(picture, lambda xy, scale, response: np.zeros(len(xy), bool))
+    assert len(nothing) == 0
+    assert join([]).descriptors.shape == (0, 128)
+
+
+def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path) -> None:
+    rng = np.random.default_rng(5)
+    data = (rng.integers(0, 2, (40, 40)).repeat(8, 0).repeat(8, 1) * 800 + 100).astype(np.uint16)
+    data[:, 250:] = 0
+    path = write_image(tmp_path / "a.tif", data, nodata=0)
+    view = View("a", str(path), (320, 320), None, (0.0, 1.0))  # type: ignore[arg-type]
+    options = TieOptions(keypoints_per_cell=10_000, tile=160, cell=32)
+    stretch = sample_stretch(path)
+    assert stretch is not None
+    found = [detect_tile(view, box, stretch, options) for box in tiles((320, 320), options)]
+    for (col, row, width, height), part in zip(tiles((320, 320), options), found, strict=True):
+        assert (part.xy >= [col - 0.5, row - 0.5]).all()
+        assert (part.xy < [col + width - 0.5, row + height - 0.5]).all()
+        assert np.lexsort((part.xy[:, 0], part.xy[:, 1])).tolist() == list(range(len(part)))
+    every = join(found)
+    assert (250 - every.xy[:, 0] > 2.9).all()
+    assert (250 - every.xy[:, 0] > every.scale - 1.5).all()
+    assert (every.xy > 2.0).all()
+    assert len(every) > 50
+
+
+# --- pixels ------------------------------------------------------------------------------------------------
+
+
+def test_a_stretch_takes_its_ends_to_0_and_255_and_holes_to_the_mean() -> None:
+    pixels = np.array([[100.0, 150.0, 200.0], [50.0, 300.0, 100.4]], np.float32)
+    whole = np.ones((2, 3), bool)
+    assert Stretch(100.0, 200.0).apply(pixels, whole).tolist() == [[0, 128, 255], [0, 255, 1]]
+    hole = whole.copy()
+    hole[1, :2] = False
+    picture = Stretch(100.0, 200.0).apply(pixels, hole)
+    assert picture[1, :2].tolist() == [96, 96]  # the mean of 0, 127.5, 255 and 1
+    assert Stretch(0.0, 1.0).apply(pixels, ~whole).tolist() == [[0] * 3] * 2
+
+
+def test_the_stretch_lies_between_the_percentiles_of_the_valid_pixels(tmp_path) -> None:
+    values = np.arange(1, 60_001, dtype=np.uint16).reshape(200, 300)
+    shuffled = np.random.default_rng(0).permutation(values.ravel()).reshape(200, 300)
+    stretch = sample_stretch(write_image(tmp_path / "a.tif", shuffled))
+    assert stretch is not None
+    assert stretch.low == pytest.approx(300, rel=0.15)
+    assert stretch.high == pytest.approx(59_700, rel=0.003)
+    flat = np.full((50, 50), 2.0**23, np.float32)  # one step of the type is 1
+    for range_, varies in ((6.0, False), (10.0, True)):
+        flat[20:30] = 2.0**23 + range_
+        assert (sample_stretch(write_image(tmp_path / f"{varies}.tif", flat)) is not None) == varies
+
+
+def test_zero_borders_of_five_pixels_are_invalid_and_smaller_ones_are_not(tmp_path) -> None:
+    data = np.full((60, 60), 7, np.uint16)
+    data[:, :5], data[40:44, 40:44], data[20:25, 20:25], data[50, 50] = 0, 0, 0, 65535
+    _, valid = read_pixels(write_image(tmp_path / "a.tif", data), (0, 0, 60, 60))
+    expected = np.ones((60, 60), bool)
+    expected[:, :5] = expected[20:25, 20:25] = expected[50, 50] = False
+    np.testing.assert_array_equal(valid, expected)
+
+
+@pytest.mark.parametrize(
+    ("box", "grown"),
+    [
+        ((10, 20, 30, 40), (5, 15, 40, 50)),
+        ((0, 3, 30, 40), (0, 0, 35, 48)),
+        ((80, 90, 20, 8), (75, 85, 25, 15)),
+    ],
+)
+def test_a_box_grows_on_every_side_up_to_the_border(box, grown) -> None:
+    assert grow(box, 5, (100, 100)) == grown

@@ -1,0 +1,469 @@
+"""Every option of the tie points, and the pieces of the matcher, each against its plain definition."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from barpc.errors import InputError
+from barpc.raster import open_raster
+from barpc.scene import Tracks
+from barpc.tie import TieOptions, TieResult, find_tracks, select_pairs
+from barpc.tie import find as find_module
+from barpc.tie.epipolar import Affine, Frame, agreeing, frame, linear_map, mad, robust_affine
+from barpc.tie.features import Keypoints, detect_tile, tiles
+from barpc.tie.find import require_known
+from barpc.tie.guided import Band, Candidates
+from barpc.tie.link import thin
+from barpc.tie.matching import _Search, common_range
+from barpc.tie.pairs import Pair
+from barpc.tie.raster import sample_stretch
+from barpc.tie.refine import _grouped, _shared, references
+from tests.tie.conftest import Rendered, write_image
+from tests.tie.test_pairs import METRE, camera, views
+
+
+@pytest.fixture(scope="module")
+def scene(render) -> Rendered:
+    return render(views=2, size=(300, 300))
+
+
+class Row(NamedTuple):
+    """An option from one value to another, and what grows (1) or shrinks (-1) by it."""
+
+    field: str
+    low: Any
+    high: Any
+    observable: Callable[[TieResult], float]
+    sign: int
+    rest: dict[str, Any] = {}  # noqa: RUF012 - never changed
+
+
+def keypoints(found: TieResult) -> float:
+    return sum(found.keypoints)
+
+
+def verified(found: TieResult) -> float:
+    return found.pairs[0].verified
+
+
+def kept(found: TieResult) -> float:
+    return len(found.tracks)
+
+
+ROWS = [
+    Row("cell", 32, 150, keypoints, -1, {"keypoints_per_cell": 10}),
+    Row("keypoints_per_cell", 10, 40, keypoints, 1),
+    Row("keypoints_per_image", 200, 5000, keypoints, 1),
+    Row("contrast", 0.005, 0.05, keypoints, -1, {"keypoints_per_cell": 1000}),
+    Row("ratio", 0.5, 0.9, verified, 1),
+    Row("false_share", 0.0005, 0.2, verified, 1),
+    Row("tolerance", 0.01, 3.0, lambda found: found.pairs[0].matches, 1),
+    Row("min_correlation", 0.5, 0.99, kept, -1),
+    Row("points_per_image", 100, 5000, kept, 1),
+    Row("patch", 9, 31, lambda found: float(np.median(found.tracks.sigma)), -1, {"min_correlation": 0.01}),
+]
+ELSEWHERE = {
+    "band": "test_the_band_that_is_asked_for_is_matched",
+    "detector": "test_names_are_those_of_the_tables",
+    "matcher": "test_names_are_those_of_the_tables",
+    "tile": "test_tiles_are_as_large_as_asked_for",
+    "min_overlap": "test_pairs_are_those_within_the_bounds",
+    "min_angle": "test_pairs_are_those_within_the_bounds",
+    "max_angle": "test_pairs_are_those_within_the_bounds",
+    "neighbours": "test_a_view_gets_as_many_partners_as_asked_for",
+    "search": "test_the_search_reaches_as_far_as_asked_for",
+    "min_matches": "test_a_pair_needs_as_many_matches_as_asked_for",
+}
+
+
+def test_every_option_has_a_row() -> None:
+    assert {row.field for row in ROWS} | set(ELSEWHERE) == {field.name for field in fields(TieOptions)}
+    assert set(ELSEWHERE.values()) <= set(globals())
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.field)
+def test_an_option_changes_the_result_in_its_direction(scene: Rendered, row: Row) -> None:
+    few, many = (
+        row.observable(find_tracks(scene.views, TieOptions(**{**row.rest, row.field: value})))
+        for value in (row.low, row.high)
+    )
+    assert (many / few if row.sign > 0 else few / many) > 1.05, (few, many)
+
+
+def test_what_is_found_lies_where_the_truth_is_and_errs_as_it_says(scene: Rendered) -> None:
+    found = find_tracks(scene.views)
+    first, second = (found.tracks.view == v for v in (0, 1))
+    xy = found.tracks.xy
+    assert np.array_equal(found.tracks.point[first], found.tracks.point[second])
+    errors = scene.errors(0, 1, xy[first], xy[second])
+    assert len(errors) > 200
+    typical = 1.4826 * np.median(np.abs(errors), axis=0)
+    assert (typical < 0.12).all()
+    assert np.abs(np.median(errors, axis=0)).max() < 0.03
+    # both ends carry half the variance of a registration
+    stated = np.sqrt(np.median(found.tracks.sigma[first] ** 2 + found.tracks.sigma[second] ** 2))
+    assert 0.5 < np.median(typical) / stated < 1.6
+    report = found.pairs[0]
+    assert report.inlier_share == report.verified / report.matches
+    assert report.control_share <= 0.01
+    assert report.angle == pytest.approx(20.85, abs=0.1)
+    truth = _offset(scene)
+    assert report.offset == pytest.approx(truth, abs=2.0)
+
+
+def _offset(scene: Rendered) -> tuple[float, float]:
+    """Of exact image points from their prediction by the delivered cameras, along and across."""
+    one, two = (shot.exact for shot in scene.scene.shots)
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(20, 280, (200, 2))
+    alt = float(np.nanmean(scene.altitude[0]))
+    seen = two.project(one.localize(xy, np.full(200, alt)))
+    where = frame(*(view.sensor for view in scene.views), xy, common_range(*scene.views))
+    along, across = np.median(where.errors(np.arange(200), seen), axis=0)
+    return float(along), float(across)
+
+
+def test_the_band_that_is_asked_for_is_matched(scene: Rendered, tmp_path) -> None:
+    stacked = []
+    for view in scene.views:
+        with open_raster(view.path) as source:
+            pixels = source.read(1)
+        path = write_image(tmp_path / f"{view.name}.tif", np.stack([np.zeros_like(pixels), pixels]))
+        stacked.append(replace(view, path=str(path)))
+    both = [find_tracks(scene.views), find_tracks(stacked, TieOptions(band=2))]
+    np.testing.assert_array_equal(both[0].tracks.xy, both[1].tracks.xy)
+
+
+def test_names_are_those_of_the_tables() -> None:
+    require_known(TieOptions())
+    for name in ("detector", "matcher"):
+        with pytest.raises(InputError, match=f"{name} 'other' is not one of"):
+            require_known(TieOptions(**{name: "other"}))
+
+
+def test_tiles_are_as_large_as_asked_for(scene: Rendered) -> None:
+    boxes = tiles((1000, 700), TieOptions(tile=256, cell=64))
+    assert {(c, r) for c, r, _, _ in boxes} == {
+        (c, r) for c in range(0, 1000, 256) for r in range(0, 700, 256)
+    }
+    assert max(w for _, _, w, _ in boxes) == 256
+    assert sum(w * h for _, _, w, h in boxes) == 700_000
+    small = detect_tile(
+        scene.views[0], (0, 0, 128, 128), sample_stretch(scene.views[0].path, 1), TieOptions(tile=128)
+    )
+    assert (small.xy < 128).all()
+
+
+@pytest.mark.parametrize(("shift", "overlap"), [(250, 0.5), (400, 0.2)])
+def test_pairs_are_those_within_the_bounds(shift: float, overlap: float) -> None:
+    """Half a kilometre square, shifted; one leans 0.1 px a metre, seen under 2.9 degrees."""
+    two = views(camera(0.0, lean=0.0), camera(shift * METRE, lean=0.1))
+    (pair,) = select_pairs(two, TieOptions())
+    angle = float(np.degrees(np.arctan(0.05)))
+    assert pair.angle == pytest.approx(angle, abs=0.05)
+    within: list[dict[str, float]] = [
+        {"min_overlap": pair.overlap - 0.01}, {"min_angle": pair.angle - 0.01}, {"max_angle": pair.angle + 0.01},
+    ]  # fmt: skip
+    beyond: list[dict[str, float]] = [
+        {"min_overlap": pair.overlap + 0.01}, {"min_angle": pair.angle + 0.01}, {"max_angle": pair.angle - 0.01},
+    ]  # fmt: skip
+    for given in within:
+        assert select_pairs(two, TieOptions(**given, search=0.1)) == [pair]
+    for given in beyond:
+        with pytest.raises(Exception, match="groups"):
+            select_pairs(two, TieOptions(**given, search=0.1))
+
+
+def test_a_view_gets_as_many_partners_as_asked_for() -> None:
+    row = [camera(10 * METRE * k, lean=0.0) for k in range(12)]
+    for asked in (1, 2, 4):
+        pairs = select_pairs(views(*row), TieOptions(neighbours=asked))
+        count = np.bincount([i for pair in pairs for i in pair.views], minlength=12)
+        assert count.min() >= asked
+        assert len(pairs) <= 12 * asked
+    assert len(pairs) < 12 * 11 / 2
+
+
+def test_the_search_reaches_as_far_as_asked_for(scene: Rendered) -> None:
+    """The second camera is 80 px wrong across the epipolar lines."""
+    where = frame(*(v.sensor for v in scene.views), np.array([[150.0, 150.0]]), common_range(*scene.views))
+    aside = np.array([-where.axis[1], where.axis[0]]) * 80.0
+    second = scene.views[1]
+    wrong = [scene.views[0], replace(second, sensor=second.sensor.crop(*-aside))]
+    across = find_tracks(wrong, TieOptions(search=150.0)).pairs[0].offset[1]
+    true = find_tracks(scene.views, TieOptions(search=150.0)).pairs[0].offset[1]
+    assert across - true == pytest.approx(-80.0, abs=1.5)
+    with pytest.raises(Exception, match="no common offset within 30 px"):
+        find_tracks(wrong, TieOptions(search=30.0))
+
+
+def test_a_pair_needs_as_many_matches_as_asked_for(scene: Rendered) -> None:
+    kept = len(find_tracks(scene.views).tracks) // 2
+    assert len(find_tracks(scene.views, TieOptions(min_matches=kept)).tracks) == 2 * kept
+    with pytest.raises(Exception, match=f"only {kept} tracks after registration"):
+        find_tracks(scene.views, TieOptions(min_matches=kept + 1))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"patch": 20}, {"patch": 7}, {"tile": 127}, {"cell": 7}, {"min_matches": 3}, {"min_overlap": 1.01},
+        {"ratio": 1.01}, {"min_correlation": 1.0}, {"min_angle": -0.1}, {"search": 0.0}, {"band": 0},
+    ],
+)  # fmt: skip
+def test_options_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="tie points"):
+        TieOptions(**wrong)
+
+
+def test_options_at_the_end_of_their_range_are_taken() -> None:
+    TieOptions(patch=9, tile=128, cell=8, min_matches=4, min_overlap=0.0, min_angle=0.0, ratio=1.0)
+    TieOptions(min_overlap=1.0, min_correlation=0.99, band=1)
+
+
+# --- pairs -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("overlap", "angle", "score"),
+    [(0.8, 3.0, 0.8), (0.8, 15.0, 0.8), (0.8, 30.0, 0.8 / np.e), (0.5, 45.0, 0.5 / np.e**2)],
+)
+def test_a_pairs_worth_is_its_overlap_less_by_e_for_every_fifteen_degrees(overlap, angle, score) -> None:
+    assert Pair((0, 1), overlap, angle).score == pytest.approx(score)
+
+
+def test_of_partners_with_the_same_overlap_the_moderate_angle_is_taken() -> None:
+    """Three leaning cameras about one place: 0 and 1 under a small angle, 2 far off both."""
+    three = views(camera(0.0, lean=0.0), camera(0.0, lean=0.3), camera(0.0, lean=2.0))
+    pairs = select_pairs(three, TieOptions(neighbours=1))
+    assert [pair.views for pair in pairs] == [(0, 1), (1, 2)]
+
+
+def test_common_altitudes_are_those_that_both_ranges_hold() -> None:
+    two = views(camera(0.0), camera(0.0))
+    ranges = [((0, 100), (40, 200), (40, 100)), ((0, 10), (50, 90), (10, 50)), ((0, 9), (2, 3), (2, 3))]
+    for first, second, common in ranges:
+        given = (replace(two[0], alt_range=first), replace(two[1], alt_range=second))
+        assert common_range(*given) == common
+        assert common_range(*given[::-1]) == common
+
+
+# --- epipolar ----------------------------------------------------------------------------------------------
+
+
+def test_a_frame_predicts_where_a_point_lies_at_any_altitude(scene: Rendered) -> None:
+    one, two = (view.sensor for view in scene.views)
+    xy = np.random.default_rng(0).uniform(0, 300, (50, 2))
+    low, high = common_range(*scene.views)
+    where = frame(one, two, xy, (low, high))
+    assert np.hypot(*where.axis) == pytest.approx(1.0)
+    for alt in np.linspace(low, high, 5):
+        seen = two.project(one.localize(xy, np.full(50, alt)))
+        errors = where.errors(np.arange(50), seen)
+        expected = where.reach * (2 * (alt - low) / (high - low) - 1)
+        np.testing.assert_allclose(errors[:, 0], expected, atol=0.02)
+        np.testing.assert_allclose(errors[:, 1], 0, atol=0.05)
+    moved = where.moved(3.0, -2.0).errors(np.arange(50), seen) - where.errors(np.arange(50), seen)
+    np.testing.assert_allclose(moved[:, 0], -3.0, atol=1e-9)
+    np.testing.assert_allclose(moved[:, 1], 2.0 + 3.0 * where.slope, atol=1e-9)
+    some = np.array([7, 3])
+    np.testing.assert_allclose(
+        where.select(some).errors(np.array([0, 1]), seen[some]), where.errors(some, seen[some])
+    )
+
+
+def test_the_linear_map_is_the_central_difference_at_one_altitude(scene: Rendered) -> None:
+    one, two = (view.sensor for view in scene.views)
+    xy, alt = np.array([[100.0, 200.0], [30.0, 40.0]]), np.array([200.0, 260.0])
+    found = linear_map(one, two, xy, alt)
+    for axis in (0, 1):
+        step = np.eye(2)[axis]
+        high, low = (two.project(one.localize(xy + s * step, alt)) for s in (0.5, -0.5))
+        np.testing.assert_allclose(found[..., axis], high - low, atol=1e-4)
+
+
+def test_an_affine_function_is_found_among_outliers_with_its_spread() -> None:
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(0, 5000, (400, 2))
+    truth = 3.0 + 2e-4 * xy[:, 0] - 5e-4 * xy[:, 1]
+    values = truth + rng.normal(0, 0.2, 400)
+    values[::4] += rng.uniform(5, 50, 100)
+    found = robust_affine(xy, values)
+    assert isinstance(found, Affine)
+    np.testing.assert_allclose(found(xy), truth, atol=0.1)
+    assert 0.2 < found.spread < 0.4  # a quarter is wrong
+    clean = robust_affine(xy, truth + rng.normal(0, 0.2, 400))
+    assert clean.spread == pytest.approx(0.2, rel=0.12)
+    constant = robust_affine(xy[:29], truth[:29])
+    assert (constant.coefficients[1:] == 0).all()
+    assert (robust_affine(xy[:30], truth[:30]).coefficients[1:] != 0).all()
+
+
+def test_the_mad_is_a_standard_deviation_about_zero() -> None:
+    assert mad(np.array([-2.0, 1.0, 3.0])) == pytest.approx(1.4826 * 2.0)
+    assert mad(np.empty(0)) == 0.0
+    assert mad(np.random.default_rng(0).normal(0, 5, 20000)) == pytest.approx(5.0, rel=0.03)
+
+
+def test_what_agrees_lies_within_three_deviations_or_the_floor_window_by_window() -> None:
+    rng = np.random.default_rng(2)
+    xy = np.vstack([rng.uniform(0, 2000, (200, 2)), rng.uniform(0, 2000, (200, 2)) + [4096, 0]])
+    noise = rng.uniform(-0.1, 0.1, 400)
+    values = noise + np.where(xy[:, 0] > 3000, 40.0, 0.0)
+    values[5], values[6], values[205] = 0.32, 0.28, 40.0 + 0.32
+    keep, residual = agreeing(xy, values, floor=0.3)
+    assert np.flatnonzero(~keep).tolist() == [5, 205]
+    np.testing.assert_allclose(residual[:5], values[:5], atol=0.05)
+    wide = rng.normal(0, 1.0, 400)
+    wide[7], wide[8] = 4.5, 2.3
+    keep, _ = agreeing(xy[:200], wide[:200], floor=0.3)
+    assert not keep[7]
+    assert keep[8]
+    assert agreeing(xy[:0], values[:0])[0].shape == (0,)
+
+
+# --- refinement --------------------------------------------------------------------------------------------
+
+
+def _tracks(*rows: tuple[int, int]) -> Tracks:
+    view, point = np.array(rows).T
+    xy = np.arange(2.0 * len(rows)).reshape(-1, 2) * 10.0 + 0.3
+    return Tracks(view, point, xy, np.full(len(rows), 0.2))
+
+
+def test_the_reference_of_a_track_is_the_view_most_like_the_others() -> None:
+    tracks = _tracks((0, 0), (1, 0), (2, 0), (0, 1), (2, 1), (1, 2), (2, 2))
+    assert references(tracks, {(0, 1): 0.1, (1, 2): 0.1, (0, 2): 0.5}, 3).tolist() == [1, 3, 5]
+    assert references(tracks, {(0, 1): 0.1, (1, 2): 0.5, (0, 2): 0.1}, 3).tolist() == [0, 3, 5]
+    # a pair that was not matched counts as twice the worst
+    assert references(tracks, {(0, 2): 0.3, (1, 2): 0.4}, 3).tolist() == [2, 3, 5]
+
+
+def test_the_variance_of_a_registration_is_shared_by_both_ends() -> None:
+    tracks = _tracks((0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (0, 2), (2, 2))
+    of_track = np.array([0, 3, 5])
+    rows, xy = np.array([1, 2, 4]), np.array([[1.25, 2.5], [3.25, 4.5], [5.5, 6.5]])
+    sigma = np.array([0.2, 0.4, 0.01])
+    found = _shared(tracks, of_track, rows, xy, sigma)
+    assert found.point.tolist() == [0, 0, 0, 1, 1]  # the third is found nowhere
+    expected = [np.sqrt((0.02 + 0.08) / 2), np.sqrt(0.02), np.sqrt(0.08), 0.02, 0.02]
+    np.testing.assert_allclose(found.sigma, expected)
+    np.testing.assert_allclose(found.xy[[1, 2, 4]], xy)
+    np.testing.assert_array_equal(found.xy[[0, 3]], np.rint(tracks.xy[[0, 3]]))
+
+
+def test_rows_are_grouped_by_equal_keys() -> None:
+    a, b = np.array([1, 0, 1, 1, 0]), np.array([2, 5, 2, 1, 5])
+    groups = _grouped(a, b)
+    assert [group.tolist() for group in groups] == [[1, 4], [3], [0, 2]]
+    assert _grouped(a[:0], b[:0]) == []
+
+
+def test_tracks_must_tie_every_pair_after_registration() -> None:
+    two = views(camera(0.0), camera(100 * METRE))
+    pairs = select_pairs(two, TieOptions())
+    reports = [find_module.PairReport(("v0", "v1"), "ok", (50, 50), 30, 20)]
+    tracks = _tracks(*[(v, p) for p in range(12) for v in (0, 1)])
+    find_module.require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=12))
+    with pytest.raises(Exception, match="only 12 tracks after registration"):
+        find_module.require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=13))
+
+
+# --- matching ----------------------------------------------------------------------------------------------
+
+
+class Scripted:
+    """A matcher that knows its answers: distances in the true band, and in the bands to either side."""
+
+    def __init__(self, true: list[float], aside: tuple[list[float], list[float]]) -> None:
+        self.true, self.aside, self.asked = np.array(true), aside, []
+
+    def match(self, a: Any, b: Any, where: Any, band: Band) -> Candidates:
+        shift = float(where.across[0])
+        self.asked.append(shift)
+        distance = self.true if shift == 0 else np.array(self.aside[int(shift > 0)])
+        index = np.stack([np.arange(len(distance))] * 2, axis=1)
+        return Candidates(index, distance, np.full(len(distance), 0.5))
+
+
+@pytest.mark.parametrize(
+    ("aside", "share", "count", "stated"),
+    [
+        (([], []), 0.01, 100, 0.0),
+        (([0.505], [0.505]), 0.01, 100, 0.01),  # two bands: half of two false ones in a hundred
+        (([0.505], [0.505]), 0.0099, 50, 0.0),
+        (([0.105], [0.205, 0.805]), 0.02, 100, 0.015),
+        (([0.105], [0.205, 0.805]), 0.0149, 80, 0.0125),
+        (([0.001] * 9, []), 0.04, 0, 0.0),
+    ],
+)
+def test_as_many_matches_are_trusted_as_the_bands_aside_allow(aside, share, count, stated) -> None:
+    """A hundred matches at distances 0.01 to 1; what lies in a shifted band is half of what is false."""
+    rng = np.random.default_rng(0)
+    points = Keypoints(rng.uniform(0, 999, (100, 2)), *(np.ones(100),) * 3, np.ones((100, 128), np.uint8))
+    where = Frame(np.array([1.0, 0.0]), *(np.zeros(100),) * 4, np.eye(2))
+    matcher = Scripted([0.01 * k for k in range(1, 101)], aside)
+    search = _Search(points, points, matcher, TieOptions())
+    found, control = search.trusted(where, Band(np.zeros(100), np.zeros(100), 3.0), share)
+    assert len(found) == count
+    assert control == pytest.approx(stated)
+    assert matcher.asked == [0.0, -12.0, 12.0]  # twice the band's half width and six pixels more
+
+
+def test_only_unambiguous_matches_count_and_each_place_once() -> None:
+    xy = np.array([[0.0, 0.0], [0.3, 0.2], [50.0, 0.0], [90.0, 0.0]])
+    points = Keypoints(xy, *(np.ones(4),) * 3, np.ones((4, 128), np.uint8))
+
+    class Answers:
+        def match(self, *_: Any) -> Candidates:
+            index = np.array([[0, 0], [1, 1], [2, 2], [3, 3]])
+            return Candidates(index, np.array([0.4, 0.3, 0.2, 0.1]), np.array([0.85, 0.8, 0.851, 0.1]))
+
+    search = _Search(points, points, Answers(), TieOptions(ratio=0.85))
+    where = Frame(np.array([1.0, 0.0]), *(np.zeros(4),) * 4, np.eye(2))
+    index, distance = search.unambiguous(where, Band(np.zeros(4), np.zeros(4), 1.0))
+    assert index.tolist() == [[3, 3], [1, 1]]  # 0 and 1 are one place, the better stays
+    assert distance.tolist() == [0.1, 0.3]
+
+
+def test_a_frames_linear_map_is_that_of_the_middle_of_the_points_that_are_seen(scene: Rendered) -> None:
+    one, two = (view.sensor for view in scene.views)
+    xy = np.random.default_rng(0).uniform(100, 5000, (51, 2))
+    limits = common_range(*scene.views)
+    xy[:3] = np.nan
+    with np.errstate(all="ignore"):
+        where = frame(one, two, xy, limits)
+    expected = linear_map(one, two, np.median(xy[3:], axis=0), 0.5 * sum(limits))
+    np.testing.assert_array_equal(where.linear, expected)
+    assert np.abs(linear_map(one, two, np.zeros(2), 0.5 * sum(limits)) - expected).max() > 1e-7
+    assert np.isnan(where.slope[:3]).all()
+    assert np.isfinite(where.slope[3:]).all()
+
+
+def test_cells_hold_the_first_quota_of_as_many_observations_as_are_kept(monkeypatch) -> None:
+    seen = []
+
+    def fill(tracks: Tracks, cell: list[int], cells: int, most: int, views: int) -> np.ndarray:
+        seen.append((cell, cells))
+        return np.ones(tracks.num_points, dtype=bool)
+
+    monkeypatch.setattr(sys.modules["barpc.tie.link"], "_fill", fill)
+    tracks = _tracks(*[(v, p) for p in range(30) for v in (0, 1)])
+    thin(tracks, [(1000, 800), (700, 700)], 20)
+    ((cell, count),) = seen
+    sides = [np.sqrt(4 * 1000 * 800 / 20), np.sqrt(4 * 700 * 700 / 20)]
+    columns, rows = (
+        [int(1000 / sides[0]) + 2, int(700 / sides[1]) + 2],
+        [int(800 / sides[0]) + 2, int(700 / sides[1]) + 2],
+    )
+    assert count == columns[0] * rows[0] + columns[1] * rows[1]
+    for k, found in enumerate(cell):
+        v = int(tracks.view[k])
+        col, row = ((tracks.xy[k] + 0.5) // sides[v]).astype(int)
+        assert found == v * columns[0] * rows[0] + row * columns[v] + col
