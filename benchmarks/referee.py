@@ -30,7 +30,7 @@ Magnitudes (one axis, one sigma):
 
     python -m benchmarks.referee                       # the table of the default, medians over seeds
     python -m benchmarks.referee --seeds 5 --only drift --option adjust.drift=1
-    python -m benchmarks.referee --statements          # >= 200 cases: what was said against what is true
+    python -m benchmarks.referee --run                 # the whole command: what was said as well
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.dem import Dem
 from barpc.fit import fit_rpc
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
 from barpc.scene import GroundPoints, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve
@@ -231,7 +231,12 @@ def _measured_series(name: str, span: float, rng: np.random.Generator) -> tuple[
     )
     sign = np.sign(w * d - x * a - y * b - z * c)[:, None]
     size = np.linalg.norm(vector, axis=1, keepdims=True)
-    rotation = 2.0 * sign * vector * np.where(size > 1e-12, np.arcsin(np.clip(size, 0, 1)) / np.maximum(size, 1e-12), 1)
+    rotation = (
+        2.0
+        * sign
+        * vector
+        * np.where(size > 1e-12, np.arcsin(np.clip(size, 0, 1)) / np.maximum(size, 1e-12), 1)
+    )
     t = np.arange(count) * step
     basis = np.vander((t - t.mean()) / np.ptp(t), 4)
     return t - step, rotation - basis @ np.linalg.lstsq(basis, rotation, rcond=None)[0]
@@ -247,7 +252,9 @@ def _attitude_error(errors: Errors, span: float, rng: np.random.Generator) -> Ca
         u = (2.0 * t / span - 1.0)[:, None]
         out = errors.attitude * constant + errors.drift * linear * u
         out = out + errors.quadratic * square * (1.5 * u**2 - 0.5)
-        out = out + errors.jitter * np.sqrt(2.0) * waves * np.sin(2 * np.pi * errors.hertz * t[:, None] + phase)
+        out = out + errors.jitter * np.sqrt(2.0) * waves * np.sin(
+            2 * np.pi * errors.hertz * t[:, None] + phase
+        )
         if measured is not None:
             at = np.clip(t + 0.1, measured[0][0], measured[0][-1])
             out = out + np.stack([np.interp(at, measured[0], axis) for axis in measured[1].T], axis=1)
@@ -269,7 +276,9 @@ def _bend(errors: Errors, cols: int, rng: np.random.Generator) -> Callable[[Arra
     return bend
 
 
-def _fly(case: Case, index: int, ground: Array, rng: np.random.Generator) -> tuple[SensorModel, Flown, tuple[float, float]]:
+def _fly(
+    case: Case, index: int, ground: Array, rng: np.random.Generator
+) -> tuple[SensorModel, Flown, tuple[float, float]]:
     """The delivered RPC of a view, and the camera that took it."""
     pitch = case.pitch[index]
     across = 4.0 * np.sin(2.4 * index + 0.6)
@@ -339,7 +348,9 @@ def make(case: Case, relief: Callable[[Array, Array], Array] | None = None) -> S
     ground = _scatter(case, case.tracks, relief, rng, textured=True)
     made = [_fly(case, i, ground, np.random.default_rng([case.seed, i, 3])) for i in range(len(case.pitch))]
     size = (case.cols, case.rows)
-    views = tuple(View(f"view_{i:02d}", f"view_{i:02d}.tif", size, rpc, alt) for i, (rpc, _, alt) in enumerate(made))
+    views = tuple(
+        View(f"view_{i:02d}", f"view_{i:02d}.tif", size, rpc, alt) for i, (rpc, _, alt) in enumerate(made)
+    )
     flown = tuple(camera for _, camera, _ in made)
     tracks = _observe(flown, ground, size, rng, visible=0.9, fewest=2)
     xy = tracks.xy + rng.normal(0.0, case.noise, tracks.xy.shape)
@@ -347,23 +358,25 @@ def make(case: Case, relief: Callable[[Array, Array], Array] | None = None) -> S
     tracks = Tracks(tracks.view, tracks.point, xy, np.full(len(tracks), case.noise))
     check_ground = _scatter(case, 800, relief, rng, textured=False)
     check = _observe(flown, check_ground, size, rng, visible=1.0, fewest=2)
-    check_ground = check_ground[np.unique(_first_index(check))] if False else check_ground
     gcps = _control(case, flown, relief, size, rng) if case.gcps else None
     return Scene(case, views, flown, tracks, bad, check_ground, check, gcps)
 
 
-def _first_index(tracks: Tracks) -> Array:
-    return np.unique(tracks.point, return_index=True)[1]
-
-
 def _observe(
-    flown: Sequence[Flown], ground: Array, size: tuple[int, int], rng: np.random.Generator, visible: float, fewest: int
+    flown: Sequence[Flown],
+    ground: Array,
+    size: tuple[int, int],
+    rng: np.random.Generator,
+    visible: float,
+    fewest: int,
 ) -> Tracks:
     """Exact image points in every view that shows a point; points keep their numbers."""
     views, points, places = [], [], []
     for i, camera in enumerate(flown):
         image = camera.project(ground)
-        seen = ((image >= 0) & (image <= np.array(size) - 1)).all(axis=1) & (rng.uniform(size=len(ground)) < visible)
+        seen = ((image >= 0) & (image <= np.array(size) - 1)).all(axis=1) & (
+            rng.uniform(size=len(ground)) < visible
+        )
         index = np.flatnonzero(seen)
         views.append(np.full(len(index), i))
         points.append(index)
@@ -398,7 +411,9 @@ def _disturb(case: Case, tracks: Tracks, xy: Array, rng: np.random.Generator) ->
     return xy, bad
 
 
-def _control(case: Case, flown: Sequence[Flown], relief: Any, size: tuple[int, int], rng: np.random.Generator) -> GroundPoints:
+def _control(
+    case: Case, flown: Sequence[Flown], relief: Any, size: tuple[int, int], rng: np.random.Generator
+) -> GroundPoints:
     ground = _scatter(case, case.gcps, relief, rng, textured=False)
     seen = _observe(flown, ground, size, rng, visible=1.0, fewest=1)
     sigma = np.full((len(ground), 3), 0.3)
@@ -442,9 +457,15 @@ def judge(scene: Scene, sensors: Sequence[SensorModel]) -> Judged:
 def _epipolar(scene: Scene, sensors: Sequence[SensorModel], i: int, j: int) -> Array:
     """Offsets (n, 2) [px] of held-out points in view j, across and along the epipolar curve of view i."""
     check, truth = scene.check, scene.check_ground
-    row_i = dict(zip(check.point[check.view == i].tolist(), np.flatnonzero(check.view == i).tolist(), strict=True))
+    row_i = dict(
+        zip(check.point[check.view == i].tolist(), np.flatnonzero(check.view == i).tolist(), strict=True)
+    )
     rows_j = np.flatnonzero(check.view == j)
-    both = [(row_i[p], r) for p, r in zip(check.point[rows_j].tolist(), rows_j.tolist(), strict=True) if p in row_i]
+    both = [
+        (row_i[p], r)
+        for p, r in zip(check.point[rows_j].tolist(), rows_j.tolist(), strict=True)
+        if p in row_i
+    ]
     if not both:
         return np.zeros((0, 2))
     a, b = np.array(both).T
@@ -452,7 +473,9 @@ def _epipolar(scene: Scene, sensors: Sequence[SensorModel], i: int, j: int) -> A
     low, high = (sensors[j].project(sensors[i].localize(check.xy[a], alt + d)) for d in _SINES)
     direction = (high - low) / np.linalg.norm(high - low, axis=1, keepdims=True)
     miss = check.xy[b] - 0.5 * (low + high)
-    return np.column_stack([miss[:, 0] * direction[:, 1] - miss[:, 1] * direction[:, 0], (miss * direction).sum(axis=1)])
+    return np.column_stack(
+        [miss[:, 0] * direction[:, 1] - miss[:, 1] * direction[:, 0], (miss * direction).sum(axis=1)]
+    )
 
 
 @dataclass(frozen=True)
@@ -495,7 +518,14 @@ def run(scene: Scene, **options: Any) -> tuple[tuple[SensorModel, ...], Any]:
         for view in scene.views:
             path = folder / view.path
             with rasterio.open(
-                path, "w", driver="GTiff", width=view.size[0], height=view.size[1], count=1, dtype="uint8", sparse_ok=True
+                path,
+                "w",
+                driver="GTiff",
+                width=view.size[0],
+                height=view.size[1],
+                count=1,
+                dtype="uint8",
+                sparse_ok=True,
             ):
                 pass
             write_rpc(view.sensor, folder / f"{view.name}_RPC.TXT")
@@ -514,7 +544,15 @@ def referee(case: Case, options: AdjustOptions | None = None, relief: Any = None
     cpu = time.process_time() - start
     rejected = ~found.inlier
     if os.environ.get("REFEREE_TALK"):
-        print(case.name, case.seed, found.prior, found.smooth, found.noise, found.status, len(found.cost_history))
+        print(
+            case.name,
+            case.seed,
+            found.prior,
+            found.smooth,
+            found.noise,
+            found.status,
+            len(found.cost_history),
+        )
     return _verdict(scene, sensors, found.gauge.sigma, found.gauge.shift, rejected, "", 0, (), cpu)
 
 
@@ -541,7 +579,15 @@ def referee_run(case: Case, relief: Any = None, **options: Any) -> Verdict:
 
 
 def _verdict(
-    scene: Scene, sensors: Sequence[SensorModel], sigma: Any, shift: Any, rejected: Array, status: str, code: int, words: tuple[str, ...], cpu: float
+    scene: Scene,
+    sensors: Sequence[SensorModel],
+    sigma: Any,
+    shift: Any,
+    rejected: Array,
+    status: str,
+    code: int,
+    words: tuple[str, ...],
+    cpu: float,
 ) -> Verdict:
     before, after = judge(scene, [view.sensor for view in scene.views]), judge(scene, sensors)
     ratio = np.array(after.move) / np.array(sigma)
@@ -620,14 +666,23 @@ def row(verdicts: Sequence[Verdict]) -> str:
     def mid(value: Callable[[Verdict], float]) -> float:
         return float(np.median([value(v) for v in verdicts]))
 
-    move = ", ".join(f"{mid(lambda v, k=k: abs(v.after.move[k])):.1f}" for k in range(3))  # type: ignore[misc]
-    stated = ", ".join(f"{mid(lambda v, k=k: v.sigma[k]):.1f}" for k in range(3))  # type: ignore[misc]
+    move = ", ".join(f"{mid(lambda v, k=k: abs(v.after.move[k])):.1f}" for k in range(3))
+    stated = ", ".join(f"{mid(lambda v, k=k: v.sigma[k]):.1f}" for k in range(3))
     said = ", ".join(sorted({f"{v.status or '-'} {v.code}" for v in verdicts}))
-    return (
-        f"| {verdicts[0].case.name} | {mid(lambda v: v.before.across):.2f} | {mid(lambda v: v.after.across):.4f} | "
-        f"{mid(lambda v: v.after.along):.3f} | {mid(lambda v: v.after.shape):.2f} ({mid(lambda v: v.before.shape):.1f}) | "
-        f"{move} | {stated} | {mid(lambda v: v.nees):.2f} | {100 * mid(lambda v: v.lost):.1f} | {said} | {mid(lambda v: v.cpu):.2f} |"
-    )
+    cells = [
+        verdicts[0].case.name,
+        f"{mid(lambda v: v.before.across):.2f}",
+        f"{mid(lambda v: v.after.across):.4f}",
+        f"{mid(lambda v: v.after.along):.3f}",
+        f"{mid(lambda v: v.after.shape):.2f} ({mid(lambda v: v.before.shape):.1f})",
+        move,
+        stated,
+        f"{mid(lambda v: v.nees):.2f}",
+        f"{100 * mid(lambda v: v.lost):.1f}",
+        said,
+        f"{mid(lambda v: v.cpu):.2f}",
+    ]
+    return f"| {' | '.join(cells)} |"
 
 
 def main() -> None:
@@ -636,7 +691,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--only", default="", help="Cases whose name holds this.")
     parser.add_argument("--run", action="store_true", help="The whole command, not the solver alone.")
-    parser.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help="Of AdjustOptions.")
+    parser.add_argument(
+        "--option", action="append", default=[], metavar="NAME=VALUE", help="Of AdjustOptions."
+    )
     given = parser.parse_args()
     warnings.simplefilter("ignore", NotGeoreferencedWarning)
     options = {name: json.loads(value) for name, _, value in (o.partition("=") for o in given.option)}

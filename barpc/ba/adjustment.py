@@ -94,9 +94,9 @@ def adjust_tracks(
     outcome = _rounds(problem, block, state, options, heights, block.use)
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
-        start = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
-        again = _rounds(problem, block, state, options, heights, start)
-        if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * start.sum():
+        agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
+        again = _rounds(problem, block, state, options, heights, agree)
+        if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
     if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
         bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
@@ -163,9 +163,7 @@ def _rounds(
     half = np.column_stack([unknowns.col_scale, unknowns.row_scale])
     smooth = Smooth(problem.structure, problem.xy, middle, half)
     variances = Variances.of(problem.camera_prior, unknowns, options)
-    return run_rounds(
-        problem, observations, state, options, block.use, use, heights.hold, variances, smooth
-    )
+    return run_rounds(problem, observations, state, options, block.use, use, heights.hold, variances, smooth)
 
 
 def make_problem(

@@ -13,7 +13,7 @@ import numpy as np
 from barpc.ba.cameras import Projected
 from barpc.ba.structure import Structure
 from barpc.geodesy import Array
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, IntArray
 
 _TRIALS = 150
 _LEAST = 30  # matches of a pair that is looked at
@@ -21,7 +21,9 @@ _NEAR = 10.0  # sigmas: what a plane cannot follow of a drift and of relief
 _STEPS = 3
 
 
-def agreeing(structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray) -> BoolArray:
+def agreeing(
+    structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray
+) -> BoolArray:
     """Observations (K,) that are left once those are put aside which most of their partners contradict.
 
     Parameters
@@ -44,7 +46,9 @@ def agreeing(structure: Structure, xy: Array, residual: Array, projected: Projec
     spread = np.hypot(sigma[first], sigma[second])
     against = np.zeros(len(first), dtype=bool)
     usable = use[first] & use[second] & np.isfinite(offset)
-    for m, (start, stop) in enumerate(zip(structure.pair_bounds[:-1], structure.pair_bounds[1:], strict=True)):
+    for m, (start, stop) in enumerate(
+        zip(structure.pair_bounds[:-1], structure.pair_bounds[1:], strict=True)
+    ):
         rows = start + np.flatnonzero(usable[start:stop])
         if len(rows) >= _LEAST:
             place = xy[:, first[rows]]
@@ -61,7 +65,7 @@ def agreeing(structure: Structure, xy: Array, residual: Array, projected: Projec
     return keep
 
 
-def _across(residual: Array, by_point: Array, first: Array, second: Array) -> Array:
+def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
     """Offset across the epipolar line (Q,) [px]: what no move of the point takes away from two observations."""
     rows = np.concatenate([by_point[:, :, first], by_point[:, :, second]])  # (4, 3, Q)
     four = np.concatenate([residual[:, first], residual[:, second]])

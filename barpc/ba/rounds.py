@@ -204,7 +204,9 @@ def run_rounds(
             problem,
             state,
             weight,
-            "sparse" if options.solver == "auto" and passes == 1 else options.solver,  # a second pass follows always
+            "sparse"
+            if options.solver == "auto" and passes == 1
+            else options.solver,  # a second pass follows always
             options.max_steps,
             options.tolerance if passes > 1 or not robust else _FIRST_TOLERANCE,
             projected,
@@ -270,7 +272,12 @@ def _robust(
 
 
 def _scatter(
-    problem: Problem, observations: Observations, smooth: Smooth, state: State, residual: Array, counted: Array
+    problem: Problem,
+    observations: Observations,
+    smooth: Smooth,
+    state: State,
+    residual: Array,
+    counted: Array,
 ) -> Array:
     """Residuals (2, K) [px] without the smooth parts of all views that see a point.
 

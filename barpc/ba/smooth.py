@@ -22,6 +22,7 @@ SPLINES = 14
 
 _TERMS = SPLINES + 4  # and col, col^2, col^3, row col
 _PER_TERM = 10  # observations a term, or the view is left as it is
+_SIGMAS = 5.0  # a mean product of neighbours that is smaller may be chance
 _RIDGE = 1e-6  # of a term's own weight: gaps in the rows leave splines without observations
 
 
@@ -38,11 +39,15 @@ class SmoothTest:
         Probability that noise alone leaves as much (F-test); 1 for a view with too few observations.
     by_row : (N,)
         Part of the smooth part's square that the row alone explains; NaN where nothing was fitted.
+    shared : (N,)
+        Error that an observation shares with its neighbour in the row, or in the column where that is more [px]:
+        waves and steps that are too fine for the smooth part are in it, too. 0 where it is not significant.
     """
 
     rms: Array
     significance: Array
     by_row: Array
+    shared: Array
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
         """Views (N,) with a smooth part above `least` [px] that is significant."""
@@ -65,6 +70,7 @@ class Smooth:
     def __init__(self, structure: Structure, xy: Array, middle: Array, half: Array) -> None:
         self.structure = structure
         col, row = ((xy - middle.T[:, structure.view]) / half.T[:, structure.view]).clip(-1.0, 1.0)
+        self._place = xy
         self._basis = np.empty((_TERMS, xy.shape[1]))
         self._basis[:SPLINES] = _bsplines(row)
         self._basis[SPLINES:] = col, col**2, col**3, row * col
@@ -86,7 +92,7 @@ class Smooth:
     def test(self, residual: Array, use: BoolArray) -> SmoothTest:
         """Whether the residuals (2, K) [px] of the observations in use hold more than scatter."""
         n = self.structure.num_views
-        rms, significance, by_row = np.zeros(n), np.ones(n), np.full(n, np.nan)
+        rms, significance, by_row, shared = np.zeros(n), np.ones(n), np.full(n, np.nan), np.zeros(n)
         weight = use.astype(np.float64)
         residual = np.where(use, residual, 0.0)
         for v, rows in self._views(weight):
@@ -101,7 +107,19 @@ class Smooth:
             rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / (0.5 * count))
             along = (coefficients[:, :SPLINES] @ self._basis[:SPLINES, rows]) * weight[rows]
             by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)
-        return SmoothTest(rms, significance, by_row)
+            shared[v] = self._shared(rows, residual, use)
+        return SmoothTest(rms, significance, by_row, shared)
+
+    def _shared(self, rows: slice, residual: Array, use: BoolArray) -> float:
+        """Root of the mean product of neighbours' residuals [px], along the rows or the columns."""
+        kept = np.arange(rows.start, rows.stop)[use[rows]]
+        most = 0.0
+        for place in self._place[:, kept]:
+            ordered = residual[:, kept[np.argsort(place, kind="stable")]]
+            product = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0)
+            if product.mean() > _SIGMAS * product.std() / np.sqrt(len(product)):
+                most = max(most, float(np.sqrt(product.mean())))
+        return most
 
     def _views(self, weight: Array) -> list[tuple[int, slice]]:
         """Views with enough observations, and where theirs are."""
@@ -120,8 +138,7 @@ class Smooth:
         matrix[np.diag_indices(_TERMS)] += _RIDGE * (diagonal + diagonal.mean())
         with np.errstate(invalid="ignore"):
             target = np.where(weight[rows] > 0, residual[:, rows], 0.0)
-        solved: Array = np.linalg.solve(matrix, weighted @ target.T).T
-        return solved
+        return np.asarray(np.linalg.solve(matrix, weighted @ target.T).T, dtype=np.float64)
 
 
 def _bsplines(u: Array) -> Array:

@@ -212,7 +212,12 @@ def _levenberg_marquardt(
             continue
         ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
         if _settled(gain, before, state.cost, tolerance):
-            return Minimum(ahead, reduced, factor if not damping else None, _status(state, "the next step gains too little"))
+            return Minimum(
+                ahead,
+                reduced,
+                factor if not damping else None,
+                _status(state, "the next step gains too little"),
+            )
         trial = problem.reduce(ahead.params, ahead.points, weight)
         if trial.cost <= state.cost * (1.0 + 1e-12):
             state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
@@ -238,9 +243,7 @@ class _Compressed:
     In them the matrix is nearly the identity: the gradient's size is what a step would gain.
     """
 
-    def __init__(
-        self, problem: Problem, state: State, weight: Array, projected: Projected | None
-    ) -> None:
+    def __init__(self, problem: Problem, state: State, weight: Array, projected: Projected | None) -> None:
         self.problem, self.weight = problem, weight
         self.reduced = problem.reduce(state.params, state.points, weight, projected)
         cost = _finite(self.reduced.cost)
@@ -260,7 +263,9 @@ class _Compressed:
         upper = self._cholesky()
         gradient = self.reduced.gradient[self.problem.free]
         self.whitened = la.solve_triangular(upper, gradient, trans="T", check_finite=False)
-        self.rest = np.sqrt(max(self.reduced.cost - self.reduced.gain - float(self.whitened @ self.whitened), 0.0))
+        self.rest = np.sqrt(
+            max(self.reduced.cost - self.reduced.gain - float(self.whitened @ self.whitened), 0.0)
+        )
         self.slope = la.solve_triangular(self.upper0, upper.T, trans="T", check_finite=False).T
 
     def params(self, x: Array) -> Array:

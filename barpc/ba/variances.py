@@ -28,13 +28,15 @@ from barpc.scene import BoolArray
 _LOG = logging.getLogger(__name__)
 
 _STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside what the block shows
-_LEVEL = 1e-3  # a sum of squares less probable than this is too large
+_LEVEL = 0.05  # a sum of squares less probable than this is too large
 _SURE = 5.0  # of two explanations whose evidences differ by less (a factor of 150) none is ruled out
 _LIKELIER = 2.3  # but one odd view is named where it is ten times as likely as that all are worse than stated
 _GROSS = 16.0  # times the variance stated: a view whose corrections are smaller is not called odd
 _FREE = 100.0  # times its prior: a view whose camera may be anywhere
 _SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
-_MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some kilometres while an image is taken
+_MOVING = (
+    0.01  # of a rotation, as drift: the centre it turns about flies some kilometres while an image is taken
+)
 _ITERATIONS = 10
 _STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
 _SMALL = 400  # unknowns up to which every view is tried and the covariance's diagonal is exact
@@ -278,7 +280,9 @@ class Variances:
         for degree in range(self._degrees):
             part = slice(c + 3 * degree, c + 3 * degree + 3)
             use = known[:, part] > 0
-            total = float((use * ((params - self.given.mean)[:, part] / self.given.sigma[:, part]) ** 2).sum())
+            total = float(
+                (use * ((params - self.given.mean)[:, part] / self.given.sigma[:, part]) ** 2).sum()
+            )
             factors[degree] = np.sqrt((_STRENGTH + total) / (_STRENGTH + float(known[:, part].sum())))
         return factors
 

@@ -71,7 +71,12 @@ ADJUSTMENT_FLAGS = (
         "Unknowns: rotation+translation, rotation, translation, shift, shift-drift or affine.",
         metavar="NAME",
     ),
-    Flag("--drift", "adjust.drift", "Degree of the rotation along the rows.", type=click.IntRange(0, 2)),
+    Flag(
+        "--drift",
+        "adjust.drift",
+        "Degree of the rotation along the rows.  [default: 1, and 2 where the residuals ask for it]",
+        type=click.IntRange(0, 2),
+    ),
     Flag(
         "--sigma-attitude",
         "adjust.sigma_attitude",

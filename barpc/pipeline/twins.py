@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ from barpc.errors import InputError
 from barpc.raster import open_raster
 from barpc.scene import View
 
-_SAMPLES = (0.5, 0.25, 0.75)  # of width and height: where the sampled windows lie
+_SAMPLES = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.75))  # of width and height: where the sampled windows lie
+_MORE = tuple((x / 5, y / 5) for x in range(6) for y in range(6))  # where nothing varies there
 _SAMPLE_SIDE = (256, 16)  # px: many columns and few rows, so that few strips are decoded
 _CHUNK = 1 << 20  # px that are hashed at a time
 
@@ -31,7 +32,8 @@ class Twins:
     -----
     Pixels are compared as decoded values, so that copies in another compression, layout, number type or
     behind a VRT are found. Three small windows of each image are read; images in which these agree are then
-    read whole, each once. The work is linear in the number of images.
+    read whole, each once. An image in which nothing varies, in these and in 36 more, is compared with none. The
+    work is linear in the number of images.
     """
 
     def __init__(self, band: int = 1) -> None:
@@ -69,7 +71,12 @@ class Twins:
     def _pixels(self, view: View) -> Hashable | None:
         """A mark of the whole image where another is like it in the samples; None for the first of its like."""
         with open_raster(view.path) as image:
-            like = (view.size, _digest(image, self._band, _samples(*view.size)))
+            sampled = _digest(image, self._band, _samples(*view.size), vary=True)
+            if sampled is None:  # fill, perhaps: the rest is asked before anything is read whole
+                sampled = _digest(image, self._band, _samples(*view.size, _MORE), vary=True)
+            if sampled is None:
+                return None
+            like = (view.size, sampled)
             if like not in self._alike:
                 self._alike[like] = view.path
                 return None
@@ -83,9 +90,9 @@ class Twins:
         return None if mark is None else (view.size, mark)
 
 
-def _samples(width: int, height: int) -> list[Window]:
+def _samples(width: int, height: int, at: Sequence[tuple[float, float]] = _SAMPLES) -> list[Window]:
     wide, high = (min(side, size) for side, size in zip(_SAMPLE_SIDE, (width, height), strict=True))
-    return [Window(int(at * (width - wide)), int(at * (height - high)), wide, high) for at in _SAMPLES]
+    return [Window(int(x * (width - wide)), int(y * (height - high)), wide, high) for x, y in at]
 
 
 def _whole(image: Any, band: int) -> bytes | None:

@@ -153,7 +153,8 @@ def _randomness(files: RunFiles) -> Section | None:
     if marked:
         answer = f"Not in {_some(marked)}: in most of their cells the residuals point the same way."
         answer += (
-            " Small ones are usual (attitude jitter, relief); where they matter, try --drift 1." * adjusted
+            " Small ones are usual (attitude jitter, relief); where they matter, the verdict says so."
+            * adjusted
         )
     else:
         answer = "Mostly: in no image do residuals point the same way in more than half of the cells."

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.ba import check_residuals
+from barpc.ba import Adjustment, check_residuals
 from barpc.ba.gauge import Mode
 from barpc.geodesy import Array
 from barpc.report.run import Run
@@ -20,6 +20,15 @@ ENOUGH_GCPS = 3
 """Control points that hold a view without any tie point."""
 MANY_REJECTED = 0.3
 """A view that lost a larger share of its observations is called doubtful."""
+
+SMOOTH_LEFT = 0.1
+"""A view whose residuals hold more than this [px] that is no scatter is called doubtful."""
+PRIOR_WIDENED = 2.0
+"""Cameras that are farther off than stated by more than this factor need a look."""
+NOISE_LIMIT = 2.5
+"""Tie points that scatter by more than so many times what the matcher states need a look."""
+MOVED = 3.0
+"""A scene that moved by more than so many of its own standard deviations needs a look."""
 
 STATUS_WORDS = {
     "adjusted": "adjusted",
@@ -104,21 +113,72 @@ def _doubt(view: View, run: Run) -> tuple[str, str]:
         return "doubtful", ""
     if view["name"] in run.copies:
         return "doubtful", f"shows the same pixels as {run.copies[view['name']]}: give each image once"
+    if run.adjustment is not None and (odd := _oddity(view["name"], run.adjustment)):
+        return "doubtful", odd
     error = view["rmse_after"] if run.kind == "adjust" else view["rmse_before"]
     if not error <= GOOD_RMSE and view["num_observations"]:
         if run.kind == "check":
             return "doubtful", f"tie points disagree by {error:.2f} px: adjust the cameras"
         return (
             "doubtful",
-            f"tie points are left with {error:.2f} px: try --drift 1, or look for wrong matches",
+            f"tie points are left with {error:.2f} px: look for wrong matches and moving things",
         )
     lost = view["num_rejected"] / max(view["num_rejected"] + view["num_observations"], 1)
     if lost > MANY_REJECTED:
         return (
             "doubtful",
-            f"{100 * lost:.0f} % of its tie points were rejected: look for clouds, water, change",
+            f"{100 * lost:.0f} % of its tie points were rejected, scattered around what is smooth: look for clouds, "
+            "water, change",
         )
     return "doubtful", ""
+
+
+def _oddity(name: str, adjustment: Adjustment) -> str:
+    """What is wrong with a view beside the others: its RPC, or something smooth that no correction follows."""
+    i, prior, smooth = adjustment.names.index(name), adjustment.prior, adjustment.smooth
+    if prior.odd[i]:
+        others = [
+            other for other, odd in zip(adjustment.names, prior.odd, strict=True) if odd and other != name
+        ]
+        either = f" (or that of {_listed(others)}: the tie points cannot tell)" if others else ""
+        return (
+            f"its RPC is {prior.scale[i]:.0f} times farther off than stated, beside the other images{either}: check "
+            "that it belongs to this image"
+        )
+    if smooth.found(SMOOTH_LEFT)[i] or smooth.shared[i] > SMOOTH_LEFT:
+        along = "along the rows" if smooth.by_row[i] > 0.5 else "over the image"
+        return (
+            f"an error of {max(smooth.rms[i], smooth.shared[i]):.2f} px that changes {along} is left, which no "
+            "rotation, translation and drift follow: attitude jitter, optics, or an image that was resampled "
+            "(--model affine)"
+        )
+    return ""
+
+
+def _block_reasons(run: Run) -> list[str]:
+    """What the adjustment says of itself that does not fit: priors, noise, the scene's move."""
+    if run.adjustment is None or not len(run.tracks):
+        return []
+    prior, gauge, noise = run.adjustment.prior, run.adjustment.gauge, run.adjustment.noise
+    out = []
+    common = float(np.min(prior.scale)) if len(prior.scale) else 1.0
+    if common > PRIOR_WIDENED:
+        out.append(
+            f"The cameras are {common:.1f} times farther off than stated: their standard deviations were widened, and "
+            "what is known of the scene's place with them."
+        )
+    if noise > NOISE_LIMIT:
+        out.append(
+            f"Tie points scatter {noise:.1f} times as much as stated: the matches are worse than they seem."
+        )
+    with np.errstate(all="ignore"):
+        moved = np.abs(gauge.shift) / gauge.sigma
+    if np.nanmax(np.where(np.isfinite(moved), moved, np.nan), initial=0.0) > MOVED:
+        out.append(
+            f"The scene moved by {_enu(gauge.shift)}, more than {MOVED:g} standard deviations: something is not as "
+            "stated; control points or a DEM would tell."
+        )
+    return out
 
 
 def block_verdict(run: Run, views: Sequence[View]) -> dict[str, Any]:
@@ -131,7 +191,7 @@ def block_verdict(run: Run, views: Sequence[View]) -> dict[str, Any]:
     look = [view for view in views if view["advice"] and view not in bad]
     reasons = [f"{view['name']}: {STATUS_WORDS[view['status']]}: {view['advice']}." for view in bad + look]
     reasons += [f"{path} was left out: {reason}" for path, reason in run.left_out]
-    control = _control_reasons(run)
+    control = _block_reasons(run) + _control_reasons(run)
     lines = {"adjust": _adjusted_lines, "check": _checked_lines, "match": _matched_lines}[run.kind](
         run, views
     )
@@ -154,7 +214,7 @@ def _headline(run: Run, num: int, bad: int, look: int, control: bool) -> str:
         if look:
             parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
         text = f"{', '.join(parts)[0].upper()}{', '.join(parts)[1:]} (of {num + len(run.left_out)})"
-    return f"{text}; ground points need a look." if control else f"{text}."
+    return f"{text}; the block needs a look." if control else f"{text}."
 
 
 def _control_reasons(run: Run) -> list[str]:
@@ -184,6 +244,12 @@ def _adjusted_lines(run: Run, views: Sequence[View]) -> list[str]:
     lines = [f"Tie points of {len(views)} images agree to {after:.3f} px (before: {before:.3f} px)."]
     if not len(run.tracks):
         lines = ["There are no tie points: the cameras are held by control points alone."]
+    drift = run.adjustment.cameras.unknowns.drift
+    if run.adjustment.prior.drift_sigma:
+        sizes = ", ".join(metres(s) for s in run.adjustment.prior.drift_sigma)
+        lines.append(
+            f"Rotations change along the rows (drift of degree {drift}; {sizes} at the first and last row)."
+        )
     lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
     known = ", ".join(metres(s) for s in gauge.sigma)
     if run.gcps is None:

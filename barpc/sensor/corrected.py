@@ -25,7 +25,9 @@ from barpc.sensor import SensorModel
 
 IntArray = npt.NDArray[np.int64]
 
-_ROW_STEPS = 8  # a drift moves an image point by some thousandths of a pixel a row: each step gains three digits
+_ROW_STEPS = (
+    8  # a drift moves an image point by some thousandths of a pixel a row: each step gains three digits
+)
 _ROW_SETTLED = 1e-6  # px: what is left is a thousandth of it
 
 
@@ -110,7 +112,9 @@ class Motion:
         self._rotation, self._bounds, self._drift = rotation, bounds, drift
         self._matrix = rotation_matrix(rotation)
         count = np.diff(bounds)
-        self._lever = _by_view(self._matrix, ecef - np.repeat((translation + center).T, count, axis=1), bounds)
+        self._lever = _by_view(
+            self._matrix, ecef - np.repeat((translation + center).T, count, axis=1), bounds
+        )
         turned = self._lever
         if drift is not None:
             self._series = _series((drift * drift).sum(axis=0))
@@ -222,9 +226,9 @@ class Correction:
 
     def motion(self, ecef: Array, row: Array | None = None) -> Motion:
         """The motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
-        of_view = (np.atleast_2d(v) for v in (self.rotation, self.translation, self.center))
         drift = None if row is None else np.ascontiguousarray(self.drift_at(row).T)
-        return Motion(ecef, *of_view, np.array([0, ecef.shape[1]]), drift)
+        bounds = np.array([0, ecef.shape[1]])
+        return Motion(ecef, self.rotation[None], self.translation[None], self.center[None], bounds, drift)
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
         """R (X - T - C) + C for ECEF points X (..., 3) [m]; turned on by the drift at the rows (...) if given."""
@@ -301,7 +305,10 @@ class Corrected:
             by_point, by_rotation, by_translation = (
                 part + share[:, None] * part[1] for part in (by_point, by_rotation, by_translation)
             )
-        parts = (np.moveaxis(part, -1, 0).reshape(*shape, *part.shape[:-1]) for part in (by_point, by_rotation, by_translation))
+        parts = (
+            np.moveaxis(part, -1, 0).reshape(*shape, *part.shape[:-1])
+            for part in (by_point, by_rotation, by_translation)
+        )
         by_ecef, of_rotation, of_translation = parts
         return image.T.reshape(*shape, 2), by_ecef, of_rotation, of_translation
 

@@ -254,7 +254,12 @@ def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(
 def test_a_joint_prior_of_an_earlier_block_adds_its_information():
     made = simulate_block(4, 60, seed=3)
     options = AdjustOptions(
-        noise_floor=0.0, min_convergence=0.01, estimate_noise=False, loss="linear", drift=0, learn_priors=False
+        noise_floor=0.0,
+        min_convergence=0.01,
+        estimate_noise=False,
+        loss="linear",
+        drift=0,
+        learn_priors=False,
     )
     centers = centers_of(made)
     old = made.tracks.select(made.tracks.view < 3)

@@ -74,7 +74,9 @@ def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies():
 @pytest.mark.parametrize("solver", ["scipy", "sparse"])
 def test_plain_least_squares_takes_two_linearisations_from_metres_away(block, solver):
     found = solve(block, **L2, solver=solver)
-    assert found.steps <= {"scipy": 5, "sparse": 4}[solver]  # two passes: the second with priors that have learnt
+    assert (
+        found.steps <= {"scipy": 5, "sparse": 4}[solver]
+    )  # two passes: the second with priors that have learnt
     assert found.cost_history[0] > 100 * found.cost_history[-1]
     tight = solve(block, **L2, solver=solver, tolerance=1e-14)
     assert found.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-9)

@@ -80,7 +80,7 @@ def corrections_in_sigmas(adjustment, truth):
     for i, (correction, known) in enumerate(zip(adjustment.corrections, truth["views"], strict=True)):
         sigma = np.sqrt(np.diag(adjustment.covariance.view(i)))
         rotation = np.array(known["rotation"]) / correction.rotation * adjustment.params[i, :3]
-        found.append((adjustment.params[i] - [*rotation, *known["translation"]]) / sigma)
+        found.append(((adjustment.params[i] - [*rotation, *known["translation"], 0, 0, 0]) / sigma)[:6])
     return np.array(found)
 
 
