@@ -657,7 +657,10 @@ def cases() -> dict[str, Case]:
     return table
 
 
-HEAD = "| case | before px | across px | along px | shape m (before) | move m E N U | stated m | NEES | lost % | said | CPU s |"
+HEAD = (
+    "| case | before px | across px | along px | shape m (before) | move m E N U | stated m | NEES | lost % | said "
+    "| CPU s |"
+)
 
 
 def row(verdicts: Sequence[Verdict]) -> str:

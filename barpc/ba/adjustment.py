@@ -18,7 +18,7 @@ from barpc.ba.incremental import BlockPrior, apply_prior
 from barpc.ba.options import AdjustOptions, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
-from barpc.ba.rounds import Observations, Outcome, run_rounds
+from barpc.ba.rounds import Observations, Outcome, revived, run_rounds
 from barpc.ba.smooth import Smooth
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
@@ -100,9 +100,11 @@ def adjust_tracks(
             outcome = again
     if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
         bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
-        params = np.hstack([outcome.minimum.state.params, np.zeros((len(views), 3))])
-        there = replace(outcome.minimum.state, params=params)
-        problem, outcome = bent, _rounds(bent, block, there, options, heights, outcome.inlier)
+        there, _ = revived(
+            problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
+        )
+        there = replace(there, params=np.hstack([there.params, np.zeros((len(views), 3))]))
+        problem, outcome = bent, _rounds(bent, block, there, options, heights, outcome.inlier, outcome.noise)
     final = outcome.minimum.state
     covariance = outcome.minimum.covariance(problem.free)
     seen = np.zeros(block.num_points, dtype=bool)
@@ -121,7 +123,13 @@ def adjust_tracks(
         noise=outcome.noise,
         cost_history=final.history,
         steps=len(final.history) - outcome.passes,
-        status=f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation",
+        status="; ".join(
+            [
+                f"{outcome.passes} passes of cutting",
+                outcome.minimum.status,
+                f"{covariance.factor.method} factorisation",
+            ]
+        ),
         cameras=cameras,
         covariance=covariance,
         gauge=gauge,
@@ -152,7 +160,13 @@ def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
 
 
 def _rounds(
-    problem: Problem, block: Block, state: State, options: AdjustOptions, heights: Heights, use: BoolArray
+    problem: Problem,
+    block: Block,
+    state: State,
+    options: AdjustOptions,
+    heights: Heights,
+    use: BoolArray,
+    known_noise: float | None = None,
 ) -> Outcome:
     """Robust rounds and cuts from a state, with the observations in use (K,) to start with."""
     unknowns = problem.cameras.unknowns

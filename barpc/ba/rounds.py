@@ -29,6 +29,8 @@ _SAME_PRIOR = 0.2  # nor of a prior's standard deviation
 _LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
 _BACKFITTING = 6
+_MANY_CUT = 0.01  # of the observations: more are looked at again
+_REVIVING = 2
 _LEAST_FREEDOM = 20
 _ROBUST_ROUNDS = 20
 _AS_STATED = 1.5  # times the noise stated, and
@@ -146,6 +148,7 @@ def run_rounds(
     hold: Callable[[Problem, Array], Problem],
     variances: Variances,
     smooth: Smooth,
+    known_noise: float | None = None,
 ) -> Outcome:
     """Robust rounds, cuts and the final least squares.
 
@@ -172,6 +175,8 @@ def run_rounds(
         What may be learnt about the cameras' priors.
     smooth : Smooth
         The smooth model of the views.
+    known_noise : float, optional
+        Of rounds that have ended near here: what is in use has been chosen, and nothing robust comes first.
 
     Returns
     -------
@@ -186,11 +191,15 @@ def run_rounds(
     problem = hold(problem, state.points)
     noise, passes, counted = 1.0, 0, use.astype(np.float64)
     floor: Array | float = 0.0
-    if robust:
+    if known_noise is not None:
+        noise = known_noise
+    elif robust:
         start = problem.with_camera_prior(variances.for_search())
         state, residual, counted, noise = _robust(start, observations, state, projected, use, options, smooth)
         floor = smooth.test(residual, use).rms
     while True:
+        if robust and projected is None and use.sum() < (1.0 - _MANY_CUT) * everything.sum():
+            state, residual = revived(problem, state, residual, use, everything / observations.sigma)
         problem = hold(problem, state.points)
         passes += 1
         kept = use
@@ -269,6 +278,23 @@ def _robust(
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
         counted = use * loss(s / scale**2)[1]
     return state, residual, counted, noise
+
+
+def revived(
+    problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array
+) -> tuple[State, Array]:
+    """The state with tracks that were cut altogether where the cameras now see them, and the residuals (2, K) there.
+
+    Nothing moved them since; with what they were cut for mended, they may come back.
+    """
+    structure = problem.structure
+    dead = structure.sum_points(use[None].astype(np.float64))[0] == 0
+    points = state.points.copy()
+    for _ in range(_REVIVING):
+        moved = problem.triangulate(points, problem.project_points(state.params, points), weight)
+        points[dead] = moved[dead]
+    again = problem.residuals(state.params, points)
+    return replace(state, points=points), np.where(dead[structure.point], again, residual)
 
 
 def _scatter(

@@ -23,7 +23,9 @@ SPLINES = 14
 _TERMS = SPLINES + 4  # and col, col^2, col^3, row col
 _PER_TERM = 10  # observations a term, or the view is left as it is
 _SIGMAS = 5.0  # a mean product of neighbours that is smaller may be chance
-_RIDGE = 1e-6  # of a term's own weight: gaps in the rows leave splines without observations
+_RIDGE = 1e-6  # of a term's own weight
+_BEND = 1e-2  # of a spline's weight: rows without observations continue what their neighbours show
+_BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=2, axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +138,7 @@ class Smooth:
         matrix = weighted @ basis.T
         diagonal = np.diag(matrix)
         matrix[np.diag_indices(_TERMS)] += _RIDGE * (diagonal + diagonal.mean())
+        matrix[:SPLINES, :SPLINES] += _BEND * diagonal[:SPLINES].mean() * _BENDING
         with np.errstate(invalid="ignore"):
             target = np.where(weight[rows] > 0, residual[:, rows], 0.0)
         return np.asarray(np.linalg.solve(matrix, weighted @ target.T).T, dtype=np.float64)

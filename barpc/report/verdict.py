@@ -21,7 +21,7 @@ ENOUGH_GCPS = 3
 MANY_REJECTED = 0.3
 """A view that lost a larger share of its observations is called doubtful."""
 
-SMOOTH_LEFT = 0.1
+SMOOTH_LEFT = 0.06
 """A view whose residuals hold more than this [px] that is no scatter is called doubtful."""
 PRIOR_WIDENED = 2.0
 """Cameras that are farther off than stated by more than this factor need a look."""
