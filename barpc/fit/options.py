@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from barpc.errors import FitError
+from barpc.frozen import Frozen
 from barpc.geodesy import Array
 
 Method = Literal["auto", "ridge", "lcurve", "vendor-denominators"]
@@ -20,7 +19,7 @@ ALTITUDE_FLOOR = 50.0
 
 
 @dataclass(frozen=True, eq=False)
-class Normalization:
+class Normalization(Frozen):
     """The offsets and scales of an RPC.
 
     Parameters
@@ -37,19 +36,10 @@ class Normalization:
     image_scale: Array
 
     def __post_init__(self) -> None:
-        for name, size in (
-            ("ground_offset", 3),
-            ("ground_scale", 3),
-            ("image_offset", 2),
-            ("image_scale", 2),
-        ):
-            value = np.array(getattr(self, name), dtype=np.float64)
-            if value.shape != (size,) or not np.isfinite(value).all():
-                raise FitError(f"normalization: {name} must be {size} finite numbers, found {value.tolist()}")
+        for name in ("ground_offset", "ground_scale", "image_offset", "image_scale"):
+            value = self._array(name, (3 if name.startswith("ground") else 2,), FitError)
             if name.endswith("scale") and not value.all():
-                raise FitError(f"normalization: {name} has a zero")
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+                raise FitError(f"Normalization {name}: a scale is zero")
 
 
 @dataclass(frozen=True)

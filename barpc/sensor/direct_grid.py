@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.interpolate import make_interp_spline
 
 from barpc.errors import RpcError
+from barpc.frozen import Frozen
 from barpc.geodesy import Array, wrap_longitude
 
 CHUNK = 2048
@@ -26,7 +27,7 @@ _SETTLED = 1e-5  # px: Newton is quadratic, what is left after a step of this si
 
 
 @dataclass(frozen=True, eq=False)
-class DirectGrid:
+class DirectGrid(Frozen):
     """A camera given by the ground points of a grid of image points: itself a `SensorModel`.
 
     Parameters
@@ -62,9 +63,7 @@ class DirectGrid:
 
     def __post_init__(self) -> None:
         for name in ("cols", "rows", "alts", "lonlat"):
-            value = np.array(getattr(self, name), dtype=np.float64)
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+            self._keep(name, np.array(getattr(self, name), dtype=np.float64))
         axes = (self.alts, self.rows, self.cols)
         shape = (*(len(np.atleast_1d(axis)) for axis in axes), 2)
         if self.lonlat.shape != shape or min(shape) < 2:
@@ -84,12 +83,10 @@ class DirectGrid:
             knots.append(np.asarray(spline.t))
             coeffs = np.moveaxis(np.asarray(spline.c), 0, i) if i else np.asarray(spline.c)
         table = np.ascontiguousarray(coeffs.reshape(-1, 2).T)  # (2, nodes)
-        for array in (inverse, table, *knots):
-            array.setflags(write=False)
-        object.__setattr__(self, "_inverse", inverse)
-        object.__setattr__(self, "_spline", table)
-        object.__setattr__(self, "_knots", tuple(knots))
-        object.__setattr__(self, "_lon", center)
+        self._keep("_inverse", inverse)
+        self._keep("_spline", table)
+        self._keep("_knots", tuple(knots))
+        self._keep("_lon", center)
 
     @classmethod
     def from_points(cls, ground: npt.ArrayLike, image: npt.ArrayLike) -> DirectGrid:
@@ -117,15 +114,6 @@ class DirectGrid:
         lonlat = np.full((*shape, 2), np.nan)
         lonlat[places] = ground[:, :2]
         return cls(axes[2], axes[1], axes[0], lonlat)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, DirectGrid) and self._content() == other._content()
-
-    def __hash__(self) -> int:
-        return hash(self._content())
-
-    def _content(self) -> tuple[bytes, ...]:
-        return tuple((a + 0.0).tobytes() for a in (self.cols, self.rows, self.alts, self.lonlat))
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN off the grid."""

@@ -18,7 +18,6 @@ from barpc.geodesy import (
     wrap_longitude,
 )
 from barpc.sensor import SensorModel
-from barpc.sensor.rational import CHUNK
 from barpc.sensor.rpc import RPC
 from barpc.sensor.triangulation import Triangulation as Triangulation
 from barpc.sensor.triangulation import triangulate as triangulate
@@ -162,41 +161,6 @@ def ground_sample_distance(sensor: SensorModel, image: Array, alt: npt.ArrayLike
     here = ecef_from_ground(sensor.localize(image, np.asarray(alt, dtype=np.float64)))
     steps = [sensor.localize(image + step, np.asarray(alt, dtype=np.float64)) for step in np.eye(2)]
     return np.stack([np.linalg.norm(ecef_from_ground(s) - here, axis=-1) for s in steps], axis=-1)
-
-
-def project_jacobian_ecef(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """Image points of ground points, with the derivative by ECEF.
-
-    The derivative by (lon, lat, alt) becomes one by metres east, north and up, and is turned into ECEF.
-
-    Parameters
-    ----------
-    sensor : SensorModel
-        The camera.
-    ground : (..., 3)
-        lon, lat [deg], alt [m].
-
-    Returns
-    -------
-    image : (..., 2)
-        col, row [px].
-    jacobian : (..., 2, 3)
-        d(col, row) / d(x, y, z) [px/m].
-    """
-    ground = np.asarray(ground, dtype=np.float64)
-    flat = ground.reshape(-1, 3)
-    image, jacobian = np.empty((len(flat), 2)), np.empty((len(flat), 2, 3))
-    for start in range(0, len(flat), CHUNK):
-        part = slice(start, start + CHUNK)
-        image[part], by_ground = sensor.project_jacobian(flat[part])
-        east, north, up = by_ground.T / metres_per_unit(flat[part]).T[:, None]
-        lon, lat = np.radians(flat[part, :2].T)
-        sin_lon, cos_lon, sin_lat, cos_lat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
-        outward = cos_lat * up - sin_lat * north  # away from the Earth's axis
-        jacobian[part, :, 0] = (cos_lon * outward - sin_lon * east).T
-        jacobian[part, :, 1] = (sin_lon * outward + cos_lon * east).T
-        jacobian[part, :, 2] = (cos_lat * north + sin_lat * up).T
-    return image.reshape(*ground.shape[:-1], 2), jacobian.reshape(*ground.shape[:-1], 2, 3)
 
 
 def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:

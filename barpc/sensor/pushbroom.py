@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import RpcError
+from barpc.frozen import Frozen
 from barpc.geodesy import (
     WGS84_A,
     WGS84_B,
@@ -49,7 +50,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Pushbroom:
+class Pushbroom(Frozen):
     """A rigorous pushbroom camera: itself a `SensorModel`.
 
     Parameters
@@ -88,22 +89,18 @@ class Pushbroom:
     _lon: float = field(init=False, repr=False, default=0.0)
 
     def __post_init__(self) -> None:
-        for name in ("mount", "look"):
-            value = np.array(getattr(self, name), dtype=np.float64)
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+        self._array("mount", (3, 3), RpcError)
+        self._array("look", (2, None), RpcError)
         self._check()
         row = (self._middle - self.first_line) / self.line_period
         with np.errstate(all="ignore"):
             center = self._meet(np.array([[self.look_origin, row]]), np.zeros(1))
-        object.__setattr__(self, "_lon", float(np.nan_to_num(center[0, 0])))
+        self._keep("_lon", float(np.nan_to_num(center[0, 0])))
 
     def _check(self) -> None:
-        if self.mount.shape != (3, 3) or self.look.shape != (2, max(2, self.look.shape[-1])):
-            shapes = f"{self.mount.shape} and {self.look.shape}"
-            raise RpcError(f"pushbroom: mount and look have shapes {shapes}, expected (3, 3) and (2, K)")
-        numbers = (self.look_origin, self.line_period, self.first_line)
-        if not all(np.isfinite(value).all() for value in (self.mount, self.look, numbers)):
+        if self.look.shape[1] < 2:
+            raise RpcError("pushbroom: look has no slope, expected (2, K) with K of two or more")
+        if not np.isfinite((self.look_origin, self.line_period, self.first_line)).all():
             raise RpcError("pushbroom: all numbers must be finite")
         if not self.line_period > 0:
             raise RpcError(f"pushbroom: line period {self.line_period} s is not positive")
@@ -111,17 +108,6 @@ class Pushbroom:
             raise RpcError("pushbroom: mount is not a rotation matrix")
         if not self._span[0] < self._span[1]:
             raise RpcError("pushbroom: orbit and attitude share no time")
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Pushbroom) and self._content() == other._content()
-
-    def __hash__(self) -> int:
-        return hash(self._content())
-
-    def _content(self) -> tuple[object, ...]:
-        numbers = (*self.mount.ravel().tolist(), self.look.shape, *self.look.ravel().tolist())
-        scalars = (self.look_origin, self.line_period, self.first_line)
-        return (self.orbit.content(), self.attitude.content(), *numbers, *scalars)
 
     @property
     def _middle(self) -> float:

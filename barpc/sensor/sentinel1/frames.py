@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from barpc.frozen import Frozen
 from barpc.geodesy import Array
-from barpc.sensor.sentinel1.record import Record
 
 SPEED_OF_LIGHT = 299792458.0
 """In vacuum [m/s]."""
@@ -20,7 +20,7 @@ _INVERSION_STEPS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class SlantFrame(Record):
+class SlantFrame(Frozen):
     """The frame of an SLC: columns at a constant interval of slant range time.
 
     Parameters
@@ -51,7 +51,7 @@ class SlantFrame(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class GroundFrame(Record):
+class GroundFrame(Frozen):
     """The frame of a GRD: columns at a constant interval of ground range.
 
     Ground range is a polynomial of slant range, whose coefficients and origin are interpolated linearly

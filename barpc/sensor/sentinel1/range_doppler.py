@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from barpc.errors import RpcError
+from barpc.frozen import Frozen
 from barpc.geodesy import (
     Array,
     ecef_from_ground,
@@ -27,7 +28,6 @@ from barpc.sensor.sentinel1.annotation import Annotation
 from barpc.sensor.sentinel1.corrections import Bistatic, Delays
 from barpc.sensor.sentinel1.frames import SPEED_OF_LIGHT, Frame
 from barpc.sensor.sentinel1.orbit import Orbit
-from barpc.sensor.sentinel1.record import Record
 
 CHUNK = 8192
 """Points worked on at a time."""
@@ -43,7 +43,7 @@ _ANGLE_SETTLED = 1e-9  # rad, about a millimetre: what is left after such a step
 
 
 @dataclass(frozen=True, eq=False)
-class RangeDoppler(Record):
+class RangeDoppler(Frozen):
     """A Sentinel-1 image: itself a `SensorModel`.
 
     Parameters
