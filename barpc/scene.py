@@ -79,7 +79,7 @@ class Tracks(Frozen):
         self._array("xy", (k, 2))
         sigma = self._array("sigma", (k,))
         if not (sigma > 0).all():
-            raise InputError("tracks: sigmas must be positive")
+            raise InputError("tracks: coordinates must be finite and sigmas positive")
         if k and (view.min() < 0 or self.point.min() < 0):
             raise InputError("tracks: negative view or track index")
 
@@ -141,7 +141,7 @@ class GroundPoints(Frozen):
         self._array("xy", (m, 2), finite=False)
         xy_sigma = self._array("xy_sigma", (m,), finite=False)
         if not ((sigma > 0).all() and (xy_sigma > 0).all()):
-            raise InputError("ground points: sigmas must be positive")
+            raise InputError("ground points: coordinates must be finite and sigmas positive")
         if m and (point.min() < 0 or point.max() >= g):
             raise InputError("ground points: an observation names a point that does not exist")
 

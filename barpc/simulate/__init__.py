@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from barpc.simulate.block import Block, BlockTruth, recentred, simulate_block
+from barpc.simulate.block import Block, BlockOptions, BlockTruth, recentred, simulate_block
 from barpc.simulate.orbit import Look, fly
-from barpc.simulate.sites import BlockOptions
 
 __all__ = [
     "Block",

@@ -25,8 +25,7 @@ from barpc.geodesy import (
     wrap_longitude,
 )
 from barpc.sensor.sentinel1.annotation import Annotation
-from barpc.sensor.sentinel1.corrections import Bistatic, Delays
-from barpc.sensor.sentinel1.frames import SPEED_OF_LIGHT, Frame
+from barpc.sensor.sentinel1.frames import SPEED_OF_LIGHT, Bistatic, Delays, Frame
 from barpc.sensor.sentinel1.orbit import Orbit
 
 CHUNK = 8192
