@@ -15,6 +15,7 @@ from scipy.interpolate import make_interp_spline
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, wrap_longitude
+from barpc.sensor.rational import monomials
 
 CHUNK = 2048
 """Points worked on at a time: what belongs to them stays in cache."""
@@ -172,7 +173,7 @@ class DirectGrid(Frozen):
     def _guess(self, lonlat: Array, alt: Array) -> Array:
         """Image points (N, 2) by the inverse cubic, brought back onto the grid."""
         offset, scale = self._inverse[0, :3], self._inverse[1, :3]
-        image = _cubic((np.column_stack([lonlat, alt]) - offset) / scale) @ self._inverse[2:, :2]
+        image = monomials(((np.column_stack([lonlat, alt]) - offset) / scale).T).T @ self._inverse[2:, :2]
         for k, axis in enumerate((self.cols, self.rows)):
             cell = 0.9 * (axis[1] - axis[0])
             image[:, k] = np.clip(image[:, k], axis[0] - cell, axis[-1] + cell)
@@ -244,14 +245,6 @@ def _inverse_2x2(matrix: Array) -> Array:
     return np.asarray(out / (a * d - b * c)[:, None, None])
 
 
-def _cubic(x: Array) -> Array:
-    """The 20 monomials (N, 20) of (N, 3)."""
-    one, (u, v, w) = np.ones(len(x)), x.T
-    second = (u * u, u * v, u * w, v * v, v * w, w * w)
-    third = [a * b for a, b in zip((u,) * 6 + (v, v, v, w), (*second, *second[3:], second[5]), strict=True)]
-    return np.stack([one, u, v, w, *second, *third], axis=1)
-
-
 def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
     """Offsets, scales and coefficients (22, 3) of cubic polynomials from (lon, lat, alt) to (col, row)."""
     thin = tuple(slice(None, None, max(1, len(axis) // 12)) for axis in axes)
@@ -259,6 +252,6 @@ def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
     lonlat = lonlat[thin]
     ground = np.column_stack([lonlat[..., 0].ravel(), lonlat[..., 1].ravel(), alt.ravel()])
     offset, scale = ground.mean(axis=0), 0.5 * np.ptp(ground, axis=0)
-    basis = _cubic((ground - offset) / scale)
+    basis = monomials(((ground - offset) / scale).T).T
     image = np.column_stack([col.ravel(), row.ravel(), np.zeros(col.size)])
     return np.vstack([offset, scale, np.linalg.lstsq(basis, image, rcond=None)[0]])
