@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
-from barpc.geodesy import Array, wrap_longitude
+from barpc.geodesy import Array, pointwise, wrap_longitude
 from barpc.sensor.rational import monomials
 
 CHUNK = 2048
@@ -118,40 +118,28 @@ class DirectGrid(Frozen):
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN off the grid."""
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        out = np.empty((len(flat), 2))
-        for start in range(0, len(flat), CHUNK):
-            out[start : start + CHUNK] = self._solve(flat[start : start + CHUNK])
-        return out.reshape(*ground.shape[:-1], 2)
+        return pointwise(lambda part: [self._solve(part)], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        image, jacobian = np.empty((len(flat), 2)), np.empty((len(flat), 2, 3))
-        for start in range(0, len(flat), CHUNK):
-            part = slice(start, start + CHUNK)
-            image[part] = self._solve(flat[part])
-            _, rate = self._value(image[part], flat[part, 2])
-            by_lonlat = _inverse_2x2(rate[:, :2])  # (N, 2, 2): d(col, row)/d(lon, lat)
-            jacobian[part, :, :2] = by_lonlat
-            jacobian[part, :, 2] = -np.einsum("nij,nj->ni", by_lonlat, rate[:, 2])
-        return image.reshape(*ground.shape[:-1], 2), jacobian.reshape(*ground.shape[:-1], 2, 3)
+        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]; NaN off the grid."""
-        image = np.asarray(image, dtype=np.float64)
-        alt = np.asarray(alt, dtype=np.float64)
-        shape = np.broadcast_shapes(image.shape[:-1], alt.shape)
-        flat = np.broadcast_to(image, (*shape, 2)).reshape(-1, 2)
-        out = np.empty((len(flat), 3))
-        out[:, 2] = np.broadcast_to(alt, shape).reshape(-1)
-        for start in range(0, len(flat), CHUNK):
-            part = slice(start, start + CHUNK)
-            out[part, :2] = self._value(flat[part], out[part, 2])[0]
-        out[:, 0] += self._lon
-        return out.reshape(*shape, 3)
+        return pointwise(self._localize, CHUNK, [(3,)], image, alt)[0]
+
+    def _localize(self, image: Array, alt: Array) -> list[Array]:
+        """`localize` of points (N, 2) at altitudes (N,)."""
+        return [np.column_stack([self._value(image, alt)[0] + [self._lon, 0.0], alt])]
+
+    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """`project_jacobian` of points (N, 3)."""
+        image = self._solve(ground)
+        _, rate = self._value(image, ground[:, 2])
+        by_lonlat = _inverse_2x2(rate[:, :2])  # (N, 2, 2): d(col, row)/d(lon, lat)
+        by_alt = -np.einsum("nij,nj->ni", by_lonlat, rate[:, 2])
+        return image, np.concatenate([by_lonlat, by_alt[:, :, None]], axis=2)
 
     def _solve(self, ground: Array) -> Array:
         """Image points (N, 2) of ground points (N, 3): Newton from an inverse cubic polynomial."""

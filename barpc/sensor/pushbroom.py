@@ -26,6 +26,7 @@ from barpc.geodesy import (
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
+    pointwise,
     wrap_longitude,
 )
 from barpc.sensor.curve import Curve
@@ -145,14 +146,7 @@ class Pushbroom(Frozen):
         image : (..., 2)
             col, row [px]; NaN behind the camera and more than `EXTRAPOLATION` beyond the orbit or attitude.
         """
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        out = np.empty((len(flat), 2))
-        with np.errstate(all="ignore"):
-            for start in range(0, len(flat), CHUNK):
-                part = slice(start, start + CHUNK)
-                out[part] = self._solve(ecef_from_ground(flat[part]).T).T
-        return out.reshape(*ground.shape[:-1], 2)
+        return pointwise(lambda part: [self._solve(ecef_from_ground(part).T).T], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Image points of ground points, with the derivative.
@@ -169,17 +163,8 @@ class Pushbroom(Frozen):
         jacobian : (..., 2, 3)
             d(col, row) / d(lon, lat, alt) [px/deg, px/deg, px/m].
         """
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        image, jacobian = np.empty((len(flat), 2)), np.empty((len(flat), 2, 3))
-        with np.errstate(all="ignore"):
-            for start in range(0, len(flat), CHUNK):
-                part = slice(start, start + CHUNK)
-                ecef = ecef_from_ground(flat[part]).T
-                found = self._solve(ecef)
-                image[part] = found.T
-                jacobian[part] = self._by_ecef(ecef, found) @ ecef_from_ground_jacobian(flat[part])
-        return image.reshape(*ground.shape[:-1], 2), jacobian.reshape(*ground.shape[:-1], 2, 3)
+        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points seen at image points, at known altitudes (the inverse of `project`).
@@ -200,17 +185,7 @@ class Pushbroom(Frozen):
             lon (continuous across the antimeridian), lat [deg], alt [m]. NaN where the line of sight misses
             the Earth or the row lies more than `EXTRAPOLATION` beyond the orbit or attitude.
         """
-        image = np.asarray(image, dtype=np.float64)
-        alt = np.asarray(alt, dtype=np.float64)
-        shape = np.broadcast_shapes(image.shape[:-1], alt.shape)
-        flat = np.broadcast_to(image, (*shape, 2)).reshape(-1, 2)
-        height = np.broadcast_to(alt, shape).reshape(-1)
-        out = np.empty((len(flat), 3))
-        with np.errstate(all="ignore"):
-            for start in range(0, len(flat), CHUNK):
-                part = slice(start, start + CHUNK)
-                out[part] = self._meet(flat[part], height[part])
-        return out.reshape(*shape, 3)
+        return pointwise(lambda *part: [self._meet(*part)], CHUNK, [(3,)], image, alt)[0]
 
     def line_of_sight(self, image: Array) -> tuple[Array, Array]:
         """Lines of sight of image points.
@@ -308,6 +283,12 @@ class Pushbroom(Frozen):
         out = np.stack([col, (time - self.first_line) / self.line_period])
         out[:, ~settled] = np.nan
         return out
+
+    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """`project_jacobian` of points (N, 3)."""
+        ecef = ecef_from_ground(ground).T
+        found = self._solve(ecef)
+        return found.T, self._by_ecef(ecef, found) @ ecef_from_ground_jacobian(ground)
 
     def _by_ecef(self, ecef: Array, image: Array) -> Array:
         """d(col, row)/dX (N, 2, 3) [px/m] at ECEF points (3, N) seen at image points (2, N)."""
