@@ -7,7 +7,6 @@ known, or heights that had to be taken as they are, raise a loud warning.
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from collections.abc import Callable
@@ -23,15 +22,14 @@ from rasterio.errors import CRSError
 from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
 
-from barpc.errors import BarpcWarning, InputError
+from barpc.errors import BarpcWarning, ImageError, InputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
 from barpc.sensor import SensorModel
-from barpc.sidefile import GRID, opened, read_head
+from barpc.sidefile import GRID, read_head
 
-_HGT_NAME = re.compile(r"([NS])(\d{2})([EW])(\d{3})", re.IGNORECASE)
-_HGT_VOID = -32768
-_GTX_VOID = -88.8888
+HEIGHTS = {".hgt": ("SRTMHGT", "EGM96 height"), ".gtx": ("GTX", "ellipsoid")}
+"""Suffix -> the driver that may open it (its first bytes say nothing), and what its heights count from."""
 _MAX_CELLS = 400_000_000
 _FAR = 1e12  # no coordinate [m or deg] comes near
 _VERTICAL = re.compile(r'(?:VERTCRS|VERT_CS|VERTICALCRS)\s*\[\s*"([^"]+)"')
@@ -77,8 +75,16 @@ class Grid:
         """
         path = Path(path)
         read_head(path, GRID, 0)  # a regular file
-        opener = {".hgt": _open_hgt, ".gtx": _open_gtx}.get(path.suffix.lower(), _open_raster)
-        return opener(path)
+        if path.suffix.lower() not in HEIGHTS:
+            return _open(path)
+        driver, reference = HEIGHTS[path.suffix.lower()]
+        try:
+            return _open(path, driver, reference)
+        except ImageError as error:
+            raise InputError(
+                f"{error} (an SRTM tile is called as N44E005.hgt and has 1201 or 3601 nodes a side; a .gtx is as long "
+                "as its header says)"
+            ) from error
 
     def sample(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
@@ -131,57 +137,13 @@ def _snapped(index: Array) -> Array:
     return np.where(np.abs(index - node) < 1e-6, node, index)
 
 
-def _open_hgt(path: Path) -> Grid:
-    name = _HGT_NAME.match(path.name)
-    with opened(path, GRID) as file:
-        side = {2 * 1201**2: 1201, 2 * 3601**2: 3601}.get(os.fstat(file.fileno()).st_size)
-        if name is None or side is None:
-            raise InputError(f"{path}: no SRTM tile (a name as N44E005.hgt and 1201 or 3601 nodes a side)")
-        data = np.memmap(file, dtype=">i2", mode="r", shape=(side, side))
-    south = int(name[2]) * (1 if name[1].upper() == "N" else -1)
-    west = int(name[4]) * (1 if name[3].upper() == "E" else -1)
-
-    def read(top: int, bottom: int, left: int, right: int) -> Array:
-        part = data[top:bottom, left:right]
-        return np.where(part == _HGT_VOID, np.nan, part.astype(np.float64))
-
-    def locate(lon: Array, lat: Array) -> tuple[Array, Array]:
-        return (south + 1 - lat) * (side - 1), (np.mod(lon - west + 180, 360) - 180) * (side - 1)
-
-    return Grid(path, (side, side), read, locate, "EGM96 height")
-
-
-def _open_gtx(path: Path) -> Grid:
-    with opened(path, GRID) as file:
-        head = file.read(40)
-        if len(head) < 40:
-            raise InputError(f"{path}: no GTX grid (shorter than its header)")
-        south, west, step_lat, step_lon = np.frombuffer(head, ">f8", 4).tolist()
-        rows, cols = (int(n) for n in np.frombuffer(head, ">i4", 2, 32))
-        places = abs(south) <= 90 and abs(west) <= 360 and 1e-6 <= step_lat <= 180 and 1e-6 <= step_lon <= 360
-        if not (places and rows > 1 and cols > 1):
-            raise InputError(f"{path}: no GTX grid (its header is no grid of longitudes and latitudes)")
-        if os.fstat(file.fileno()).st_size != 40 + 4 * rows * cols:
-            raise InputError(f"{path}: no GTX grid (its header does not go with its size)")
-        data = np.memmap(file, dtype=">f4", mode="r", offset=40, shape=(rows, cols))
-    turn = 360.0 / step_lon
-    around = round(turn) if cols >= round(turn) - 1e-6 else 0
-
-    def read(top: int, bottom: int, left: int, right: int) -> Array:
-        part = data[top:bottom, left:right].astype(np.float64)
-        return np.where(np.abs(part - _GTX_VOID) < 1e-3, np.nan, part)
-
-    def locate(lon: Array, lat: Array) -> tuple[Array, Array]:
-        return (lat - south) / step_lat, np.mod(lon - west, 360.0) / step_lon
-
-    return Grid(path, (rows, cols), read, locate, "ellipsoid", float(around))
-
-
-def _open_raster(path: Path) -> Grid:
-    with open_raster(path) as dataset:
+def _open(path: Path, driver: str | None = None, reference: str | None = None) -> Grid:
+    with open_raster(path, driver) as dataset:
         crs, shape, forward, extent = dataset.crs, dataset.shape, dataset.transform, dataset.bounds
         if crs is None:
             raise InputError(f"{path}: a DEM or geoid grid needs a CRS, and this raster has none")
+        if driver == "GTX" and path.stat().st_size != 40 + 4 * shape[0] * shape[1]:
+            raise ImageError(f"{path}: its header does not go with its size")
     inverse = _inverse(forward, path)
     around = 0.0
     geographic = bool(crs.is_geographic)
@@ -189,7 +151,7 @@ def _open_raster(path: Path) -> Grid:
         around = float(round(360.0 * abs(inverse.a)))
 
     def read(top: int, bottom: int, left: int, right: int) -> Array:
-        with open_raster(path) as dataset:
+        with open_raster(path, driver) as dataset:
             window = Window.from_slices((top, bottom), (left, right))
             return np.asarray(dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan))
 
@@ -208,7 +170,7 @@ def _open_raster(path: Path) -> Grid:
             inverse.a * x + inverse.b * y + inverse.c - 0.5,
         )
 
-    return Grid(path, shape, read, locate, _vertical_reference(crs.to_wkt()), around)
+    return Grid(path, shape, read, locate, reference or _vertical_reference(crs.to_wkt()), around)
 
 
 def _inverse(forward: Affine, path: Path) -> Affine:

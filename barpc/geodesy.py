@@ -6,6 +6,7 @@ last axis; leading axes broadcast. Nothing here raises for a point: what is not 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,44 @@ WGS84_E2 = WGS84_F * (2.0 - WGS84_F)
 _EP2 = WGS84_E2 / (1.0 - WGS84_E2)  # second eccentricity, squared
 _CHUNK = 8192  # points worked on at a time, so that temporaries stay in cache
 _RAD = np.pi / 180.0
+
+
+def pointwise(
+    function: Callable[..., Iterable[Array]],
+    chunk: int,
+    shapes: Sequence[tuple[int, ...]],
+    points: npt.ArrayLike,
+    alt: npt.ArrayLike | None = None,
+) -> list[Array]:
+    """What a function of a batch of points gives for points with any leading axes, in pieces that stay in cache.
+
+    Parameters
+    ----------
+    function : callable
+        (n, k) points, and (n,) altitudes if there are any -> arrays (n, ...); what is not finite is no news.
+    chunk : int
+        Points worked on at a time.
+    shapes : sequence of tuple of int
+        Of what a point gives.
+    points : (..., k)
+    alt : (...), optional
+        Broadcast with `points`.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    lead, k = points.shape[:-1], points.shape[-1]
+    flat: list[Array] = [points.reshape(-1, k)]
+    if alt is not None:
+        alt = np.asarray(alt, dtype=np.float64)
+        lead = np.broadcast_shapes(lead, alt.shape)
+        flat = [np.broadcast_to(points, (*lead, k)).reshape(-1, k), np.broadcast_to(alt, lead).reshape(-1)]
+    count = len(flat[0])
+    out = [np.empty((count, *shape)) for shape in shapes]
+    with np.errstate(all="ignore"):
+        for start in range(0, count, chunk):
+            part = slice(start, start + chunk)
+            for whole, piece in zip(out, function(*(array[part] for array in flat)), strict=True):
+                whole[part] = piece
+    return [whole.reshape(*lead, *shape) for whole, shape in zip(out, shapes, strict=True)]
 
 
 def ecef_from_ground(ground: npt.ArrayLike) -> Array:
@@ -67,13 +106,9 @@ def ground_from_ecef(ecef: npt.ArrayLike) -> Array:
     ground : (..., 3)
         lon [deg, -180 to 180], lat [deg], alt [m above the WGS84 ellipsoid].
     """
-    ecef = np.asarray(ecef, dtype=np.float64)
-    flat = ecef.reshape(-1, 3)
-    ground = np.empty(flat.shape)
-    for start in range(0, len(flat), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        ground[part] = _geodetic(*np.ascontiguousarray(flat[part].T)).ground.T
-    return ground.reshape(ecef.shape)
+    return pointwise(lambda part: [_geodetic(*np.ascontiguousarray(part.T)).ground.T], _CHUNK, [(3,)], ecef)[
+        0
+    ]
 
 
 def ground_rows_from_ecef(ecef: Array) -> tuple[Array, Array]:

@@ -55,13 +55,15 @@ _WARNINGS = threading.Lock()  # catch_warnings is process-wide
 
 
 @contextmanager
-def open_raster(path: str | os.PathLike[str]) -> Iterator[Any]:
+def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iterator[Any]:
     """Open a raster read-only; an error while it is open names the file, too.
 
     Parameters
     ----------
     path : path
         An existing regular file.
+    driver : str, optional
+        The one that may open it, of a kind whose first bytes do not tell (`barpc.dem.HEIGHTS`).
 
     Yields
     ------
@@ -75,7 +77,7 @@ def open_raster(path: str | os.PathLike[str]) -> Iterator[Any]:
         VRT that is not of the grammar of `barpc.vrt` or points at anything else than plain local rasters.
     """
     name = os.fspath(path)
-    file, driver = identify(name)
+    file, driver = identify(name, driver)
     try:
         with (
             rasterio.Env(**GDAL_OPTIONS, **_ALONE),
@@ -105,8 +107,8 @@ def _mosaic(file: Path, name: str) -> Mosaic:
     return Mosaic(name, vrt, lambda source: _opened(source, drivers[source]))
 
 
-def identify(path: str | os.PathLike[str]) -> tuple[Path, str]:
-    """The absolute path of a raster and the only driver that may open it.
+def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[Path, str]:
+    """The absolute path of a raster and the only driver that may open it: `driver`, or what its first bytes say.
 
     Raises
     ------
@@ -131,7 +133,7 @@ def identify(path: str | os.PathLike[str]) -> tuple[Path, str]:
         raise ImageError(f"{name}: cannot be read: {error}") from error
     if not head:
         raise ImageError(f"{name}: the file is empty")
-    driver = next((driver for magic, driver in DRIVERS.items() if head.startswith(magic)), None)
+    driver = driver or next((driver for magic, driver in DRIVERS.items() if head.startswith(magic)), None)
     if driver is None:
         known = ", ".join(sorted(set(DRIVERS.values())))
         raise ImageError(f"{name}: not a raster that is read here (kinds known: {known})")

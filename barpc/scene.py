@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import InputError
+from barpc.frozen import Frozen
 from barpc.geodesy import Array
 from barpc.sensor import SensorModel
 
@@ -20,18 +20,8 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 
-def _frozen(owner: object, name: str, shape: tuple[int | None, ...], dtype: npt.DTypeLike) -> Any:
-    """Store the field `name` of `owner` as a read-only array of the given shape (None: any length)."""
-    value: npt.NDArray[Any] = np.array(getattr(owner, name), dtype=dtype)
-    if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
-        raise InputError(f"{type(owner).__name__}.{name}: shape {value.shape}, expected {shape}")
-    value.setflags(write=False)
-    object.__setattr__(owner, name, value)
-    return value
-
-
 @dataclass(frozen=True, eq=False)
-class View:
+class View(Frozen):
     """One image and its camera.
 
     Parameters
@@ -62,7 +52,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracks:
+class Tracks(Frozen):
     """Tie points over the views, one row an observation.
 
     Parameters
@@ -83,12 +73,12 @@ class Tracks:
     sigma: Array
 
     def __post_init__(self) -> None:
-        view = _frozen(self, "view", (None,), np.int64)
+        view = self._array("view", (None,), dtype=np.int64)
         k = len(view)
-        _frozen(self, "point", (k,), np.int64)
-        xy = _frozen(self, "xy", (k, 2), np.float64)
-        sigma = _frozen(self, "sigma", (k,), np.float64)
-        if not (np.isfinite(xy).all() and np.isfinite(sigma).all() and (sigma > 0).all()):
+        self._array("point", (k,), dtype=np.int64)
+        self._array("xy", (k, 2))
+        sigma = self._array("sigma", (k,))
+        if not (sigma > 0).all():
             raise InputError("tracks: coordinates must be finite and sigmas positive")
         if k and (view.min() < 0 or self.point.min() < 0):
             raise InputError("tracks: negative view or track index")
@@ -111,7 +101,7 @@ class Tracks:
 
 
 @dataclass(frozen=True, eq=False)
-class GroundPoints:
+class GroundPoints(Frozen):
     """Points of known position (GCPs or check points), and where they are seen.
 
     Parameters
@@ -143,14 +133,14 @@ class GroundPoints:
 
     def __post_init__(self) -> None:
         g = len(self.names)
-        _frozen(self, "lonlatalt", (g, 3), np.float64)
-        sigma = _frozen(self, "sigma", (g, 3), np.float64)
-        point = _frozen(self, "point", (None,), np.int64)
+        self._array("lonlatalt", (g, 3))
+        sigma = self._array("sigma", (g, 3), finite=False)
+        point = self._array("point", (None,), dtype=np.int64)
         m = len(point)
-        _frozen(self, "view", (m,), np.int64)
-        _frozen(self, "xy", (m, 2), np.float64)
-        xy_sigma = _frozen(self, "xy_sigma", (m,), np.float64)
-        if not ((sigma > 0).all() and (xy_sigma > 0).all() and np.isfinite(self.lonlatalt).all()):
+        self._array("view", (m,), dtype=np.int64)
+        self._array("xy", (m, 2), finite=False)
+        xy_sigma = self._array("xy_sigma", (m,), finite=False)
+        if not ((sigma > 0).all() and (xy_sigma > 0).all()):
             raise InputError("ground points: coordinates must be finite and sigmas positive")
         if m and (point.min() < 0 or point.max() >= g):
             raise InputError("ground points: an observation names a point that does not exist")

@@ -93,7 +93,7 @@ def line(name: str, ours: float, peer: float | None) -> None:
 def measure(path: Path, eos: str | None, rpcfit: str | None) -> None:
     """All figures of one product."""
     from barpc.fit import FitOptions
-    from barpc.fit.grid import control_points
+    from barpc.fit.points import control_points
     from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 
     annotation = read_annotation(path)
@@ -162,7 +162,7 @@ def measure_floor(control, control_image, options, peer) -> None:
 
 def check_data(model, control) -> dict[str, np.ndarray]:
     """Check points between the control points."""
-    from barpc.fit.grid import check_points
+    from barpc.fit.points import check_points
 
     check = np.concatenate(list(check_points(control)))
     return {"check": check, "check_image": model.project(check)}

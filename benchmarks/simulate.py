@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import argparse
 import resource
+import sys
 import tempfile
 import time
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 
 def main() -> None:
@@ -19,7 +22,8 @@ def main() -> None:
     arguments = parser.parse_args()
 
     from barpc.sensor.corrected import Corrected
-    from barpc.simulate import ImageOptions, simulate_block, write_scene
+    from barpc.simulate import simulate_block
+    from tests.scenes import ImageOptions, write_scene
 
     print(f"{'block':>22}{'observations':>14}{'CPU s':>8}{'delivered px':>14}{'exact px':>10}")
     for views, tracks in ((3, 2_000), (10, 5_000), (100, 30_000), (arguments.views, 100 * arguments.views)):

@@ -113,14 +113,49 @@ def test_a_grid_that_goes_around_the_earth_has_no_seam(tmp_path):
     assert grid.sample(180.0, 90.0) == pytest.approx(-1.0)
 
 
+HEADER = np.array([-90.0, -180.0, 10.0, 10.0], ">f8").tobytes() + np.array([19, 36], ">i4").tobytes()
+
+
 @pytest.mark.parametrize(
     ("name", "data"),
-    [("N44E005.hgt", b"x" * 10), ("tile.hgt", b"\0" * 2 * 1201**2), ("g.gtx", b""), ("g.gtx", b"\0" * 400)],
+    [
+        ("N44E005.hgt", b"x" * 10),
+        ("tile.hgt", b"\0" * 2 * 1201**2),
+        ("g.gtx", b""),
+        ("g.gtx", b"\0" * 400),
+        ("g.gtx", HEADER),
+        ("g.gtx", HEADER + b"\0" * 4 * 19 * 36 + b"more"),
+        ("g.gtx", b"II*\0" * 200),
+        ("N44E005_v2.hgt", b"\0" * 2 * 1201**2),
+    ],
 )
 def test_a_file_that_is_not_what_its_name_says_is_refused(name, data, tmp_path):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(InputError, match=name.replace(".", r"\.")):
         Grid.open(tmp_path / name)
+
+
+def test_a_tile_and_a_geoid_are_read_as_their_bytes_stand(tmp_path):
+    """SRTM: rows from the north, big-endian, -32768 a void; GTX: rows from the south, -88.8888 a void."""
+    rng = np.random.default_rng(4)
+    tile = rng.integers(-100, 5000, (1201, 1201)).astype(">i2")
+    tile[3, 5] = -32768
+    (tmp_path / "S34W071.hgt").write_bytes(tile.tobytes())
+    grid = Grid.open(tmp_path / "S34W071.hgt")
+    expected = np.where(tile == -32768, np.nan, tile.astype(float))
+    np.testing.assert_array_equal(grid.read(0, 1201, 0, 1201), expected)
+    assert grid.reference == "EGM96 height"
+    assert grid.sample(-71.0, -33.0) == tile[0, 0]
+    assert grid.sample(-70.0, -34.0) == tile[-1, -1]
+    geoid = rng.normal(0, 30, (19, 36)).astype(">f4")
+    geoid[2, 1] = -88.8888
+    (tmp_path / "g.gtx").write_bytes(HEADER + geoid.tobytes())
+    grid = Grid.open(tmp_path / "g.gtx")
+    heights = grid.sample(*np.meshgrid(np.arange(-180, 180, 10.0), np.arange(-90, 91, 10.0)))
+    np.testing.assert_array_equal(
+        heights, np.where(geoid == np.float32(-88.8888), np.nan, geoid.astype(float))
+    )
+    assert grid.reference == "ellipsoid"
 
 
 def test_a_dem_without_crs_is_refused(tmp_path):

@@ -226,7 +226,7 @@ def _dem_range(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], flags: dict[str, Any]
 ) -> tuple[float, float]:
     from barpc.dem import Dem
-    from barpc.fit.grid import terrain_range
+    from barpc.fit.points import terrain_range
 
     return terrain_range(model, size, alt_range, Dem.open(flags["dem"], flags["geoid"]), flags["dem_margin"])
 

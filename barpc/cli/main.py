@@ -45,7 +45,6 @@ COMMANDS = {
     "apply": "Give images other RPCs in a new folder and prove that tools read them.",
     "report": "Make report.html of a finished run again.",
     "compare": "Compare two finished runs of the same images.",
-    "simulate": "Make synthetic images with known cameras and truth.",
     "doctor": "Print versions and check the installation.",
 }
 """Verb -> its line in `barpc --help`; the code is `barpc.cli.<verb>.command`."""

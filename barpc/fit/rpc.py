@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit.certificate import Errors, RpcFit, coverage, roundtrip, smallest_denominator
-from barpc.fit.grid import check_points, control_points, widened
 from barpc.fit.options import FitOptions
-from barpc.fit.points import extent, numbers, screened
+from barpc.fit.points import check_points, control_points, extent, numbers, screened, widened
 from barpc.fit.solve import Solution, solve
 from barpc.geodesy import Array
 from barpc.sensor import SensorModel
@@ -63,35 +62,36 @@ def fit_rpc(
         A few control points have no ground point.
     """
     options = options or FitOptions()
-    if min(size) < 1:
-        raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
     ground, image = control_points(model, size, widened(alt_range), options)
-    cnp, cnp_image = ground.reshape(-1, 3), image.reshape(-1, 2)
-    ok = np.isfinite(cnp).all(axis=1) & np.isfinite(cnp_image).all(axis=1)
+    cnp, cnp_image = _found(ground.reshape(-1, 3), image.reshape(-1, 2), alt_range)
+    vendor = underlying_rpc(model)
+
+    def attempt(method: str) -> RpcFit:
+        solution = solve(cnp, cnp_image, options, method, vendor=vendor)
+        residuals = (solution.rpc.project(middle) - model.project(middle) for middle in check_points(ground))
+        loop = max((roundtrip(solution.rpc, middle) for middle in check_points(ground)), default=0.0)
+        return _certified(solution, residuals, loop, size)
+
+    return _first_accepted(attempt, options, vendor, strict)
+
+
+def _found(cnp: Array, image: Array, alt_range: tuple[float, float]) -> tuple[Array, Array]:
+    """The control points (N, 3) and (N, 2) at which the model was localised."""
+    ok = np.isfinite(cnp).all(axis=1) & np.isfinite(image).all(axis=1)
     if ok.mean() < 0.9:
         raise FitError(
             f"the model has no ground point for {1 - ok.mean():.0%} of the image over altitudes "
             f"{alt_range[0]:g} to {alt_range[1]:g} m: give an altitude range that it is made for"
         )
-    if not ok.all():
-        warnings.warn(
-            f"{np.count_nonzero(~ok)} of {ok.size} control points have no ground point and are left out: the "
-            "RPC extrapolates there",
-            BarpcWarning,
-            stacklevel=2,
-        )
-        cnp, cnp_image = cnp[ok], cnp_image[ok]
-    vendor = underlying_rpc(model)
-
-    def attempt(method: str) -> RpcFit:
-        solution = solve(cnp, cnp_image, options, method, vendor=vendor)
-        on_ckp, loop = Errors(), 0.0
-        for middle in check_points(ground):
-            on_ckp.add(solution.rpc.project(middle) - model.project(middle))
-            loop = max(loop, roundtrip(solution.rpc, middle))
-        return _certified(solution, on_ckp, loop, size)
-
-    return _first_accepted(attempt, options, vendor, strict)
+    if ok.all():
+        return cnp, image
+    warnings.warn(
+        f"{np.count_nonzero(~ok)} of {ok.size} control points have no ground point and are left out: the "
+        "RPC extrapolates there",
+        BarpcWarning,
+        stacklevel=3,
+    )
+    return cnp[ok], image[ok]
 
 
 def fit_rpc_points(
@@ -135,27 +135,18 @@ def fit_rpc_points(
     Raises
     ------
     FitError
-        Too few points, not finite, swapped columns, points in a plane; or the RPC does not reach the
-        tolerance.
+        Too few points, not finite, swapped columns, points in a plane; or the tolerance is not reached.
     """
     options = options or FitOptions()
     cnp, cnp_image = screened(ground, image, options.allow_mirrored)
     weight = relative_weight(sigma, len(cnp))
-    distinct = len(np.unique(cnp, axis=0)) if len(cnp) < 400 else len(cnp)
-    if distinct < min(len(cnp), 40):
-        raise FitError(f"points: only {distinct} of {len(cnp)} are distinct, too few for an RPC")
     held_out = None if check is None else numbers(*check)
 
     def attempt(method: str) -> RpcFit:
         solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
-        on_ckp = Errors()
-        if held_out is None:
-            for residual in solution.leave_one_out():
-                on_ckp.add(residual)
-        else:
-            on_ckp.add(solution.rpc.project(held_out[0]) - held_out[1])
+        left = None if held_out is None else [solution.rpc.project(held_out[0]) - held_out[1]]
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // _LOOPS)])
-        return _certified(solution, on_ckp, loop, size)
+        return _certified(solution, left or solution.leave_one_out(), loop, size)
 
     return _first_accepted(attempt, options, vendor, strict)
 
@@ -177,10 +168,15 @@ def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
     return np.asarray(value.min() / value)
 
 
-def _certified(solution: Solution, on_ckp: Errors, loop: float, size: tuple[int, int] | None) -> RpcFit:
+def _certified(
+    solution: Solution, residuals: Iterable[Array], loop: float, size: tuple[int, int] | None
+) -> RpcFit:
+    """The fit with its certificate; `residuals` (n, 2) [px] of the check points come some at a time."""
     problem, rpc = solution.problem, solution.rpc
     ground, image = problem.ground, problem.image
-    on_cnp = Errors()
+    on_cnp, on_ckp = Errors(), Errors()
+    for residual in residuals:
+        on_ckp.add(residual)
     for start in range(0, len(ground), _CHUNK):
         part = slice(start, start + _CHUNK)
         on_cnp.add(rpc.project(ground[part]) - image[part])

@@ -11,11 +11,12 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from barpc.errors import RpcError
+from barpc.frozen import Frozen
 from barpc.geodesy import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class Curve(Frozen):
     """A piecewise polynomial of time with values in three dimensions.
 
     Parameters
@@ -30,17 +31,10 @@ class Curve:
     coeffs: Array
 
     def __post_init__(self) -> None:
-        knots = np.array(self.knots, dtype=np.float64)
-        coeffs = np.array(self.coeffs, dtype=np.float64)
-        if knots.ndim != 1 or coeffs.ndim != 3 or coeffs.shape[0] != len(knots) - 1 or coeffs.shape[2] != 3:
-            raise RpcError(
-                f"curve: knots {knots.shape} and coefficients {coeffs.shape} do not belong together"
-            )
-        if not (np.isfinite(knots).all() and np.isfinite(coeffs).all() and (np.diff(knots) > 0).all()):
-            raise RpcError("curve: knots must ascend and all numbers must be finite")
-        for name, value in (("knots", knots), ("coeffs", coeffs)):
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+        knots = self._array("knots", (None,), RpcError)
+        self._array("coeffs", (len(knots) - 1, None, 3), RpcError)
+        if not (np.diff(knots) > 0).all():
+            raise RpcError("Curve knots: they must ascend")
 
     @classmethod
     def polynomial(cls, coeffs: npt.ArrayLike, start: float, stop: float) -> Curve:
@@ -103,16 +97,6 @@ class Curve:
             rate = rate * dt + value
             value = value * dt + power
         return value, np.broadcast_to(rate, value.shape)
-
-    def content(self) -> tuple[object, ...]:
-        """Numbers that decide equality."""
-        return (*self.knots.tolist(), self.coeffs.shape, *self.coeffs.ravel().tolist())
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Curve) and self.content() == other.content()
-
-    def __hash__(self) -> int:
-        return hash(self.content())
 
 
 def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[Array, Curve]:

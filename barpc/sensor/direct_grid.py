@@ -13,7 +13,9 @@ import numpy.typing as npt
 from scipy.interpolate import make_interp_spline
 
 from barpc.errors import RpcError
-from barpc.geodesy import Array, wrap_longitude
+from barpc.frozen import Frozen
+from barpc.geodesy import Array, pointwise, wrap_longitude
+from barpc.sensor.rational import monomials
 
 CHUNK = 2048
 """Points worked on at a time: what belongs to them stays in cache."""
@@ -26,7 +28,7 @@ _SETTLED = 1e-5  # px: Newton is quadratic, what is left after a step of this si
 
 
 @dataclass(frozen=True, eq=False)
-class DirectGrid:
+class DirectGrid(Frozen):
     """A camera given by the ground points of a grid of image points: itself a `SensorModel`.
 
     Parameters
@@ -62,9 +64,7 @@ class DirectGrid:
 
     def __post_init__(self) -> None:
         for name in ("cols", "rows", "alts", "lonlat"):
-            value = np.array(getattr(self, name), dtype=np.float64)
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+            self._keep(name, np.array(getattr(self, name), dtype=np.float64))
         axes = (self.alts, self.rows, self.cols)
         shape = (*(len(np.atleast_1d(axis)) for axis in axes), 2)
         if self.lonlat.shape != shape or min(shape) < 2:
@@ -84,12 +84,10 @@ class DirectGrid:
             knots.append(np.asarray(spline.t))
             coeffs = np.moveaxis(np.asarray(spline.c), 0, i) if i else np.asarray(spline.c)
         table = np.ascontiguousarray(coeffs.reshape(-1, 2).T)  # (2, nodes)
-        for array in (inverse, table, *knots):
-            array.setflags(write=False)
-        object.__setattr__(self, "_inverse", inverse)
-        object.__setattr__(self, "_spline", table)
-        object.__setattr__(self, "_knots", tuple(knots))
-        object.__setattr__(self, "_lon", center)
+        self._keep("_inverse", inverse)
+        self._keep("_spline", table)
+        self._keep("_knots", tuple(knots))
+        self._keep("_lon", center)
 
     @classmethod
     def from_points(cls, ground: npt.ArrayLike, image: npt.ArrayLike) -> DirectGrid:
@@ -118,51 +116,30 @@ class DirectGrid:
         lonlat[places] = ground[:, :2]
         return cls(axes[2], axes[1], axes[0], lonlat)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, DirectGrid) and self._content() == other._content()
-
-    def __hash__(self) -> int:
-        return hash(self._content())
-
-    def _content(self) -> tuple[bytes, ...]:
-        return tuple((a + 0.0).tobytes() for a in (self.cols, self.rows, self.alts, self.lonlat))
-
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN off the grid."""
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        out = np.empty((len(flat), 2))
-        for start in range(0, len(flat), CHUNK):
-            out[start : start + CHUNK] = self._solve(flat[start : start + CHUNK])
-        return out.reshape(*ground.shape[:-1], 2)
+        return pointwise(lambda part: [self._solve(part)], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        image, jacobian = np.empty((len(flat), 2)), np.empty((len(flat), 2, 3))
-        for start in range(0, len(flat), CHUNK):
-            part = slice(start, start + CHUNK)
-            image[part] = self._solve(flat[part])
-            _, rate = self._value(image[part], flat[part, 2])
-            by_lonlat = _inverse_2x2(rate[:, :2])  # (N, 2, 2): d(col, row)/d(lon, lat)
-            jacobian[part, :, :2] = by_lonlat
-            jacobian[part, :, 2] = -np.einsum("nij,nj->ni", by_lonlat, rate[:, 2])
-        return image.reshape(*ground.shape[:-1], 2), jacobian.reshape(*ground.shape[:-1], 2, 3)
+        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]; NaN off the grid."""
-        image = np.asarray(image, dtype=np.float64)
-        alt = np.asarray(alt, dtype=np.float64)
-        shape = np.broadcast_shapes(image.shape[:-1], alt.shape)
-        flat = np.broadcast_to(image, (*shape, 2)).reshape(-1, 2)
-        out = np.empty((len(flat), 3))
-        out[:, 2] = np.broadcast_to(alt, shape).reshape(-1)
-        for start in range(0, len(flat), CHUNK):
-            part = slice(start, start + CHUNK)
-            out[part, :2] = self._value(flat[part], out[part, 2])[0]
-        out[:, 0] += self._lon
-        return out.reshape(*shape, 3)
+        return pointwise(self._localize, CHUNK, [(3,)], image, alt)[0]
+
+    def _localize(self, image: Array, alt: Array) -> list[Array]:
+        """`localize` of points (N, 2) at altitudes (N,)."""
+        return [np.column_stack([self._value(image, alt)[0] + [self._lon, 0.0], alt])]
+
+    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """`project_jacobian` of points (N, 3)."""
+        image = self._solve(ground)
+        _, rate = self._value(image, ground[:, 2])
+        by_lonlat = _inverse_2x2(rate[:, :2])  # (N, 2, 2): d(col, row)/d(lon, lat)
+        by_alt = -np.einsum("nij,nj->ni", by_lonlat, rate[:, 2])
+        return image, np.concatenate([by_lonlat, by_alt[:, :, None]], axis=2)
 
     def _solve(self, ground: Array) -> Array:
         """Image points (N, 2) of ground points (N, 3): Newton from an inverse cubic polynomial."""
@@ -184,7 +161,7 @@ class DirectGrid:
     def _guess(self, lonlat: Array, alt: Array) -> Array:
         """Image points (N, 2) by the inverse cubic, brought back onto the grid."""
         offset, scale = self._inverse[0, :3], self._inverse[1, :3]
-        image = _cubic((np.column_stack([lonlat, alt]) - offset) / scale) @ self._inverse[2:, :2]
+        image = monomials(((np.column_stack([lonlat, alt]) - offset) / scale).T).T @ self._inverse[2:, :2]
         for k, axis in enumerate((self.cols, self.rows)):
             cell = 0.9 * (axis[1] - axis[0])
             image[:, k] = np.clip(image[:, k], axis[0] - cell, axis[-1] + cell)
@@ -256,14 +233,6 @@ def _inverse_2x2(matrix: Array) -> Array:
     return np.asarray(out / (a * d - b * c)[:, None, None])
 
 
-def _cubic(x: Array) -> Array:
-    """The 20 monomials (N, 20) of (N, 3)."""
-    one, (u, v, w) = np.ones(len(x)), x.T
-    second = (u * u, u * v, u * w, v * v, v * w, w * w)
-    third = [a * b for a, b in zip((u,) * 6 + (v, v, v, w), (*second, *second[3:], second[5]), strict=True)]
-    return np.stack([one, u, v, w, *second, *third], axis=1)
-
-
 def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
     """Offsets, scales and coefficients (22, 3) of cubic polynomials from (lon, lat, alt) to (col, row)."""
     thin = tuple(slice(None, None, max(1, len(axis) // 12)) for axis in axes)
@@ -271,6 +240,6 @@ def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
     lonlat = lonlat[thin]
     ground = np.column_stack([lonlat[..., 0].ravel(), lonlat[..., 1].ravel(), alt.ravel()])
     offset, scale = ground.mean(axis=0), 0.5 * np.ptp(ground, axis=0)
-    basis = _cubic((ground - offset) / scale)
+    basis = monomials(((ground - offset) / scale).T).T
     image = np.column_stack([col.ravel(), row.ravel(), np.zeros(col.size)])
     return np.vstack([offset, scale, np.linalg.lstsq(basis, image, rcond=None)[0]])

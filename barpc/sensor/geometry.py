@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,10 +19,7 @@ from barpc.geodesy import (
     wrap_longitude,
 )
 from barpc.sensor import SensorModel
-from barpc.sensor.rational import CHUNK
 from barpc.sensor.rpc import RPC
-from barpc.sensor.triangulation import Triangulation as Triangulation
-from barpc.sensor.triangulation import triangulate as triangulate
 
 CenterMethod = Literal["line", "projective", "nominal"]
 
@@ -162,41 +160,6 @@ def ground_sample_distance(sensor: SensorModel, image: Array, alt: npt.ArrayLike
     here = ecef_from_ground(sensor.localize(image, np.asarray(alt, dtype=np.float64)))
     steps = [sensor.localize(image + step, np.asarray(alt, dtype=np.float64)) for step in np.eye(2)]
     return np.stack([np.linalg.norm(ecef_from_ground(s) - here, axis=-1) for s in steps], axis=-1)
-
-
-def project_jacobian_ecef(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """Image points of ground points, with the derivative by ECEF.
-
-    The derivative by (lon, lat, alt) becomes one by metres east, north and up, and is turned into ECEF.
-
-    Parameters
-    ----------
-    sensor : SensorModel
-        The camera.
-    ground : (..., 3)
-        lon, lat [deg], alt [m].
-
-    Returns
-    -------
-    image : (..., 2)
-        col, row [px].
-    jacobian : (..., 2, 3)
-        d(col, row) / d(x, y, z) [px/m].
-    """
-    ground = np.asarray(ground, dtype=np.float64)
-    flat = ground.reshape(-1, 3)
-    image, jacobian = np.empty((len(flat), 2)), np.empty((len(flat), 2, 3))
-    for start in range(0, len(flat), CHUNK):
-        part = slice(start, start + CHUNK)
-        image[part], by_ground = sensor.project_jacobian(flat[part])
-        east, north, up = by_ground.T / metres_per_unit(flat[part]).T[:, None]
-        lon, lat = np.radians(flat[part, :2].T)
-        sin_lon, cos_lon, sin_lat, cos_lat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
-        outward = cos_lat * up - sin_lat * north  # away from the Earth's axis
-        jacobian[part, :, 0] = (cos_lon * outward - sin_lon * east).T
-        jacobian[part, :, 1] = (sin_lon * outward + cos_lon * east).T
-        jacobian[part, :, 2] = (cos_lat * north + sin_lat * up).T
-    return image.reshape(*ground.shape[:-1], 2), jacobian.reshape(*ground.shape[:-1], 2, 3)
 
 
 def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
@@ -367,3 +330,151 @@ def epipolar_offset(
                 alt += (miss * along).sum(axis=1) / length2
         offset = (along[:, 0] * miss[:, 1] - along[:, 1] * miss[:, 0]) / np.sqrt(length2)
     return offset, alt
+
+
+@dataclass(frozen=True, eq=False)
+class Triangulation:
+    """Ground points intersected from tracks.
+
+    Parameters
+    ----------
+    points : (P, 3)
+        ECEF [m]; NaN where the rays do not meet (fewer than two, parallel, or outside a model's domain).
+    residuals : (K, 2)
+        Projected - observed [px]; NaN for the rows of such points.
+    ok : (P,)
+        Whether the point is usable.
+    """
+
+    points: Array
+    residuals: Array
+    ok: npt.NDArray[np.bool_]
+
+
+def triangulate(
+    sensors: Sequence[SensorModel],
+    view: npt.ArrayLike,
+    point: npt.ArrayLike,
+    xy: Array,
+    sigma: Array | None = None,
+    *,
+    alt: float | npt.ArrayLike = 0.0,
+    steps: int = 10,
+) -> Triangulation:
+    """Intersect the rays of tracks: batched Gauss-Newton on the reprojection error.
+
+    Parameters
+    ----------
+    sensors : sequence of SensorModel
+        One a view.
+    view, point : (K,)
+        View and track of each observation.
+    xy : (K, 2)
+        col, row [px].
+    sigma : (K,), optional
+        Standard deviations [px]; equal if not given.
+    alt : float or (P,)
+        Altitude [m] that the first guess is localised at.
+    steps : int
+        At most so many steps.
+
+    Returns
+    -------
+    Triangulation
+        Points (P, 3) in ECEF [m], residuals (K, 2) [px], and which points are usable.
+    """
+    view, point = np.asarray(view, dtype=np.int64), np.asarray(point, dtype=np.int64)
+    xy = np.asarray(xy, dtype=np.float64)
+    num = int(point.max()) + 1 if len(point) else 0
+    if not num:
+        return Triangulation(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, dtype=bool))
+    order = np.argsort(view, kind="stable")  # so that the rows of a view are a slice
+    at, goal = point[order], xy[order]
+    first = np.flatnonzero(np.diff(view[order], prepend=-1))
+    rows = [
+        (sensors[view[order[i]]], slice(i, j)) for i, j in zip(first, [*first[1:], len(view)], strict=True)
+    ]
+    weight = np.ones(len(xy)) if sigma is None else 1.0 / np.asarray(sigma, dtype=np.float64)[order]
+    ground = _first_guess(rows, at, goal, np.broadcast_to(np.asarray(alt, dtype=np.float64), num))
+    left = np.empty((len(xy), 2))
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        ok = _intersect(rows, at, goal, weight, ground, steps)
+        for sensor, part in rows:
+            left[order[part]] = sensor.project(ground[at[part]]) - goal[part]
+    ok &= np.bincount(point, minlength=num) > 0
+    ok[point[~np.isfinite(left).all(axis=1)]] = False
+    ground[~ok] = np.nan
+    left[~ok[point]] = np.nan
+    return Triangulation(ecef_from_ground(ground), left, ok)
+
+
+def _intersect(
+    rows: list[tuple[SensorModel, slice]],
+    point: npt.NDArray[np.int64],
+    xy: Array,
+    weight: Array,
+    ground: Array,
+    steps: int,
+) -> npt.NDArray[np.bool_]:
+    """Gauss-Newton on `ground` (P, 3) in place; for which points the rays determine a step.
+
+    The unknowns of a step are metres east, north and up at the point: the step in ECEF without the conversions.
+    """
+    jacobian, residual = np.empty((3, 2, len(xy))), np.empty((2, len(xy)))
+    ok = np.ones(len(ground), dtype=bool)
+    for _ in range(steps):
+        scale = metres_per_unit(ground)
+        for sensor, part in rows:
+            image, by_ground = sensor.project_jacobian(ground[point[part]])
+            np.multiply((image - xy[part]).T, weight[part], out=residual[:, part])
+            np.multiply(by_ground.T, weight[part], out=jacobian[:, :, part])
+        step, ok = _normal_step(jacobian, residual, point, scale.T)
+        ground -= np.where(ok, step, 0.0).T / scale
+        if not np.abs(step[:, ok]).max(initial=0.0) > 1e-3:  # metres; quadratic: the next is below 1e-9
+            break
+    return ok
+
+
+def _first_guess(
+    rows: list[tuple[SensorModel, slice]],
+    point: npt.NDArray[np.int64],
+    xy: Array,
+    alt: Array,
+) -> Array:
+    """Each track localised at `alt` in one of its views."""
+    ground = np.full((len(alt), 3), np.nan)
+    for sensor, part in rows:
+        new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start
+        if len(new):
+            ground[point[new]] = sensor.localize(xy[new], alt[point[new]])
+    return ground
+
+
+def _normal_step(
+    jacobian: Array, residual: Array, point: npt.NDArray[np.int64], scale: Array
+) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Gauss-Newton steps (3, num) [m], and for which points the rays determine one.
+
+    `jacobian` (3, 2, K) by (lon, lat, alt) and `residual` (2, K) are weighted; `scale` (3, num) holds the
+    metres of a unit of each. The 3 x 3 systems are solved by their cofactors, one vector an entry.
+    """
+    num = scale.shape[1]
+
+    def total(u: Array, v: Array) -> Array:
+        weights: Array = u[0] * v[0] + u[1] * v[1]
+        return np.asarray(np.bincount(point, weights, minlength=num), dtype=np.float64)
+
+    a, b, c = jacobian
+    (e, n, u) = scale
+    aa, bb, cc = total(a, a) / (e * e), total(b, b) / (n * n), total(c, c) / (u * u)
+    ab, ac, bc = total(a, b) / (e * n), total(a, c) / (e * u), total(b, c) / (n * u)
+    ra, rb, rc = total(a, residual) / e, total(b, residual) / n, total(c, residual) / u
+    paa, pab, pac = bb * cc - bc * bc, ac * bc - ab * cc, ab * bc - ac * bb
+    pbb, pbc, pcc = aa * cc - ac * ac, ab * ac - aa * bc, aa * bb - ab * ab
+    det = aa * paa + ab * pab + ac * pac
+    # parallel rays: the determinant against the trace; 1e-10 is 0.0006 degrees
+    ok = np.isfinite(det) & (det > 1e-10 * (aa + bb + cc) ** 3 / 27)
+    step = np.stack(
+        [paa * ra + pab * rb + pac * rc, pab * ra + pbb * rb + pbc * rc, pac * ra + pbc * rb + pcc * rc]
+    )
+    return step / det, ok

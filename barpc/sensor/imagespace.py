@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from barpc.errors import RpcError
+from barpc.frozen import Frozen
 from barpc.geodesy import Array
 from barpc.sensor import SensorModel
 
 
 @dataclass(frozen=True, eq=False)
-class ImageAffine:
+class ImageAffine(Frozen):
     """image + shift + slope @ image.
 
     Parameters
@@ -32,23 +33,8 @@ class ImageAffine:
     slope: Array
 
     def __post_init__(self) -> None:
-        for name, shape in (("shift", (2,)), ("slope", (2, 2))):
-            value = np.array(getattr(self, name), dtype=np.float64)
-            if value.shape != shape or not np.isfinite(value).all():
-                raise RpcError(
-                    f"image correction {name}: expected {shape} finite numbers, found {value.tolist()}"
-                )
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, ImageAffine) and self._content() == other._content()
-
-    def __hash__(self) -> int:
-        return hash(self._content())
-
-    def _content(self) -> tuple[float, ...]:
-        return (*self.shift.tolist(), *self.slope.ravel().tolist())
+        self._array("shift", (2,), RpcError)
+        self._array("slope", (2, 2), RpcError)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import RpcError
+from barpc.frozen import Frozen
 from barpc.geodesy import (
     WGS84_A,
     WGS84_B,
@@ -25,6 +26,7 @@ from barpc.geodesy import (
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
+    pointwise,
     wrap_longitude,
 )
 from barpc.sensor.curve import Curve
@@ -49,7 +51,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Pushbroom:
+class Pushbroom(Frozen):
     """A rigorous pushbroom camera: itself a `SensorModel`.
 
     Parameters
@@ -88,22 +90,18 @@ class Pushbroom:
     _lon: float = field(init=False, repr=False, default=0.0)
 
     def __post_init__(self) -> None:
-        for name in ("mount", "look"):
-            value = np.array(getattr(self, name), dtype=np.float64)
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+        self._array("mount", (3, 3), RpcError)
+        self._array("look", (2, None), RpcError)
         self._check()
         row = (self._middle - self.first_line) / self.line_period
         with np.errstate(all="ignore"):
             center = self._meet(np.array([[self.look_origin, row]]), np.zeros(1))
-        object.__setattr__(self, "_lon", float(np.nan_to_num(center[0, 0])))
+        self._keep("_lon", float(np.nan_to_num(center[0, 0])))
 
     def _check(self) -> None:
-        if self.mount.shape != (3, 3) or self.look.shape != (2, max(2, self.look.shape[-1])):
-            shapes = f"{self.mount.shape} and {self.look.shape}"
-            raise RpcError(f"pushbroom: mount and look have shapes {shapes}, expected (3, 3) and (2, K)")
-        numbers = (self.look_origin, self.line_period, self.first_line)
-        if not all(np.isfinite(value).all() for value in (self.mount, self.look, numbers)):
+        if self.look.shape[1] < 2:
+            raise RpcError("pushbroom: look has no slope, expected (2, K) with K of two or more")
+        if not np.isfinite((self.look_origin, self.line_period, self.first_line)).all():
             raise RpcError("pushbroom: all numbers must be finite")
         if not self.line_period > 0:
             raise RpcError(f"pushbroom: line period {self.line_period} s is not positive")
@@ -111,17 +109,6 @@ class Pushbroom:
             raise RpcError("pushbroom: mount is not a rotation matrix")
         if not self._span[0] < self._span[1]:
             raise RpcError("pushbroom: orbit and attitude share no time")
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Pushbroom) and self._content() == other._content()
-
-    def __hash__(self) -> int:
-        return hash(self._content())
-
-    def _content(self) -> tuple[object, ...]:
-        numbers = (*self.mount.ravel().tolist(), self.look.shape, *self.look.ravel().tolist())
-        scalars = (self.look_origin, self.line_period, self.first_line)
-        return (self.orbit.content(), self.attitude.content(), *numbers, *scalars)
 
     @property
     def _middle(self) -> float:
@@ -159,14 +146,7 @@ class Pushbroom:
         image : (..., 2)
             col, row [px]; NaN behind the camera and more than `EXTRAPOLATION` beyond the orbit or attitude.
         """
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        out = np.empty((len(flat), 2))
-        with np.errstate(all="ignore"):
-            for start in range(0, len(flat), CHUNK):
-                part = slice(start, start + CHUNK)
-                out[part] = self._solve(ecef_from_ground(flat[part]).T).T
-        return out.reshape(*ground.shape[:-1], 2)
+        return pointwise(lambda part: [self._solve(ecef_from_ground(part).T).T], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Image points of ground points, with the derivative.
@@ -183,17 +163,8 @@ class Pushbroom:
         jacobian : (..., 2, 3)
             d(col, row) / d(lon, lat, alt) [px/deg, px/deg, px/m].
         """
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        image, jacobian = np.empty((len(flat), 2)), np.empty((len(flat), 2, 3))
-        with np.errstate(all="ignore"):
-            for start in range(0, len(flat), CHUNK):
-                part = slice(start, start + CHUNK)
-                ecef = ecef_from_ground(flat[part]).T
-                found = self._solve(ecef)
-                image[part] = found.T
-                jacobian[part] = self._by_ecef(ecef, found) @ ecef_from_ground_jacobian(flat[part])
-        return image.reshape(*ground.shape[:-1], 2), jacobian.reshape(*ground.shape[:-1], 2, 3)
+        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points seen at image points, at known altitudes (the inverse of `project`).
@@ -214,17 +185,7 @@ class Pushbroom:
             lon (continuous across the antimeridian), lat [deg], alt [m]. NaN where the line of sight misses
             the Earth or the row lies more than `EXTRAPOLATION` beyond the orbit or attitude.
         """
-        image = np.asarray(image, dtype=np.float64)
-        alt = np.asarray(alt, dtype=np.float64)
-        shape = np.broadcast_shapes(image.shape[:-1], alt.shape)
-        flat = np.broadcast_to(image, (*shape, 2)).reshape(-1, 2)
-        height = np.broadcast_to(alt, shape).reshape(-1)
-        out = np.empty((len(flat), 3))
-        with np.errstate(all="ignore"):
-            for start in range(0, len(flat), CHUNK):
-                part = slice(start, start + CHUNK)
-                out[part] = self._meet(flat[part], height[part])
-        return out.reshape(*shape, 3)
+        return pointwise(lambda *part: [self._meet(*part)], CHUNK, [(3,)], image, alt)[0]
 
     def line_of_sight(self, image: Array) -> tuple[Array, Array]:
         """Lines of sight of image points.
@@ -322,6 +283,12 @@ class Pushbroom:
         out = np.stack([col, (time - self.first_line) / self.line_period])
         out[:, ~settled] = np.nan
         return out
+
+    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """`project_jacobian` of points (N, 3)."""
+        ecef = ecef_from_ground(ground).T
+        found = self._solve(ecef)
+        return found.T, self._by_ecef(ecef, found) @ ecef_from_ground_jacobian(ground)
 
     def _by_ecef(self, ecef: Array, image: Array) -> Array:
         """d(col, row)/dX (N, 2, 3) [px/m] at ECEF points (3, N) seen at image points (2, N)."""

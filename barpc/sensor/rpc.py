@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from barpc.errors import RpcError
+from barpc.frozen import Frozen
 from barpc.geodesy import Array, wrap_longitude
 from barpc.sensor.rational import CHUNK, MONOMIALS, REACH, BoolArray, Rational, monomials
 
@@ -18,7 +19,7 @@ _ACCURACY = 1e-9  # px: a localised point must project this near to where it was
 
 
 @dataclass(frozen=True, eq=False)
-class RPC:
+class RPC(Frozen):
     """A rational polynomial camera: itself a `SensorModel`.
 
     Parameters
@@ -63,28 +64,12 @@ class RPC:
             "image_scale": (2,),
         }
         for name, shape in shapes.items():
-            value = np.array(getattr(self, name), dtype=np.float64)  # a copy of our own, then read-only
-            if value.shape != shape:
-                raise RpcError(f"RPC {name}: shape {value.shape}, expected {shape}")
-            if not np.isfinite(value).all():
-                raise RpcError(f"RPC {name}: not finite ({value[~np.isfinite(value)][0]})")
+            value = self._array(name, shape, RpcError)
             if name.endswith("scale") and (value == 0).any():
                 raise RpcError(f"RPC {name}: a scale is zero")
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
         if not self.coeffs[1::2].any(axis=1).all():
             raise RpcError("RPC coeffs: a denominator is zero everywhere")
-        object.__setattr__(self, "_map", Rational(self.coeffs, _ACCURACY / np.abs(self.image_scale)))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, RPC) and self._content() == other._content()
-
-    def __hash__(self) -> int:
-        return hash(self._content())
-
-    def _content(self) -> tuple[object, ...]:
-        arrays = (self.coeffs, self.ground_offset, self.ground_scale, self.image_offset, self.image_scale)
-        return (*(tuple(a.ravel().tolist()) for a in arrays), self.err_bias, self.err_rand)
+        self._keep("_map", Rational(self.coeffs, _ACCURACY / np.abs(self.image_scale)))
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
         """Normalised longitude, latitude, altitude, one row each.

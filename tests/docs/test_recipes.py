@@ -6,9 +6,11 @@ finds what an earlier one left there, as a reader does.
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -46,8 +48,9 @@ def run_line(line: str, codes: dict[str, int]) -> None:
             main(words[1:])
         codes[line] = int(stop.value.code or 0)
         assert codes[line] == (3 if line.endswith(GATE) else 0), line
-    elif shutil.which(words[0]):
-        subprocess.run(words, check=True)
+    elif words[0] == "python" or shutil.which(words[0]):
+        words[0] = sys.executable if words[0] == "python" else words[0]
+        subprocess.run(words, check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
 
 
 def expanded(word: str) -> list[str]:

@@ -13,11 +13,17 @@ from barpc.errors import FitError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import rpc as fit_module
 from barpc.fit.certificate import Errors, coverage, roundtrip, smallest_denominator
-from barpc.fit.grid import check_points, control_points, spaced, terrain_range, widened
-from barpc.fit.lcurve import _curvature, solve_lcurve
-from barpc.fit.points import _check_order, screened
-from barpc.fit.ridge import expected_size, noise_scaled, solution
+from barpc.fit.points import (
+    _check_order,
+    check_points,
+    control_points,
+    screened,
+    spaced,
+    terrain_range,
+    widened,
+)
 from barpc.fit.rpc import relative_weight, underlying_rpc
+from barpc.fit.solve import _curvature, expected_size, noise_scaled, solution, solve_lcurve
 from barpc.fit.system import ALL, Problem
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
@@ -356,7 +362,7 @@ def test_check_points_of_large_grids_are_all_middles(monkeypatch: pytest.MonkeyP
     ground = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     middles = np.stack(np.meshgrid(*(a[:-1] + 0.5 for a in axes), indexing="ij"), axis=-1).reshape(-1, 3)
     for slab in (8192, 24, 1):
-        monkeypatch.setattr("barpc.fit.grid._SLAB", slab)
+        monkeypatch.setattr("barpc.fit.points._SLAB", slab)
         np.testing.assert_array_equal(np.concatenate(list(check_points(ground))), middles)
     ground[0, 0, 0] = np.nan
     assert len(np.concatenate(list(check_points(ground)))) == len(middles) - 1

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from barpc.fit import Normalization
-from barpc.fit.lcurve import corner
-from barpc.fit.precision import PRECISIONS
-from barpc.fit.ridge import expected_size, noise_scaled, penalized, solution
+from barpc.fit.options import PRECISIONS
+from barpc.fit.solve import corner, expected_size, noise_scaled, penalized, solution
 from barpc.fit.system import ALL, Problem
 from barpc.geodesy import Array
 from tests.fit.cameras import Camera, random_points

@@ -17,9 +17,9 @@ from barpc.errors import BarpcWarning, FitError, InputError, OutputError
 from barpc.fit import FitOptions
 from barpc.geodesy import ground_from_ecef
 from barpc.pipeline import AdjustResult, RunOptions, adjust
-from barpc.simulate.files import write_scene
-from barpc.simulate.images import ImageOptions
 from barpc.tie import TieOptions
+from tests.scenes.files import write_scene
+from tests.scenes.images import ImageOptions
 from tests.test_dem import write_dem, write_geoid
 
 Run = Callable[..., AdjustResult]

@@ -138,7 +138,7 @@ def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, tmp_path):
 @posix
 @pytest.mark.parametrize("step", [5, pytest.param(1, marks=pytest.mark.slow)])
 def test_killed_between_any_two_outputs_the_same_command_finishes(step):
-    """adjust in all formats, with copies, over a finished run; match, apply, simulate: the same bytes."""
+    """adjust in all formats, with copies, over a finished run; match, apply: the same bytes."""
     command = [sys.executable, "-m", "tests.reliability.trials", "--every-output", str(step)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr
@@ -184,21 +184,17 @@ def test_the_vendor_s_file_of_an_input_is_never_replaced(crops, verb, end):
         assert hashes([crops[0].parent]) == before
 
 
-def test_apply_and_simulate_replace_their_own_files_only(crops, tmp_path):
+def test_apply_replaces_its_own_files_only(crops, tmp_path):
     out = tmp_path / "out"
-    verbs = {
-        "apply": ("apply", crops[0], "--rpc", crops[1], "-o", out / "apply"),
-        "simulate": ("simulate", out / "simulate", "--size", 64, 64),
-    }
-    for name, command in verbs.items():
-        assert barpc(*command).code == 0
-        assert_one_line(barpc(*command), 1, "--overwrite")
-        assert barpc(*command, "--overwrite").code == 0
-        mine = out / name / ("view_00_RPC.TXT" if name == "apply" else "truth.json")
-        mine.write_text("mine")
-        before = hashes([out])
-        assert_one_line(barpc(*command, "--overwrite"), 1, mine.name, "not replaced")
-        assert hashes([out]) == before
+    command = ("apply", crops[0], "--rpc", crops[1], "-o", out)
+    assert barpc(*command).code == 0
+    assert_one_line(barpc(*command), 1, "--overwrite")
+    assert barpc(*command, "--overwrite").code == 0
+    mine = out / "view_00_RPC.TXT"
+    mine.write_text("mine")
+    before = hashes([out])
+    assert_one_line(barpc(*command, "--overwrite"), 1, mine.name, "not replaced")
+    assert hashes([out]) == before
 
 
 def test_apply_adds_to_a_folder_and_hides_no_input(crops, tmp_path):

@@ -18,7 +18,7 @@ from barpc.errors import BarpcWarning, InputError
 from barpc.pipeline import AdjustResult, RunOptions, adjust, load_views, twins
 from barpc.pipeline.views import unique_names
 from barpc.rpcio import read_rpc, write_rpc_vrt
-from barpc.simulate import ImageOptions, write_scene
+from tests.scenes import ImageOptions, write_scene
 
 from .conftest import barpc, rewrite
 from .trials import SAMPLES, crop, outputs

@@ -197,13 +197,11 @@ def at_every_output(step: int, folder: Path) -> dict[str, dict[str, int]]:
         "adjust --overwrite": ([*adjust, "--overwrite", "--model", "translation"], first),
         "match": (["-q", "match", *images], cached),
         "apply": (["-q", "apply", *images, "--rpc", str(first)], empty),
-        "simulate": (["-q", "simulate", "--size", "64", "64", "--gcps", "3"], empty),
     }
     found = {}
     for name, (command, before) in commands.items():
         (place := folder / name).mkdir()
-        out = [str(place / "out")] if "simulate" in command else ["-o", str(place / "out")]
-        found[name] = boundaries([*command, *out], before, place, step)
+        found[name] = boundaries([*command, "-o", str(place / "out")], before, place, step)
     return found
 
 

@@ -131,7 +131,7 @@ def test_it_is_frozen_compares_by_content_and_survives_a_pickle(sensor):
     [
         ({"line_period": 0.0}, "line period"),
         ({"mount": 2 * np.eye(3)}, "rotation"),
-        ({"mount": np.eye(2)}, "shapes"),
+        ({"mount": np.eye(2)}, "shape"),
         ({"look": np.array([[0.0, np.nan], [0.0, 1.0]])}, "finite"),
     ],
 )

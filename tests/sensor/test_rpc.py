@@ -12,10 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from barpc.errors import RpcError
-from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.rpcio import read_rpc
-from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import project_jacobian_ecef
 from barpc.sensor.rational import MONOMIALS, monomials
 from barpc.sensor.rpc import RPC
 from tests.sensor.conftest import make_rpc
@@ -108,26 +105,6 @@ def test_the_jacobian_is_the_central_difference(file, shared_data):
         numeric = (rpc.project(ground + step) - rpc.project(ground - step)) / (2 * step[axis])
         scale = np.abs(jacobian[:, :, axis]).max()
         np.testing.assert_allclose(jacobian[:, :, axis], numeric, rtol=0, atol=2e-6 * scale)
-
-
-def test_the_derivative_by_ecef_is_the_central_difference():
-    rpc = make_rpc()
-    ground = rpc.localize(*box(rpc, 0.9, 100))
-    image, jacobian = project_jacobian_ecef(rpc, ground)
-    np.testing.assert_array_equal(image, rpc.project_jacobian(ground)[0])
-    ecef = ecef_from_ground(ground)
-    for axis in range(3):
-        step = 20.0 * np.eye(3)[axis]
-        numeric = rpc.project(ground_from_ecef(ecef + step)) - rpc.project(ground_from_ecef(ecef - step))
-        np.testing.assert_allclose(jacobian[:, :, axis], numeric / 40.0, rtol=0, atol=1e-7)
-
-
-def test_the_derivative_by_ecef_is_that_of_a_correction_at_rest():
-    rpc = make_rpc()
-    ground = rpc.localize(*box(rpc, 1.0, 100))
-    still = Corrected(rpc, Correction([0.0] * 3, [0.0] * 3, [7e6, 0.0, 0.0]))
-    _, by_ecef, _, _ = still.project_ecef(ecef_from_ground(ground))
-    np.testing.assert_allclose(project_jacobian_ecef(rpc, ground)[1], by_ecef, rtol=0, atol=1e-9)
 
 
 def test_a_chunk_border_shows_nowhere():

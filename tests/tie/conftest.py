@@ -16,8 +16,8 @@ from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
-from barpc.simulate import ImageOptions, Scene
 from barpc.tie import TieResult, find_tracks
+from tests.scenes import ImageOptions, Scene
 
 
 def write_image(path: Path, data: np.ndarray, **profile: object) -> Path:

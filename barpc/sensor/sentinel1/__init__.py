@@ -15,11 +15,10 @@ from barpc.sensor.sentinel1.build import (
     grid_residuals,
     mosaic,
     mosaic_offsets,
+    open_product,
 )
-from barpc.sensor.sentinel1.corrections import Delays
-from barpc.sensor.sentinel1.frames import GroundFrame, SlantFrame
+from barpc.sensor.sentinel1.frames import Delays, GroundFrame, SlantFrame
 from barpc.sensor.sentinel1.orbit import Orbit, fit_orbit
-from barpc.sensor.sentinel1.product import open_product
 from barpc.sensor.sentinel1.range_doppler import RangeDoppler
 
 __all__ = [

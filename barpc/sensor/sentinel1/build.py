@@ -1,17 +1,20 @@
-"""Range-Doppler models from annotations: one swath, one burst, a mosaic of swaths, a GRD."""
+"""Range-Doppler models from what is delivered: folders, zips, annotations; a swath, a burst, a mosaic, a GRD."""
 
 from __future__ import annotations
 
+import re
 import warnings
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from barpc.errors import BarpcWarning, InputError, RpcFormatError
+from barpc.errors import BarpcError, BarpcWarning, InputError, RpcError, RpcFormatError
 from barpc.geodesy import Array
+from barpc.safexml import MAX_BYTES
 from barpc.sensor.sentinel1.annotation import (
     Annotation,
     StateVectors,
@@ -19,16 +22,20 @@ from barpc.sensor.sentinel1.annotation import (
     read_orbit_file,
     seconds,
 )
-from barpc.sensor.sentinel1.corrections import Bistatic, Delays, bistatic_constant
-from barpc.sensor.sentinel1.frames import Frame, GroundFrame, SlantFrame
+from barpc.sensor.sentinel1.frames import Bistatic, Delays, Frame, GroundFrame, SlantFrame, bistatic_constant
 from barpc.sensor.sentinel1.orbit import MARGIN, Orbit, fit_orbit
 from barpc.sensor.sentinel1.range_doppler import RangeDoppler
+from barpc.sidefile import PRODUCT, opened, read_head
 
 RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
 
 _GRID_TOLERANCE = 5.0  # px and lines: a grid farther off does not belong to the orbit
 _SAME = 1e-9  # relative: intervals and rates of the swaths of one mosaic
+MOSAIC = "mosaic"
+"""The swath of all swaths."""
+_NAME = re.compile(r"s1[a-d]-(?P<swath>\w+)-(slc|grd)-(?P<pol>vv|hh|vh|hv)-.*\.xml", re.IGNORECASE)
+_POLARISATIONS = ("vv", "hh", "vh", "hv")
 
 
 @dataclass(frozen=True)
@@ -86,10 +93,8 @@ def from_annotation(
 
     Raises
     ------
-    RpcFormatError
-        Not a Sentinel-1 annotation.
     RpcError
-        An orbit that cannot be used.
+        Not a Sentinel-1 annotation (an `RpcFormatError`), or an orbit that cannot be used.
     InputError
         No such burst, or a correction that this product does not take.
 
@@ -99,24 +104,29 @@ def from_annotation(
         The geolocation grid does not belong to the orbit; it is not used but for its range of heights.
     """
     annotation = source if isinstance(source, Annotation) else read_annotation(source)
-    first, lines = annotation.first_line_time, annotation.lines
-    if burst is not None:
-        if not 0 <= burst < len(annotation.bursts):
-            raise InputError(f"{annotation.name}: no burst {burst}, it has {len(annotation.bursts)}")
-        first, lines = annotation.bursts[burst].time, annotation.lines_per_burst
-    elif annotation.bursts:
-        lines = max(b.first_row for b in burst_rows(annotation)) + annotation.lines_per_burst
-    constant = None if bistatic is None else bistatic_constant(annotation, bistatic)
+    first, lines = _extent(annotation, burst)
     model = RangeDoppler(
         orbit=_orbit(annotation, orbit, first),
         epoch=first,
         frame=_frame(annotation, first),
         size=(annotation.samples, lines),
         alt_range=_alt_range([annotation]),
-        delays=Delays(atmosphere, constant),
+        delays=Delays(atmosphere, None if bistatic is None else bistatic_constant(annotation, bistatic)),
     )
     _warn_of_grid(annotation, model)
     return model
+
+
+def _extent(annotation: Annotation, burst: int | None = None) -> tuple[np.datetime64, int]:
+    """Time of row 0 and number of rows: of a burst, or of all there is, stitched."""
+    if burst is not None:
+        if not 0 <= burst < len(annotation.bursts):
+            raise InputError(f"{annotation.name}: no burst {burst}, it has {len(annotation.bursts)}")
+        return annotation.bursts[burst].time, annotation.lines_per_burst
+    if not annotation.bursts:
+        return annotation.first_line_time, annotation.lines
+    last = max(b.first_row for b in burst_rows(annotation))
+    return annotation.first_line_time, last + annotation.lines_per_burst
 
 
 def mosaic(
@@ -157,8 +167,7 @@ def mosaic(
     offsets = mosaic_offsets(swaths)
     nearest = min(swaths, key=lambda a: a.slant_range_time)
     epoch = min(a.first_line_time for a in swaths)
-    rows = [max(b.first_row for b in burst_rows(a)) + a.lines_per_burst for a in swaths]
-    size = np.rint((offsets + [[a.samples, n] for a, n in zip(swaths, rows, strict=True)]).max(axis=0))
+    size = np.rint((offsets + [[a.samples, _extent(a)[1]] for a in swaths]).max(axis=0))
     model = RangeDoppler(
         orbit=_orbit(nearest, orbit, epoch),
         epoch=epoch,
@@ -324,3 +333,151 @@ def _warn_of_grid(annotation: Annotation, model: RangeDoppler) -> None:
 
 def _kind(annotation: Annotation) -> str:
     return f"a {annotation.mode} {annotation.product_type} of {annotation.swath}"
+
+
+def open_product(
+    path: str | Path,
+    *,
+    swath: str | None = None,
+    polarisation: str | None = None,
+    orbit: str | Path | None = None,
+    burst: int | None = None,
+    atmosphere: bool = False,
+    bistatic: Bistatic | None = None,
+) -> RangeDoppler:
+    """The model of a Sentinel-1 product.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ``.SAFE`` folder, its ``manifest.safe``, a ``.zip`` of it, or one annotation XML.
+    swath : str, optional
+        "iw1", "s3", ..., or "mosaic" for all of them; may be left out where there is one.
+    polarisation : str, optional
+        "vv", "vh", "hh" or "hv"; the geometry is the same, the first one is taken if left out.
+    orbit : str or Path, optional
+        Precise orbit file (``.EOF``).
+    burst : int, optional
+        One burst of the swath alone, from 0.
+    atmosphere : bool
+        Add the path delay of the atmosphere.
+    bistatic : "annotated" or "full", optional
+        Add a bistatic correction.
+
+    Returns
+    -------
+    model : RangeDoppler
+        With `size` [px] and `alt_range` [m].
+
+    Raises
+    ------
+    InputError
+        No such swath or polarisation, or a choice that does not go with the product; the message lists
+        what there is.
+    RpcFormatError
+        Not a Sentinel-1 product.
+    """
+    try:
+        return _open(Path(path), swath, polarisation, orbit, burst, atmosphere, bistatic)
+    except RpcError as error:
+        guilty = Path(path if orbit is None else orbit)
+        if guilty.name in str(error):
+            raise
+        raise type(error)(f"{guilty}: {error}") from error
+
+
+def _open(
+    path: Path,
+    swath: str | None,
+    polarisation: str | None,
+    orbit: str | Path | None,
+    burst: int | None,
+    atmosphere: bool,
+    bistatic: Bistatic | None,
+) -> RangeDoppler:
+    found = _choose(path, polarisation)
+    precise = None if orbit is None else Path(orbit)
+    name = None if swath is None else swath.lower()
+    if name == MOSAIC:
+        if burst is not None:
+            raise InputError(f"{path}: burst {burst} of the mosaic; choose one swath")
+        swaths = [file.read() for file in found.values()]
+        return mosaic(swaths, orbit=precise, atmosphere=atmosphere, bistatic=bistatic)
+    if name is None and len(found) == 1:
+        name = next(iter(found))
+    if name not in found:
+        wanted = "the product has several swaths" if name is None else f"no swath {name}"
+        choices = [*sorted(found), MOSAIC] if len(found) > 1 else sorted(found)
+        raise InputError(f"{path}: {wanted}; choose one of {', '.join(choices)}")
+    annotation = found[name].read()
+    return from_annotation(annotation, burst=burst, orbit=precise, atmosphere=atmosphere, bistatic=bistatic)
+
+
+@dataclass(frozen=True, order=True)
+class _File:
+    """An annotation: its swath, its polarisation, and where it is."""
+
+    swath: str
+    polarisation: str
+    path: Path
+    member: str | None = None
+
+    def read(self) -> Annotation:
+        if self.member is None:
+            return read_annotation(self.path)
+        name = PurePosixPath(self.member).name
+        try:
+            with opened(self.path, PRODUCT) as archive, zipfile.ZipFile(archive).open(self.member) as file:
+                data = file.read(MAX_BYTES + 1)
+        except BarpcError:
+            raise
+        except Exception as error:
+            raise RpcFormatError(f"{self.path}: {name} cannot be read from it ({error})") from error
+        return read_annotation(data, name=name)
+
+
+def _annotations(path: Path) -> list[_File]:
+    """The annotations of a product, in order of swath and polarisation."""
+    if path.name == "manifest.safe":
+        path = path.parent
+    if path.is_dir():
+        names = [str(p.relative_to(path)) for p in path.glob("annotation/*.xml")]
+        files = [_named(path / name, None) for name in names]
+    elif read_head(path, PRODUCT, 4) in (b"PK\3\4", b"PK\5\6"):
+        names = [name for name in _members(path) if PurePosixPath(name).parent.name == "annotation"]
+        files = [_named(path, name) for name in names]
+    else:
+        annotation = read_annotation(path)
+        files = [_File(annotation.swath.lower(), annotation.polarisation.lower(), path)]
+    return sorted(file for file in files if file is not None)
+
+
+def _members(path: Path) -> list[str]:
+    try:
+        with opened(path, PRODUCT) as file, zipfile.ZipFile(file) as archive:
+            return archive.namelist()
+    except BarpcError:
+        raise
+    except Exception as error:
+        raise RpcFormatError(f"{path}: a zip file that cannot be read ({error})") from error
+
+
+def _named(path: Path, member: str | None) -> _File | None:
+    """The file, if its name is that of an annotation."""
+    match = _NAME.fullmatch(path.name if member is None else PurePosixPath(member).name)
+    return match and _File(match["swath"].lower(), match["pol"].lower(), path, member)
+
+
+def _choose(path: Path, polarisation: str | None) -> dict[str, _File]:
+    """Swath -> annotation, of one polarisation."""
+    files = _annotations(path)
+    if not files:
+        raise RpcFormatError(f"{path}: no Sentinel-1 annotation (annotation/s1?-*.xml) in it")
+    there = sorted({f.polarisation for f in files}, key=_POLARISATIONS.index)
+    wanted = polarisation.lower() if polarisation else there[0]
+    chosen = {f.swath: f for f in files if f.polarisation == wanted}
+    if not chosen:
+        raise InputError(f"{path}: no polarisation {wanted}; choose one of {', '.join(there)}")
+    if len(chosen) < sum(f.polarisation == wanted for f in files):
+        raise InputError(f"{path}: several images of one swath; give the annotation XML of one of them")
+    return chosen

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from barpc.errors import RpcError
+from barpc.frozen import Frozen
 from barpc.geodesy import Array
-from barpc.sensor.sentinel1.record import Record
 
 MARGIN = 70.0
 """State vectors so far before and after the image take part in the fit [s]."""
@@ -33,7 +33,7 @@ _GAIN = 1.5  # a higher degree must lower the residual across the track by this 
 
 
 @dataclass(frozen=True, eq=False)
-class Orbit(Record):
+class Orbit(Frozen):
     """Position as a polynomial of time.
 
     Parameters

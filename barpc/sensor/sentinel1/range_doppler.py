@@ -15,19 +15,19 @@ from typing import Literal
 import numpy as np
 
 from barpc.errors import RpcError
+from barpc.frozen import Frozen
 from barpc.geodesy import (
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     enu_basis,
     ground_from_ecef,
+    pointwise,
     wrap_longitude,
 )
 from barpc.sensor.sentinel1.annotation import Annotation
-from barpc.sensor.sentinel1.corrections import Bistatic, Delays
-from barpc.sensor.sentinel1.frames import SPEED_OF_LIGHT, Frame
+from barpc.sensor.sentinel1.frames import SPEED_OF_LIGHT, Bistatic, Delays, Frame
 from barpc.sensor.sentinel1.orbit import Orbit
-from barpc.sensor.sentinel1.record import Record
 
 CHUNK = 8192
 """Points worked on at a time."""
@@ -43,7 +43,7 @@ _ANGLE_SETTLED = 1e-9  # rad, about a millimetre: what is left after such a step
 
 
 @dataclass(frozen=True, eq=False)
-class RangeDoppler(Record):
+class RangeDoppler(Frozen):
     """A Sentinel-1 image: itself a `SensorModel`.
 
     Parameters
@@ -109,13 +109,10 @@ class RangeDoppler(Record):
         range_time : (...)
             Two-way slant range time [s].
         """
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        out = np.empty((2, len(flat)))
-        with np.errstate(all="ignore"):
-            for part in _chunks(len(flat)):
-                out[:, part] = self._geometry(ecef_from_ground(flat[part])).times
-        return out[0].reshape(ground.shape[:-1]), out[1].reshape(ground.shape[:-1])
+        azimuth_time, range_time = pointwise(
+            lambda part: self._geometry(ecef_from_ground(part)).times, CHUNK, [(), ()], ground
+        )
+        return azimuth_time, range_time
 
     def incidence(self, ground: Array) -> Array:
         """Incidence angles of the radar beam.
@@ -133,15 +130,7 @@ class RangeDoppler(Record):
         incidence : (...)
             Angle between the ellipsoid's normal and the beam [deg]; NaN where `azimuth_range` is.
         """
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        out = np.empty(len(flat))
-        with np.errstate(all="ignore"):
-            for part in _chunks(len(flat)):
-                seen = self._geometry(ecef_from_ground(flat[part]))
-                cosine = _dot(enu_basis(flat[part])[:, 2, :].T, seen.sight)
-                out[part] = np.where(np.isnan(seen.times[0]), np.nan, np.rad2deg(np.arccos(cosine)))
-        return out.reshape(ground.shape[:-1])
+        return pointwise(self._incidence, CHUNK, [()], ground)[0]
 
     def project(self, ground: Array) -> Array:
         """Image points of ground points.
@@ -156,17 +145,7 @@ class RangeDoppler(Record):
         image : (..., 2)
             col, row [px]; NaN off the orbit's time span or on the other side of the track.
         """
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        out = np.empty((len(flat), 2))
-        with np.errstate(all="ignore"):
-            for part in _chunks(len(flat)):
-                seen = self._geometry(ecef_from_ground(flat[part]))
-                times = seen.times
-                if self.delays:
-                    times = times + self.delays.shift(times, flat[part], seen.sight)
-                out[part] = self.frame.image(times)[0].T
-        return _nan_rows(out).reshape(*ground.shape[:-1], 2)
+        return pointwise(self._project, CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Image points of ground points, with the derivative.
@@ -183,15 +162,8 @@ class RangeDoppler(Record):
         jacobian : (..., 2, 3)
             d(col, row) / d(lon, lat, alt) [px/deg, px/deg, px/m].
         """
-        ground = np.asarray(ground, dtype=np.float64)
-        flat = ground.reshape(-1, 3)
-        image, jacobian = np.empty((len(flat), 2)), np.empty((len(flat), 2, 3))
-        with np.errstate(all="ignore"):
-            for part in _chunks(len(flat)):
-                image[part], jacobian[part] = self._jacobian(flat[part])
-        jacobian[~np.isfinite(image).all(axis=1)] = np.nan
-        shape = ground.shape[:-1]
-        return _nan_rows(image).reshape(*shape, 2), jacobian.reshape(*shape, 2, 3)
+        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points seen at image points, at known altitudes (the inverse of `project`).
@@ -212,16 +184,10 @@ class RangeDoppler(Record):
             lon, lat [deg], alt [m]; NaN off the orbit's time span or where the range does not reach.
             Longitudes run on across the antimeridian.
         """
-        image, alt = np.asarray(image, dtype=np.float64), np.asarray(alt, dtype=np.float64)
-        shape = np.broadcast_shapes(image.shape[:-1], alt.shape)
-        flat = np.broadcast_to(image, (*shape, 2)).reshape(-1, 2)
-        alt = np.broadcast_to(alt, shape).reshape(-1)
-        out = np.empty((len(flat), 3))
+        ground = pointwise(lambda part, alt: [self._localize(part.T, alt)], CHUNK, [(3,)], image, alt)[0]
         with np.errstate(all="ignore"):
-            for part in _chunks(len(flat)):
-                out[part] = self._localize(flat[part].T, alt[part])
-            out[:, 0] = wrap_longitude(out[:, 0], self._middle)
-        return out.reshape(*shape, 3)
+            ground[..., 0] = wrap_longitude(ground[..., 0], self._middle)
+        return ground
 
     @cached_property
     def _middle(self) -> float:
@@ -257,6 +223,22 @@ class RangeDoppler(Record):
         """Of velocity x position along the look: that vector points right of the track."""
         return 1.0 if self.look == "right" else -1.0
 
+    def _incidence(self, ground: Array) -> list[Array]:
+        """`incidence` of points (N, 3)."""
+        seen = self._geometry(ecef_from_ground(ground))
+        cosine = _dot(enu_basis(ground)[:, 2, :].T, seen.sight)
+        return [np.where(np.isnan(seen.times[0]), np.nan, np.rad2deg(np.arccos(cosine)))]
+
+    def _project(self, ground: Array) -> list[Array]:
+        """`project` of points (N, 3)."""
+        seen = self._geometry(ecef_from_ground(ground))
+        times = seen.times
+        if self.delays:
+            times = times + self.delays.shift(times, ground, seen.sight)
+        image = self.frame.image(times)[0]
+        image[:, ~np.isfinite(image).all(axis=0)] = np.nan
+        return [image.T]
+
     def _jacobian(self, ground: Array) -> tuple[Array, Array]:
         """`project_jacobian` of points (N, 3)."""
         seen = self._geometry(ecef_from_ground(ground))
@@ -269,7 +251,10 @@ class RangeDoppler(Record):
             extra = self.delays.shift_jacobian(by_ground, ground, seen.sight, by_sight)
             times, by_ground = times + self.delays.shift(times, ground, seen.sight), by_ground + extra
         image, by_times = self.frame.image(times)
-        return image.T, np.einsum("ijn,jnk->nik", by_times, by_ground)
+        jacobian = np.einsum("ijn,jnk->nik", by_times, by_ground)
+        bad = ~np.isfinite(image).all(axis=0)
+        image[:, bad], jacobian[bad] = np.nan, np.nan
+        return image.T, jacobian
 
     def _localize(self, image: Array, alt: Array) -> Array:
         """`localize` of image points (2, N)."""
@@ -332,13 +317,3 @@ def _dot(a: Array, b: Array) -> Array:
     """Scalar products (N,) of vectors (3, N)."""
     product: Array = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     return product
-
-
-def _chunks(count: int) -> list[slice]:
-    return [slice(start, start + CHUNK) for start in range(0, count, CHUNK)]
-
-
-def _nan_rows(points: Array) -> Array:
-    """Rows with anything that is not finite become NaN throughout, in place."""
-    points[~np.isfinite(points).all(axis=1)] = np.nan
-    return points

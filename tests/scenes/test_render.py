@@ -9,9 +9,9 @@ import pytest
 
 from barpc.errors import InputError
 from barpc.simulate.orbit import Look, fly, looks
-from barpc.simulate.render import Radiometry, expose, render
-from barpc.simulate.terrain import Grid, Plane, Ray, make_terrain
-from barpc.simulate.texture import Date, Surface, make_surfaces
+from tests.scenes.render import Radiometry, expose, render
+from tests.scenes.terrain import Grid, Plane, Ray, make_terrain
+from tests.scenes.texture import Date, Surface, make_surfaces
 
 SIZE = (240, 200)
 PLANE = Plane(5.4, 43.3)

@@ -10,14 +10,14 @@ import pytest
 import rasterio
 from click.testing import CliRunner
 
-from barpc.cli.main import cli
 from barpc.errors import InputError, OutputError
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
 from barpc.sensor.rpc import RPC
-from barpc.simulate import ImageOptions, Scene, write_scene
-from barpc.simulate.images import inverse
+from tests.scenes import ImageOptions, Scene, write_scene
+from tests.scenes.__main__ import command
+from tests.scenes.images import inverse
 
 SMALL = ImageOptions(size=(200, 160), seed=3, checks=40, gcps=3)
 
@@ -178,11 +178,7 @@ def test_options_that_make_no_scene_are_refused(wrong):
 
 def test_the_command_prints_the_images_that_it_wrote(tmp_path):
     out = tmp_path / "scene"
-    result = CliRunner().invoke(
-        cli,
-        ["-q", "simulate", str(out), "--views", "2", "--size", "120", "100", "--drift", "5"],
-        standalone_mode=False,
-    )
+    result = CliRunner().invoke(command, [str(out), "--views", "2", "--size", "120", "100", "--drift", "5"])
     assert result.exit_code == 0, result.output
     assert result.output.split() == [str(out / "view_00.tif"), str(out / "view_01.tif")]
     assert json.loads((out / "truth.json").read_text())["options"]["drift"] == pytest.approx(5e-6)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from barpc.geodesy import Array
-from barpc.simulate.terrain import Float32, Grid, Ray, Terrain, fractal
+from tests.scenes.terrain import Float32, Grid, Ray, Terrain, fractal
 
 IntIndex = npt.NDArray[np.signedinteger[Any]]
 

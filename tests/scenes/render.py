@@ -18,8 +18,8 @@ from scipy.interpolate import CubicSpline
 from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.sensor import SensorModel
-from barpc.simulate.terrain import Float32, Ray, Terrain, fractal
-from barpc.simulate.texture import Surface
+from tests.scenes.terrain import Float32, Ray, Terrain, fractal
+from tests.scenes.texture import Surface
 
 STRIP = 128
 """Rows rendered at a time."""

@@ -1,4 +1,7 @@
-"""`barpc simulate`: synthetic images whose cameras and ground are known."""
+"""Synthetic images whose cameras and ground are known.
+
+python -m tests.scenes scene --views 5 --size 2000 2000
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,12 @@ from typing import Any
 
 import click
 
-from barpc.cli.progress import progress_bars
-from barpc.cli.terminal import echo
+from barpc.errors import BarpcError
+from tests.scenes.files import write_scene
+from tests.scenes.images import ImageOptions
 
 
-@click.command("simulate")
+@click.command()
 @click.argument("out", metavar="OUT")
 @click.option("--views", default=3, show_default=True, help="Number of images.")
 @click.option(
@@ -57,17 +61,14 @@ from barpc.cli.terminal import echo
 @click.option("--checks", default=200, show_default=True, help="Held-out check points.")
 @click.option("--gcps", default=0, show_default=True, help="Ground control points (gcps.geojson).")
 @click.option("--overwrite", is_flag=True, help="Replace files of an earlier run.")
-@click.pass_obj
 def command(
-    obj: dict[str, Any],
-    /,
     out: str,
     center: tuple[float, float, float],
     attitude: float,
     drift: float,
     overwrite: bool,
     **scene: Any,
-) -> int:
+) -> None:
     r"""Make synthetic images with known cameras and truth.
 
     OUT receives one GeoTIFF a view, with a delivered RPC that is wrong by a known correction, and truth.json
@@ -75,16 +76,20 @@ def command(
 
     \b
     Examples:
-      barpc simulate scene --views 5 --size 2000 2000
-      barpc simulate dates --views 6 --sun-azimuth 150 --sun-azimuth 215 --change 0.3 --clouds 0.15
+      python -m tests.scenes scene --views 5 --size 2000 2000
+      python -m tests.scenes dates --views 6 --sun-azimuth 150 --sun-azimuth 215 --change 0.3 --clouds 0.15
     """
-    from barpc.simulate.files import write_scene
-    from barpc.simulate.images import ImageOptions
-
     lon, lat, alt = center
-    options = ImageOptions(lon=lon, lat=lat, alt=alt, attitude=attitude * 1e-6, drift=drift * 1e-6, **scene)
-    with progress_bars(obj["quiet"]) as progress:
-        paths = write_scene(out, options, overwrite=overwrite, progress=progress)
+    try:
+        options = ImageOptions(
+            lon=lon, lat=lat, alt=alt, attitude=attitude * 1e-6, drift=drift * 1e-6, **scene
+        )
+        paths = write_scene(out, options, overwrite=overwrite)
+    except BarpcError as error:
+        raise click.ClickException(str(error)) from error
     for path in paths:
-        echo(path)
-    return 0
+        click.echo(path)
+
+
+if __name__ == "__main__":
+    command(prog_name="python -m tests.scenes")

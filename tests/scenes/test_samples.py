@@ -10,7 +10,7 @@ import pytest
 import rasterio
 
 from barpc.rpcio import read_rpc
-from barpc.simulate import ImageOptions, Scene
+from tests.scenes import ImageOptions, Scene
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
 

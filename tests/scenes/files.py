@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,8 @@ from barpc.geodesy import Array
 from barpc.rpcio.tiff import put_tag
 from barpc.scene import BoolArray
 from barpc.sensor.rpc import RPC
-from barpc.simulate.images import ImageOptions, Scene, Shot
 from barpc.workspace import Workspace
-
-Progress = Callable[[str, int, int], None]
+from tests.scenes.images import ImageOptions, Scene, Shot
 
 CONVENTION = (
     "ground = lon [deg], lat [deg], altitude above the WGS84 ellipsoid [m]; image = col, row [px], (0, 0) "
@@ -37,7 +34,6 @@ def write_scene(
     options: ImageOptions | None = None,
     *,
     overwrite: bool = False,
-    progress: Progress | None = None,
 ) -> list[Path]:
     """Render a scene into a folder.
 
@@ -49,8 +45,6 @@ def write_scene(
         The scene.
     overwrite : bool
         Replace what an earlier run wrote here and nobody has changed since.
-    progress : callable
-        Called with ("simulate", views done, views).
 
     Returns
     -------
@@ -72,14 +66,12 @@ def write_scene(
         *["gcps.geojson"] * (options.gcps > 0),
     ]
     with Workspace(out, overwrite=overwrite, names=names) as workspace:
-        _write_scene(workspace, scene, options, progress)
+        _write_scene(workspace, scene, options)
         workspace.remove_stale()
     return [Path(out) / f"{shot.name}.tif" for shot in scene.shots]
 
 
-def _write_scene(
-    workspace: Workspace, scene: Scene, options: ImageOptions, progress: Progress | None
-) -> None:
+def _write_scene(workspace: Workspace, scene: Scene, options: ImageOptions) -> None:
     ground = scene.candidates(4 * (options.checks + options.gcps) + 64)
     images, in_sight = [], []
     for i, shot in enumerate(scene.shots):
@@ -89,8 +81,6 @@ def _write_scene(
         image, visible = scene.shows(i, ground, picture.altitude)
         images.append(image)
         in_sight.append(visible)
-        if progress:
-            progress("simulate", i + 1, options.views)
     xy, seen = np.array(images), np.array(in_sight)
     good = np.flatnonzero(seen.sum(axis=0) >= min(2, options.views))
     gcps, checks = good[: options.gcps], good[options.gcps :][: options.checks]

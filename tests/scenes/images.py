@@ -22,9 +22,9 @@ from barpc.sensor.curve import Curve
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.simulate.orbit import Look, fly, looks
-from barpc.simulate.render import Radiometry, expose, render
-from barpc.simulate.terrain import TALLEST, Float32, Plane, Terrain, make_terrain
-from barpc.simulate.texture import Date, Surface, make_surfaces
+from tests.scenes.render import Radiometry, expose, render
+from tests.scenes.terrain import TALLEST, Float32, Plane, Terrain, make_terrain
+from tests.scenes.texture import Date, Surface, make_surfaces
 
 ALTITUDES = (694e3, 617e3, 770e3)
 """Satellites of the first, second and third date [m above the ellipsoid]; then again from the first."""
