@@ -64,6 +64,7 @@ class Mosaic:
         self.dtypes = tuple(band.dtype for band in vrt.bands)
         self.nodatavals = tuple(band.nodata for band in vrt.bands)
         self.nodata = self.nodatavals[0]
+        self.block_shapes = [(min(_BLOCK, self.height), min(_BLOCK, self.width))] * self.count
         names = ColorInterp.__members__
         self.colorinterp = tuple(names.get(band.color, ColorInterp.undefined) for band in vrt.bands)
         self.crs = self._crs(vrt.srs)

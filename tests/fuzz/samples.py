@@ -31,7 +31,8 @@ from barpc.pointio.matches import read_matches
 from barpc.pointio.tables import read_correspondences
 from barpc.record import from_record, load_npz, to_record
 from barpc.report.compare import compare_runs
-from barpc.report.page import remake_report
+from barpc.report.load import read_summary
+from barpc.report.page import report_html
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.text import decode
@@ -296,7 +297,7 @@ def _run_sample(name: str, read: Callable[[Path], object], *mutations: Mutate, s
 
 
 def _report(path: Path) -> object:
-    return remake_report(path.parent)
+    return report_html(read_summary(path.parent), path.parent)
 
 
 # --- Sentinel-1 -------------------------------------------------------------------------------------------
