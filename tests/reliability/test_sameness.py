@@ -189,7 +189,7 @@ def test_cameras_of_one_image_may_be_compared_with_others(scene, tmp_path):
 
 
 def test_images_that_are_nearly_empty_are_no_twins(scene, tmp_path, monkeypatch):
-    """Each is read whole once, however many there are."""
+    """None is read whole, however many there are; a copy among them is found."""
     reads = []
     whole = twins._whole
     monkeypatch.setattr(twins, "_whole", lambda image, band: reads.append(image.name) or whole(image, band))
@@ -207,7 +207,7 @@ def test_images_that_are_nearly_empty_are_no_twins(scene, tmp_path, monkeypatch)
         target = Path(shutil.copy(scene / "view_00.tif", tmp_path / f"v{number}.tif"))
         images.append(rewrite(target, pixels=corner, camera=camera, nodata=0))
     assert len(load_views(images).views) == 8
-    assert sorted(reads) == sorted(map(str, images))
+    assert reads == []  # more windows are asked where the first show nothing
     twin = copied(images[3], tmp_path / "w.tif")
     with pytest.raises(InputError, match=r"w\.tif: shows the same pixels as .*v3\.tif"):
         load_views([*images, twin])

@@ -44,7 +44,7 @@ def test_options_and_images_of_one_run_alone_are_named(block_run, tmp_path):
     summary["pairs"] = [pair for pair in summary["pairs"] if gone not in (pair["a"], pair["b"])]
     (tmp_path / "other/summary.json").write_text(json.dumps(summary))
     found = compare_runs(block_run.folder, tmp_path / "other")
-    assert found["options"] == [{"option": "adjust.drift", "values": [0, 1]}]
+    assert found["options"] == [{"option": "adjust.drift", "values": [None, 1]}]
     assert found["only_a"] == [block_run.views[-1].name]
     assert "Option adjust.drift: 0 in A, 1 in B." in found["lines"]
 
