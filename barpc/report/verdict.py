@@ -173,7 +173,9 @@ def _block_reasons(run: Run) -> list[str]:
         )
     with np.errstate(all="ignore"):
         moved = np.abs(gauge.shift) / gauge.sigma
-    if run.gcps is None and (moved[np.isfinite(moved)] > MOVED).any():  # control moves a scene as far as it must
+    if (
+        run.gcps is None and (moved[np.isfinite(moved)] > MOVED).any()
+    ):  # control moves a scene as far as it must
         out.append(
             f"The scene moved by {_enu(gauge.shift)}, more than {MOVED:g} standard deviations: something is not as "
             "stated; control points or a DEM would tell."
@@ -191,20 +193,27 @@ def block_verdict(run: Run, views: Sequence[View]) -> dict[str, Any]:
     look = [view for view in views if view["advice"] and view not in bad]
     reasons = [f"{view['name']}: {STATUS_WORDS[view['status']]}: {view['advice']}." for view in bad + look]
     reasons += [f"{path} was left out: {reason}" for path, reason in run.left_out]
-    control = _block_reasons(run) + _control_reasons(run)
+    whole, points = _block_reasons(run), _control_reasons(run)
+    control = whole + points
     lines = {"adjust": _adjusted_lines, "check": _checked_lines, "match": _matched_lines}[run.kind](
         run, views
     )
     num_bad = len(bad) + len(run.left_out)
     return {
         "status": "bad" if num_bad else "look" if look or control else "good",
-        "headline": _headline(run, len(views), num_bad, len(look), bool(control)),
+        "headline": _headline(
+            run,
+            len(views),
+            num_bad,
+            len(look),
+            "the block needs" if whole else "ground points need" * bool(points),
+        ),
         "lines": lines + reasons + control,
         "reasons": reasons + control,
     }
 
 
-def _headline(run: Run, num: int, bad: int, look: int, control: bool) -> str:
+def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
     text = _ALL_WELL[run.kind].format(num)
     if bad or look:
         parts = []
@@ -214,7 +223,7 @@ def _headline(run: Run, num: int, bad: int, look: int, control: bool) -> str:
         if look:
             parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
         text = f"{', '.join(parts)[0].upper()}{', '.join(parts)[1:]} (of {num + len(run.left_out)})"
-    return f"{text}; the block needs a look." if control else f"{text}."
+    return f"{text}; {more} a look." if more else f"{text}."
 
 
 def _control_reasons(run: Run) -> list[str]:

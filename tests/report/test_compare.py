@@ -46,7 +46,7 @@ def test_options_and_images_of_one_run_alone_are_named(block_run, tmp_path):
     found = compare_runs(block_run.folder, tmp_path / "other")
     assert found["options"] == [{"option": "adjust.drift", "values": [None, 1]}]
     assert found["only_a"] == [block_run.views[-1].name]
-    assert "Option adjust.drift: 0 in A, 1 in B." in found["lines"]
+    assert "Option adjust.drift: None in A, 1 in B." in found["lines"]
 
 
 def test_runs_without_files_are_compared_by_their_errors(block_run, check_run):
