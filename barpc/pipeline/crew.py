@@ -28,7 +28,6 @@ import numpy as np
 from barpc.errors import AdjustError, BarpcError
 from barpc.pipeline.parcel import Parcel, Shelf
 from barpc.record import from_record, to_record
-from barpc.tie.work import one_thread
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
@@ -257,7 +256,6 @@ class _Task(Future[Any]):
 
 def work_off(fn: Function, tasks: Sequence[tuple[Any, ...] | Parcel]) -> list[Outcome]:
     """Work on a batch, in a worker: one task's error leaves the others their results."""
-    one_thread()
     outcomes: list[Outcome] = []
     for task in tasks:
         start = time.perf_counter()

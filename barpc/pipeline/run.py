@@ -245,14 +245,17 @@ def _with_ties(
         return replace(run, tracks=read_matches(options.matches, [view.name for view in run.views]))
     if len(run.views) < 2:
         return run
+    views = run.views
+    if adjustment is not None:
+        corrected = zip(views, adjustment.sensors, strict=True)
+        views = tuple(replace(view, sensor=sensor) for view, sensor in corrected)
     given: dict[str, Any] = {"executor": executor, "progress": progress}
-    given["sensors"] = None if adjustment is None else adjustment.sensors
     if options.overlap_list is not None:
         given["only"] = read_pairs(options.overlap_list, run.views, [path for path, _ in run.left_out])
     if options.aoi is not None:
         given["area"] = read_area(options.aoi)
     try:
-        ties = find_tracks(run.views, options.tie, **given)
+        ties = find_tracks(views, options.tie, **given)
     except DisconnectedError as error:
         if not options.adjust.keep_largest or len(error.groups[0]) < 2:
             raise

@@ -11,18 +11,16 @@ import numpy as np
 from barpc.errors import InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks, View
-from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
 from barpc.tie.area import Area
 from barpc.tie.features import DETECTORS, Keypoints, bounded, detect_tile, join, tiles
-from barpc.tie.guided import MATCHERS
 from barpc.tie.link import link, thin
-from barpc.tie.matching import Matches, PairReport, match_pair
-from barpc.tie.options import TieOptions
+from barpc.tie.matcher import Matches
+from barpc.tie.matching import MATCHERS, PairReport, match_pair
+from barpc.tie.options import Progress, TieOptions, ordered
 from barpc.tie.pairs import Pair, require_connected, select_pairs, shared_boxes
 from barpc.tie.raster import sample_stretch
 from barpc.tie.refine import refine
-from barpc.tie.work import Progress, ordered
 
 _DEFAULTS = TieOptions()
 _SPARE = 1.3  # tracks registered for each one kept
@@ -53,7 +51,6 @@ def detect(
     *,
     pairs: Sequence[Pair] | None = None,
     area: Area | None = None,
-    sensors: Sequence[SensorModel] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Keypoints]:
@@ -69,8 +66,6 @@ def detect(
         As `select_pairs` gave them: tiles that no partner may see are not read. None: all are.
     area : Area, optional
         Together with `pairs`: tiles outside are not read either.
-    sensors : sequence of SensorModel, optional
-        Corrected cameras to use instead of the views' own.
     executor : Executor, optional
         Works on the tiles; without one they are worked on here, one after the other.
     progress : callable, optional
@@ -84,7 +79,7 @@ def detect(
     stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
     boxes = [tiles(view.size, options) for view in views]
     if pairs is not None:
-        wanted = shared_boxes(views, pairs, boxes, options, sensors=sensors, area=area)
+        wanted = shared_boxes(views, pairs, boxes, options, area=area)
         boxes = [
             [box for box, keep in zip(*both, strict=True) if keep] for both in zip(boxes, wanted, strict=True)
         ]
@@ -92,7 +87,7 @@ def detect(
     for owner, (view, stretch) in enumerate(zip(views, stretches, strict=True)):
         of_view = boxes[owner] if stretch is not None else []
         owners += [owner] * len(of_view)
-        tasks += [(view, box, stretch, options) for box in of_view]
+        tasks += [(view.path, view.size, box, stretch, options) for box in of_view]
     found = ordered(executor, detect_tile, tasks, "detect", progress)
     parts: list[list[Keypoints]] = [[] for _ in views]
     for owner, part in zip(owners, found, strict=True):
@@ -106,18 +101,14 @@ def match(
     pairs: Sequence[Pair],
     options: TieOptions = _DEFAULTS,
     *,
-    sensors: Sequence[SensorModel] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
     """Matches of every pair, each with its report: `match_pair` over all pairs."""
-    cameras = [view.sensor for view in views] if sensors is None else sensors
     tasks = []
     for pair in pairs:
         i, j = pair.views
-        tasks.append(
-            ((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options, (cameras[i], cameras[j]))
-        )
+        tasks.append(((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options))
     return ordered(executor, match_pair, tasks, "match", progress)
 
 
@@ -127,7 +118,6 @@ def find_tracks(
     *,
     executor: Executor | None = None,
     progress: Progress | None = None,
-    sensors: Sequence[SensorModel] | None = None,
     only: Sequence[tuple[int, int]] = (),
     area: Area | None = None,
 ) -> TieResult:
@@ -136,15 +126,13 @@ def find_tracks(
     Parameters
     ----------
     views : sequence of View
-        At least two.
+        At least two; in a second pass with their corrected cameras, `replace(view, sensor=...)`.
     options : TieOptions
         How.
     executor : Executor, optional
         Works on tiles and pairs; the result does not depend on it.
     progress : callable, optional
         `progress(stage, done, total)`.
-    sensors : sequence of SensorModel, optional
-        Corrected cameras to use instead of the views' own (a second pass).
     only : sequence of (int, int)
         Match these pairs and no others.
     area : Area, optional
@@ -165,26 +153,19 @@ def find_tracks(
         An image cannot be read.
     """
     require_known(options)
-    pairs = select_pairs(views, options, sensors=sensors, only=only, area=area)
-    keypoints = detect(
-        views, options, pairs=pairs, area=area, sensors=sensors, executor=executor, progress=progress
-    )
-    matched = match(views, keypoints, pairs, options, sensors=sensors, executor=executor, progress=progress)
-    reports = tuple(report for _, report in matched)
+    pairs = select_pairs(views, options, only=only, area=area)
+    keypoints = [join([])] * len(views)
+    if MATCHERS[options.matcher].detects:
+        keypoints = detect(views, options, pairs=pairs, area=area, executor=executor, progress=progress)
+    matched = match(views, keypoints, pairs, options, executor=executor, progress=progress)
+    found, reports = [matches for matches, _ in matched], tuple(report for _, report in matched)
     require_matches(views, pairs, reports)
     sizes, most = [view.size for view in views], options.points_per_image
-    linked = link([len(k) for k in keypoints], [found for found, _ in matched])
-    linked = inside(views, linked, area, sensors)
-    tracks = refine(
-        views,
-        thin(linked, sizes, int(_SPARE * most)),
-        {found.pair: report.spread for found, report in matched if len(found)},
-        options,
-        sensors=sensors,
-        executor=executor,
-        progress=progress,
-    )
-    tracks = thin(inside(views, tracks, area, sensors), sizes, most)
+    linked = inside(views, link([pair.views for pair in pairs], found), area)
+    spreads = {p.views: r.spread for p, r in zip(pairs, reports, strict=True) if r.status == "ok"}
+    linked = thin(linked, sizes, int(_SPARE * most))
+    tracks = refine(views, linked, spreads, options, executor=executor, progress=progress)
+    tracks = thin(inside(views, tracks, area), sizes, most)
     require_tracks(views, tracks, pairs, reports, options)
     return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
 
@@ -199,9 +180,7 @@ def require_known(options: TieOptions) -> None:
             raise InputError(f"{what} {name!r} is not one of {', '.join(table)}")
 
 
-def inside(
-    views: Sequence[View], tracks: Tracks, area: Area | None, sensors: Sequence[SensorModel] | None = None
-) -> Tracks:
+def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
     """The tracks whose ground points lie in an area; all without one.
 
     Raises
@@ -211,7 +190,7 @@ def inside(
     """
     if area is None or not len(tracks):
         return tracks
-    cameras = [view.sensor for view in views] if sensors is None else sensors
+    cameras = [view.sensor for view in views]
     alt = float(np.mean([view.alt_range for view in views]))
     points = triangulate(cameras, tracks.view, tracks.point, tracks.xy, alt=alt).points
     ground = ground_from_ecef(points)
@@ -237,12 +216,12 @@ def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Seque
         f"{r.verified} of {r.matches} matches verified)"
         for r in failed[:4]
     )
-    blank = sorted({name for r in failed for name, n in zip(r.names, r.keypoints, strict=True) if not n})
+    bare = [r for r in failed if r.status == "too few keypoints"]
+    blank = sorted({name for r in bare for name, n in zip(r.names, r.keypoints, strict=True) if not n})
     advice = "look at the images (clouds? dates? band?), or loosen ratio, search or min_matches"
     if blank:
-        advice = (
-            f"no detail in {', '.join(blank[:4])} (one value? no valid pixels? clouds?): look at the images"
-        )
+        names = ", ".join(blank[:4])
+        advice = f"no detail in {names} (one value? no valid pixels? clouds?): look at the images"
     if len(views) == 2 and failed:
         raise TiePointError(f"too few tie points: {told}: {advice}")
     links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]

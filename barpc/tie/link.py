@@ -10,48 +10,49 @@ from scipy.sparse.csgraph import connected_components
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray, Tracks
-from barpc.tie.matching import Matches
+from barpc.tie.matcher import Matches
 
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
 
 
-def link(num_keypoints: Sequence[int], matches: Sequence[Matches]) -> Tracks:
-    """Join matches that share keypoints; a track that meets a view twice is thrown away.
+def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks:
+    """Join matches that share points; a track that meets a view twice is thrown away.
 
     Parameters
     ----------
-    num_keypoints : sequence of int
-        Keypoints of each view.
+    pairs : sequence of (int, int)
+        The two views of each pair, in any order: the result does not depend on it.
     matches : sequence of Matches
-        Of the pairs, in any order: the result does not depend on it.
+        Of each pair.
 
     Returns
     -------
     tracks : Tracks
-        Ordered by their first keypoint; sigma is that of the best match an observation took part in.
+        Ordered by their first observation; sigma is that of the best match an observation took part in.
     """
-    offset = np.concatenate([[0], np.cumsum(num_keypoints)])
-    total = int(offset[-1])
-    used = [m for m in matches if len(m)]
-    if not used:
+    if not any(len(m) for m in matches):
         return Tracks(*(np.empty(0, np.int64),) * 2, np.empty((0, 2)), np.empty(0))
-    ends = [m.index + offset[list(m.pair)] for m in used]
-    node = np.concatenate(ends).ravel()
-    xy = np.concatenate([m.xy for m in used]).reshape(-1, 2)
-    sigma = np.concatenate([m.sigma for m in used]).repeat(2)
+    count = [2 * len(m) for m in matches]
+    view: IntArray = np.concatenate([np.tile(pair, len(m)) for pair, m in zip(pairs, matches, strict=True)])
+    number = np.concatenate([m.index for m in matches]).ravel()
+    xy = np.concatenate([m.xy for m in matches]).reshape(-1, 2)
+    sigma = np.repeat([m.sigma for m in matches], count)
+    order = np.lexsort((number, view))
+    new = (np.diff(view[order]) != 0) | (np.diff(number[order]) != 0)
+    node: IntArray = np.empty(len(order), dtype=np.int64)
+    node[order] = np.concatenate([[0], np.cumsum(new)])
+    total = int(node.max()) + 1
     first, second = node.reshape(-1, 2).T
     graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(total, total))
-    label = connected_components(graph, directed=False)[1]
+    label: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)
     order = np.lexsort((sigma, node))
     once = order[np.r_[True, np.diff(node[order]) > 0]]
-    node, xy, sigma = node[once], xy[once], sigma[once]
-    view = np.searchsorted(offset, node, side="right") - 1
-    return _clean(view, label[node], xy, sigma)
+    return _clean(view[once], label[node[once]], xy[once], sigma[once])
 
 
 def _clean(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
-    """Rows grouped by track and sorted by view; tracks with two keypoints of one view dropped."""
+    """Rows grouped by track and sorted by view; tracks with two points of one view dropped."""
     order = np.lexsort((view, label))
     view, label, xy, sigma = view[order], label[order], xy[order], sigma[order]
     twice = (np.diff(view) == 0) & (np.diff(label) == 0)

@@ -12,9 +12,9 @@ import shapely
 from barpc.errors import DisconnectedError, TiePointError
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.scene import BoolArray, View, connected_groups
-from barpc.sensor import SensorModel
 from barpc.sensor.geometry import convergence_angle, footprint
 from barpc.tie.area import Area
+from barpc.tie.epipolar import common_range
 from barpc.tie.options import TieOptions
 from barpc.tie.raster import Box
 
@@ -80,19 +80,13 @@ class Footprints:
         return np.asarray(plane, dtype=np.float64) / self._scale + self.origin
 
 
-def footprints(
-    views: Sequence[View],
-    sensors: Sequence[SensorModel],
-    alt: float,
-    reach: float = 0.0,
-    area: Area | None = None,
-) -> Footprints:
+def footprints(views: Sequence[View], alt: float, reach: float = 0.0, area: Area | None = None) -> Footprints:
     """Outlines of views at one altitude, as far as they lie in an area.
 
     Parameters
     ----------
-    views, sensors : sequences
-        The views and the cameras to use for them.
+    views : sequence of View
+        The views.
     alt : float
         Altitude [m].
     reach : float
@@ -100,7 +94,7 @@ def footprints(
     area : Area, optional
         None: everywhere.
     """
-    rings = [footprint(sensor, view.size, alt)[:, :2] for view, sensor in zip(views, sensors, strict=True)]
+    rings = [footprint(view.sensor, view.size, alt)[:, :2] for view in views]
     usable = [ring[np.isfinite(ring).all(axis=1)] for ring in rings]
     first = next((ring[0] for ring in usable if len(ring)), np.zeros(2))
     plane = Footprints(first, alt, ())
@@ -120,24 +114,19 @@ def footprints(
 
 def _levels(views: Sequence[View]) -> tuple[float, float, float]:
     """Middle, lowest and highest altitude [m] of what the views' ranges have in common."""
-    ranges = np.array([view.alt_range for view in views])
-    low, high = np.sort([ranges[:, 0].max(), ranges[:, 1].min()]).tolist()
+    low, high = common_range(*views)
     return 0.5 * (low + high), low, high
 
 
 def overlapping_pairs(
-    views: Sequence[View],
-    sensors: Sequence[SensorModel],
-    options: TieOptions,
-    reach: float = 0.0,
-    area: Area | None = None,
+    views: Sequence[View], options: TieOptions, reach: float = 0.0, area: Area | None = None
 ) -> list[Pair]:
     """All pairs that overlap enough at some altitude, under an angle that is asked for, ascending.
 
     Parameters
     ----------
-    views, sensors : sequences
-        The views and the cameras to use for them.
+    views : sequence of View
+        The views.
     options : TieOptions
         `min_overlap`, `min_angle`, `max_angle`.
     reach : float
@@ -147,13 +136,13 @@ def overlapping_pairs(
     """
     best: dict[tuple[int, int], Pair] = {}
     for alt in _levels(views):
-        for pair in _overlapping_at(footprints(views, sensors, alt, reach, area), sensors, options):
+        for pair in _overlapping_at(footprints(views, alt, reach, area), views, options):
             if pair.views not in best or pair.overlap > best[pair.views].overlap:
                 best[pair.views] = pair
     return [best[views] for views in sorted(best)]
 
 
-def _overlapping_at(prints: Footprints, sensors: Sequence[SensorModel], options: TieOptions) -> list[Pair]:
+def _overlapping_at(prints: Footprints, views: Sequence[View], options: TieOptions) -> list[Pair]:
     outlines = np.array(prints.outlines, dtype=object)
     first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
     pairs = []
@@ -166,7 +155,7 @@ def _overlapping_at(prints: Footprints, sensors: Sequence[SensorModel], options:
             continue
         middle = common.point_on_surface()
         ground = np.array([*prints.lonlat(np.array([middle.x, middle.y])), prints.alt])
-        angle = float(convergence_angle(sensors[i], sensors[j], ground))
+        angle = float(convergence_angle(views[i].sensor, views[j].sensor, ground))
         if options.min_angle <= angle <= options.max_angle:
             pairs.append(Pair((i, j), float(overlap), angle))
     return pairs
@@ -176,7 +165,6 @@ def select_pairs(
     views: Sequence[View],
     options: TieOptions,
     *,
-    sensors: Sequence[SensorModel] | None = None,
     only: Sequence[tuple[int, int]] = (),
     area: Area | None = None,
 ) -> list[Pair]:
@@ -190,8 +178,6 @@ def select_pairs(
         At least two.
     options : TieOptions
         `min_overlap`, `min_angle`, `max_angle`, `neighbours`.
-    sensors : sequence of SensorModel, optional
-        Corrected cameras to use instead of the views' own.
     only : sequence of (int, int)
         These pairs, all that overlap, and no others.
     area : Area, optional
@@ -211,9 +197,8 @@ def select_pairs(
     """
     if len(views) < 2:
         raise TiePointError(f"{len(views)} image given: tie points need at least two that overlap")
-    cameras = [view.sensor for view in views] if sensors is None else sensors
     wanted = {(min(pair), max(pair)) for pair in only}
-    pairs = _candidates(views, cameras, options, wanted, area)
+    pairs = _candidates(views, options, wanted, area)
     where = "between them" + (" among the listed pairs" if wanted else "")
     where += " inside the area of interest" if area is not None else ""
     require_connected(
@@ -229,13 +214,12 @@ def select_pairs(
 
 def _candidates(
     views: Sequence[View],
-    cameras: Sequence[SensorModel],
     options: TieOptions,
     wanted: set[tuple[int, int]],
     area: Area | None,
 ) -> list[Pair]:
     """Pairs that overlap, of those wanted (none: all); with grown outlines where that leaves something out."""
-    pairs = overlapping_pairs(views, cameras, options, area=area)
+    pairs = overlapping_pairs(views, options, area=area)
     pairs = [pair for pair in pairs if not wanted or pair.views in wanted]
     known = {pair.views for pair in pairs}
     partners = np.bincount([i for pair in known for i in pair], minlength=len(views))
@@ -243,7 +227,7 @@ def _candidates(
     lonely |= ~np.isin(np.arange(len(views)), connected_groups(len(views), sorted(known))[0])
     if not (wanted - known if wanted else lonely.any()):
         return pairs
-    grown = overlapping_pairs(views, cameras, options, options.search, area)  # a camera may be wrong by more
+    grown = overlapping_pairs(views, options, options.search, area)  # a camera may be wrong by more
     for pair in grown:
         worth = pair.views in wanted if wanted else lonely[list(pair.views)].any()
         if worth and pair.views not in known:
@@ -302,7 +286,6 @@ def shared_boxes(
     boxes: Sequence[Sequence[Box]],
     options: TieOptions,
     *,
-    sensors: Sequence[SensorModel] | None = None,
     area: Area | None = None,
 ) -> list[BoolArray]:
     """Which windows of the views a partner may see at some altitude: only those are worth reading.
@@ -317,8 +300,6 @@ def shared_boxes(
         Windows of every view.
     options : TieOptions
         `search`: how far the cameras may be wrong.
-    sensors : sequence of SensorModel, optional
-        Corrected cameras to use instead of the views' own.
     area : Area, optional
         What lies outside is not worth reading either.
 
@@ -327,7 +308,6 @@ def shared_boxes(
     masks : list of (B,)
         One a view.
     """
-    cameras = [view.sensor for view in views] if sensors is None else sensors
     partners: list[list[int]] = [[] for _ in views]
     for pair in pairs:
         i, j = pair.views
@@ -335,11 +315,11 @@ def shared_boxes(
         partners[j].append(i)
     masks = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     for alt in _levels(views):
-        prints = footprints(views, cameras, alt, options.search, area)
+        prints = footprints(views, alt, options.search, area)
         for i, of_view in enumerate(boxes):
             seen = shapely.union_all([prints.outlines[j] for j in partners[i]])
             corners = np.array([[(c, r), (c + w, r), (c + w, r + h), (c, r + h)] for c, r, w, h in of_view])
-            ground = cameras[i].localize(corners.reshape(-1, 4, 2) - 0.5, np.array(alt))
+            ground = views[i].sensor.localize(corners.reshape(-1, 4, 2) - 0.5, np.array(alt))
             unknown = ~np.isfinite(ground).all(axis=(1, 2))
             ground[unknown] = 0.0
             windows = shapely.polygons(prints.plane(ground[..., :2]))

@@ -123,6 +123,7 @@ def _read(dataset: Any, box: Box, band: int) -> tuple[Pixels, BoolArray]:
     if np.issubdtype(raw.dtype, np.integer):
         valid &= raw < np.iinfo(raw.dtype).max
         if dataset.nodata is None:  # zeros without a name: a border where they stand together
+            cv2.setNumThreads(1)  # the work is spread by processes
             zeros = cv2.morphologyEx((raw == 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
             valid &= zeros == 0
     return np.where(valid, pixels, pixels.dtype.type(0.0)), valid

@@ -10,12 +10,9 @@ import numpy as np
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray, Tracks, View
-from barpc.sensor import SensorModel
 from barpc.tie.epipolar import agreeing, frame, linear_map, mad
-from barpc.tie.matching import common_range
-from barpc.tie.options import TieOptions
+from barpc.tie.options import Progress, TieOptions, ordered
 from barpc.tie.register import Registration, Task, register_task
-from barpc.tie.work import Progress, ordered
 
 _FLOOR = 0.1  # px across the epipolar line that are always tolerated
 _DISTORTED = 2.0  # times the median sigma: the patch lies across a step of the ground
@@ -30,7 +27,6 @@ def refine(
     spreads: Mapping[tuple[int, int], float],
     options: TieOptions,
     *,
-    sensors: Sequence[SensorModel] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Tracks:
@@ -46,8 +42,6 @@ def refine(
         `PairReport.spread` of the pairs of views: tells which view of a track makes the best reference.
     options : TieOptions
         `patch`, `min_correlation`, `band`, `tile`.
-    sensors : sequence of SensorModel, optional
-        Corrected cameras to use instead of the views' own.
     executor : Executor, optional
         Works on the tiles of the pairs.
     progress : callable, optional
@@ -61,10 +55,9 @@ def refine(
     """
     if not len(tracks):
         return tracks
-    cameras = [view.sensor for view in views] if sensors is None else sensors
     of_track = references(tracks, spreads, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
-    links = _Links(views, cameras, tracks, of_track[tracks.point[other]], other)
+    links = _Links(views, tracks, of_track[tracks.point[other]], other)
     found = links.register(options, executor, progress)
     good = links.verified(found, found.ok & (found.correlation >= options.min_correlation))
     sigma = links.scaled(found, good)
@@ -76,7 +69,6 @@ class _Links:
     """Observations that are registered (`other`), each with the reference of its track; rows of `tracks`."""
 
     views: Sequence[View]
-    cameras: Sequence[SensorModel]
     tracks: Tracks
     reference: IntArray
     other: IntArray
@@ -89,10 +81,10 @@ class _Links:
         """Whole pixels at which the reference patches stand."""
         return np.rint(self.tracks.xy[self.reference])
 
-    def of(self, part: IntArray) -> tuple[int, int]:
+    def of(self, part: IntArray) -> tuple[View, View]:
         """The two views of links that have them in common."""
-        first = part[0]
-        return int(self.tracks.view[self.reference[first]]), int(self.tracks.view[self.other[first]])
+        ends = self.reference[part[0]], self.other[part[0]]
+        return self.views[self.tracks.view[ends[0]]], self.views[self.tracks.view[ends[1]]]
 
     def groups(self, *more: IntArray) -> list[IntArray]:
         """Indices of the links between the same two views, and of equal values of `more`."""
@@ -105,15 +97,13 @@ class _Links:
         origin = self.origin
         linear = np.empty((len(self), 2, 2))
         for group in self.groups():
-            r, v = self.of(group)
-            alt = 0.5 * sum(common_range(self.views[r], self.views[v]))
-            linear[group] = linear_map(self.cameras[r], self.cameras[v], origin[group], alt)
+            linear[group] = linear_map(*self.of(group), origin[group])
         rounding = (origin - self.tracks.xy[self.reference])[:, :, None]
         start = self.tracks.xy[self.other] + (linear @ rounding)[:, :, 0]
         parts = self.groups(*np.floor(origin[:, ::-1] / options.tile).astype(np.int64).T)
         tasks = []
         for part in parts:
-            first, second = (self.views[k] for k in self.of(part))
+            first, second = self.of(part)
             files, sizes = (first.path, second.path), (first.size, second.size)
             where = (origin[part], start[part], linear[part])
             tasks.append((Task(files, sizes, options.band, *where, options.patch),))
@@ -126,18 +116,13 @@ class _Links:
 
     def errors(self, found: Registration, group: IntArray) -> tuple[Array, Array]:
         """Along and across the epipolar lines (M, 2) [px] between two views; half the segments' length (M,)."""
-        r, v = self.of(group)
-        limits = common_range(self.views[r], self.views[v])
-        where = frame(self.cameras[r], self.cameras[v], self.origin[group], limits)
-        return where.errors(np.arange(len(group)), found.xy[group]), where.reach
+        where = frame(*self.of(group), self.origin[group])
+        return where.errors(found.xy[group]), where.after
 
     def verified(self, found: Registration, good: BoolArray) -> BoolArray:
         """Those near their epipolar line, no less certain than others, at one altitude with their track."""
         verified = np.zeros(len(self), dtype=bool)
-        altitude, reach = (
-            np.zeros(len(self)),
-            np.zeros(len(self)),
-        )  # from the middle of the range, in its halves
+        altitude, reach = np.zeros((2, len(self)))  # from the middle of the range, in its halves
         for group in self.groups():
             group = group[good[group]]
             if len(group):

@@ -244,7 +244,7 @@ def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(
     monkeypatch.setattr(
         find,
         "detect_tile",
-        lambda view, box, *rest: read.append((view.name, box)) or original(view, box, *rest),
+        lambda path, size, box, *rest: read.append((path, box)) or original(path, size, box, *rest),
     )
     options = TieOptions(tile=150, search=30)
     result = find_tracks(scene.views, options, area=area)
