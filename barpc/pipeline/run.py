@@ -15,7 +15,7 @@ from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.handoff import refuse_hiding
-from barpc.pipeline.crew import Crew
+from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
 from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import MATCHES, SUFFIXES, output_names, refuse_shadows, write_tables, write_view
@@ -141,8 +141,8 @@ def adjust(
     refuse_hiding(Path(out_dir), names, keep)
     refuse_shadows(Path(out_dir), names)
     with Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names) as workspace:
-        with _crew(loaded, workspace, executor) as crew:
-            run = _solve(loaded, options, workspace, crew, progress)
+        with _caching(loaded, workspace, executor) as caching:
+            run = _solve(loaded, options, workspace, caching, progress)
         if run.adjustment is not None and options.stop_after == "all":
             with workspace.stage("fit and write"):
                 run = _fit_and_write(run, options, workspace, progress)
@@ -187,10 +187,10 @@ def _load(images: Sequence[str | Path], options: RunOptions) -> LoadedViews:
     return load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
 
 
-def _crew(loaded: LoadedViews, workspace: Workspace, executor: Executor | None) -> Crew:
+def _caching(loaded: LoadedViews, workspace: Workspace, executor: Executor | None) -> CachingExecutor:
     with workspace.stage("fingerprints"):
         fingerprints = {view.path: fingerprint(view.path) for view in loaded.views}
-    return Crew(workspace, fingerprints, executor)
+    return CachingExecutor(workspace, fingerprints, executor)
 
 
 def _empty_run(kind: str, loaded: LoadedViews, options: RunOptions) -> Run:
@@ -199,7 +199,11 @@ def _empty_run(kind: str, loaded: LoadedViews, options: RunOptions) -> Run:
 
 
 def _solve(
-    loaded: LoadedViews, options: RunOptions, workspace: Workspace, crew: Crew, progress: Progress | None
+    loaded: LoadedViews,
+    options: RunOptions,
+    workspace: Workspace,
+    executor: Executor,
+    progress: Progress | None,
 ) -> Run:
     """Tie points and the adjustment, as often as there are passes."""
     run = _empty_run("adjust", loaded, options)
@@ -209,7 +213,7 @@ def _solve(
     for number in range(passes):
         again = f" (pass {number + 1})" if number else ""
         with workspace.stage("tie points" + again):
-            run = _with_ties(run, options, crew, progress, adjustment)
+            run = _with_ties(run, options, executor, progress, adjustment)
         if options.stop_after == "matching":
             _write_matches(run, workspace)
             return replace(run, kind="match")

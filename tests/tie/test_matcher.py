@@ -105,7 +105,7 @@ def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(render, matcher) 
 
 def test_a_matcher_that_guesses_is_not_believed(render, monkeypatch) -> None:
     monkeypatch.setitem(MATCHERS, "another", Guessing)
-    with pytest.raises(TiePointError, match="no common offset|too few matches"):
+    with pytest.raises(TiePointError, match=r"no common offset|too few matches"):
         find_tracks(render(views=2).views, TieOptions(matcher="another"))
 
 
