@@ -66,20 +66,14 @@ class CachingExecutor(Executor):
     executor : Executor, optional
         Works on the tasks; None: they are worked on in this process, one after the other, when their result
         is asked for.
-    workers : int, optional
-        How many workers the executor has; by default it is asked.
     """
 
     def __init__(
-        self,
-        workspace: Workspace,
-        fingerprints: Mapping[str, str],
-        executor: Executor | None = None,
-        workers: int | None = None,
+        self, workspace: Workspace, fingerprints: Mapping[str, str], executor: Executor | None = None
     ) -> None:
         self.workspace, self._fingerprints = workspace, dict(fingerprints)
         self.executor = executor
-        self._limit = _PER_WORKER * max(worker_count(executor) if workers is None else workers, 1)
+        self._limit = _PER_WORKER * worker_count(executor)
         self._lock = threading.Lock()
         self._storing = threading.RLock()  # while results are kept: `shutdown` waits for it
         self._waiting: deque[_Task] = deque()

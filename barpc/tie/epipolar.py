@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray, View
@@ -73,21 +75,9 @@ def common_range(*views: View) -> tuple[float, float]:
 
 
 def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> Frame:
-    """Predict points of one view in another, at the altitudes that both are used for.
+    """Predict points of one view (N, 2) [px] in another, at the altitudes that both are used for.
 
-    Parameters
-    ----------
-    first, second : View
-        Views A and B.
-    xy : (N, 2)
-        col, row in A [px].
-    axis : (2,), optional
-        Of the frame; by default the mean direction of the points' epipolar segments.
-
-    Returns
-    -------
-    frame : Frame
-        NaN where a camera fails.
+    The axis is by default the mean direction of the points' epipolar segments. NaN where a camera fails.
     """
     levels = common_range(first, second)
     low, high = (second.sensor.project(first.sensor.localize(xy, np.full(len(xy), alt))) for alt in levels)
@@ -127,16 +117,9 @@ def linear_map(first: View, second: View, xy: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """A scalar that varies affinely over an image: value = coefficients . (1, x, y), x and y normalised.
+    """A scalar [px] that varies affinely over an image: coefficients (3,) . (1, x, y), (x, y) = (xy - middle) / scale.
 
-    Parameters
-    ----------
-    coefficients : (3,)
-        [px].
-    middle, scale : (2,)
-        x = (col - middle) / scale.
-    spread : float
-        Robust standard deviation of the values about it [px].
+    `spread` is the robust standard deviation of the values about it [px].
     """
 
     coefficients: Array
@@ -155,18 +138,9 @@ def _design(xy: Array, middle: Array, scale: Array) -> Array:
 
 
 def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
-    """Fit `values` by an affine function of position, in spite of outliers.
+    """Fit values (N,) [px] at positions (N, 2) [px] by an affine function, in spite of outliers.
 
     Tukey's biweight on a scale that follows the residuals' MAD; a constant for few points.
-
-    Parameters
-    ----------
-    xy : (N, 2)
-        Positions [px].
-    values : (N,)
-        What is fitted [px].
-    steps : int
-        Reweighting steps.
     """
     middle, scale = np.median(xy, axis=0), np.maximum(np.ptp(xy, axis=0), 1.0)
     design = _design(xy, middle, scale)
@@ -190,37 +164,25 @@ def mad(values: Array) -> float:
 
 
 def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
-    """Which values agree with an affine function of position, window by window.
+    """Which values (N,) [px] agree with an affine function of position (N, 2) [px], window by window.
 
-    Parameters
-    ----------
-    xy : (N, 2)
-        Positions [px].
-    values : (N,)
-        Errors across the epipolar lines [px].
-    floor : float
-        What is always tolerated [px].
-
-    Returns
-    -------
-    keep : (N,)
-        Within three robust standard deviations of the window's function.
-    residual : (N,)
-        Distance from that function [px].
+    Returns the mask (N,) of those within three robust standard deviations of their window's function, or within
+    `floor` [px], and the distances (N,) from it [px].
     """
     keep = np.zeros(len(values), dtype=bool)
     if not len(values):
         return keep, values
     residual = values - robust_affine(xy, values)(xy)
-    for rows in _windows(xy):
+    for rows in grouped(*np.floor(xy[:, ::-1] / _WINDOW).T):
         if len(rows) >= _WINDOW_POINTS:
             residual[rows] = values[rows] - robust_affine(xy[rows], values[rows])(xy[rows])
         keep[rows] = np.abs(residual[rows]) <= max(3.0 * mad(residual[rows]), floor)
     return keep, residual
 
 
-def _windows(xy: Array) -> list[IntArray]:
-    cell = np.floor(xy / _WINDOW)
-    order = np.lexsort((cell[:, 0], cell[:, 1]))
-    cuts = np.flatnonzero((np.diff(cell[order], axis=0) != 0).any(axis=1)) + 1
-    return np.split(order, cuts)
+def grouped(*keys: npt.NDArray[Any]) -> list[IntArray]:
+    """Indices of rows with equal keys, in ascending order of the keys."""
+    table = np.stack(keys)
+    order = np.lexsort(table[::-1])
+    cuts = np.flatnonzero((np.diff(table[:, order], axis=1) != 0).any(axis=0)) + 1
+    return np.split(order, cuts) if len(order) else []

@@ -99,38 +99,12 @@ def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
     return table[:, :2], table[:, 2], table[:, 3]
 
 
-def tiles(size: tuple[int, int], options: TieOptions) -> list[Box]:
-    """Boxes that cover an image of `size` (width, height) without overlap, cut at whole cells."""
-    edges = []
-    for length in size:
-        step = -(-length // -(-length // options.tile))  # equal tiles, none larger than asked
-        step = -(-step // options.cell) * options.cell
-        edges.append([(start, min(step, length - start)) for start in range(0, length, step)])
-    return [(col, row, width, height) for row, height in edges[1] for col, width in edges[0]]
-
-
 def detect_tile(
     path: str, size: tuple[int, int], box: Box, stretch: Stretch, options: TieOptions
 ) -> Keypoints:
-    """Keypoints of one tile of an image, at most a quota a cell.
+    """Keypoints of one tile of an image of `size` (width, height), at most a quota a cell.
 
-    Parameters
-    ----------
-    path : str
-        The image.
-    size : tuple of int
-        Its width and height [px].
-    box : Box
-        The tile.
-    stretch : Stretch
-        8-bit stretch of the whole image.
-    options : TieOptions
-        Detector, cells, quota.
-
-    Returns
-    -------
-    keypoints : Keypoints
-        In the coordinates of the whole image, sorted by row and column.
+    In the coordinates of the whole image, sorted by row and column; `stretch` is that of the whole image.
     """
     cv2.setNumThreads(1)
     window = grow(box, _MARGIN, size)
@@ -159,19 +133,7 @@ def detect_tile(
 
 
 def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Indices of the strongest points of every cell, at most `most` each, ascending.
-
-    Parameters
-    ----------
-    xy : (N, 2)
-        col, row [px].
-    response : (N,)
-        Strength.
-    cell : float
-        Side of a cell [px].
-    most : int
-        Points kept in a cell.
-    """
+    """Indices of the strongest of points (N, 2) [px] in every cell of a side [px], at most so many each, ascending."""
     if not len(xy):
         return np.empty(0, dtype=np.int64)
     cells = np.floor((xy + 0.5) / cell).astype(np.int64)

@@ -13,14 +13,13 @@ from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
 from barpc.tie.area import Area
-from barpc.tie.features import DETECTORS, Keypoints, bounded, detect_tile, join, tiles
-from barpc.tie.link import link, thin
+from barpc.tie.features import DETECTORS, Keypoints, bounded, detect_tile, join
 from barpc.tie.matcher import Matches
 from barpc.tie.matching import MATCHERS, PairReport, match_pair
 from barpc.tie.options import Progress, TieOptions, ordered
-from barpc.tie.pairs import Pair, require_connected, select_pairs, shared_boxes
-from barpc.tie.raster import sample_stretch
-from barpc.tie.refine import refine
+from barpc.tie.pairs import Pair, require_connected, select_pairs, shared_tiles
+from barpc.tie.raster import sample_stretch, tiles
+from barpc.tie.tracks import link, refine, thin
 
 _DEFAULTS = TieOptions()
 _SPARE = 1.3  # tracks registered for each one kept
@@ -66,10 +65,8 @@ def detect(
         As `select_pairs` gave them: tiles that no partner may see are not read. None: all are.
     area : Area, optional
         Together with `pairs`: tiles outside are not read either.
-    executor : Executor, optional
-        Works on the tiles; without one they are worked on here, one after the other.
-    progress : callable, optional
-        `progress("detect", done, total)`.
+    executor, progress : optional
+        Who does the work, and who hears how far it is: see `ordered`. The result does not depend on them.
 
     Returns
     -------
@@ -79,10 +76,7 @@ def detect(
     stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
     boxes = [tiles(view.size, options) for view in views]
     if pairs is not None:
-        wanted = shared_boxes(views, pairs, boxes, options, area=area)
-        boxes = [
-            [box for box, keep in zip(*both, strict=True) if keep] for both in zip(boxes, wanted, strict=True)
-        ]
+        boxes = shared_tiles(views, pairs, options, area)
     owners, tasks = [], []
     for owner, (view, stretch) in enumerate(zip(views, stretches, strict=True)):
         of_view = boxes[owner] if stretch is not None else []
@@ -129,10 +123,8 @@ def find_tracks(
         At least two; in a second pass with their corrected cameras, `replace(view, sensor=...)`.
     options : TieOptions
         How.
-    executor : Executor, optional
-        Works on tiles and pairs; the result does not depend on it.
-    progress : callable, optional
-        `progress(stage, done, total)`.
+    executor, progress : optional
+        Who does the work, and who hears how far it is: see `ordered`. The result does not depend on them.
     only : sequence of (int, int)
         Match these pairs and no others.
     area : Area, optional
@@ -181,13 +173,7 @@ def require_known(options: TieOptions) -> None:
 
 
 def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
-    """The tracks whose ground points lie in an area; all without one.
-
-    Raises
-    ------
-    TiePointError
-        There are tracks, but none in the area.
-    """
+    """The tracks whose ground points lie in an area, all without one; TiePointError where none does."""
     if area is None or not len(tracks):
         return tracks
     cameras = [view.sensor for view in views]
@@ -201,15 +187,7 @@ def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
 
 
 def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
-    """Raise unless the pairs that matched connect all views.
-
-    Raises
-    ------
-    TiePointError
-        There are two views and they do not match.
-    DisconnectedError
-        There are more, and they fall into groups.
-    """
+    """Raise TiePointError where two views do not match, DisconnectedError where more fall into groups."""
     failed = [report for report in reports if report.status != "ok"]
     told = "; ".join(
         f"{r.names[0]} - {r.names[1]}: {r.status} ({r.keypoints[0]} and {r.keypoints[1]} keypoints, "
@@ -235,13 +213,7 @@ def require_tracks(
     reports: Sequence[PairReport],
     options: TieOptions,
 ) -> None:
-    """Raise unless the tracks connect all views by at least `min_matches` observations a pair.
-
-    Raises
-    ------
-    TiePointError, DisconnectedError
-        As for `require_matches`.
-    """
+    """As `require_matches`, for the pairs that `min_matches` tracks or more are left of."""
     left = []
     for pair, report in zip(pairs, reports, strict=True):
         common = len(np.intersect1d(*(tracks.point[tracks.view == view] for view in pair.views)))

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from barpc.geodesy import Array
 from barpc.scene import IntArray, View
-from barpc.tie.epipolar import Frame
+from barpc.tie.epipolar import Frame, grouped
 from barpc.tie.features import Keypoints
-from barpc.tie.matcher import Matches, Prediction
+from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.options import TieOptions
 
 FloatArray = npt.NDArray[np.float32]
@@ -35,6 +35,8 @@ class Guided:
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
         """Mutual best keypoints whose second best is farther by the ratio test (Lowe 2004)."""
+        if not (len(self._a) and len(self._b)):
+            return NO_MATCHES
         where, across = prediction.at(self._a.xy), prediction.half_width
         if self._prepared is None:  # the axis of the frames, and so all this, is one for a pair
             described = _Described.of(self._a, where.linear), _Described.of(self._b, np.eye(2))
@@ -157,9 +159,5 @@ class _Strips:
 def _cells(where: Frame, wanted: IntArray, side: float) -> list[IntArray]:
     """The wanted points of A, cell by cell of B; points without a prediction are left out."""
     usable = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
-    if not len(usable):
-        return []
-    cell = np.floor(np.stack([where.across[usable], where.along[usable]], axis=1) / side)
-    order = np.lexsort((cell[:, 1], cell[:, 0]))
-    cuts = np.flatnonzero((np.diff(cell[order], axis=0) != 0).any(axis=1)) + 1
-    return np.split(usable[order], cuts)
+    cell = np.floor(np.stack([where.across[usable], where.along[usable]]) / side)
+    return [usable[rows] for rows in grouped(*cell)]

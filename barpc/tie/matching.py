@@ -19,12 +19,11 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.scene import View
 from barpc.tie.epipolar import Frame, agreeing, frame, mad, robust_affine
-from barpc.tie.features import Keypoints, tiles
+from barpc.tie.features import Keypoints
 from barpc.tie.guided import Guided
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
 from barpc.tie.options import TieOptions
-from barpc.tie.pairs import Pair, shared_boxes
-from barpc.tie.raster import Box
+from barpc.tie.pairs import Pair, shared_tiles
 
 T = TypeVar("T")
 
@@ -149,16 +148,8 @@ def _latest(function: Callable[[Array], T]) -> Callable[[Array], T]:
 
 @dataclass(frozen=True, eq=False)
 class _Peak:
-    """What a blind pass finds.
-
-    Parameters
-    ----------
-    prediction : Prediction
-        Where to search next.
-    share : float
-        Part of the matches that stand in the peak.
-    significance : float
-        Matches in the peak beyond chance, in standard deviations.
+    """What a blind pass finds: where to search next, the part of the matches in the peak, and how many standard
+    deviations these are beyond chance.
     """
 
     prediction: Prediction
@@ -175,19 +166,13 @@ class _Search:
         self._views, self._options = views, options
         self._matcher = MATCHERS[options.matcher](options, keypoints)
         points = keypoints[0].xy
-        self._windows = cache(self._seen)
+        self._windows = cache(lambda: shared_tiles(views, [Pair((0, 1), 1.0, 0.0)], options)[0])
         if not self._matcher.detects:
             middles = [(col + 0.5 * width, row + 0.5 * height) for col, row, width, height in self._windows()]
             points = np.array(middles).reshape(-1, 2)
         first = frame(*views, points)
         self._axis = first.axis
         self._frame = _latest(lambda xy: first if xy is points else frame(*views, xy, first.axis))
-
-    def _seen(self) -> list[Box]:
-        """The windows of A that B may see."""
-        boxes = [tiles(view.size, self._options) for view in self._views]
-        seen = shared_boxes(self._views, [Pair((0, 1), 1.0, 0.0)], boxes, self._options)
-        return [box for box, keep in zip(boxes[0], seen[0], strict=True) if keep]
 
     def errors(self, found: Matches) -> Array:
         """Distance along and across (M, 2) [px] of matches from where the cameras say."""

@@ -112,12 +112,8 @@ def ordered(
         Works on the tasks; None: they are worked on here, one after the other.
     function : callable
         Of a module, so that it can be sent to another process.
-    tasks : sequence of tuple
-        Its arguments.
-    stage : str
-        Name for the progress.
-    progress : callable, optional
-        `progress(stage, done, total)`.
+    tasks, stage, progress
+        Its arguments; `progress(stage, done, total)` is called as they are done.
     """
     results = []
     futures = [executor.submit(function, *task) for task in tasks] if executor is not None else []

@@ -16,8 +16,8 @@ from barpc.errors import DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.sensor.geometry import triangulate
 from barpc.tie import TieOptions, find, find_tracks, read_area, select_pairs
-from barpc.tie.features import tiles
-from barpc.tie.pairs import footprints, shared_boxes
+from barpc.tie.pairs import Footprints, shared_tiles
+from barpc.tie.raster import tiles
 
 from .test_pairs import METRE, camera, views
 
@@ -184,20 +184,19 @@ def test_only_windows_in_the_area_are_read(tmp_path, lon) -> None:
     options = TieOptions(search=10, tile=250, cell=50)
     (pair,) = select_pairs(two, options, area=area)
     assert pair.overlap == pytest.approx(1.0)
-    boxes = [tiles((1000, 1000), options)] * 2
-    for mask in shared_boxes(two, [pair], boxes, options, area=area):
-        assert mask.reshape(4, 4).tolist() == [[True, False, False, False]] * 4
+    boxes = tiles((1000, 1000), options)
+    for kept in shared_tiles(two, [pair], options, area):
+        assert [box in kept for box in boxes] == [True, False, False, False] * 4
 
 
 def test_outlines_and_the_area_grow_by_as_much_as_the_cameras_may_be_wrong(tmp_path) -> None:
     two = views(camera(0.0, lean=0.0), camera(0.0, lean=0.0))  # half a metre a pixel
     west, south, east, north = METRE * np.array([-400, -100, 50, 100])
     area = read_area(written(tmp_path / "a.json", box(west, south, east, north)))
-    cameras = [view.sensor for view in two]
-    plain = footprints(two, cameras, 100.0)
+    plain = Footprints(two, 100.0)
     for reach, metres in ((0.0, 0.0), (40.0, 20.0)):
-        grown = footprints(two, cameras, 100.0, reach)
-        inside = footprints(two, cameras, 100.0, reach, area)
+        grown = Footprints(two, 100.0, reach)
+        inside = Footprints(two, 100.0, reach, area)
         for outline, grew, part in zip(plain.outlines, grown.outlines, inside.outlines, strict=True):
             edge = np.array(outline.bounds) + metres * np.array([-1, -1, 1, 1])
             np.testing.assert_allclose(grew.bounds, edge, atol=0.1)
@@ -214,7 +213,7 @@ def test_outlines_and_the_area_grow_by_as_much_as_the_cameras_may_be_wrong(tmp_p
 def test_outlines_of_an_oblong_image_grow_by_whole_pixels_too() -> None:
     (square,) = views(camera(0.0, lean=0.0))
     oblong = replace(square, size=(1000, 250))
-    plain, grown = (footprints([oblong], [square.sensor], 100.0, reach).outlines[0] for reach in (0.0, 40.0))
+    plain, grown = (Footprints([oblong], 100.0, reach).outlines[0] for reach in (0.0, 40.0))
     np.testing.assert_allclose(np.subtract(grown.bounds, plain.bounds), [-20, -20, 20, 20], atol=0.1)
 
 
