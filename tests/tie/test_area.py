@@ -105,7 +105,7 @@ def test_the_whole_world_is_an_area(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ("{", "not an area of interest"),
+        ("{", "not a GeoJSON file"),
         ("[]", "not an area of interest"),
         ("{}", "not an area of interest"),
         ({"type": "Point", "coordinates": [5, 43]}, "a Point is no polygon"),
@@ -115,12 +115,12 @@ def test_the_whole_world_is_an_area(tmp_path) -> None:
         ({"type": "Polygon", "coordinates": [[[1], [2], [3], [1]]]}, "not an area of interest"),
         ({"type": "Polygon", "coordinates": []}, "not an area of interest"),
         (box(500000, 4800000, 501000, 4801000), "not a longitude and a latitude"),
-        ('{"type": "Polygon", "coordinates": [[[5, NaN], [6, 44], [5, 44], [5, 43]]]}', "not a longitude"),
+        ('{"type": "Polygon", "coordinates": [[[5, NaN], [6, 44], [5, 44], [5, 43]]]}', "NaN is no finite number"),
         (box(5, 43, 5, 44), "of any extent"),
         (wrapped({"type": "MultiPolygon", "coordinates": []}), "of any extent"),
         ({**box(1, 2, 3, 4), "crs": {"properties": {"name": "EPSG:32631"}}}, "EPSG:32631"),
-        ('{"type": "FeatureCollection", "features":' * 5000, "not an area of interest"),
-        ('{"type": "GeometryCollection", "geometries":[' * 900 + "]}" * 900, "not an area of interest|any extent"),
+        ('{"type": "FeatureCollection", "features":' * 5000, "nested too deep"),
+        ('{"type": "GeometryCollection", "geometries":[' * 900 + "]}" * 900, "nested too deep"),
     ],
 )  # fmt: skip
 def test_what_is_no_area_is_refused_in_one_line(tmp_path, data, message) -> None:
@@ -168,10 +168,10 @@ def test_any_json_is_an_area_or_one_line(tmp_path_factory, data) -> None:
 
 
 def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path) -> None:
-    with pytest.raises(InputError, match=r"gone\.json: cannot be read"):
+    with pytest.raises(InputError, match=r"gone\.json: no such file"):
         read_area(tmp_path / "gone.json")
     (tmp_path / "b.json").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match="not an area of interest"):
+    with pytest.raises(InputError, match="not a UTF-8 text"):
         read_area(tmp_path / "b.json")
 
 
