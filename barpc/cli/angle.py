@@ -10,7 +10,8 @@ from typing import Any
 import click
 import numpy as np
 
-from barpc.cli.points import camera_options, load_camera, middle_altitude
+from barpc.cameras import open_camera
+from barpc.cli.points import as_json
 from barpc.cli.terminal import echo
 from barpc.sensor.geometry import convergence_angle, view_angles
 
@@ -18,14 +19,10 @@ from barpc.sensor.geometry import convergence_angle, view_angles
 @click.command("angle")
 @click.argument("images", nargs=-1, required=True, metavar="IMAGE...")
 @click.option("--at", type=(float, float, float), help="Ground point: lon, lat, alt.  [default: each centre]")
-@click.option("--size", type=(int, int), help="Width and height of the image, for RPC files.")
-@camera_options
+@as_json
 def command(
     images: tuple[str, ...],
     at: tuple[float, float, float] | None,
-    size: tuple[int, int] | None,
-    pixel_convention: str,
-    band: int,
     as_json: bool,
 ) -> None:
     r"""Print incidence and azimuth of each image, convergence angle and B/H of each pair, in degrees.
@@ -37,21 +34,21 @@ def command(
     Example:
       barpc angle left.tif right.tif
     """
-    cameras = [load_camera(image, pixel_convention, band, size) for image in images]
+    cameras = [open_camera(image) for image in images]
     points = []
     for camera in cameras:
         if at is not None:
             points.append(np.array(at))
             continue
         center = (np.array(camera.extent) - 1) / 2
-        points.append(camera.rpc.localize(center, np.asarray(middle_altitude(camera.rpc))))
+        points.append(camera.model.localize(center, np.asarray(camera.altitude)))
     views: list[dict[str, Any]] = []
     for image, camera, point in zip(images, cameras, points, strict=True):
-        incidence, azimuth = view_angles(camera.rpc, point)
+        incidence, azimuth = view_angles(camera.model, point)
         views.append({"name": Path(image).stem, "incidence": float(incidence), "azimuth": float(azimuth)})
     pairs: list[dict[str, Any]] = []
     for (i, a), (j, b) in combinations(enumerate(cameras), 2):
-        angle = float(convergence_angle(a.rpc, b.rpc, points[i]))
+        angle = float(convergence_angle(a.model, b.model, points[i]))
         ratio = 2 * float(np.tan(np.radians(angle) / 2))
         pairs.append({"a": views[i]["name"], "b": views[j]["name"], "convergence": angle, "b_over_h": ratio})
     if as_json:

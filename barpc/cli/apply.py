@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from barpc.cli.points import camera_options, load_camera
+from barpc.cameras import open_camera
+from barpc.cli.points import as_json
 from barpc.cli.terminal import echo, say, tell_gate
 from barpc.errors import InputError
 from barpc.handoff import Reading, refuse_hiding, verify
@@ -32,7 +33,7 @@ _ENDS = [*dict.fromkeys(s for row in FORMATS.values() for s in row.suffixes), ".
     "--rpc-format", default="txt", show_default=True, help="Files to write beside: txt,rpb,geom,xml,json."
 )
 @click.option("--overwrite", is_flag=True, help="Replace files of an earlier run.")
-@camera_options
+@as_json
 def command(
     images: tuple[str, ...],
     rpcs: str,
@@ -40,8 +41,6 @@ def command(
     carrier: str,
     rpc_format: str,
     overwrite: bool,
-    pixel_convention: str,
-    band: int,
     as_json: bool,
 ) -> int:
     r"""Write images with other RPCs into a new folder, then open every file as GDAL, rpcm and others do.
@@ -65,7 +64,7 @@ def command(
     reasons: list[str] = []
     with Workspace(folder, overwrite=overwrite, keep=inputs, names=together, adds=True) as workspace:
         for image, source, row in zip(images, sources, names, strict=True):
-            rpc = load_camera(str(source), pixel_convention, band).rpc
+            rpc = open_camera(str(source)).rpc
             _write(workspace, Path(image), rpc, row, formats)
             written = [folder / name for name in row]
             readings += verify(written, rpc, _size(image), altitude_range(rpc))

@@ -37,15 +37,18 @@ def command(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None
 
 
 def _compare(images: list[str], against: Path, as_json: bool) -> int:
+    from barpc.cameras import open_camera
     from barpc.handoff import TOLERANCE, difference
     from barpc.pipeline import load_views
-    from barpc.rpcio import read_rpc
 
     views = load_views(images, min_views=1, distinct=False).views
     found = {}
     for view in views:
         other = _counterpart(Path(view.path), against)
-        found[view.path] = (str(other), difference(view.sensor, read_rpc(other), view.size, view.alt_range))
+        found[view.path] = (
+            str(other),
+            difference(view.sensor, open_camera(other).model, view.size, view.alt_range),
+        )
     if as_json:
         entries = [{"image": a, "against": b, "max_px": px} for a, (b, px) in found.items()]
         echo(json.dumps(entries, indent=1))

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import click
 
-from barpc.cli.points import camera_options, check_target, load_camera
+from barpc.cameras import open_camera
+from barpc.cli.points import as_json, check_target
 from barpc.cli.terminal import echo, say
 from barpc.rpcio import FORMATS, write_rpc, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
 
@@ -27,15 +28,13 @@ _WRITABLE = [name for name, row in FORMATS.items() if row.write is not None]
 @click.option("--format", "name", type=click.Choice(_WRITABLE), help="Whatever the target's name says.")
 @click.option("--image", metavar="FILE", help="Pixels of a .vrt, .tif or .ntf.  [default: SOURCE]")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-@camera_options
+@as_json
 def command(
     source: str,
     target: str,
     name: str | None,
     image: str | None,
     overwrite: bool,
-    pixel_convention: str,
-    band: int,
     as_json: bool,
 ) -> None:
     r"""Write the RPC of SOURCE (an image or an RPC file) to TARGET; its name chooses the format.
@@ -47,7 +46,7 @@ def command(
       barpc convert RPC_PHR1A.XML image_RPC.TXT
       barpc convert vendor.XML with_rpc.vrt --image image.tif
     """
-    camera = load_camera(source, pixel_convention, band)
+    camera = open_camera(source)
     check_target(target, [source, *([image] if image else [])], overwrite, camera.rpc)
     writer = _RASTERS.get(Path(target).suffix.lower()) if name is None else None
     if writer is not None:
@@ -55,10 +54,8 @@ def command(
     else:
         write_rpc(camera.rpc, target, format=name, overwrite=overwrite)
     if as_json:
-        echo(
-            json.dumps({"source": str(camera.source.path), "format": camera.source.format, "target": target})
-        )
+        echo(json.dumps({"source": str(camera.path), "format": camera.format, "target": target}))
     else:
-        echo(f"{camera.source.path} ({camera.source.format}) -> {target}")
-        for note in camera.source.notes:
+        echo(f"{camera.path} ({camera.format}) -> {target}")
+        for note in camera.notes:
             say(note)

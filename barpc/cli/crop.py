@@ -7,7 +7,8 @@ import json
 import click
 import numpy as np
 
-from barpc.cli.points import Camera, camera_options, check_target, load_camera, middle_altitude
+from barpc.cameras import Camera, open_camera
+from barpc.cli.points import as_json, check_target
 from barpc.cli.terminal import echo
 from barpc.rpcio import write_crop
 from barpc.sensor.geometry import image_border
@@ -20,7 +21,7 @@ from barpc.sensor.geometry import image_border
 @click.option("--bbox", type=(float, float, float, float), help="WEST SOUTH EAST NORTH [deg].")
 @click.option("--alt", type=float, help="Altitude of the ground for --bbox [m].  [default: the RPC's middle]")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-@camera_options
+@as_json
 def command(
     image: str,
     output: str,
@@ -28,8 +29,6 @@ def command(
     bbox: tuple[float, float, float, float] | None,
     alt: float | None,
     overwrite: bool,
-    pixel_convention: str,
-    band: int,
     as_json: bool,
 ) -> None:
     r"""Write a window of an image as GeoTIFF, with the RPC of exactly that window.
@@ -41,9 +40,9 @@ def command(
     """
     if (window is None) == (bbox is None):
         raise click.UsageError("give either --window or --bbox")
-    camera = load_camera(image, pixel_convention, band)
+    camera = open_camera(image)
     if bbox is not None:
-        window = _window(camera, bbox, middle_altitude(camera.rpc) if alt is None else alt)
+        window = _window(camera, bbox, camera.altitude if alt is None else alt)
     assert window is not None
     check_target(output, [image], overwrite)
     write_crop(camera.rpc, image, output, window, overwrite=overwrite)
@@ -61,6 +60,6 @@ def _window(camera: Camera, bbox: tuple[float, float, float, float], alt: float)
     low = np.maximum(np.floor(image.min(axis=0) + 0.5), 0)
     high = np.minimum(np.ceil(image.max(axis=0) + 0.5), [width, height])
     if not (np.isfinite(image).all() and (high > low).all()):
-        raise click.UsageError(f"--bbox {bbox} does not meet {camera.source.path} at {alt:g} m")
+        raise click.UsageError(f"--bbox {bbox} does not meet {camera.path} at {alt:g} m")
     col, row = (int(v) for v in low)
     return col, row, int(high[0]) - col, int(high[1]) - row

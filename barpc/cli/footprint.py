@@ -9,7 +9,8 @@ import click
 import numpy as np
 
 from barpc.atomic import write_text
-from barpc.cli.points import camera_options, check_target, load_camera, middle_altitude
+from barpc.cameras import open_camera
+from barpc.cli.points import as_json, check_target
 from barpc.cli.terminal import echo
 from barpc.errors import RpcError
 from barpc.geojson import collection, feature
@@ -19,18 +20,14 @@ from barpc.sensor.geometry import footprint
 @click.command("footprint")
 @click.argument("images", nargs=-1, required=True, metavar="IMAGE...")
 @click.option("--alt", type=float, help="Altitude of the ground [m].  [default: the RPC's middle]")
-@click.option("--size", type=(int, int), help="Width and height of the image, for RPC files.")
 @click.option("-o", "--output", metavar="FILE", help="Write here instead of to standard output.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-@camera_options
+@as_json
 def command(
     images: tuple[str, ...],
     alt: float | None,
-    size: tuple[int, int] | None,
     output: str | None,
     overwrite: bool,
-    pixel_convention: str,
-    band: int,
     as_json: bool,
 ) -> None:
     r"""Print the footprints of images as GeoJSON (RFC 7946: cut at the antimeridian).
@@ -43,9 +40,9 @@ def command(
         check_target(output, images, overwrite)
     features = []
     for image in images:
-        camera = load_camera(image, pixel_convention, band, size)
-        at = middle_altitude(camera.rpc) if alt is None else alt
-        ring = footprint(camera.rpc, camera.extent, at)
+        camera = open_camera(image)
+        at = camera.altitude if alt is None else alt
+        ring = footprint(camera.model, camera.extent, at)
         if not np.isfinite(ring).all():
             raise RpcError(f"{image}: the RPC has no ground point at its image's border at {at:g} m")
         features.append(feature(ring, name=Path(image).stem, path=str(image), alt=at))

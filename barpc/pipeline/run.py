@@ -19,7 +19,7 @@ from barpc.pipeline.crew import Crew
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
 from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import MATCHES, SUFFIXES, output_names, refuse_shadows, write_tables, write_view
-from barpc.pipeline.views import LoadedViews, load_views
+from barpc.pipeline.views import Image, LoadedViews, image_path, load_views
 from barpc.plain import plain_path
 from barpc.pointio.matches import asp_text, read_matches, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
@@ -88,7 +88,7 @@ class AdjustResult:
 
 
 def adjust(
-    images: Sequence[str | Path],
+    images: Sequence[Image],
     out_dir: str | Path,
     options: RunOptions | None = None,
     *,
@@ -99,9 +99,10 @@ def adjust(
 
     Parameters
     ----------
-    images : sequence of path
-        Two or more rasters with RPCs, in any order: the files written do not depend on it. They are opened
-        read-only.
+    images : sequence of path or View
+        Two or more rasters, in any order: the files written do not depend on it. They are opened read-only. What
+        a camera is read from is found as `barpc.cameras.open_camera` does; a View brings its own model (a frozen
+        dataclass, so that its results can be kept).
     out_dir : path
         Folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``.
     options : RunOptions, optional
@@ -161,7 +162,7 @@ def adjust(
 
 
 def check(
-    images: Sequence[str | Path],
+    images: Sequence[Image],
     options: RunOptions | None = None,
     *,
     executor: Executor | None = None,
@@ -175,12 +176,12 @@ def check(
     return AdjustResult(_as_given(run.views, images), run, summarize(run))
 
 
-def _as_given(views: Iterable[View], images: Sequence[str | Path]) -> tuple[View, ...]:
-    place = {str(Path(path).absolute()): number for number, path in enumerate(images)}
+def _as_given(views: Iterable[View], images: Sequence[Image]) -> tuple[View, ...]:
+    place = {str(image_path(image)): number for number, image in enumerate(images)}
     return tuple(sorted(views, key=lambda view: place[view.path]))
 
 
-def _load(images: Sequence[str | Path], options: RunOptions) -> LoadedViews:
+def _load(images: Sequence[Image], options: RunOptions) -> LoadedViews:
     for path in input_files(options):
         plain_path(path)
     least = 1 if options.gcp else 2  # one image and control points are enough

@@ -159,9 +159,9 @@ def test_footprint_is_geojson_with_a_polygon_an_image(image, other, tmp_path, ca
 
 def test_an_rpc_file_has_no_size_and_asks_for_it(tmp_path, capsys):
     write_rpc(make_rpc(), tmp_path / "a.RPB")
-    assert run("footprint", tmp_path / "a.RPB") == 2
-    assert "--size" in capsys.readouterr().err
-    assert run("footprint", tmp_path / "a.RPB", "--size", 2000, 1900) == 0
+    assert run("footprint", tmp_path / "a.RPB") == 1
+    assert "size=" in capsys.readouterr().err
+    assert run("footprint", f"{tmp_path / 'a.RPB'},size=2000:1900") == 0
 
 
 def test_info_says_where_the_rpc_comes_from_and_what_was_passed_over(image, capsys):
@@ -189,7 +189,7 @@ def test_convert_can_be_told_the_pixel_convention(tmp_path, capsys):
     (tmp_path / "RPC_S6.XML").write_text(dimap_v2(make_rpc()))
     for convention, shift in (("auto", 0), ("0", 1), ("0.5", 0.5)):
         target = tmp_path / f"{convention}.geom"
-        assert run("convert", tmp_path / "RPC_S6.XML", target, "--pixel-convention", convention) == 0
+        assert run("convert", f"{tmp_path / 'RPC_S6.XML'},first_pixel={convention}", target) == 0
         np.testing.assert_allclose(read_rpc(target).image_offset, make_rpc().image_offset + shift, atol=1e-9)
     assert run("convert", tmp_path / "RPC_S6.XML", tmp_path / "c.doc") == 1
     assert "choose one of" in capsys.readouterr().err
