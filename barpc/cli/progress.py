@@ -1,4 +1,4 @@
-"""Progress bars on stderr, and the executors that `-j` and `--dask` ask for."""
+"""Progress bars on stderr, and the executors that `-j` asks for."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 
 
 @contextmanager
-def executor_for(jobs: int, dask: str | None) -> Iterator[Executor | None]:
+def executor_for(jobs: int | str) -> Iterator[Executor | None]:
     """The executor of a run: None works in this process."""
-    if dask is not None:
-        with _cluster(dask) as executor:
+    if isinstance(jobs, str):
+        with _cluster(jobs) as executor:
             yield executor
     elif jobs > 1:
         with _processes(jobs) as executor:
@@ -71,11 +71,11 @@ def _cluster(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise InputError("--dask needs the extra: pip install 'barpc[cluster]'") from error
+        raise InputError("-j with an address needs the extra: pip install 'barpc[cluster]'") from error
     try:
         client = Client(address, timeout=20)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
-        raise InputError(f"--dask {address}: no scheduler answers there ({error})") from error
+        raise InputError(f"-j {address}: no scheduler answers there ({error})") from error
     with client:
         yield client.get_executor()  # type: ignore[no-untyped-call]
 

@@ -228,8 +228,15 @@ def _adjusted(run: Run, options: RunOptions, given: Given) -> tuple[Run, Adjustm
     gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
     centers = tuple(_center(view, options) for view in run.views)
     ecef = np.array([center.ecef for center in centers])
+    adjusting = replace(options.adjust, keep_largest=options.keep_going or options.adjust.keep_largest)
     adjustment = adjust_tracks(
-        run.views, run.tracks, options.adjust, gcps, given.dem, centers=ecef, prior=given.prior
+        run.views,
+        run.tracks,
+        adjusting,
+        gcps,
+        given.dem,
+        centers=ecef,
+        prior=given.prior,
     )
     return replace(run, centers=centers, gcps=gcps, check_points=checks), adjustment
 
@@ -255,7 +262,7 @@ def _with_ties(
     try:
         ties = find_tracks(run.views, options.tie, **given)
     except DisconnectedError as error:
-        if not options.adjust.keep_largest or len(error.groups[0]) < 2:
+        if not (options.keep_going or options.adjust.keep_largest) or len(error.groups[0]) < 2:
             raise
         kept = _only(run, frozenset(error.groups[0]))
         logger.warning("%d of %d images are tied together and kept", len(kept.views), len(run.views))
@@ -305,7 +312,9 @@ def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
     for i, (view, model) in enumerate(zip(run.views, run.adjustment.sensors, strict=True)):
         try:
-            fit = fit_rpc(model, view.size, view.alt_range, options=options.fit, strict=not options.force)
+            fit = fit_rpc(
+                model, view.size, view.alt_range, options=options.fit, strict=not options.keep_going
+            )
         except FitError as error:
             raise FitError(f"{view.name}: {error}") from error
         rand = view.sensor.err_rand if isinstance(view.sensor, RPC) else None
