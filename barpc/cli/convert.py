@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -13,31 +12,12 @@ from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.points import as_json, check_target
 from barpc.cli.terminal import echo, say, tell_gate
 from barpc.errors import InputError
-from barpc.handoff import Reading, refuse_hiding, verify
+from barpc.handoff import Reading, refuse_hiding, unverified, verify
 from barpc.plain import plain_path
 from barpc.raster import open_raster
-from barpc.rpcio import (
-    FORMATS,
-    rpc_vrt,
-    shadows,
-    write_crop,
-    write_rpc,
-    write_rpc_copy,
-    write_rpc_nitf,
-    write_rpc_vrt,
-)
+from barpc.rpcio import CARRIERS, WRITABLE, find_rpc, shadows, write_camera, write_crop, write_rpc
 from barpc.sensor.geometry import image_border
-from barpc.sensor.rpc import RPC
 from barpc.workspace import Workspace
-
-_RASTERS: dict[str, Callable[..., None]] = {
-    ".vrt": write_rpc_vrt,
-    ".tif": write_rpc_copy,
-    ".tiff": write_rpc_copy,
-    ".ntf": write_rpc_nitf,
-}
-_WRITABLE = [name for name, row in FORMATS.items() if row.write is not None]
-_ENDS = [*dict.fromkeys(s for row in FORMATS.values() for s in row.suffixes), ".vrt", ".tif"]
 
 Window = tuple[int, int, int, int]
 Box = tuple[float, float, float, float]
@@ -59,7 +39,7 @@ Box = tuple[float, float, float, float]
     "--rpc-format",
     "formats",
     metavar="NAMES",
-    help=f"Of {', '.join(_WRITABLE)}.  [default: TARGET's name; txt]",
+    help=f"Of {', '.join(WRITABLE)}.  [default: TARGET's name; txt]",
 )
 @click.option("--window", type=(int, int, int, int), help="Cut out COL ROW WIDTH HEIGHT [px].")
 @click.option("--bbox", type=(float, float, float, float), help="Cut out WEST SOUTH EAST NORTH [deg].")
@@ -119,9 +99,8 @@ def command(
 def _convert(
     camera: Camera, source: str, target: str, name: str | None, overwrite: bool, as_json: bool
 ) -> None:
-    writer = _RASTERS.get(Path(target).suffix.lower()) if name is None else None
-    if writer is not None:
-        writer(camera.rpc, split_spec(source)[0], target, overwrite=overwrite)
+    if name is None:
+        write_camera(camera.rpc, target, split_spec(source)[0], overwrite=overwrite)
     else:
         write_rpc(camera.rpc, target, format=name, overwrite=overwrite)
     if as_json:
@@ -174,7 +153,7 @@ def _hand_off(
     """Write images with their RPCs, open every file as its readers do, and say what they see."""
     files = [split_spec(image)[0] for image in images]
     _check(files, folder, formats)
-    sources = images if rpcs is None else [str(_rpc_file(Path(rpcs), file)) for file in files]
+    sources = images if rpcs is None else [_rpc_file(Path(rpcs), file) for file in files]
     cameras = [open_camera(source) for source in sources]
     names = [_names(file, carrier, formats) for file in files]
     together = [name for row in names for name in row]
@@ -184,11 +163,15 @@ def _hand_off(
     reasons: list[str] = []
     with Workspace(folder, overwrite=overwrite, keep=inputs, names=together, adds=True) as workspace:
         for file, camera, row in zip(files, cameras, names, strict=True):
-            _write(workspace, file, camera.rpc, row, formats)
+            for name in row:
+                with workspace.output(name) as partial:
+                    write_camera(camera.rpc, partial, file, place=folder / name, overwrite=True)
             written = [folder / name for name in row]
             readings += verify(written, camera.rpc, _size(file), camera.alt_range)
             reasons += _shadow_reasons(file, written)
     _tell(readings, as_json)
+    for sentence in unverified([folder / name for name in names[0]]):
+        say(sentence)
     reasons += [
         f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}."
         for r in readings
@@ -236,7 +219,7 @@ def _size(image: Path) -> tuple[int, int]:
 
 def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
     for name in formats:
-        if name not in FORMATS or FORMATS[name].write is None:
+        if name not in WRITABLE:
             raise click.UsageError(f"--rpc-format {name}: not a format that is written")
     for path in (*images, folder):
         plain_path(path.absolute())
@@ -248,32 +231,11 @@ def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
         raise InputError(f"{folder}: the folder of the images; choose a new one")
 
 
-def _rpc_file(rpcs: Path, image: Path) -> Path:
-    if not rpcs.is_dir():
-        return rpcs
-    present = {entry.name.lower(): entry for entry in rpcs.iterdir()}
-    for end in _ENDS:
-        found = present.get(f"{image.stem}{end}".lower())
-        if found is not None:
-            return found
-    raise InputError(
-        f"{rpcs}: no RPC of {image.name} there (looked for {image.stem}_RPC.TXT, .RPB, .geom, .vrt, ...)"
-    )
-
-
 def _names(image: Path, carrier: str, formats: list[str]) -> list[str]:
     """What is written for an image: the raster, then a file for each format."""
-    ends = [".vrt" if carrier == "vrt" else ".tif", *(FORMATS[name].suffixes[0] for name in formats)]
+    ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
     return [image.stem + end for end in ends]
 
 
-def _write(workspace: Workspace, image: Path, rpc: RPC, names: list[str], formats: list[str]) -> None:
-    raster, *files = names
-    with workspace.output(raster) as partial:
-        if raster.endswith(".vrt"):
-            partial.write_text(rpc_vrt(rpc, image, workspace.folder / raster), encoding="utf-8")
-        else:
-            write_rpc_copy(rpc, image, partial, overwrite=True)
-    for name, format in zip(files, formats, strict=True):
-        with workspace.output(name) as partial:
-            write_rpc(rpc, partial, format=format, overwrite=True)
+def _rpc_file(rpcs: Path, image: Path) -> str:
+    return str(find_rpc(rpcs, image) if rpcs.is_dir() else rpcs)

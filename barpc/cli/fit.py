@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -132,15 +131,9 @@ def _write(fit: RpcFit, source: str, output: str, overwrite: bool) -> str:
     """Write the RPC, read it back as a consumer does, and say what is lost."""
     import numpy as np
 
-    from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy, write_rpc_vrt
+    from barpc.rpcio import read_rpc, write_camera
 
-    suffix = Path(output).suffix.lower()
-    if suffix in (".tif", ".tiff"):
-        write_rpc_copy(fit.rpc, source, output, overwrite=overwrite)
-    elif suffix == ".vrt":
-        write_rpc_vrt(fit.rpc, source, output, overwrite=overwrite)
-    else:
-        write_rpc(fit.rpc, output, overwrite=overwrite)
+    write_camera(fit.rpc, output, source, overwrite=overwrite)
     corners = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1)
     ground = fit.rpc.ground_offset + corners * fit.rpc.ground_scale
     lost = float(np.abs(read_rpc(output).project(ground) - fit.rpc.project(ground)).max())

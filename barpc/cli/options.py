@@ -93,7 +93,11 @@ RUN_FLAGS = (
         "Carry the new RPC in a small VRT that points at the image, in a full copy, or not.  [default: vrt]",
         type=click.Choice(["vrt", "copy", "none"]),
     ),
-    Flag("--rpc-format", "rpc_formats", "RPC files to write, of txt,rpb,geom,json,xml.  [default: txt]"),
+    Flag(
+        "--rpc-format",
+        "rpc_formats",
+        "RPC files to write, of those that 'barpc convert --help' lists.",
+    ),
     Flag(
         "--keep-going",
         "keep_going",

@@ -14,11 +14,11 @@ import numpy as np
 from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
-from barpc.handoff import refuse_hiding
+from barpc.handoff import refuse_hiding, unverified
 from barpc.pipeline.crew import Crew
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
 from barpc.pipeline.options import RunOptions
-from barpc.pipeline.outputs import MATCHES, SUFFIXES, output_names, refuse_shadows, write_tables, write_view
+from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import Image, LoadedViews, image_path, load_views
 from barpc.plain import plain_path
 from barpc.pointio.matches import asp_text, read_matches, write_matches
@@ -26,7 +26,7 @@ from barpc.pointio.names import pair_name, require_pair_names
 from barpc.report import Run, summarize
 from barpc.report.measures import pair_ties
 from barpc.report.page import remake_report
-from barpc.rpcio import plain_source
+from barpc.rpcio import WRITABLE, plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
@@ -122,9 +122,9 @@ def adjust(
         See `barpc.errors`; nothing is written then.
     """
     options = options or RunOptions()
-    unknown = [name for name in options.rpc_formats if name not in SUFFIXES]
+    unknown = [name for name in options.rpc_formats if name not in WRITABLE]
     if unknown:
-        raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(SUFFIXES)}")
+        raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(WRITABLE)}")
     plain_path(Path(out_dir).absolute())
     loaded = _load(images, options)
     if options.stop_after == "matching":
@@ -327,4 +327,6 @@ def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress
         written.append(write_view(workspace, view, fit, model, options.images, options.rpc_formats))
         if progress is not None:
             progress("write", i + 1, len(run.views))
+    for sentence in unverified([workspace.folder / name for name in written[0]]):
+        logger.warning(sentence)
     return replace(run, fits=tuple(fits), written=tuple(written))

@@ -311,7 +311,7 @@ def test_convert_reports_a_file_that_a_tool_cannot_read_as_valid_json(image, tmp
     def broken(path):
         raise RuntimeError("no such\nfield")
 
-    monkeypatch.setitem(handoff.CONSUMERS, "gdal", handoff.Consumer((".vrt",), "rasterio", broken))
+    monkeypatch.setitem(handoff.CONSUMERS, "gdal", handoff.Consumer("rasterio", broken))
     write_rpc(read_rpc(image), tmp_path / "a.geom")
     assert run("convert", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--json") == 3
     rows = {row["consumer"]: row for row in json.loads(capsys.readouterr().out)}
