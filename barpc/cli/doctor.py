@@ -14,7 +14,16 @@ from typing import Any
 
 from barpc.cli.terminal import echo
 
-REQUIRED = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely", "click", "rich", "filelock")
+REQUIRED = (
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "rasterio",
+    "shapely",
+    "click",
+    "filelock",
+    "fastjsonschema",
+)
 OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
 
 

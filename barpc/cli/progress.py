@@ -11,6 +11,14 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import click
+
+from barpc.plain import visible
+
+if TYPE_CHECKING:
+    from click._termui_impl import ProgressBar
 
 Progress = Callable[[str, int, int], None]
 
@@ -19,36 +27,29 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 @contextmanager
 def progress_bars(quiet: bool) -> Iterator[Progress]:
-    """A callback `progress(stage, done, total)` that draws one bar a stage; silent in pipes and with -q."""
+    """A callback `progress(stage, done, total)` that draws one bar a stage at a time; silent in pipes and with -q."""
     if quiet or not sys.stderr.isatty():
         yield lambda _stage, _done, _total: None
         return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    bars: dict[str, ProgressBar[int]] = {}
 
-    columns = (
-        TextColumn("{task.description:<22}"),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        tasks: dict[str, object] = {}
+    def show(stage: str, done: int, total: int) -> None:
+        if stage not in bars:
+            finish()
+            label = visible(f"{stage:<22}")
+            bars[stage] = click.progressbar(length=total, label=label, show_pos=True, file=sys.stderr)
+        bars[stage].length = total
+        bars[stage].update(done - bars[stage].pos)
 
-        def show(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+    def finish() -> None:
+        for bar in bars.values():
+            bar.render_finish()
+        bars.clear()
 
+    try:
         yield show
+    finally:
+        finish()
 
 
 @contextmanager

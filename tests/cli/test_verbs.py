@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import logging
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from barpc.cli import main
 from barpc.cli.main import MOVED
+from barpc.cli.progress import progress_bars
 from barpc.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.geometry import triangulate
@@ -185,6 +187,26 @@ def test_what_was_said_otherwise_says_how_now_and_does_nothing_else(former, imag
     assert captured.out == ""
     assert MOVED[former] in captured.err
     assert len(captured.err.splitlines()) == 1
+
+
+class Terminal(io.StringIO):
+    """What stderr is when somebody looks."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_progress_is_drawn_for_a_terminal_only(quiet, monkeypatch):
+    monkeypatch.setattr("sys.stderr", Terminal() if not quiet else io.StringIO())
+    with progress_bars(False) as progress:
+        for stage, total in (("detect", 3), ("match", 2), ("detect", 3)):  # a second pass begins again
+            for done in range(1, total + 1):
+                progress(stage, done, total)
+    drawn = sys.stderr.getvalue()
+    assert [f"{stage:<22}" in drawn for stage in ("detect", "match")] == [not quiet] * 2
+    assert [drawn.count("3/3") > 0, drawn.count("2/2") > 0] == [not quiet] * 2
+    assert drawn.count("\n") == (0 if quiet else 3)
 
 
 def test_general_flags_stand_before_and_after_the_verb(image, tmp_path, capsys, monkeypatch):
