@@ -104,8 +104,9 @@ def _fit(source: str, flags: dict[str, Any]) -> tuple[RpcFit, float]:
     from barpc.cli.options import run_options
     from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 
-    values = {} if flags["tolerance"] is None else {"flag_fit_tolerance": flags["tolerance"]}
-    options = run_options(values, flags["options_file"]).fit
+    options = run_options({}, flags["options_file"]).fit
+    if flags["tolerance"] is not None:
+        options = replace(options, tolerance=flags["tolerance"])
     points, size = read_points(source)
     if points is not None:
         ground, image = points.ground, points.image

@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from barpc.cli.terminal import echo, tell_gate
+from barpc.cli.terminal import echo, say, tell_gate
 from barpc.errors import InputError, OutputError
 from barpc.geodesy import Array
 from barpc.rpcio import FORMATS, hidden_by, sidecars
@@ -56,7 +56,7 @@ def check_target(
                 f"{target}: would be read in place of the RPC that {image} has; give another folder or name, or "
                 "--overwrite if that is meant"
             )
-        click.echo(f"barpc: {target} is read in place of the RPC that {image} had", err=True)
+        say(f"{target} is read in place of the RPC that {image} had")
 
 
 def read_points(
