@@ -88,6 +88,7 @@ def test_a_file_that_a_tool_cannot_read_is_reported_with_its_reason(tmp_path):
 
 
 def test_a_new_format_is_one_row_written_verified_and_offered(image, tmp_path, monkeypatch, capsys):
+    import barpc.cli.convert  # noqa: F401  before the row is there: its help is written once
     from barpc.cli import main
     from barpc.rpcio import formats, text
 
