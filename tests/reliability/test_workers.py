@@ -109,7 +109,7 @@ def cluster(tmp_path):
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_bytes_also_when_it_loses_a_worker(scene, alone, cluster):
     address, workers = cluster
-    run = [sys.executable, "-m", "barpc", *map(str, command(scene, "dask", "--dask", address))]
+    run = [sys.executable, "-m", "barpc", *map(str, command(scene, "dask", "-j", address))]
     process = subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 600
     while len(list(scene.glob("dask/.barpc/cache/detect_tile/*.npz"))) < 3:
