@@ -27,16 +27,20 @@ _PUBLIC = {
     "fit_rpc": "barpc.fit",
     "fit_rpc_points": "barpc.fit",
     "adjust": "barpc.pipeline",
+    "check": "barpc.pipeline",
+    "open_camera": "barpc.cameras",
     "BarpcError": "barpc.errors",
     "BarpcWarning": "barpc.errors",
 }
 
 if TYPE_CHECKING:
+    from barpc.cameras import open_camera as open_camera
     from barpc.errors import BarpcError as BarpcError
     from barpc.errors import BarpcWarning as BarpcWarning
     from barpc.fit import fit_rpc as fit_rpc
     from barpc.fit import fit_rpc_points as fit_rpc_points
     from barpc.pipeline import adjust as adjust
+    from barpc.pipeline import check as check
     from barpc.rpcio import read_rpc as read_rpc
     from barpc.rpcio import write_rpc as write_rpc
     from barpc.scene import GroundPoints as GroundPoints

@@ -30,7 +30,7 @@ from barpc.errors import OutputError
 from barpc.geodesy import Array, wrap_longitude
 from barpc.owned import own_files
 from barpc.raster import GDAL_OPTIONS
-from barpc.rpcio import hidden_by, read_rpc, sidecars
+from barpc.rpcio import Carrier, hidden_by, read_rpc, row_of, sidecars
 from barpc.sensor import SensorModel
 from barpc.vrt import Vrt, read_vrt
 
@@ -39,9 +39,6 @@ TOLERANCE = 1e-6
 
 Projection = Callable[[Array], Array]
 """Ground points (N, 3) [deg, deg, m] -> image points (N, 2) [px], centre of the first pixel = (0, 0)."""
-
-_RASTERS = (".vrt", ".tif", ".tiff", ".ntf")
-_TEXTS = ("_rpc.txt", ".rpb", ".xml")
 
 
 @dataclass(frozen=True)
@@ -158,12 +155,30 @@ def verify(
     ground, image = control_grid(model, size, alt_range)
     if not len(ground):
         raise OutputError("hand-off: the model sees no ground point inside its own image")
-    readings = []
-    for path in map(Path, paths):
-        for name, consumer in CONSUMERS.items():
-            if path.name.lower().endswith(consumer.reads) and consumer.installed:
-                readings.append(_reading(path, name, consumer.open, ground, image))
-    return readings
+    return [
+        _reading(path, name, CONSUMERS[name].open, ground, image)
+        for path in map(Path, paths)
+        for name in (*_others(path), "barpc")
+    ]
+
+
+def unverified(paths: Sequence[Path | str]) -> list[str]:
+    """A sentence for each kind of these files that no installed tool but barpc reads."""
+    kinds = {Path(path).suffix: path for path in paths if not _others(Path(path))}
+    return [
+        f"{path}: only barpc itself has read it ({kind}: {' and '.join(_readers(Path(path))) or 'no other tool'} "
+        "would, and is not installed)"
+        for kind, path in kinds.items()
+    ]
+
+
+def _readers(path: Path) -> tuple[str, ...]:
+    row = row_of(path)
+    return () if row is None else row.consumers
+
+
+def _others(path: Path) -> list[str]:
+    return [name for name in _readers(path) if CONSUMERS[name].installed]
 
 
 def _reading(
@@ -186,7 +201,7 @@ def _lent(path: Path) -> Iterator[Path]:
     An overview, a mask or an ``.aux.xml`` beside a file may be, or name, a web service, and so may the sources
     of a VRT: the pixels, which no consumer needs, are left out of it.
     """
-    if not path.name.lower().endswith(_RASTERS):
+    if not isinstance(row_of(path), Carrier):
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -213,9 +228,8 @@ def _camera_only(vrt: Vrt) -> str:
 
 @dataclass(frozen=True)
 class Consumer:
-    """A tool that reads RPCs: the ends of the file names it takes, its package, and how it opens one."""
+    """A tool that reads RPCs: its package, and how it opens a file."""
 
-    reads: tuple[str, ...]
     package: str
     open: Callable[[Path], Projection]
 
@@ -261,7 +275,7 @@ def _rpcm(path: Path) -> Projection:
     rpcm = import_module("rpcm.rpc_model")
     if path.suffix == ".json":
         model = rpcm.RPCModel(json.loads(path.read_text())["rpc"], dict_format="rpcm")
-    elif path.name.lower().endswith(_RASTERS):
+    elif isinstance(row_of(path), Carrier):
         model = rpcm.rpc_from_geotiff(str(path))
     else:
         model = rpcm.rpc_from_rpc_file(str(path))
@@ -313,12 +327,12 @@ def _keywords(path: Path) -> Projection:
 
 
 CONSUMERS: dict[str, Consumer] = {
-    "gdal": Consumer(_RASTERS, "rasterio", _gdal_raster),
-    "gdal, beside an image": Consumer(_TEXTS, "rasterio", _gdal_text),
-    "keywords": Consumer((".geom",), "rasterio", _keywords),
-    "rpcm": Consumer((*_RASTERS, "_rpc.txt", ".json"), "rpcm", _rpcm),
-    "shareloc": Consumer((*_RASTERS, ".geom"), "shareloc", _shareloc),
-    "orthority": Consumer(_RASTERS, "orthority", _orthority),
-    "barpc": Consumer((*_RASTERS, *_TEXTS, ".geom", ".json"), "barpc", lambda path: read_rpc(path).project),
+    "gdal": Consumer("rasterio", _gdal_raster),
+    "gdal, beside an image": Consumer("rasterio", _gdal_text),
+    "keywords": Consumer("rasterio", _keywords),
+    "rpcm": Consumer("rpcm", _rpcm),
+    "shareloc": Consumer("shareloc", _shareloc),
+    "orthority": Consumer("orthority", _orthority),
+    "barpc": Consumer("barpc", lambda path: read_rpc(path).project),
 }
-"""Consumer -> how it reads. Those that are not installed are passed over."""
+"""Consumer -> how it reads. Which formats it reads stands in their rows; those not installed are passed over."""

@@ -34,8 +34,8 @@ def nothing(number: int) -> float:
 
 
 def cost_of_a_task() -> None:
-    """Milliseconds a task takes on its way, handed in one by one and by the crew."""
-    from barpc.pipeline.crew import Crew
+    """Milliseconds a task takes on its way, handed in one by one and by CachingExecutor."""
+    from barpc.pipeline.executor import CachingExecutor
     from barpc.workspace import Workspace
 
     def measure(name: str, pool: Executor, tasks: int) -> None:
@@ -47,13 +47,15 @@ def cost_of_a_task() -> None:
         with (
             tempfile.TemporaryDirectory() as folder,
             Workspace(Path(folder) / "run") as workspace,
-            Crew(workspace, {}, pool) as crew,
+            CachingExecutor(workspace, {}, pool) as caching,
         ):
             began = time.perf_counter()
-            for future in [crew.submit(nothing, n) for n in range(tasks)]:
+            for future in [caching.submit(nothing, n) for n in range(tasks)]:
                 future.result()
-        crewed = 1e3 * (time.perf_counter() - began) / tasks
-        print(f"{name:22} one by one {alone:6.2f} ms, by the crew (result kept on disk) {crewed:6.2f} ms")
+        cached = 1e3 * (time.perf_counter() - began) / tasks
+        print(
+            f"{name:22} one by one {alone:6.2f} ms, by CachingExecutor (result kept on disk) {cached:6.2f} ms"
+        )
 
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         measure("process pool, 2", pool, 2000)

@@ -65,10 +65,15 @@ def stages(views: list[View]) -> float:
     matched = match(views, keypoints, pairs, options)
     lap("match", start, f"{[r.verified for _, r in matched]} verified")
     start = time.process_time()
-    linked = link([len(k) for k in keypoints], [found for found, _ in matched])
+    linked = link([pair.views for pair in pairs], [found for found, _ in matched])
     lap("link", start, f"{linked.num_points} tracks")
     start = time.process_time()
-    refined = refine(views, linked, {m.pair: r.spread for m, r in matched if len(m)}, options)
+    refined = refine(
+        views,
+        linked,
+        {p.views: r.spread for p, (m, r) in zip(pairs, matched, strict=True) if len(m)},
+        options,
+    )
     lap("refine", start, f"{refined.num_points} tracks")
     registered = len(linked) - linked.num_points
     print(f"  {1e6 * (time.process_time() - start) / max(registered, 1):.0f} us a registered observation")
@@ -85,12 +90,7 @@ def stages(views: list[View]) -> float:
 
 def spread(first: View, second: View, xy_first: np.ndarray, xy_second: np.ndarray) -> float:
     """Robust standard deviation across the epipolar line after an affine fit [px]."""
-    limits = (
-        max(first.alt_range[0], second.alt_range[0]),
-        min(first.alt_range[1], second.alt_range[1]),
-    )
-    where = frame(first.sensor, second.sensor, xy_first, limits)
-    across = where.errors(np.arange(len(xy_first)), xy_second)[:, 1]
+    across = frame(first, second, xy_first).errors(xy_second)[:, 1]
     return mad(agreeing(xy_first, across)[1])
 
 

@@ -24,7 +24,7 @@ from barpc.fit import FitOptions
 from barpc.pipeline import RunOptions
 from barpc.tie import TieOptions
 from barpc.tie.features import DETECTORS
-from barpc.tie.guided import MATCHERS
+from barpc.tie.matching import MATCHERS
 
 PAGE = Path(__file__).with_name("options.md")
 TABLES = {"": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions}

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from barpc.errors import OutputError
-from barpc.handoff import CONSUMERS, TOLERANCE, control_grid, difference, verify
-from barpc.rpcio import write_rpc, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.handoff import CONSUMERS, TOLERANCE, control_grid, difference, unverified, verify
+from barpc.rpcio import (
+    CARRIERS,
+    WRITABLE,
+    find_rpc,
+    read_rpc,
+    row_of,
+    write_camera,
+    write_rpc,
+    write_rpc_copy,
+)
 from barpc.sensor.rpc import RPC
 from tests.rpcio.conftest import make_rpc, write_image
 
@@ -19,11 +29,7 @@ NAMES = ["a_RPC.TXT", "a.RPB", "a.geom", "a.XML", "a.json", "a.vrt", "a.tif"]
 
 def write(rpc: RPC, image: Path, folder: Path, name: str) -> Path:
     path = folder / name
-    writer = {".vrt": write_rpc_vrt, ".tif": write_rpc_copy, ".ntf": write_rpc_nitf}.get(path.suffix)
-    if writer is None:
-        write_rpc(rpc, path, overwrite=True)
-    else:
-        writer(rpc, image, path, overwrite=True)
+    write_camera(rpc, path, image, overwrite=True)
     return path
 
 
@@ -79,6 +85,52 @@ def test_a_file_that_a_tool_cannot_read_is_reported_with_its_reason(tmp_path):
         assert np.isnan(reading.max_error)
         assert reading.note
         assert "\n" not in reading.note
+
+
+def test_a_new_format_is_one_row_written_verified_and_offered(image, tmp_path, monkeypatch, capsys):
+    import barpc.cli.convert  # noqa: F401  before the row is there: its help is written once
+    from barpc.cli import main
+    from barpc.rpcio import formats, text
+
+    def read(content, name, options):
+        return text.read_txt(content.removeprefix("NEW\n"), name, options)
+
+    row = formats.Format(
+        "new",
+        (".new",),
+        lambda t: t.startswith("NEW"),
+        read,
+        lambda rpc: "NEW\n" + text.write_txt(rpc),
+        ".new",
+    )
+    monkeypatch.setattr(formats, "FORMATS", {"new": row, **formats.FORMATS})
+    monkeypatch.setitem(formats.WRITABLE, "new", row)
+    write_rpc_copy(make_rpc(), image, tmp_path / "in" / "scene.tif")
+    args = ["convert", tmp_path / "in" / "scene.tif", "--rpc-format", "new", "-o", tmp_path / "out"]
+    with pytest.raises(SystemExit) as stop:
+        main([str(arg) for arg in args])
+    captured = capsys.readouterr()
+    assert stop.value.code == 0, captured.err
+    assert f"{tmp_path / 'out' / 'scene.new'}: barpc 0.0e+00 px" in captured.out
+    assert "scene.new: only barpc itself has read it" in captured.err
+    write_rpc(make_rpc(), tmp_path / "again.new")
+    assert read_rpc(tmp_path / "again.new") == make_rpc()
+    assert find_rpc(tmp_path / "out", Path("scene.ntf")).name == "scene.vrt"
+
+
+@pytest.mark.parametrize("row", [*CARRIERS.values(), *WRITABLE.values()], ids=lambda row: row.suffixes[0])
+def test_every_row_names_consumers_that_exist(row):
+    assert row.consumers
+    assert set(row.consumers) <= set(CONSUMERS)
+    assert all(row_of(f"a{suffix}") is row for suffix in row.suffixes)
+
+
+def test_a_format_that_no_installed_tool_reads_says_so(monkeypatch):
+    assert unverified(["a.geom", "a.vrt"]) == []
+    monkeypatch.setitem(CONSUMERS, "rpcm", replace(CONSUMERS["rpcm"], package="no_such_package"))
+    (sentence,) = unverified(["a.vrt", "a.json", "b.json"])
+    assert "json" in sentence
+    assert "rpcm" in sentence
 
 
 def test_the_grid_covers_the_image_and_its_altitudes():

@@ -37,15 +37,19 @@ def command(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None
 
 
 def _compare(images: list[str], against: Path, as_json: bool) -> int:
+    from barpc.cameras import open_camera
     from barpc.handoff import TOLERANCE, difference
     from barpc.pipeline import load_views
-    from barpc.rpcio import read_rpc
+    from barpc.rpcio import find_rpc
 
     views = load_views(images, min_views=1, distinct=False).views
     found = {}
     for view in views:
-        other = _counterpart(Path(view.path), against)
-        found[view.path] = (str(other), difference(view.sensor, read_rpc(other), view.size, view.alt_range))
+        other = find_rpc(against, Path(view.path)) if against.is_dir() else against
+        found[view.path] = (
+            str(other),
+            difference(view.sensor, open_camera(other).model, view.size, view.alt_range),
+        )
     if as_json:
         entries = [{"image": a, "against": b, "max_px": px} for a, (b, px) in found.items()]
         echo(json.dumps(entries, indent=1))
@@ -54,22 +58,3 @@ def _compare(images: list[str], against: Path, as_json: bool) -> int:
             echo(f"{path}  {compared}  max {px:.3g} px")
     off = [f"{path}: {px:.3g} px." for path, (_, px) in found.items() if not px <= TOLERANCE]
     return tell_gate(f"{len(off)} of {len(found)} RPCs differ.", off) if off else 0
-
-
-def _counterpart(image: Path, against: Path) -> Path:
-    """The file to compare with: `against` itself, or the one in that folder that has the image's name."""
-    from barpc.errors import InputError
-
-    if not against.is_dir():
-        return against
-    names = [
-        image.name,
-        f"{image.stem}.vrt",
-        f"{image.stem}.tif",
-        f"{image.stem}.TIF",
-        f"{image.stem}_RPC.TXT",
-    ]
-    for name in (*names, f"{image.stem}.RPB", f"{image.stem}.geom"):
-        if (against / name).is_file():
-            return against / name
-    raise InputError(f"{against}: holds no RPC for {image.name}")

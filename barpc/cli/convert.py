@@ -1,64 +1,241 @@
-"""`barpc convert`: an RPC from one format into another."""
+"""`barpc convert`: RPCs in other formats, in windows of images, and in folders of images with a proof."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import click
+import numpy as np
 
-from barpc.cli.points import camera_options, check_target, load_camera
-from barpc.cli.terminal import echo, say
-from barpc.rpcio import FORMATS, write_rpc, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cli.points import as_json, check_target
+from barpc.cli.terminal import echo, say, tell_gate
+from barpc.errors import InputError
+from barpc.handoff import Reading, refuse_hiding, unverified, verify
+from barpc.plain import plain_path
+from barpc.raster import open_raster
+from barpc.rpcio import CARRIERS, WRITABLE, find_rpc, shadows, write_camera, write_crop, write_rpc
+from barpc.sensor.geometry import image_border
+from barpc.workspace import Workspace
 
-_RASTERS: dict[str, Callable[..., None]] = {
-    ".vrt": write_rpc_vrt,
-    ".tif": write_rpc_copy,
-    ".tiff": write_rpc_copy,
-    ".ntf": write_rpc_nitf,
-}
-_WRITABLE = [name for name, row in FORMATS.items() if row.write is not None]
+Window = tuple[int, int, int, int]
+Box = tuple[float, float, float, float]
 
 
 @click.command("convert")
-@click.argument("source")
-@click.argument("target")
-@click.option("--format", "name", type=click.Choice(_WRITABLE), help="Whatever the target's name says.")
-@click.option("--image", metavar="FILE", help="Pixels of a .vrt, .tif or .ntf.  [default: SOURCE]")
-@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-@camera_options
+@click.argument("files", nargs=-1, required=True, metavar="SOURCE... [TARGET]")
+@click.option("-o", "--out-dir", metavar="DIR", help="New folder for images of the same names, with proof.")
+@click.option(
+    "--rpc", "rpcs", metavar="PATH", help="With -o: an RPC file, or a folder of them by image name."
+)
+@click.option(
+    "--images",
+    "carrier",
+    type=click.Choice(["vrt", "copy"]),
+    help="With -o: what is written.  [default: vrt]",
+)
+@click.option(
+    "--rpc-format",
+    "formats",
+    metavar="NAMES",
+    help=f"Of {', '.join(WRITABLE)}.  [default: TARGET's name; txt]",
+)
+@click.option("--window", type=(int, int, int, int), help="Cut out COL ROW WIDTH HEIGHT [px].")
+@click.option("--bbox", type=(float, float, float, float), help="Cut out WEST SOUTH EAST NORTH [deg].")
+@click.option(
+    "--alt", type=float, help="Altitude of the ground of --bbox [m].  [default: the camera's middle]"
+)
+@click.option("--overwrite", is_flag=True, help="Replace an existing file, or files of an earlier run.")
+@as_json
 def command(
-    source: str,
-    target: str,
-    name: str | None,
-    image: str | None,
+    files: tuple[str, ...],
+    out_dir: str | None,
+    rpcs: str | None,
+    carrier: str | None,
+    formats: str | None,
+    window: Window | None,
+    bbox: Box | None,
+    alt: float | None,
     overwrite: bool,
-    pixel_convention: str,
-    band: int,
     as_json: bool,
-) -> None:
-    r"""Write the RPC of SOURCE (an image or an RPC file) to TARGET; its name chooses the format.
+) -> int:
+    r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.
 
-    _RPC.TXT, .RPB, .geom, .XML (Maxar), .json (rpcm); .vrt, .tif and .ntf carry an image, too.
+    _RPC.TXT, .RPB, .geom, .XML (Maxar), .json (rpcm); .vrt, .tif and .ntf carry the image, too. With --window or
+    --bbox the GeoTIFF TARGET is a part of the image, with the RPC of exactly that part. With -o images get their RPCs,
+    or those of --rpc, in a new folder; every file is then opened as GDAL, rpcm and others do, and what lies beside an
+    image and would hide an RPC put into it is named. Images stay as they are.
 
     \b
     Examples:
       barpc convert RPC_PHR1A.XML image_RPC.TXT
-      barpc convert vendor.XML with_rpc.vrt --image image.tif
+      barpc convert image.tif,camera=vendor.XML with_rpc.vrt
+      barpc convert image.tif part.tif --bbox 5.43 43.25 5.44 43.26 --alt 180
+      barpc convert scene/*.tif --rpc adjusted -o handoff
     """
-    camera = load_camera(source, pixel_convention, band)
-    check_target(target, [source, *([image] if image else [])], overwrite, camera.rpc)
-    writer = _RASTERS.get(Path(target).suffix.lower()) if name is None else None
-    if writer is not None:
-        writer(camera.rpc, image or source, target, overwrite=overwrite)
+    if out_dir is not None:
+        if window or bbox:
+            raise click.UsageError("--window and --bbox go with a TARGET, not with -o")
+        names = [name.strip() for name in (formats or "txt").split(",") if name.strip()]
+        return _hand_off(files, Path(out_dir), rpcs, carrier or "vrt", names, overwrite, as_json)
+    if len(files) != 2 or rpcs or carrier:
+        raise click.UsageError("give SOURCE and TARGET, or images and -o DIR (with it: --rpc, --images)")
+    source, target = files
+    camera = open_camera(source)
+    check_target(
+        target, [split_spec(source)[0], camera.path], overwrite, None if window or bbox else camera.rpc
+    )
+    if window or bbox:
+        _crop(camera, source, target, _window(camera, window, bbox, alt), overwrite, as_json)
+    else:
+        _convert(camera, source, target, formats, overwrite, as_json)
+    return 0
+
+
+# --- one file ---------------------------------------------------------------------------------------------
+
+
+def _convert(
+    camera: Camera, source: str, target: str, name: str | None, overwrite: bool, as_json: bool
+) -> None:
+    if name is None:
+        write_camera(camera.rpc, target, split_spec(source)[0], overwrite=overwrite)
     else:
         write_rpc(camera.rpc, target, format=name, overwrite=overwrite)
     if as_json:
-        echo(
-            json.dumps({"source": str(camera.source.path), "format": camera.source.format, "target": target})
-        )
+        echo(json.dumps({"source": str(camera.path), "format": camera.format, "target": target}))
     else:
-        echo(f"{camera.source.path} ({camera.source.format}) -> {target}")
-        for note in camera.source.notes:
+        echo(f"{camera.path} ({camera.format}) -> {target}")
+        for note in camera.notes:
             say(note)
+
+
+def _crop(camera: Camera, source: str, target: str, window: Window, overwrite: bool, as_json: bool) -> None:
+    write_crop(camera.rpc, split_spec(source)[0], target, window, overwrite=overwrite)
+    text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
+    echo(json.dumps({"path": target, "window": window}) if as_json else text)
+
+
+def _window(camera: Camera, window: Window | None, bbox: Box | None, alt: float | None) -> Window:
+    """The window, or the pixels that a box on the ground covers, cut to the image."""
+    if (window is None) == (bbox is None):
+        raise click.UsageError("give either --window or --bbox")
+    if bbox is None:
+        assert window is not None
+        return window
+    west, south, east, north = bbox
+    east += 360.0 * (east < west)  # a box across the antimeridian
+    alt = camera.altitude if alt is None else alt
+    t = (image_border((1, 1), 16) + 0.5) * [east - west, north - south] + [west, south]
+    image = camera.model.project(np.column_stack([t, np.full(len(t), alt)]))
+    width, height = camera.extent
+    low = np.maximum(np.floor(image.min(axis=0) + 0.5), 0)
+    high = np.minimum(np.ceil(image.max(axis=0) + 0.5), [width, height])
+    if not (np.isfinite(image).all() and (high > low).all()):
+        raise click.UsageError(f"--bbox {bbox} does not meet {camera.path} at {alt:g} m")
+    col, row = (int(v) for v in low)
+    return col, row, int(high[0]) - col, int(high[1]) - row
+
+
+# --- a folder ---------------------------------------------------------------------------------------------
+
+
+def _hand_off(
+    images: tuple[str, ...],
+    folder: Path,
+    rpcs: str | None,
+    carrier: str,
+    formats: list[str],
+    overwrite: bool,
+    as_json: bool,
+) -> int:
+    """Write images with their RPCs, open every file as its readers do, and say what they see."""
+    files = [split_spec(image)[0] for image in images]
+    _check(files, folder, formats)
+    sources = images if rpcs is None else [_rpc_file(Path(rpcs), file) for file in files]
+    cameras = [open_camera(source) for source in sources]
+    names = [_names(file, carrier, formats) for file in files]
+    together = [name for row in names for name in row]
+    inputs = [*files, *(camera.path for camera in cameras)]
+    refuse_hiding(folder, together, inputs)
+    readings: list[Reading] = []
+    reasons: list[str] = []
+    with Workspace(folder, overwrite=overwrite, keep=inputs, names=together, adds=True) as workspace:
+        for file, camera, row in zip(files, cameras, names, strict=True):
+            for name in row:
+                with workspace.output(name) as partial:
+                    write_camera(camera.rpc, partial, file, place=folder / name, overwrite=True)
+            written = [folder / name for name in row]
+            readings += verify(written, camera.rpc, _size(file), camera.alt_range)
+            reasons += _shadow_reasons(file, written)
+    _tell(readings, as_json)
+    for sentence in unverified([folder / name for name in names[0]]):
+        say(sentence)
+    reasons += [
+        f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}."
+        for r in readings
+        if not r.passed
+    ]
+    return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
+
+
+def _tell(readings: list[Reading], as_json: bool) -> None:
+    if not as_json:
+        for r in readings:
+            echo(f"{r.path}: {r.consumer} {r.note or f'{r.max_error:.1e} px'}")
+        return
+    echo(
+        json.dumps(
+            [
+                {
+                    "path": str(r.path),
+                    "consumer": r.consumer,
+                    "max_px": None if r.note else r.max_error,
+                    "note": r.note,
+                }
+                for r in readings
+            ]
+        )
+    )
+
+
+def _shadow_reasons(image: Path, written: list[Path]) -> list[str]:
+    """What lies beside a new file and hides its RPC; what lies beside the image is only said."""
+    for sidecar in shadows(image):
+        say(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
+    return [
+        f"{sidecar.path} hides the RPC of {written[0]}: move it away."
+        for sidecar in shadows(written[0])
+        if sidecar.path not in written
+    ]
+
+
+def _size(image: Path) -> tuple[int, int]:
+    """Width and height of an image [px]."""
+    with open_raster(image) as dataset:
+        return dataset.width, dataset.height
+
+
+def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
+    for name in formats:
+        if name not in WRITABLE:
+            raise click.UsageError(f"--rpc-format {name}: not a format that is written")
+    for path in (*images, folder):
+        plain_path(path.absolute())
+    stems = [image.stem for image in images]
+    twins = sorted({stem for stem in stems if stems.count(stem) > 1})
+    if twins:
+        raise InputError(f"several images named {twins[0]}: apply them one folder at a time")
+    if any(image.resolve().parent == folder.resolve() for image in images):
+        raise InputError(f"{folder}: the folder of the images; choose a new one")
+
+
+def _names(image: Path, carrier: str, formats: list[str]) -> list[str]:
+    """What is written for an image: the raster, then a file for each format."""
+    ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
+    return [image.stem + end for end in ends]
+
+
+def _rpc_file(rpcs: Path, image: Path) -> str:
+    return str(find_rpc(rpcs, image) if rpcs.is_dir() else rpcs)

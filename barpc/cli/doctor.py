@@ -1,4 +1,4 @@
-"""`barpc doctor`: what is installed, and whether it works."""
+"""`barpc info --doctor`: what is installed, and whether it works."""
 
 from __future__ import annotations
 
@@ -12,11 +12,18 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import click
-
 from barpc.cli.terminal import echo
 
-REQUIRED = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely", "click", "rich", "filelock")
+REQUIRED = (
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "rasterio",
+    "shapely",
+    "click",
+    "filelock",
+    "fastjsonschema",
+)
 OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
 
 
@@ -73,15 +80,8 @@ CHECKS: dict[str, Callable[[], str]] = {
 }
 
 
-@click.command("doctor")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON on stdout.")
-def command(as_json: bool) -> int:
-    r"""Print the versions of what barpc stands on, and try each part once.
-
-    \b
-    Example:
-      barpc doctor
-    """
+def doctor(as_json: bool) -> int:
+    """Print the versions of what barpc stands on, try each part once, and give the exit code."""
     from barpc import __version__
 
     versions = {"barpc": __version__, "python": platform.python_version()}
@@ -94,7 +94,7 @@ def command(as_json: bool) -> int:
     for name, check in CHECKS.items():
         try:
             results[name] = {"ok": True, "found": check()}
-        except Exception as error:  # noqa: BLE001  whatever is broken is what this verb is there to show
+        except Exception as error:  # noqa: BLE001  whatever is broken is what this is there to show
             results[name] = {"ok": False, "found": f"{type(error).__name__}: {error}"}
     good = all(result["ok"] for result in results.values()) and "MISSING" not in versions.values()
     if as_json:

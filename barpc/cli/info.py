@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import click
 import numpy as np
 
-from barpc.cli.points import Camera, camera_options, load_camera, middle_altitude
+from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cli.points import as_json
 from barpc.cli.terminal import echo
+from barpc.errors import RpcError
 from barpc.fit.certificate import smallest_denominator
-from barpc.geojson import polygon
+from barpc.geodesy import Array
+from barpc.geojson import collection, feature, polygon
 from barpc.sensor.geometry import (
-    altitude_range,
     camera_center,
+    convergence_angle,
     footprint,
     ground_sample_distance,
     view_angles,
@@ -23,68 +27,141 @@ from barpc.sensor.rpc import RPC
 
 
 @click.command("info")
-@click.argument("images", nargs=-1, required=True, metavar="IMAGE...")
-@click.option("--size", type=(int, int), help="Width and height of the image, for RPC files.")
-@camera_options
+@click.argument("images", nargs=-1, metavar="IMAGE...")
+@click.option(
+    "--at", type=(float, float, float), help="Ground point of the angles: LON LAT ALT.  [default: the centre]"
+)
+@click.option("--alt", type=float, help="Altitude of the ground [m].  [default: the middle of the camera's]")
+@click.option(
+    "--footprint", "outlines", is_flag=True, help="Print outlines on the ground as GeoJSON instead."
+)
+@click.option("--doctor", is_flag=True, help="Print versions and try the installation instead.")
+@as_json
 def command(
-    images: tuple[str, ...], size: tuple[int, int] | None, pixel_convention: str, band: int, as_json: bool
-) -> None:
-    r"""Say where an RPC comes from, what it covers and how it looks at the ground.
+    images: tuple[str, ...],
+    at: tuple[float, float, float] | None,
+    alt: float | None,
+    outlines: bool,
+    doctor: bool,
+    as_json: bool,
+) -> int:
+    r"""Say where a camera comes from, what it covers and how it looks at the ground; of several, each pair's angle.
+
+    The azimuth is that of the direction from the ground to the sensor, clockwise from north. A pair's convergence
+    angle is taken at the first image's centre, or at --at. An IMAGE is a file with an RPC, a Sentinel-1 product or
+    annotation, or a localisation grid; choices stand behind it:
+    ",size=W:H" and ",camera=FILE" (all); ",first_pixel=0.5" and ",band=2" (RPC); ",swath=iw1" (or mosaic),
+    ",pol=vv", ",burst=3", ",orbit=X.EOF", ",atmosphere=yes", ",bistatic=full" (Sentinel-1); ",altitudes=0:500" (grid).
 
     \b
-    Example:
-      barpc info image.tif
+    Examples:
+      barpc info left.tif right.tif
+      barpc info vendor.RPB,size=20000:19000
+      barpc info --footprint scene/*.tif > footprints.geojson
+      barpc info --doctor
     """
-    reports = [describe(load_camera(image, pixel_convention, band, size)) for image in images]
+    if doctor:
+        from barpc.cli.doctor import doctor as examine
+
+        return examine(as_json)
+    if not images:
+        raise click.UsageError("give at least one IMAGE")
+    cameras = [open_camera(image) for image in images]
+    if outlines:
+        echo(json.dumps(_outlines(images, cameras, alt)))
+        return 0
+    reports = [_describe(camera, alt, at) for camera in cameras]
+    if len(cameras) > 1:
+        for i, report in enumerate(reports):
+            report["pairs"] = _pairs(images, cameras, i, alt, at)
     if as_json:
         echo(json.dumps(reports))
-        return
+    else:
+        _print(images, reports)
+    return 0
+
+
+def _print(images: Sequence[str], reports: Sequence[Mapping[str, Any]]) -> None:
     for image, report in zip(images, reports, strict=True):
         echo(image)
         for key, value in report.items():
-            if key != "footprint":
-                echo(f"  {key.replace('_', ' ')}: {_text(value)}")
+            for line in value if key == "pairs" else [value]:
+                if key != "footprint":
+                    echo(f"  {key.replace('_', ' ')}: {_text(line)}")
 
 
-def describe(camera: Camera) -> dict[str, Any]:
-    """Everything that `barpc info` tells, with plain values."""
-    rpc = camera.rpc
-    low, high = altitude_range(rpc)
+def _outlines(images: Sequence[str], cameras: Sequence[Camera], alt: float | None) -> dict[str, Any]:
+    """GeoJSON (RFC 7946: cut at the antimeridian) of the images' outlines."""
+    features = []
+    for image, camera in zip(images, cameras, strict=True):
+        height = camera.altitude if alt is None else alt
+        ring = footprint(camera.model, camera.extent, height)
+        if not np.isfinite(ring).all():
+            raise RpcError(f"{image}: no ground point at its image's border at {height:g} m")
+        path = split_spec(image)[0]
+        features.append(feature(ring, name=path.stem, path=str(path), alt=height))
+    return collection(features)
+
+
+def _center(camera: Camera, alt: float | None) -> Array:
+    """The ground point (3,) in the middle of the image."""
+    middle = (np.array(camera.extent) - 1) / 2
+    return camera.model.localize(middle, np.asarray(camera.altitude if alt is None else alt))
+
+
+def _pairs(
+    images: Sequence[str], cameras: Sequence[Camera], i: int, alt: float | None, at: tuple[float, ...] | None
+) -> list[dict[str, Any]]:
+    """What an image and each later one see together: the angle between their rays, and B/H."""
+    point = _center(cameras[i], alt) if at is None else np.array(at)
+    rows = []
+    for image, camera in list(zip(images, cameras, strict=True))[i + 1 :]:
+        angle = float(convergence_angle(cameras[i].model, camera.model, point))
+        ratio = 2 * float(np.tan(np.radians(angle) / 2))
+        rows.append({"with": split_spec(image)[0].stem, "convergence_deg": angle, "b_over_h": ratio})
+    return rows
+
+
+def _describe(camera: Camera, alt: float | None, at: tuple[float, ...] | None) -> dict[str, Any]:
+    """Everything that is told of a camera, with plain values."""
     report: dict[str, Any] = {
-        "rpc": f"{camera.source.format} in {camera.source.path}",
-        "notes": list(camera.source.notes),
+        "rpc": f"{camera.format} in {camera.path}",
+        "notes": list(camera.notes),
         "first_pixel": "its centre is (0, 0)",
-        "altitude_range_m": [low, high],
-        "domain": _domain(rpc),
-        "err_bias_m": rpc.err_bias,
-        "err_rand_m": rpc.err_rand,
-        "smallest_denominator": smallest_denominator(
-            rpc, rpc.ground_offset - np.abs(rpc.ground_scale), rpc.ground_offset + np.abs(rpc.ground_scale)
-        ),
+        "altitude_range_m": list(camera.alt_range),
     }
+    if isinstance(camera.model, RPC):
+        report |= _box(camera.model)
     if camera.size is not None:
-        report |= _geometry(rpc, camera.size)
+        report |= _geometry(camera, camera.size, camera.altitude if alt is None else alt, at)
     return report
 
 
-def _domain(rpc: RPC) -> dict[str, list[float]]:
-    low = rpc.ground_offset - np.abs(rpc.ground_scale)
-    high = rpc.ground_offset + np.abs(rpc.ground_scale)
-    return {"lon_deg": [float(low[0]), float(high[0])], "lat_deg": [float(low[1]), float(high[1])]}
+def _box(rpc: RPC) -> dict[str, Any]:
+    """What an RPC alone states: its box on the ground, its accuracy, and how near to a pole it comes there."""
+    low, high = rpc.ground_offset - np.abs(rpc.ground_scale), rpc.ground_offset + np.abs(rpc.ground_scale)
+    return {
+        "domain": {"lon_deg": [float(low[0]), float(high[0])], "lat_deg": [float(low[1]), float(high[1])]},
+        "err_bias_m": rpc.err_bias,
+        "err_rand_m": rpc.err_rand,
+        "smallest_denominator": smallest_denominator(rpc, low, high),
+    }
 
 
-def _geometry(rpc: RPC, size: tuple[int, int]) -> dict[str, Any]:
-    """What follows from the RPC and the image's size: angles, ground sample distance, footprint."""
-    alt = middle_altitude(rpc)
+def _geometry(
+    camera: Camera, size: tuple[int, int], alt: float, at: tuple[float, ...] | None
+) -> dict[str, Any]:
+    """What follows from the camera and the image's size: angles, ground sample distance, footprint."""
+    model = camera.model
     middle = (np.array(size) - 1) / 2
-    center = rpc.localize(middle, np.asarray(alt))
+    center = model.localize(middle, np.asarray(alt))
     report: dict[str, Any] = {"size_px": list(size), "center_deg": center[:2].tolist()}
     if not np.isfinite(center).all():
-        return report | {"problem": "the RPC has no ground point at the image's centre"}
-    incidence, azimuth = view_angles(rpc, center)
-    metres = ground_sample_distance(rpc, middle, alt)
-    stand = camera_center(rpc, size, altitude_range(rpc))
-    ring = footprint(rpc, size, alt)
+        return report | {"problem": "no ground point at the image's centre"}
+    incidence, azimuth = view_angles(model, center if at is None else np.array(at))
+    metres = ground_sample_distance(model, middle, alt)
+    stand = camera_center(model, size, camera.alt_range)
+    ring = footprint(model, size, alt)
     return report | {
         "incidence_deg": float(incidence),
         "azimuth_deg": float(azimuth),

@@ -34,20 +34,62 @@ COMMANDS = {
     "match": "Match tie points and stop.",
     "check": "Measure how well cameras agree, without adjusting.",
     "fit": "Fit an RPC to any camera or to points, and certify it.",
-    "info": "Say where an image's RPC comes from and how it looks at the ground.",
+    "info": "Where cameras come from, how they look at the ground and at each other.",
     "project": "Ground points to image points.",
     "localize": "Image points to ground points, at an altitude or on a DEM.",
     "triangulate": "Corresponding image points to ground points.",
-    "angle": "Incidence and azimuth of images, convergence angle of pairs.",
-    "footprint": "Outlines of images on the ground as GeoJSON.",
-    "convert": "Write an RPC in another format.",
-    "crop": "Cut a window out of an image with its exact RPC.",
-    "apply": "Give images other RPCs in a new folder and prove that tools read them.",
-    "report": "Make report.html of a finished run again.",
-    "compare": "Compare two finished runs of the same images.",
-    "doctor": "Print versions and check the installation.",
+    "convert": "Write RPCs in other formats, cut out windows, hand images over.",
+    "report": "Make report.html of a finished run again, or compare two runs.",
 }
 """Verb -> its line in `barpc --help`; the code is `barpc.cli.<verb>.command`."""
+
+MOVED = {
+    "angle": "info IMAGE IMAGE",
+    "footprint": "info --footprint IMAGE",
+    "doctor": "info --doctor",
+    "crop": "convert IMAGE TARGET --window ...",
+    "apply": "convert IMAGE... --rpc PATH -o DIR",
+    "compare": "report RUN RUN",
+    "--size": "FILE,size=WIDTH:HEIGHT",
+    "--pixel-convention": "FILE,first_pixel=0.5",
+    "--swath": "PRODUCT,swath=iw1",
+    "--pol": "PRODUCT,pol=vv",
+    "--burst": "PRODUCT,burst=3",
+    "--orbit": "PRODUCT,orbit=FILE",
+    "--atmosphere": "PRODUCT,atmosphere=yes",
+    "--bistatic": "PRODUCT,bistatic=full",
+    "--grid-altitudes": "GRID,altitudes=0:500",
+    "--image": "IMAGE,camera=FILE as SOURCE",
+    "--dask": "-j ADDRESS",
+    "--force": "--keep-going",
+    "--keep-largest": "--keep-going",
+    "--format": "--rpc-format",
+    "--stop-after": "barpc match, or stop_after in a file given with --options",
+    **{
+        flag: f"{option} of a file given with --options"
+        for flag, option in (
+            ("--detector", "[tie] detector"),
+            ("--max-pairwise-matches", "[tie] points_per_image"),
+            ("--min-overlap", "[tie] min_overlap"),
+            ("--min-triangulation-angle", "[tie] min_angle"),
+            ("--num-passes", "num_passes"),
+            ("--loss", "[adjust] loss"),
+            ("--robust-threshold", "[adjust] robust_threshold"),
+            ("--center", "[adjust] center_method"),
+            ("--tolerance", "[fit] tolerance"),
+            ("--method", "[fit] method"),
+            ("--joint", "[fit] joint"),
+            ("--grid", "[fit] grid"),
+            ("--space", "[fit] space"),
+            ("--nodes", "[fit] nodes"),
+            ("--for-format", "[fit] precision"),
+            ("--allow-mirrored", "[fit] allow_mirrored"),
+        )
+    },
+}
+"""Former verb or flag -> how it is said now."""
+
+_GENERAL = {"-q": "quiet", "--quiet": "quiet", "--debug": "debug", "-v": "verbose", "--verbose": "verbose"}
 
 
 def _kept_lines(text: str | None) -> str | None:
@@ -74,11 +116,29 @@ class Verbs(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Refuse an unknown verb with the nearest known one."""
+        args = self._general(ctx, args)
+        if args and args[0] in MOVED:
+            raise click.UsageError(f"'{args[0]}' is said otherwise now: barpc {MOVED[args[0]]}")
         if args and not args[0].startswith("-") and args[0] not in COMMANDS:
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f" Did you mean '{near[0]}'?" if near else f" One of: {', '.join(COMMANDS)}."
             raise click.UsageError(f"No such verb '{args[0]}'.{hint}")
-        return super().resolve_command(ctx, args)
+        name, command, rest = super().resolve_command(ctx, args)
+        known = {flag for parameter in command.params for flag in parameter.opts} if command else set()
+        for word in rest[: rest.index("--") if "--" in rest else None]:
+            flag = word.split("=")[0]
+            if flag.startswith("-") and flag in MOVED and flag not in known:
+                raise click.UsageError(f"{flag} is said otherwise now: {MOVED[flag]}")
+        return name, command, rest
+
+    def _general(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Take out of a verb's arguments those that every verb has: they may stand before and after it."""
+        end = args.index("--") if "--" in args else len(args)
+        for word in args[1:end]:
+            name = "verbose" if word == "-vv" else _GENERAL.get(word)
+            if name is not None:
+                ctx.params[name] = ctx.params[name] + word.count("v", 0, 3) if name == "verbose" else True
+        return [word for i, word in enumerate(args) if not 0 < i < end or word not in (*_GENERAL, "-vv")]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs from the table, without importing them."""

@@ -45,24 +45,8 @@ TIE_FLAGS = (
     ),
     Flag("--overlap-list", "overlap_list", "Match only these pairs: two image names a line.", metavar="FILE"),
     Flag("--aoi", "aoi", "Tie points only inside: polygons in lon/lat (GeoJSON).", metavar="FILE"),
-    Flag("--detector", "tie.detector", "Keypoint detector.", metavar="NAME"),
     Flag("--ip-per-image", "tie.keypoints_per_image", "Keypoints an image, at most.", type=COUNT),
-    Flag("--max-pairwise-matches", "tie.points_per_image", "Tie points an image, at most.", type=COUNT),
-    Flag(
-        "--min-overlap",
-        "tie.min_overlap",
-        "Share of a footprint that a pair must have in common.",
-        type=float,
-    ),
-    Flag(
-        "--min-triangulation-angle",
-        "tie.min_angle",
-        "Smallest angle between a pair's rays.",
-        type=float,
-        metavar="DEG",
-    ),
     Flag("--search", "tie.search", "How far an RPC may be wrong.", type=float, metavar="PX"),
-    Flag("--num-passes", "num_passes", "Passes of matching and adjustment.", type=COUNT),
 )
 ADJUSTMENT_FLAGS = (
     Flag(
@@ -85,20 +69,9 @@ ADJUSTMENT_FLAGS = (
         metavar="M",
     ),
     Flag("--sigma-position", "adjust.sigma_position", "Prior of the translation.", type=float, metavar="M"),
-    Flag("--loss", "adjust.loss", "Robust loss of the first rounds.", metavar="NAME"),
-    Flag(
-        "--robust-threshold", "adjust.robust_threshold", "Cut observations beyond so many sigmas.", type=float
-    ),
-    Flag(
-        "--center",
-        "adjust.center_method",
-        "How the camera centre is regressed.",
-        type=click.Choice(["line", "projective"]),
-    ),
     Flag(
         "--fixed", "adjust.fixed", "A view that keeps its camera (repeatable).", multiple=True, metavar="NAME"
     ),
-    Flag("--keep-largest", "adjust.keep_largest", "Go on with the largest connected group.", is_flag=True),
     Flag("--gcp", "gcp", "Ground control points: .gcp, GeoJSON, image tags.", multiple=True, metavar="FILE"),
     Flag(
         "--check-points",
@@ -125,14 +98,19 @@ RUN_FLAGS = (
         "Carry the new RPC in a small VRT that points at the image, in a full copy, or not.  [default: vrt]",
         type=click.Choice(["vrt", "copy", "none"]),
     ),
-    Flag("--rpc-format", "rpc_formats", "RPC files to write, of txt,rpb,geom,json,xml.  [default: txt]"),
-    Flag("--stop-after", "stop_after", "End early.", type=click.Choice(["matching", "adjustment"])),
-    Flag("--tolerance", "fit.tolerance", "Largest error of a refitted RPC.", type=float, metavar="PX"),
-    Flag("--force", "force", "Write RPCs that miss the tolerance; exit 3.", is_flag=True),
-    Flag("--keep-going", "keep_going", "Leave bad files out; exit 3 at the end.", is_flag=True),
+    Flag(
+        "--rpc-format",
+        "rpc_formats",
+        "RPC files to write, of those that 'barpc convert --help' lists.",
+    ),
+    Flag(
+        "--keep-going",
+        "keep_going",
+        "Leave bad files out, keep the largest connected group, write RPCs that miss the tolerance; exit 3.",
+        is_flag=True,
+    ),
 )
 MATCH_FLAGS = tuple(flag for flag in RUN_FLAGS if flag.target in ("overwrite", "keep_going"))
-MATCH_FLAGS += tuple(flag for flag in ADJUSTMENT_FLAGS if flag.target == "adjust.keep_largest")
 _BY_PARAMETER = {flag.parameter: flag for flag in (*TIE_FLAGS, *ADJUSTMENT_FLAGS, *RUN_FLAGS)}
 
 
@@ -147,11 +125,27 @@ def with_flags(*flags: Flag) -> Callable[[Function], Function]:
     return decorate
 
 
+def _jobs(_context: click.Context, _parameter: click.Parameter, value: str) -> int | str:
+    """A number of processes, or the address of a cluster."""
+    if "://" in value:
+        return value
+    if not value.isdecimal() or not 1 <= len(value) <= 4 or int(value) < 1:
+        raise click.BadParameter(f"{value!r} is no number of processes, and no address (tcp://host:8786)")
+    return int(value)
+
+
 _RUN_OPTIONS = (
     click.option("--image-list", metavar="FILE", help="More image paths from a file, one a line."),
     click.option("--options", "options_file", metavar="FILE", help="Options from a TOML file; flags win."),
-    click.option("-j", "--jobs", type=COUNT, default=1, show_default=True, help="Worker processes."),
-    click.option("--dask", metavar="ADDRESS", help="Work on a dask.distributed cluster."),
+    click.option(
+        "-j",
+        "--jobs",
+        metavar="N|ADDRESS",
+        callback=_jobs,
+        default="1",
+        show_default=True,
+        help="Worker processes, or a dask.distributed cluster (tcp://host:8786).",
+    ),
     click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
 )
 

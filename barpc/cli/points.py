@@ -1,4 +1,4 @@
-"""What the verbs on points and cameras share: arguments, tables of points, an image's camera and size."""
+"""What the verbs on points and cameras share: tables of points, and which files may be written."""
 
 from __future__ import annotations
 
@@ -6,81 +6,24 @@ import csv
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
 
 import click
 import numpy as np
 
-from barpc.cli.terminal import echo, tell_gate
-from barpc.errors import ImageError, InputError, OutputError
+from barpc.cli.terminal import echo, say, tell_gate
+from barpc.errors import InputError, OutputError
 from barpc.geodesy import Array
-from barpc.raster import open_raster
-from barpc.rpcio import FORMATS, RpcSource, hidden_by, read_rpc_source, sidecars
+from barpc.rpcio import FORMATS, hidden_by, sidecars
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import TABLE, opened_text
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 NUMBERS = {"ignore_unknown_options": True}
 """Context settings under which -3.5 is a number, not an option."""
 
-CONVENTIONS = {"auto": None, "0": 0.0, "0.5": 0.5, "1": 1.0}
-
-
-@dataclass(frozen=True)
-class Camera:
-    """The RPC of an image or an RPC file, and the image's size where there is one."""
-
-    source: RpcSource
-    size: tuple[int, int] | None
-
-    @property
-    def rpc(self) -> RPC:
-        """The camera."""
-        return self.source.rpc
-
-    @property
-    def extent(self) -> tuple[int, int]:
-        """The image's size [px], or a usage error that asks for it."""
-        if self.size is None:
-            raise click.UsageError(f"{self.source.path} is no image: give its size with --size WIDTH HEIGHT")
-        return self.size
-
-
-def camera_options(function: Function) -> Function:
-    """Options of every verb that reads an RPC."""
-    for option in (
-        click.option(
-            "--band", default=1, show_default=True, help="Which RPC, where a file holds one a band."
-        ),
-        click.option(
-            "--pixel-convention",
-            type=click.Choice(list(CONVENTIONS)),
-            default="auto",
-            help="Coordinate that an RPC file gives to the centre of the first pixel, if not its format's own.",
-        ),
-        click.option("--json", "as_json", is_flag=True, help="JSON on stdout."),
-    ):
-        function = option(function)
-    return function
-
-
-def load_camera(
-    path: str, pixel_convention: str = "auto", band: int = 1, size: tuple[int, int] | None = None
-) -> Camera:
-    """The camera of an image or an RPC file, and the size of the image."""
-    source = read_rpc_source(path, first_pixel=CONVENTIONS[pixel_convention], band=band)
-    if size is None:
-        try:
-            with open_raster(path) as dataset:
-                size = (dataset.width, dataset.height)
-        except ImageError:  # an RPC file: there is no raster to ask
-            size = None
-    return Camera(source, size)
+as_json = click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
 
 
 def check_target(
@@ -113,7 +56,7 @@ def check_target(
                 f"{target}: would be read in place of the RPC that {image} has; give another folder or name, or "
                 "--overwrite if that is meant"
             )
-        click.echo(f"barpc: {target} is read in place of the RPC that {image} had", err=True)
+        say(f"{target} is read in place of the RPC that {image} had")
 
 
 def read_points(
@@ -196,11 +139,6 @@ def print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_
     echo(",".join(names))
     for row in values.tolist():
         echo(",".join(f"{v:.{d}f}" for v, d in zip(row, digits, strict=True)))
-
-
-def middle_altitude(rpc: RPC) -> float:
-    """The altitude in the middle of an RPC's range [m]."""
-    return float(rpc.ground_offset[2])
 
 
 def tell_failures(points: Array, what: str) -> int:

@@ -1,4 +1,4 @@
-"""Progress bars on stderr, and the executors that `-j` and `--dask` ask for."""
+"""Progress bars on stderr, and the executors that `-j` asks for."""
 
 from __future__ import annotations
 
@@ -11,6 +11,14 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import click
+
+from barpc.plain import visible
+
+if TYPE_CHECKING:
+    from click._termui_impl import ProgressBar
 
 Progress = Callable[[str, int, int], None]
 
@@ -19,43 +27,36 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 @contextmanager
 def progress_bars(quiet: bool) -> Iterator[Progress]:
-    """A callback `progress(stage, done, total)` that draws one bar a stage; silent in pipes and with -q."""
+    """A callback `progress(stage, done, total)` that draws one bar a stage at a time; silent in pipes and with -q."""
     if quiet or not sys.stderr.isatty():
         yield lambda _stage, _done, _total: None
         return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    bars: dict[str, ProgressBar[int]] = {}
 
-    columns = (
-        TextColumn("{task.description:<22}"),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        tasks: dict[str, object] = {}
+    def show(stage: str, done: int, total: int) -> None:
+        if stage not in bars:
+            finish()
+            label = visible(f"{stage:<22}")
+            bars[stage] = click.progressbar(length=total, label=label, show_pos=True, file=sys.stderr)
+        bars[stage].length = total
+        bars[stage].update(done - bars[stage].pos)
 
-        def show(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+    def finish() -> None:
+        for bar in bars.values():
+            bar.render_finish()
+        bars.clear()
 
+    try:
         yield show
+    finally:
+        finish()
 
 
 @contextmanager
-def executor_for(jobs: int, dask: str | None) -> Iterator[Executor | None]:
+def executor_for(jobs: int | str) -> Iterator[Executor | None]:
     """The executor of a run: None works in this process."""
-    if dask is not None:
-        with _cluster(dask) as executor:
+    if isinstance(jobs, str):
+        with _cluster(jobs) as executor:
             yield executor
     elif jobs > 1:
         with _processes(jobs) as executor:
@@ -71,11 +72,11 @@ def _cluster(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise InputError("--dask needs the extra: pip install 'barpc[cluster]'") from error
+        raise InputError("-j with an address needs the extra: pip install 'barpc[cluster]'") from error
     try:
         client = Client(address, timeout=20)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
-        raise InputError(f"--dask {address}: no scheduler answers there ({error})") from error
+        raise InputError(f"-j {address}: no scheduler answers there ({error})") from error
     with client:
         yield client.get_executor()  # type: ignore[no-untyped-call]
 

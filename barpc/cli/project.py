@@ -5,7 +5,8 @@ from __future__ import annotations
 import click
 import numpy as np
 
-from barpc.cli.points import NUMBERS, camera_options, load_camera, print_points, read_points, tell_failures
+from barpc.cameras import open_camera
+from barpc.cli.points import NUMBERS, as_json, print_points, read_points, tell_failures
 from barpc.dem import Dem
 
 
@@ -16,7 +17,7 @@ from barpc.dem import Dem
 @click.option("--alt", type=float, help="Altitude of points without one [m above the ellipsoid].")
 @click.option("--dem", metavar="FILE", help="Take the altitudes from a DEM.")
 @click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
-@camera_options
+@as_json
 def command(
     image: str,
     numbers: tuple[float, ...],
@@ -24,8 +25,6 @@ def command(
     alt: float | None,
     dem: str | None,
     geoid: str | None,
-    pixel_convention: str,
-    band: int,
     as_json: bool,
 ) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
@@ -36,10 +35,10 @@ def command(
       barpc project image.tif --points ground.csv --json
     """
     terrain = Dem.open(dem, geoid) if dem else None
-    camera = load_camera(image, pixel_convention, band)
+    camera = open_camera(image)
     ground = read_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else alt)
     if terrain is not None:
         ground[:, 2] = terrain(ground[:, 0], ground[:, 1])
-    found = camera.rpc.project(ground)
+    found = camera.model.project(ground)
     print_points(("col", "row"), found, (6, 6), as_json)
     return tell_failures(found, "could not be projected")

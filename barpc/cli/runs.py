@@ -38,9 +38,9 @@ def run(
         Options that the verb sets itself.
     """
     paths = image_paths(images, flags.pop("image_list"))
-    jobs, dask, as_json = flags.pop("jobs"), flags.pop("dask"), flags.pop("as_json")
+    jobs, as_json = flags.pop("jobs"), flags.pop("as_json")
     options = replace(run_options(flags, flags.pop("options_file")), **fixed)
-    with executor_for(jobs, dask) as executor, progress_bars(obj["quiet"]) as progress:
+    with executor_for(jobs) as executor, progress_bars(obj["quiet"]) as progress:
         result = work(paths, options, executor=executor, progress=progress)
     if as_json:
         echo(json.dumps(result.summary, indent=1))

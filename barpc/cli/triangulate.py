@@ -5,15 +5,8 @@ from __future__ import annotations
 import click
 import numpy as np
 
-from barpc.cli.points import (
-    NUMBERS,
-    camera_options,
-    load_camera,
-    middle_altitude,
-    print_points,
-    read_points,
-    tell_failures,
-)
+from barpc.cameras import open_camera
+from barpc.cli.points import NUMBERS, as_json, print_points, read_points, tell_failures
 from barpc.geodesy import ground_from_ecef
 from barpc.sensor.geometry import triangulate
 
@@ -22,13 +15,11 @@ from barpc.sensor.geometry import triangulate
 @click.argument("images", nargs=-1, required=True, metavar="IMAGE IMAGE...")
 @click.option("--at", type=(float, float), multiple=True, help="COL ROW, once for each image.")
 @click.option("--points", metavar="FILE", help="CSV with col1, row1, col2, row2, ...; - is standard input.")
-@camera_options
+@as_json
 def command(
     images: tuple[str, ...],
     at: tuple[tuple[float, float], ...],
     points: str | None,
-    pixel_convention: str,
-    band: int,
     as_json: bool,
 ) -> int:
     r"""Print the ground points where the lines of sight of several images meet, and the error that is left.
@@ -41,7 +32,7 @@ def command(
       barpc triangulate left.tif right.tif --at 512 300 --at 498 301
       barpc triangulate a.tif b.tif c.tif --points ties.csv
     """
-    cameras = [load_camera(image, pixel_convention, band) for image in images]
+    cameras = [open_camera(image) for image in images]
     if len(cameras) < 2:
         raise click.UsageError("one image; the lines of sight of at least two can meet")
     names = [f"{axis}{i}" for i in range(1, len(cameras) + 1) for axis in ("col", "row")]
@@ -49,8 +40,8 @@ def command(
         raise click.UsageError(f"{len(at)} points given with --at for {len(cameras)} images")
     xy = read_points([v for pair in at for v in pair], points, names).reshape(-1, len(cameras), 2)
     point, view = np.nonzero(np.isfinite(xy).all(axis=2))
-    rpcs = [camera.rpc for camera in cameras]
-    found = triangulate(rpcs, view, point, xy[point, view], alt=middle_altitude(rpcs[0]))
+    models = [camera.model for camera in cameras]
+    found = triangulate(models, view, point, xy[point, view], alt=cameras[0].altitude)
     table = np.full((len(xy), 4), np.nan)
     square = np.bincount(point, (found.residuals**2).sum(axis=1), minlength=len(found.points))
     count = np.bincount(point, minlength=len(found.points))

@@ -43,9 +43,9 @@ class RunOptions:
     stop_after : {"matching", "adjustment", "all"}
         End early: after the tracks, or before RPCs are written.
     keep_going : bool
-        Leave out a file that cannot be used instead of stopping; the run then ends with exit code 3.
-    force : bool
-        Write an RPC that misses the fit's tolerance; the run then ends with exit code 3.
+        Do what can be done instead of stopping: leave out a file that cannot be used and images that the largest
+        connected group is not tied to, write an RPC that misses the fit's tolerance. Such a run ends with exit
+        code 3.
     overwrite : bool
         Replace the results of an earlier run in the same folder.
     matches : str or None
@@ -74,7 +74,6 @@ class RunOptions:
     num_passes: int = 1
     stop_after: str = "all"
     keep_going: bool = False
-    force: bool = False
     overwrite: bool = False
     matches: str | None = None
     overlap_list: str | None = None

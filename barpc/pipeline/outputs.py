@@ -18,15 +18,12 @@ from barpc.pipeline.options import RunOptions
 from barpc.report import Run
 from barpc.report.page import can_render, report_html
 from barpc.report.tables import TABLES
-from barpc.rpcio import rpc_vrt, sidecars, write_rpc, write_rpc_copy
+from barpc.rpcio import CARRIERS, WRITABLE, sidecars, write_camera
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.workspace import Workspace
 
 MATCHES = ("matches.csv", "matches.npz")
-
-SUFFIXES = {"txt": "_RPC.TXT", "rpb": ".RPB", "geom": ".geom", "json": ".rpc.json", "xml": ".rpc.xml"}
-"""RPC file written for each format, after the view's name."""
 
 REOPENED = 1e-5
 """A reopened file may differ from P_BA by the error of the fit and this [px] more (15-digit printing)."""
@@ -50,7 +47,7 @@ def write_view(
     images : {"vrt", "copy", "none"}
         What carries the RPC.
     formats : sequence of str
-        RPC files to write, keys of `SUFFIXES`.
+        RPC files to write, keys of `barpc.rpcio.WRITABLE`.
 
     Returns
     -------
@@ -66,12 +63,7 @@ def write_view(
     names = file_names(view, images, formats)
     for name in names:
         with run.output(name) as partial:
-            if name.endswith(".vrt"):
-                partial.write_text(rpc_vrt(fit.rpc, view.path, run.folder / name), encoding="utf-8")
-            elif name.endswith(".tif"):
-                write_rpc_copy(fit.rpc, view.path, partial, overwrite=True)
-            else:
-                write_rpc(fit.rpc, partial, overwrite=True)
+            write_camera(fit.rpc, partial, view.path, place=run.folder / name, overwrite=True)
     largest = float(np.linalg.norm(fit.max_ckp)) + REOPENED
     written: dict[str, dict[str, float | str]] = {name: {} for name in names}
     for reading in verify([run.folder / name for name in names], model, view.size, view.alt_range):
@@ -87,8 +79,8 @@ def write_view(
 
 def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
     """The files that `write_view` writes for a view."""
-    names = {"vrt": [f"{view.name}.vrt"], "copy": [f"{view.name}.tif"], "none": []}[images]
-    return names + [view.name + SUFFIXES[key] for key in formats]
+    ends = [CARRIERS[images].suffixes[0]] if images in CARRIERS else []
+    return [view.name + end for end in (*ends, *(WRITABLE[key].beside for key in formats))]
 
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:

@@ -14,19 +14,19 @@ import numpy as np
 from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
-from barpc.handoff import refuse_hiding
-from barpc.pipeline.crew import Crew
+from barpc.handoff import refuse_hiding, unverified
+from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
 from barpc.pipeline.options import RunOptions
-from barpc.pipeline.outputs import MATCHES, SUFFIXES, output_names, refuse_shadows, write_tables, write_view
-from barpc.pipeline.views import LoadedViews, load_views
+from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
+from barpc.pipeline.views import Image, LoadedViews, image_path, load_views
 from barpc.plain import plain_path
 from barpc.pointio.matches import asp_text, read_matches, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.report import Run, summarize
 from barpc.report.measures import pair_ties
 from barpc.report.page import remake_report
-from barpc.rpcio import plain_source
+from barpc.rpcio import WRITABLE, plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
@@ -88,7 +88,7 @@ class AdjustResult:
 
 
 def adjust(
-    images: Sequence[str | Path],
+    images: Sequence[Image],
     out_dir: str | Path,
     options: RunOptions | None = None,
     *,
@@ -99,9 +99,10 @@ def adjust(
 
     Parameters
     ----------
-    images : sequence of path
-        Two or more rasters with RPCs, in any order: the files written do not depend on it. They are opened
-        read-only.
+    images : sequence of path or View
+        Two or more rasters, in any order: the files written do not depend on it. They are opened read-only. What
+        a camera is read from is found as `barpc.cameras.open_camera` does; a View brings its own model (a frozen
+        dataclass, so that its results can be kept).
     out_dir : path
         Folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``.
     options : RunOptions, optional
@@ -121,9 +122,9 @@ def adjust(
         See `barpc.errors`; nothing is written then.
     """
     options = options or RunOptions()
-    unknown = [name for name in options.rpc_formats if name not in SUFFIXES]
+    unknown = [name for name in options.rpc_formats if name not in WRITABLE]
     if unknown:
-        raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(SUFFIXES)}")
+        raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(WRITABLE)}")
     plain_path(Path(out_dir).absolute())
     loaded = _load(images, options)
     if options.stop_after == "matching":
@@ -141,8 +142,8 @@ def adjust(
     refuse_hiding(Path(out_dir), names, keep)
     refuse_shadows(Path(out_dir), names)
     with Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names) as workspace:
-        with _crew(loaded, workspace, executor) as crew:
-            run = _solve(loaded, options, workspace, crew, progress)
+        with _caching(loaded, workspace, executor) as caching:
+            run = _solve(loaded, options, workspace, caching, progress)
         if run.adjustment is not None and options.stop_after == "all":
             with workspace.stage("fit and write"):
                 run = _fit_and_write(run, options, workspace, progress)
@@ -161,7 +162,7 @@ def adjust(
 
 
 def check(
-    images: Sequence[str | Path],
+    images: Sequence[Image],
     options: RunOptions | None = None,
     *,
     executor: Executor | None = None,
@@ -175,22 +176,22 @@ def check(
     return AdjustResult(_as_given(run.views, images), run, summarize(run))
 
 
-def _as_given(views: Iterable[View], images: Sequence[str | Path]) -> tuple[View, ...]:
-    place = {str(Path(path).absolute()): number for number, path in enumerate(images)}
+def _as_given(views: Iterable[View], images: Sequence[Image]) -> tuple[View, ...]:
+    place = {str(image_path(image)): number for number, image in enumerate(images)}
     return tuple(sorted(views, key=lambda view: place[view.path]))
 
 
-def _load(images: Sequence[str | Path], options: RunOptions) -> LoadedViews:
+def _load(images: Sequence[Image], options: RunOptions) -> LoadedViews:
     for path in input_files(options):
         plain_path(path)
     least = 1 if options.gcp else 2  # one image and control points are enough
     return load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
 
 
-def _crew(loaded: LoadedViews, workspace: Workspace, executor: Executor | None) -> Crew:
+def _caching(loaded: LoadedViews, workspace: Workspace, executor: Executor | None) -> CachingExecutor:
     with workspace.stage("fingerprints"):
         fingerprints = {view.path: fingerprint(view.path) for view in loaded.views}
-    return Crew(workspace, fingerprints, executor)
+    return CachingExecutor(workspace, fingerprints, executor)
 
 
 def _empty_run(kind: str, loaded: LoadedViews, options: RunOptions) -> Run:
@@ -199,7 +200,11 @@ def _empty_run(kind: str, loaded: LoadedViews, options: RunOptions) -> Run:
 
 
 def _solve(
-    loaded: LoadedViews, options: RunOptions, workspace: Workspace, crew: Crew, progress: Progress | None
+    loaded: LoadedViews,
+    options: RunOptions,
+    workspace: Workspace,
+    executor: Executor,
+    progress: Progress | None,
 ) -> Run:
     """Tie points and the adjustment, as often as there are passes."""
     run = _empty_run("adjust", loaded, options)
@@ -209,7 +214,7 @@ def _solve(
     for number in range(passes):
         again = f" (pass {number + 1})" if number else ""
         with workspace.stage("tie points" + again):
-            run = _with_ties(run, options, crew, progress, adjustment)
+            run = _with_ties(run, options, executor, progress, adjustment)
         if options.stop_after == "matching":
             _write_matches(run, workspace)
             return replace(run, kind="match")
@@ -227,8 +232,15 @@ def _adjusted(run: Run, options: RunOptions, given: Given) -> tuple[Run, Adjustm
     gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
     centers = tuple(_center(view, options) for view in run.views)
     ecef = np.array([center.ecef for center in centers])
+    adjusting = replace(options.adjust, keep_largest=options.keep_going or options.adjust.keep_largest)
     adjustment = adjust_tracks(
-        run.views, run.tracks, options.adjust, gcps, given.dem, centers=ecef, prior=given.prior
+        run.views,
+        run.tracks,
+        adjusting,
+        gcps,
+        given.dem,
+        centers=ecef,
+        prior=given.prior,
     )
     return replace(run, centers=centers, gcps=gcps, check_points=checks), adjustment
 
@@ -245,16 +257,19 @@ def _with_ties(
         return replace(run, tracks=read_matches(options.matches, [view.name for view in run.views]))
     if len(run.views) < 2:
         return run
+    views = run.views
+    if adjustment is not None:
+        corrected = zip(views, adjustment.sensors, strict=True)
+        views = tuple(replace(view, sensor=sensor) for view, sensor in corrected)
     given: dict[str, Any] = {"executor": executor, "progress": progress}
-    given["sensors"] = None if adjustment is None else adjustment.sensors
     if options.overlap_list is not None:
         given["only"] = read_pairs(options.overlap_list, run.views, [path for path, _ in run.left_out])
     if options.aoi is not None:
         given["area"] = read_area(options.aoi)
     try:
-        ties = find_tracks(run.views, options.tie, **given)
+        ties = find_tracks(views, options.tie, **given)
     except DisconnectedError as error:
-        if not options.adjust.keep_largest or len(error.groups[0]) < 2:
+        if not (options.keep_going or options.adjust.keep_largest) or len(error.groups[0]) < 2:
             raise
         kept = _only(run, frozenset(error.groups[0]))
         logger.warning("%d of %d images are tied together and kept", len(kept.views), len(run.views))
@@ -304,7 +319,9 @@ def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
     for i, (view, model) in enumerate(zip(run.views, run.adjustment.sensors, strict=True)):
         try:
-            fit = fit_rpc(model, view.size, view.alt_range, options=options.fit, strict=not options.force)
+            fit = fit_rpc(
+                model, view.size, view.alt_range, options=options.fit, strict=not options.keep_going
+            )
         except FitError as error:
             raise FitError(f"{view.name}: {error}") from error
         rand = view.sensor.err_rand if isinstance(view.sensor, RPC) else None
@@ -317,4 +334,6 @@ def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress
         written.append(write_view(workspace, view, fit, model, options.images, options.rpc_formats))
         if progress is not None:
             progress("write", i + 1, len(run.views))
+    for sentence in unverified([workspace.folder / name for name in written[0]]):
+        logger.warning(sentence)
     return replace(run, fits=tuple(fits), written=tuple(written))

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from barpc.cameras import Camera, open_camera, split_spec
 from barpc.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.pipeline.twins import Twins
 from barpc.plain import plain_path
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
-from barpc.rpcio import RpcSource, read_rpc_source
 from barpc.scene import View
-from barpc.sensor.geometry import altitude_range, footprint
+from barpc.sensor.geometry import footprint
 
 logger = logging.getLogger(__name__)
 
@@ -24,27 +24,35 @@ ALTITUDE_LIMITS = (-1000.0, 9500.0)
 """The Earth's ground stays inside this [m], with a margin; RPCs that state more are cut to it."""
 
 
+Image = str | Path | View
+
+
 @dataclass(frozen=True, eq=False)
 class LoadedViews:
-    """Views, where their RPCs came from, and what was left out.
+    """Views, where their cameras came from, and what was left out.
 
     Parameters
     ----------
     views : tuple of View
         In the order of their names.
-    sources : tuple of RpcSource
+    sources : tuple of Camera
         One a view.
     left_out : tuple of (str, str)
         Path and reason of each file that was left out.
     """
 
     views: tuple[View, ...]
-    sources: tuple[RpcSource, ...]
+    sources: tuple[Camera, ...]
     left_out: tuple[tuple[str, str], ...] = ()
 
 
+def image_path(image: Image) -> Path:
+    """The file with the pixels, absolute."""
+    return (Path(image.path) if isinstance(image, View) else split_spec(image)[0]).absolute()
+
+
 def load_views(
-    paths: Sequence[str | Path],
+    images: Sequence[Image],
     *,
     min_views: int = 2,
     keep_going: bool = False,
@@ -55,8 +63,9 @@ def load_views(
 
     Parameters
     ----------
-    paths : sequence of path
-        The image files.
+    images : sequence of path or View
+        The image files, perhaps with choices behind them (`barpc.cameras.open_camera`), or views of them with
+        a camera of one's own.
     min_views : int
         So many are needed.
     keep_going : bool
@@ -77,19 +86,20 @@ def load_views(
     InputError
         Too few images, the same image twice, or a name that the files of a run cannot carry.
     """
-    files = [plain_path(Path(path).absolute()) for path in paths]
+    files = [plain_path(image_path(image)) for image in images]
     if len(files) < min_views:
         found = files[0] if files else "none"
         raise InputError(
             f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed"
         )
     views: list[View] = []
-    sources: list[RpcSource] = []
+    sources: list[Camera] = []
     left_out: list[tuple[str, str]] = []
     twins = Twins(band)
-    for name, file in sorted(zip(unique_names(files), files, strict=True)):
+    given = zip(unique_names(files), files, images, strict=True)
+    for name, file, image in sorted(given, key=lambda row: row[:2]):
         try:
-            view, source = _load(name, file, band)
+            view, source = _load(name, file, image, band)
             if distinct:
                 twins.add(view)
         except BarpcError as error:
@@ -105,19 +115,28 @@ def load_views(
     return LoadedViews(tuple(views), tuple(sources), tuple(left_out))
 
 
-def _load(name: str, file: Path, band: int) -> tuple[View, RpcSource]:
-    with open_raster(file) as image:
-        size = (int(image.width), int(image.height))
-        if not 1 <= band <= image.count:
-            raise ImageError(f"{file}: has {image.count} band(s), no band {band}")
-    source = read_rpc_source(file)
-    low, high = altitude_range(source.rpc)
-    low, high = max(low, ALTITUDE_LIMITS[0]), min(high, ALTITUDE_LIMITS[1])
+def _load(name: str, file: Path, image: Image, band: int) -> tuple[View, Camera]:
+    with open_raster(file) as dataset:
+        size = (int(dataset.width), int(dataset.height))
+        if not 1 <= band <= dataset.count:
+            raise ImageError(f"{file}: has {dataset.count} band(s), no band {band}")
+    if isinstance(image, View):
+        camera = Camera(image.sensor, file, "given", image.size, image.alt_range)
+        if image.size != size:
+            raise InputError(f"{file}: is {size} px large, but its view says {image.size}")
+    else:
+        camera = open_camera(image, size=size)
+    view = View(name, str(file), size, camera.model, _altitudes(camera))
+    ring = footprint(view.sensor, size, sum(view.alt_range) / 2)
+    if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
+        raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
+    return view, camera
+
+
+def _altitudes(camera: Camera) -> tuple[float, float]:
+    """The altitudes that a camera is used for [m]."""
+    low, high = max(camera.alt_range[0], ALTITUDE_LIMITS[0]), min(camera.alt_range[1], ALTITUDE_LIMITS[1])
     if high - low < MIN_ALTITUDE_SPAN:
         middle = min(max((low + high) / 2, ALTITUDE_LIMITS[0]), ALTITUDE_LIMITS[1])
         low, high = middle - MIN_ALTITUDE_SPAN / 2, middle + MIN_ALTITUDE_SPAN / 2
-    view = View(name, str(file), size, source.rpc, (low, high))
-    ring = footprint(view.sensor, size, (low + high) / 2)
-    if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
-        raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
-    return view, source
+    return low, high

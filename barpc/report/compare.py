@@ -148,8 +148,8 @@ def flat_options(options: Record, before: str = "") -> dict[str, Any]:
 
     Examples
     --------
-    >>> flat_options({"tie": {"band": 1}, "force": False})
-    {'tie.band': 1, 'force': False}
+    >>> flat_options({"tie": {"band": 1}, "overwrite": False})
+    {'tie.band': 1, 'overwrite': False}
     """
     flat: dict[str, Any] = {}
     for key, value in options.items():

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment
+from barpc.cameras import Camera
 from barpc.fit import RpcFit
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.report.measures import PairTies, pair_ties, triangulate_tracks, whole_shift
-from barpc.rpcio import RpcSource
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Triangulation
@@ -30,7 +30,7 @@ class Run:
         Whether cameras were adjusted, looked at, or only tied.
     views : tuple of View
         The images.
-    sources : tuple of RpcSource
+    sources : tuple of Camera
         Where their RPCs came from; empty for views that were not read from files.
     tracks : Tracks
         Tie points.
@@ -61,7 +61,7 @@ class Run:
 
     kind: str
     views: tuple[View, ...]
-    sources: tuple[RpcSource, ...]
+    sources: tuple[Camera, ...]
     tracks: Tracks
     matched: tuple[PairReport, ...] = ()
     adjustment: Adjustment | None = None

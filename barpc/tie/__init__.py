@@ -6,11 +6,11 @@
 from barpc.tie.area import Area, read_area
 from barpc.tie.features import Keypoints
 from barpc.tie.find import TieResult, detect, find_tracks, match, require_matches
-from barpc.tie.link import common_tracks, link, thin
-from barpc.tie.matching import Matches, PairReport, match_pair
+from barpc.tie.matcher import Matches
+from barpc.tie.matching import PairReport, match_pair
 from barpc.tie.options import TieOptions
 from barpc.tie.pairs import Pair, select_pairs
-from barpc.tie.refine import refine
+from barpc.tie.tracks import common_tracks, link, refine, thin
 
 __all__ = [
     "Area",

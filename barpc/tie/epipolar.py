@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from barpc.geodesy import Array
-from barpc.scene import BoolArray, IntArray
-from barpc.sensor import SensorModel
+from barpc.scene import BoolArray, IntArray, View
 
 _FEW = 30  # points below which an affine error is not told from a constant one
 _TUKEY = 4.685
@@ -30,8 +31,9 @@ class Frame:
         Coordinate across it at the middle altitude [px].
     slope : (N,)
         d(across)/d(along).
-    reach : (N,)
-        Half the way between the lowest and the highest altitude [px].
+    before, after : (N,)
+        Where to look for the point along the axis, from (negative: backwards) and to [px]: as the cameras say,
+        from the lowest to the highest altitude.
     linear : (2, 2)
         d(image B)/d(image A) at constant altitude, in the middle of the points.
     """
@@ -40,7 +42,8 @@ class Frame:
     along: Array
     across: Array
     slope: Array
-    reach: Array
+    before: Array
+    after: Array
     linear: Array
 
     def turn(self, xy: Array) -> Array:
@@ -48,89 +51,63 @@ class Frame:
         turned: Array = xy @ np.array([[self.axis[0], -self.axis[1]], [self.axis[1], self.axis[0]]])
         return turned
 
-    def select(self, rows: IntArray) -> Frame:
-        """The frame of some points."""
-        return replace(
-            self,
-            along=self.along[rows],
-            across=self.across[rows],
-            slope=self.slope[rows],
-            reach=self.reach[rows],
-        )
+    def moved(self, across: Array | float) -> Frame:
+        """The frame with its points moved across the epipolar lines [px]."""
+        return replace(self, across=self.across + across)
 
-    def moved(self, along: Array | float, across: Array | float) -> Frame:
-        """The frame with its points moved [px]."""
-        return replace(self, along=self.along + along, across=self.across + across)
+    def place(self, along: Array) -> Array:
+        """Points of B (N, 2) [px] on the epipolar lines, `along` (N,) [px] from the middle altitude's."""
+        turned = np.stack([self.along + along, self.across + self.slope * along], axis=-1)
+        out: Array = turned @ np.array([[self.axis[0], self.axis[1]], [-self.axis[1], self.axis[0]]])
+        return out
 
-    def errors(self, index: IntArray, xy: Array) -> Array:
-        """Distance along and across (M, 2) of points of B (M, 2) from the points `index` of A."""
+    def errors(self, xy: Array) -> Array:
+        """Distance along and across (N, 2) of points of B (N, 2), one each, from where they are predicted."""
         u, w = self.turn(xy).T
-        along = u - self.along[index]
-        return np.stack([along, w - self.across[index] - self.slope[index] * along], axis=-1)
+        along = u - self.along
+        return np.stack([along, w - self.across - self.slope * along], axis=-1)
 
 
-def frame(sensor_a: SensorModel, sensor_b: SensorModel, xy: Array, alt_range: tuple[float, float]) -> Frame:
-    """Predict points of image A in image B.
+def common_range(*views: View) -> tuple[float, float]:
+    """The altitudes [m] at which views may see the same ground."""
+    low, high = max(view.alt_range[0] for view in views), min(view.alt_range[1] for view in views)
+    return min(low, high), max(low, high)
 
-    Parameters
-    ----------
-    sensor_a, sensor_b : SensorModel
-        The cameras.
-    xy : (N, 2)
-        col, row in A [px].
-    alt_range : tuple of float
-        Lowest and highest altitude [m].
 
-    Returns
-    -------
-    frame : Frame
-        NaN where a camera fails.
+def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> Frame:
+    """Predict points of one view (N, 2) [px] in another, at the altitudes that both are used for.
+
+    The axis is by default the mean direction of the points' epipolar segments. NaN where a camera fails.
     """
-    low, high = (sensor_b.project(sensor_a.localize(xy, np.full(len(xy), alt))) for alt in alt_range)
+    levels = common_range(first, second)
+    low, high = (second.sensor.project(first.sensor.localize(xy, np.full(len(xy), alt))) for alt in levels)
     step = high - low
     usable = np.isfinite(step).all(axis=1)
-    mean = step[usable].mean(axis=0) if usable.any() else np.zeros(2)
-    length = float(np.hypot(*mean))
-    axis = mean / length if length > 1e-3 else np.array([1.0, 0.0])
-    result = Frame(
-        axis,
-        *(np.empty(0),) * 4,
-        linear_map(
-            sensor_a,
-            sensor_b,
-            np.median(xy[usable], axis=0) if usable.any() else np.zeros(2),
-            0.5 * sum(alt_range),
-        ),
-    )
+    if axis is None:
+        mean = step[usable].mean(axis=0) if usable.any() else np.zeros(2)
+        length = float(np.hypot(*mean))
+        axis = mean / length if length > 1e-3 else np.array([1.0, 0.0])
+    middle = np.median(xy[usable], axis=0) if usable.any() else np.zeros(2)
+    none = np.empty(0)
+    result = Frame(axis, none, none, none, none, none, linear_map(first, second, middle))
     (u0, w0), (u1, w1) = result.turn(low).T, result.turn(high).T
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.where(np.abs(u1 - u0) > 1e-3, (w1 - w0) / (u1 - u0), 0.0)
     slope[~usable] = np.nan
-    return replace(
-        result, along=0.5 * (u0 + u1), across=0.5 * (w0 + w1), slope=slope, reach=0.5 * np.abs(u1 - u0)
-    )
+    reach = 0.5 * np.abs(u1 - u0)
+    along, across = 0.5 * (u0 + u1), 0.5 * (w0 + w1)
+    return replace(result, along=along, across=across, slope=slope, before=-reach, after=reach)
 
 
-def linear_map(sensor_a: SensorModel, sensor_b: SensorModel, xy: Array, alt: Array | float) -> Array:
-    """Derivative of the coordinates in B by those in A at constant altitude.
+def linear_map(first: View, second: View, xy: Array) -> Array:
+    """Derivative (..., 2, 2) of the place in B by that in A (..., 2) [px], at the middle altitude.
 
-    Parameters
-    ----------
-    sensor_a, sensor_b : SensorModel
-        The cameras.
-    xy : (..., 2)
-        col, row in A [px].
-    alt : (...)
-        Altitude [m].
-
-    Returns
-    -------
-    linear : (..., 2, 2)
-        [px/px]; the identity where a camera fails.
+    The identity where a camera fails.
     """
-    ground = sensor_a.localize(xy, np.broadcast_to(np.asarray(alt, dtype=np.float64), xy.shape[:-1]))
-    by_a = sensor_a.project_jacobian(ground)[1][..., :2]
-    by_b = sensor_b.project_jacobian(ground)[1][..., :2]
+    alt = 0.5 * sum(common_range(first, second))
+    ground = first.sensor.localize(xy, np.full(xy.shape[:-1], alt))
+    by_a = first.sensor.project_jacobian(ground)[1][..., :2]
+    by_b = second.sensor.project_jacobian(ground)[1][..., :2]
     usable = np.isfinite(by_a).all(axis=(-2, -1)) & np.isfinite(by_b).all(axis=(-2, -1))
     usable = np.asarray(usable)[..., None, None]
     by_a, by_b = np.where(usable, by_a, np.eye(2)), np.where(usable, by_b, np.eye(2))
@@ -140,16 +117,9 @@ def linear_map(sensor_a: SensorModel, sensor_b: SensorModel, xy: Array, alt: Arr
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """A scalar that varies affinely over an image: value = coefficients . (1, x, y), x and y normalised.
+    """A scalar [px] that varies affinely over an image: coefficients (3,) . (1, x, y), (x, y) = (xy - middle) / scale.
 
-    Parameters
-    ----------
-    coefficients : (3,)
-        [px].
-    middle, scale : (2,)
-        x = (col - middle) / scale.
-    spread : float
-        Robust standard deviation of the values about it [px].
+    `spread` is the robust standard deviation of the values about it [px].
     """
 
     coefficients: Array
@@ -168,18 +138,9 @@ def _design(xy: Array, middle: Array, scale: Array) -> Array:
 
 
 def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
-    """Fit `values` by an affine function of position, in spite of outliers.
+    """Fit values (N,) [px] at positions (N, 2) [px] by an affine function, in spite of outliers.
 
     Tukey's biweight on a scale that follows the residuals' MAD; a constant for few points.
-
-    Parameters
-    ----------
-    xy : (N, 2)
-        Positions [px].
-    values : (N,)
-        What is fitted [px].
-    steps : int
-        Reweighting steps.
     """
     middle, scale = np.median(xy, axis=0), np.maximum(np.ptp(xy, axis=0), 1.0)
     design = _design(xy, middle, scale)
@@ -203,37 +164,25 @@ def mad(values: Array) -> float:
 
 
 def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
-    """Which values agree with an affine function of position, window by window.
+    """Which values (N,) [px] agree with an affine function of position (N, 2) [px], window by window.
 
-    Parameters
-    ----------
-    xy : (N, 2)
-        Positions [px].
-    values : (N,)
-        Errors across the epipolar lines [px].
-    floor : float
-        What is always tolerated [px].
-
-    Returns
-    -------
-    keep : (N,)
-        Within three robust standard deviations of the window's function.
-    residual : (N,)
-        Distance from that function [px].
+    Returns the mask (N,) of those within three robust standard deviations of their window's function, or within
+    `floor` [px], and the distances (N,) from it [px].
     """
     keep = np.zeros(len(values), dtype=bool)
     if not len(values):
         return keep, values
     residual = values - robust_affine(xy, values)(xy)
-    for rows in _windows(xy):
+    for rows in grouped(*np.floor(xy[:, ::-1] / _WINDOW).T):
         if len(rows) >= _WINDOW_POINTS:
             residual[rows] = values[rows] - robust_affine(xy[rows], values[rows])(xy[rows])
         keep[rows] = np.abs(residual[rows]) <= max(3.0 * mad(residual[rows]), floor)
     return keep, residual
 
 
-def _windows(xy: Array) -> list[IntArray]:
-    cell = np.floor(xy / _WINDOW)
-    order = np.lexsort((cell[:, 0], cell[:, 1]))
-    cuts = np.flatnonzero((np.diff(cell[order], axis=0) != 0).any(axis=1)) + 1
-    return np.split(order, cuts)
+def grouped(*keys: npt.NDArray[Any]) -> list[IntArray]:
+    """Indices of rows with equal keys, in ascending order of the keys."""
+    table = np.stack(keys)
+    order = np.lexsort(table[::-1])
+    cuts = np.flatnonzero((np.diff(table[:, order], axis=1) != 0).any(axis=0)) + 1
+    return np.split(order, cuts) if len(order) else []

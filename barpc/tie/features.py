@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.geodesy import Array
-from barpc.scene import BoolArray, IntArray, View
+from barpc.scene import BoolArray, IntArray
 from barpc.tie.options import TieOptions
 from barpc.tie.raster import Box, ByteImage, Stretch, grow, read_pixels
 
@@ -48,13 +48,7 @@ class Keypoints:
 
     def select(self, which: IntArray | BoolArray) -> Keypoints:
         """The keypoints of a mask or of indices."""
-        return Keypoints(
-            self.xy[which],
-            self.scale[which],
-            self.angle[which],
-            self.response[which],
-            self.descriptors[which],
-        )
+        return Keypoints(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 def join(parts: Sequence[Keypoints]) -> Keypoints:
@@ -63,11 +57,7 @@ def join(parts: Sequence[Keypoints]) -> Keypoints:
         none = np.empty(0)
         return Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))
     return Keypoints(
-        np.concatenate([p.xy for p in parts]),
-        np.concatenate([p.scale for p in parts]),
-        np.concatenate([p.angle for p in parts]),
-        np.concatenate([p.response for p in parts]),
-        np.concatenate([p.descriptors for p in parts]),
+        *(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Keypoints))
     )
 
 
@@ -109,38 +99,16 @@ def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
     return table[:, :2], table[:, 2], table[:, 3]
 
 
-def tiles(size: tuple[int, int], options: TieOptions) -> list[Box]:
-    """Boxes that cover an image of `size` (width, height) without overlap, cut at whole cells."""
-    edges = []
-    for length in size:
-        step = -(-length // -(-length // options.tile))  # equal tiles, none larger than asked
-        step = -(-step // options.cell) * options.cell
-        edges.append([(start, min(step, length - start)) for start in range(0, length, step)])
-    return [(col, row, width, height) for row, height in edges[1] for col, width in edges[0]]
+def detect_tile(
+    path: str, size: tuple[int, int], box: Box, stretch: Stretch, options: TieOptions
+) -> Keypoints:
+    """Keypoints of one tile of an image of `size` (width, height), at most a quota a cell.
 
-
-def detect_tile(view: View, box: Box, stretch: Stretch, options: TieOptions) -> Keypoints:
-    """Keypoints of one tile of a view, at most a quota a cell.
-
-    Parameters
-    ----------
-    view : View
-        The image.
-    box : Box
-        The tile.
-    stretch : Stretch
-        8-bit stretch of the whole image.
-    options : TieOptions
-        Detector, cells, quota.
-
-    Returns
-    -------
-    keypoints : Keypoints
-        In the coordinates of the whole image, sorted by row and column.
+    In the coordinates of the whole image, sorted by row and column; `stretch` is that of the whole image.
     """
     cv2.setNumThreads(1)
-    window = grow(box, _MARGIN, view.size)
-    pixels, valid = read_pixels(view.path, window, options.band)
+    window = grow(box, _MARGIN, size)
+    pixels, valid = read_pixels(path, window, options.band)
     if not valid.any():
         return join([])
     distance = cv2.distanceTransform(np.pad(valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
@@ -159,25 +127,13 @@ def detect_tile(view: View, box: Box, stretch: Stretch, options: TieOptions) -> 
         ] = True
         return chosen
 
-    found = DETECTORS[options.detector](options).detect(Stretch.apply(stretch, pixels, valid), keep)
+    found = DETECTORS[options.detector](options).detect(stretch.apply(pixels, valid), keep)
     found = found.select(np.lexsort((found.angle, found.xy[:, 0], found.xy[:, 1])))
-    return Keypoints(found.xy + origin, found.scale, found.angle, found.response, found.descriptors)
+    return replace(found, xy=found.xy + origin)
 
 
 def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Indices of the strongest points of every cell, at most `most` each, ascending.
-
-    Parameters
-    ----------
-    xy : (N, 2)
-        col, row [px].
-    response : (N,)
-        Strength.
-    cell : float
-        Side of a cell [px].
-    most : int
-        Points kept in a cell.
-    """
+    """Indices of the strongest of points (N, 2) [px] in every cell of a side [px], at most so many each, ascending."""
     if not len(xy):
         return np.empty(0, dtype=np.int64)
     cells = np.floor((xy + 0.5) / cell).astype(np.int64)

@@ -11,18 +11,15 @@ import numpy as np
 from barpc.errors import InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks, View
-from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
 from barpc.tie.area import Area
-from barpc.tie.features import DETECTORS, Keypoints, bounded, detect_tile, join, tiles
-from barpc.tie.guided import MATCHERS
-from barpc.tie.link import link, thin
-from barpc.tie.matching import Matches, PairReport, match_pair
-from barpc.tie.options import TieOptions
-from barpc.tie.pairs import Pair, require_connected, select_pairs, shared_boxes
-from barpc.tie.raster import sample_stretch
-from barpc.tie.refine import refine
-from barpc.tie.work import Progress, ordered
+from barpc.tie.features import DETECTORS, Keypoints, bounded, detect_tile, join
+from barpc.tie.matcher import Matches
+from barpc.tie.matching import MATCHERS, PairReport, match_pair
+from barpc.tie.options import Progress, TieOptions, ordered
+from barpc.tie.pairs import Pair, require_connected, select_pairs, shared_tiles
+from barpc.tie.raster import sample_stretch, tiles
+from barpc.tie.tracks import link, refine, thin
 
 _DEFAULTS = TieOptions()
 _SPARE = 1.3  # tracks registered for each one kept
@@ -53,7 +50,6 @@ def detect(
     *,
     pairs: Sequence[Pair] | None = None,
     area: Area | None = None,
-    sensors: Sequence[SensorModel] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Keypoints]:
@@ -69,12 +65,8 @@ def detect(
         As `select_pairs` gave them: tiles that no partner may see are not read. None: all are.
     area : Area, optional
         Together with `pairs`: tiles outside are not read either.
-    sensors : sequence of SensorModel, optional
-        Corrected cameras to use instead of the views' own.
-    executor : Executor, optional
-        Works on the tiles; without one they are worked on here, one after the other.
-    progress : callable, optional
-        `progress("detect", done, total)`.
+    executor, progress : optional
+        Who does the work, and who hears how far it is: see `ordered`. The result does not depend on them.
 
     Returns
     -------
@@ -84,15 +76,12 @@ def detect(
     stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
     boxes = [tiles(view.size, options) for view in views]
     if pairs is not None:
-        wanted = shared_boxes(views, pairs, boxes, options, sensors=sensors, area=area)
-        boxes = [
-            [box for box, keep in zip(*both, strict=True) if keep] for both in zip(boxes, wanted, strict=True)
-        ]
+        boxes = shared_tiles(views, pairs, options, area)
     owners, tasks = [], []
     for owner, (view, stretch) in enumerate(zip(views, stretches, strict=True)):
         of_view = boxes[owner] if stretch is not None else []
         owners += [owner] * len(of_view)
-        tasks += [(view, box, stretch, options) for box in of_view]
+        tasks += [(view.path, view.size, box, stretch, options) for box in of_view]
     found = ordered(executor, detect_tile, tasks, "detect", progress)
     parts: list[list[Keypoints]] = [[] for _ in views]
     for owner, part in zip(owners, found, strict=True):
@@ -106,18 +95,14 @@ def match(
     pairs: Sequence[Pair],
     options: TieOptions = _DEFAULTS,
     *,
-    sensors: Sequence[SensorModel] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
     """Matches of every pair, each with its report: `match_pair` over all pairs."""
-    cameras = [view.sensor for view in views] if sensors is None else sensors
     tasks = []
     for pair in pairs:
         i, j = pair.views
-        tasks.append(
-            ((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options, (cameras[i], cameras[j]))
-        )
+        tasks.append(((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options))
     return ordered(executor, match_pair, tasks, "match", progress)
 
 
@@ -127,7 +112,6 @@ def find_tracks(
     *,
     executor: Executor | None = None,
     progress: Progress | None = None,
-    sensors: Sequence[SensorModel] | None = None,
     only: Sequence[tuple[int, int]] = (),
     area: Area | None = None,
 ) -> TieResult:
@@ -136,15 +120,11 @@ def find_tracks(
     Parameters
     ----------
     views : sequence of View
-        At least two.
+        At least two; in a second pass with their corrected cameras, `replace(view, sensor=...)`.
     options : TieOptions
         How.
-    executor : Executor, optional
-        Works on tiles and pairs; the result does not depend on it.
-    progress : callable, optional
-        `progress(stage, done, total)`.
-    sensors : sequence of SensorModel, optional
-        Corrected cameras to use instead of the views' own (a second pass).
+    executor, progress : optional
+        Who does the work, and who hears how far it is: see `ordered`. The result does not depend on them.
     only : sequence of (int, int)
         Match these pairs and no others.
     area : Area, optional
@@ -165,26 +145,19 @@ def find_tracks(
         An image cannot be read.
     """
     require_known(options)
-    pairs = select_pairs(views, options, sensors=sensors, only=only, area=area)
-    keypoints = detect(
-        views, options, pairs=pairs, area=area, sensors=sensors, executor=executor, progress=progress
-    )
-    matched = match(views, keypoints, pairs, options, sensors=sensors, executor=executor, progress=progress)
-    reports = tuple(report for _, report in matched)
+    pairs = select_pairs(views, options, only=only, area=area)
+    keypoints = [join([])] * len(views)
+    if MATCHERS[options.matcher].detects:
+        keypoints = detect(views, options, pairs=pairs, area=area, executor=executor, progress=progress)
+    matched = match(views, keypoints, pairs, options, executor=executor, progress=progress)
+    found, reports = [matches for matches, _ in matched], tuple(report for _, report in matched)
     require_matches(views, pairs, reports)
     sizes, most = [view.size for view in views], options.points_per_image
-    linked = link([len(k) for k in keypoints], [found for found, _ in matched])
-    linked = inside(views, linked, area, sensors)
-    tracks = refine(
-        views,
-        thin(linked, sizes, int(_SPARE * most)),
-        {found.pair: report.spread for found, report in matched if len(found)},
-        options,
-        sensors=sensors,
-        executor=executor,
-        progress=progress,
-    )
-    tracks = thin(inside(views, tracks, area, sensors), sizes, most)
+    linked = inside(views, link([pair.views for pair in pairs], found), area)
+    spreads = {p.views: r.spread for p, r in zip(pairs, reports, strict=True) if r.status == "ok"}
+    linked = thin(linked, sizes, int(_SPARE * most))
+    tracks = refine(views, linked, spreads, options, executor=executor, progress=progress)
+    tracks = thin(inside(views, tracks, area), sizes, most)
     require_tracks(views, tracks, pairs, reports, options)
     return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
 
@@ -199,19 +172,11 @@ def require_known(options: TieOptions) -> None:
             raise InputError(f"{what} {name!r} is not one of {', '.join(table)}")
 
 
-def inside(
-    views: Sequence[View], tracks: Tracks, area: Area | None, sensors: Sequence[SensorModel] | None = None
-) -> Tracks:
-    """The tracks whose ground points lie in an area; all without one.
-
-    Raises
-    ------
-    TiePointError
-        There are tracks, but none in the area.
-    """
+def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
+    """The tracks whose ground points lie in an area, all without one; TiePointError where none does."""
     if area is None or not len(tracks):
         return tracks
-    cameras = [view.sensor for view in views] if sensors is None else sensors
+    cameras = [view.sensor for view in views]
     alt = float(np.mean([view.alt_range for view in views]))
     points = triangulate(cameras, tracks.view, tracks.point, tracks.xy, alt=alt).points
     ground = ground_from_ecef(points)
@@ -222,27 +187,19 @@ def inside(
 
 
 def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
-    """Raise unless the pairs that matched connect all views.
-
-    Raises
-    ------
-    TiePointError
-        There are two views and they do not match.
-    DisconnectedError
-        There are more, and they fall into groups.
-    """
+    """Raise TiePointError where two views do not match, DisconnectedError where more fall into groups."""
     failed = [report for report in reports if report.status != "ok"]
     told = "; ".join(
         f"{r.names[0]} - {r.names[1]}: {r.status} ({r.keypoints[0]} and {r.keypoints[1]} keypoints, "
         f"{r.verified} of {r.matches} matches verified)"
         for r in failed[:4]
     )
-    blank = sorted({name for r in failed for name, n in zip(r.names, r.keypoints, strict=True) if not n})
+    bare = [r for r in failed if r.status == "too few keypoints"]
+    blank = sorted({name for r in bare for name, n in zip(r.names, r.keypoints, strict=True) if not n})
     advice = "look at the images (clouds? dates? band?), or loosen ratio, search or min_matches"
     if blank:
-        advice = (
-            f"no detail in {', '.join(blank[:4])} (one value? no valid pixels? clouds?): look at the images"
-        )
+        names = ", ".join(blank[:4])
+        advice = f"no detail in {names} (one value? no valid pixels? clouds?): look at the images"
     if len(views) == 2 and failed:
         raise TiePointError(f"too few tie points: {told}: {advice}")
     links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]
@@ -256,13 +213,7 @@ def require_tracks(
     reports: Sequence[PairReport],
     options: TieOptions,
 ) -> None:
-    """Raise unless the tracks connect all views by at least `min_matches` observations a pair.
-
-    Raises
-    ------
-    TiePointError, DisconnectedError
-        As for `require_matches`.
-    """
+    """As `require_matches`, for the pairs that `min_matches` tracks or more are left of."""
     left = []
     for pair, report in zip(pairs, reports, strict=True):
         common = len(np.intersect1d(*(tracks.point[tracks.view == view] for view in pair.views)))

@@ -1,111 +1,60 @@
-"""Searching the best counterpart of every keypoint inside a band about its epipolar segment."""
+"""The best counterpart of every keypoint inside a band about its epipolar segment."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from barpc.geodesy import Array
-from barpc.scene import IntArray
-from barpc.tie.epipolar import Frame
+from barpc.scene import IntArray, View
+from barpc.tie.epipolar import Frame, grouped
 from barpc.tie.features import Keypoints
+from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
+from barpc.tie.options import TieOptions
 
 FloatArray = npt.NDArray[np.float32]
 
+_CLEAR_RATIO = 0.8  # where only clear matches count
 _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
 _MAX_ZOOM = np.log(1.8)  # the same for the scale
 _APART = 2.0  # px; nearer candidates are the same point
 _NONE = np.float32(-2.0)  # below every cosine
 
 
-@dataclass(frozen=True, eq=False)
-class Band:
-    """Where points of A are looked for in B, relative to a `Frame`.
-
-    Parameters
-    ----------
-    before, after : (N,)
-        How far along the axis, from (negative: backwards) and to [px].
-    across : float
-        Half width [px].
-    """
-
-    before: Array
-    after: Array
-    across: float
-
-    def select(self, rows: IntArray) -> Band:
-        """The band of some points."""
-        return Band(self.before[rows], self.after[rows], self.across)
-
-
-@dataclass(frozen=True, eq=False)
-class Candidates:
-    """Mutual best pairs of keypoints.
-
-    Parameters
-    ----------
-    index : (M, 2)
-        Keypoints of A and of B.
-    distance : (M,)
-        Of the descriptors, 0 to 2.
-    ambiguity : (M,)
-        `distance` over that to the second best candidate; over 1 where there is none.
-    """
-
-    index: IntArray
-    distance: Array
-    ambiguity: Array
-
-
-class Matcher(Protocol):
-    """Finds for keypoints of A their best counterparts in B within a band."""
-
-    def match(self, a: Keypoints, b: Keypoints, where: Frame, band: Band) -> Candidates:
-        """Mutual best candidates inside the band."""
-        ...
-
-
 class Guided:
     """Mutual best descriptors of like scale and orientation, cell by cell of the predicted positions."""
 
-    def match(self, a: Keypoints, b: Keypoints, where: Frame, band: Band) -> Candidates:
-        """Mutual best candidates inside the band."""
-        best = _Best(len(a), len(b))
-        if len(a) and len(b):
-            turned = where.turn(b.xy)
-            strips = _Strips(turned)
-            described_a, described_b = _Described.of(a, where.linear), _Described.of(b, np.eye(2))
-            for rows in _cells(where, float(np.clip(band.across, 64.0, 512.0))):
-                part = band.select(rows)
-                tilt = np.abs(where.slope[rows]).max() * max(-part.before.min(), part.after.max(), 0.0)
-                u, w = where.along[rows, None], where.across[rows, None]
-                side = part.across + tilt
-                cols = strips.inside(
-                    (u[:, 0] + part.before).min(),
-                    (u[:, 0] + part.after).max(),
-                    w.min() - side,
-                    w.max() + side,
-                )
-                if not len(cols):
-                    continue
-                du = (turned[cols, 0] - u).astype(np.float32)
-                dw = (turned[cols, 1] - w).astype(np.float32) - where.slope[rows, None].astype(
-                    np.float32
-                ) * du
-                allowed = (
-                    (np.abs(dw) <= part.across) & (du >= part.before[:, None]) & (du <= part.after[:, None])
-                )
-                best.update(rows, cols, described_a.likeness(rows, described_b, cols, allowed), du, dw)
-        return best.mutual()
+    detects: ClassVar[bool] = True
 
+    def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None:
+        self._ratio, (self._a, self._b) = options.ratio, keypoints
+        self._prepared: tuple[_Strips, _Described, _Described] | None = None
 
-MATCHERS: dict[str, Callable[[], Matcher]] = {"guided": Guided}
-"""Name -> matcher."""
+    def match(self, a: View, b: View, prediction: Prediction) -> Matches:
+        """Mutual best keypoints whose second best is farther by the ratio test (Lowe 2004)."""
+        if not (len(self._a) and len(self._b)):
+            return NO_MATCHES
+        where, across = prediction.at(self._a.xy), prediction.half_width
+        if self._prepared is None:  # the axis of the frames, and so all this, is one for a pair
+            described = _Described.of(self._a, where.linear), _Described.of(self._b, np.eye(2))
+            self._prepared = _Strips(where.turn(self._b.xy)), *described
+        strips, first, second = self._prepared
+        best = _Best(len(self._a), len(self._b))
+        side = float(np.clip(across, 64.0, 512.0))
+        for rows in _cells(where, prediction.chosen(len(self._a)), side):
+            cols = strips.near(where, across, rows)
+            if len(cols):
+                du, dw = strips.apart(where, rows, cols)
+                allowed = np.abs(dw) <= across
+                allowed &= (du >= where.before[rows, None]) & (du <= where.after[rows, None])
+                best.update(rows, cols, first.likeness(rows, second, cols, allowed), du, dw)
+        index, distance, ambiguity = best.mutual()
+        clear = ambiguity <= (self._ratio if prediction.probes is None else min(self._ratio, _CLEAR_RATIO))
+        xy = np.stack([self._a.xy[index[:, 0]], self._b.xy[index[:, 1]]], axis=1)
+        return Matches(xy, distance, index).select(clear)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,13 +109,17 @@ class _Best:
         likeness[same] = _NONE
         self._second[rows] = likeness.max(axis=1)
 
-    def mutual(self) -> Candidates:
+    def mutual(self) -> tuple[IntArray, Array, Array]:
+        """Mutual best pairs (M, 2), their distances, and these over those to the second best (M,).
+
+        Distances of descriptors are 0 to 2; where there is no second best, its distance counts as 1.
+        """
         found = np.flatnonzero(self._top > -1)
         found = found[self._of_b[self._of_a[found]] == found]
         top, second = self._top[found].astype(np.float64), self._second[found].astype(np.float64)
         distance = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0))
         rival = np.where(second < -1, 1.0, np.sqrt(np.maximum(2.0 - 2.0 * second, 1e-12)))
-        return Candidates(np.stack([found, self._of_a[found]], axis=1), distance, distance / rival)
+        return np.stack([found, self._of_a[found]], axis=1), distance, distance / rival
 
 
 class _Strips:
@@ -175,30 +128,36 @@ class _Strips:
     height = 32.0
 
     def __init__(self, turned: Array) -> None:
+        self._turned = turned
         self._first = float(turned[:, 1].min())
         strip = np.floor((turned[:, 1] - self._first) / self.height).astype(np.int64)
         self._order = np.lexsort((turned[:, 0], strip))
         self._along = turned[self._order, 0]
         self._starts = np.searchsorted(strip[self._order], np.arange(strip.max() + 2))
 
-    def inside(self, left: float, right: float, low: float, high: float) -> IntArray:
-        """Indices of the points in strips that touch [low, high] across, within [left, right] along."""
+    def near(self, where: Frame, across: float, rows: IntArray) -> IntArray:
+        """Indices of the points in strips that the bands of some points of A touch, ascending."""
+        before, after, u, w = (x[rows] for x in (where.before, where.after, where.along, where.across))
+        tilt = np.abs(where.slope[rows]).max() * max(-before.min(), after.max(), 0.0)
+        low, high = w.min() - (across + tilt), w.max() + (across + tilt)
         first = max(0, int((low - self._first) // self.height))
         last = min(len(self._starts) - 2, int((high - self._first) // self.height))
         parts = []
         for strip in range(first, last + 1):
             start, stop = self._starts[strip], self._starts[strip + 1]
-            begin, end = np.searchsorted(self._along[start:stop], [left, right])
+            begin, end = np.searchsorted(self._along[start:stop], [(u + before).min(), (u + after).max()])
             parts.append(self._order[start + begin : start + end])
         return np.sort(np.concatenate(parts)) if parts else np.empty(0, dtype=np.int64)
 
+    def apart(self, where: Frame, rows: IntArray, cols: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Distances along and across (rows, cols) of points of B from the predicted ones of A."""
+        du = (self._turned[cols, 0] - where.along[rows, None]).astype(np.float32)
+        dw = (self._turned[cols, 1] - where.across[rows, None]).astype(np.float32)
+        return du, dw - where.slope[rows, None].astype(np.float32) * du
 
-def _cells(where: Frame, side: float) -> list[IntArray]:
-    """Indices of the predicted points of A, cell by cell of B; points without a prediction are left out."""
-    usable = np.flatnonzero(np.isfinite(where.along + where.across + where.slope))
-    if not len(usable):
-        return []
-    cell = np.floor(np.stack([where.across[usable], where.along[usable]], axis=1) / side)
-    order = np.lexsort((cell[:, 1], cell[:, 0]))
-    cuts = np.flatnonzero((np.diff(cell[order], axis=0) != 0).any(axis=1)) + 1
-    return np.split(usable[order], cuts)
+
+def _cells(where: Frame, wanted: IntArray, side: float) -> list[IntArray]:
+    """The wanted points of A, cell by cell of B; points without a prediction are left out."""
+    usable = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
+    cell = np.floor(np.stack([where.across[usable], where.along[usable]]) / side)
+    return [usable[rows] for rows in grouped(*cell)]

@@ -1,8 +1,11 @@
-"""What the user may change about tie points."""
+"""What the user may change about tie points, and how their tasks are handed to whoever works on them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields
+from typing import Any
 
 from barpc.errors import InputError
 
@@ -18,7 +21,7 @@ class TieOptions:
     detector : str
         A row of `barpc.tie.features.DETECTORS`.
     matcher : str
-        A row of `barpc.tie.guided.MATCHERS`.
+        A row of `barpc.tie.matching.MATCHERS`.
     tile : int
         Side of the tiles that are read and searched for keypoints [px].
     cell : int
@@ -88,3 +91,38 @@ class TieOptions:
             raise InputError("tie points: tile >= 128, cell >= 8 and min_matches >= 4 are needed")
         if self.min_overlap > 1 or self.ratio > 1 or self.min_correlation >= 1:
             raise InputError("tie points: min_overlap, ratio and min_correlation are shares, at most 1")
+
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage, how much is done, of how much."""
+
+
+def ordered(
+    executor: Executor | None,
+    function: Callable[..., Any],
+    tasks: Sequence[tuple[Any, ...]],
+    stage: str,
+    progress: Progress | None = None,
+) -> list[Any]:
+    """Results of `function(*task)` in the order of the tasks; the rest is cancelled when one fails.
+
+    Parameters
+    ----------
+    executor : Executor or None
+        Works on the tasks; None: they are worked on here, one after the other.
+    function : callable
+        Of a module, so that it can be sent to another process.
+    tasks, stage, progress
+        Its arguments; `progress(stage, done, total)` is called as they are done.
+    """
+    results = []
+    futures = [executor.submit(function, *task) for task in tasks] if executor is not None else []
+    try:
+        for done, task in enumerate(tasks, start=1):
+            results.append(futures[done - 1].result() if futures else function(*task))
+            if progress is not None:
+                progress(stage, done, len(tasks))
+    finally:
+        for future in futures:
+            future.cancel()
+    return results

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 import shapely
 
 from barpc.errors import DisconnectedError, TiePointError
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
-from barpc.scene import BoolArray, View, connected_groups
-from barpc.sensor import SensorModel
+from barpc.scene import View, connected_groups
 from barpc.sensor.geometry import convergence_angle, footprint
 from barpc.tie.area import Area
+from barpc.tie.epipolar import common_range
 from barpc.tie.options import TieOptions
-from barpc.tie.raster import Box
+from barpc.tie.raster import Box, tiles
 
 logger = logging.getLogger(__name__)
 
@@ -48,112 +49,63 @@ class Pair:
         return self.overlap * float(np.exp(-max(0.0, self.angle - _BEST_ANGLE) / _ANGLE_DECAY))
 
 
-@dataclass(frozen=True, eq=False)
 class Footprints:
-    """Outlines of the views in a common plane.
+    """Outlines of views at one altitude [m], as far as they lie in an area, in a common plane [m east, north].
 
-    Parameters
-    ----------
-    origin : (2,)
-        lon, lat of the plane's origin [deg].
-    alt : float
-        Altitude of the outlines [m].
-    outlines : tuple of shapely geometries
-        [m east, m north of the origin]; empty where the camera sees no ground at that altitude.
+    They grow by as much as the cameras may be wrong (`reach` [px]), and the area does; an outline is empty where
+    the camera sees no ground at that altitude.
     """
 
-    origin: Array
-    alt: float
-    outlines: tuple[shapely.Geometry, ...]
-    _scale: Array = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_scale", metres_per_unit(np.array([*self.origin, self.alt]))[:2])
+    def __init__(
+        self, views: Sequence[View], alt: float, reach: float = 0.0, area: Area | None = None
+    ) -> None:
+        rings = [footprint(view.sensor, view.size, alt)[:, :2] for view in views]
+        usable = [ring[np.isfinite(ring).all(axis=1)] for ring in rings]
+        self._origin = next((ring[0] for ring in usable if len(ring)), np.zeros(2))
+        self._scale = metres_per_unit(np.array([*self._origin, alt]))[:2]
+        self.alt = alt
+        wanted = None if area is None else area.plane(self._origin, self._scale)
+        self.outlines: list[shapely.Geometry] = []
+        for view, ring in zip(views, usable, strict=True):
+            ring = self.plane(ring) if len(ring) > 3 else ring[:0]
+            outline = shapely.make_valid(shapely.Polygon(ring))
+            more = reach * float(np.sqrt(outline.area / (view.size[0] * view.size[1])))
+            if reach:
+                outline = shapely.buffer(outline, more)
+            if wanted is not None:
+                near = shapely.buffer(wanted, more) if reach else wanted
+                outline = shapely.intersection(outline, near)
+            self.outlines.append(outline)
 
     def plane(self, lonlat: Array) -> Array:
         """East and north (..., 2) [m] of longitudes and latitudes (..., 2) [deg]."""
-        lon = wrap_longitude(lonlat[..., 0], self.origin[0])
-        return (np.stack([lon, lonlat[..., 1]], axis=-1) - self.origin) * self._scale
+        lon = wrap_longitude(lonlat[..., 0], self._origin[0])
+        return (np.stack([lon, lonlat[..., 1]], axis=-1) - self._origin) * self._scale
 
-    def lonlat(self, plane: Array) -> Array:
-        """Longitudes and latitudes (..., 2) [deg] of points of the plane (..., 2) [m]."""
-        return np.asarray(plane, dtype=np.float64) / self._scale + self.origin
-
-
-def footprints(
-    views: Sequence[View],
-    sensors: Sequence[SensorModel],
-    alt: float,
-    reach: float = 0.0,
-    area: Area | None = None,
-) -> Footprints:
-    """Outlines of views at one altitude, as far as they lie in an area.
-
-    Parameters
-    ----------
-    views, sensors : sequences
-        The views and the cameras to use for them.
-    alt : float
-        Altitude [m].
-    reach : float
-        How far the cameras may be wrong [px]: the outlines grow by as much, and the area does.
-    area : Area, optional
-        None: everywhere.
-    """
-    rings = [footprint(sensor, view.size, alt)[:, :2] for view, sensor in zip(views, sensors, strict=True)]
-    usable = [ring[np.isfinite(ring).all(axis=1)] for ring in rings]
-    first = next((ring[0] for ring in usable if len(ring)), np.zeros(2))
-    plane = Footprints(first, alt, ())
-    wanted = None if area is None else area.plane(plane.origin, plane._scale)
-    outlines = []
-    for view, ring in zip(views, usable, strict=True):
-        outline = (
-            shapely.make_valid(shapely.Polygon(plane.plane(ring))) if len(ring) > 3 else shapely.Polygon()
-        )
-        pixel = float(np.sqrt(outline.area / (view.size[0] * view.size[1])))
-        grown = shapely.buffer(outline, reach * pixel) if reach else outline
-        if wanted is not None:
-            grown = shapely.intersection(grown, shapely.buffer(wanted, reach * pixel) if reach else wanted)
-        outlines.append(grown)
-    return Footprints(first, alt, tuple(outlines))
+    def ground(self, point: shapely.Point) -> Array:
+        """lon, lat [deg], alt [m] of a point of the plane."""
+        return np.array([*(np.array([point.x, point.y]) / self._scale + self._origin), self.alt])
 
 
 def _levels(views: Sequence[View]) -> tuple[float, float, float]:
     """Middle, lowest and highest altitude [m] of what the views' ranges have in common."""
-    ranges = np.array([view.alt_range for view in views])
-    low, high = np.sort([ranges[:, 0].max(), ranges[:, 1].min()]).tolist()
+    low, high = common_range(*views)
     return 0.5 * (low + high), low, high
 
 
-def overlapping_pairs(
-    views: Sequence[View],
-    sensors: Sequence[SensorModel],
-    options: TieOptions,
-    reach: float = 0.0,
-    area: Area | None = None,
+def _overlapping(
+    views: Sequence[View], options: TieOptions, reach: float = 0.0, area: Area | None = None
 ) -> list[Pair]:
-    """All pairs that overlap enough at some altitude, under an angle that is asked for, ascending.
-
-    Parameters
-    ----------
-    views, sensors : sequences
-        The views and the cameras to use for them.
-    options : TieOptions
-        `min_overlap`, `min_angle`, `max_angle`.
-    reach : float
-        How far the cameras may be wrong [px].
-    area : Area, optional
-        Where the overlap counts; None: everywhere.
-    """
+    """All pairs that overlap enough at some altitude, under an angle that is asked for, ascending."""
     best: dict[tuple[int, int], Pair] = {}
     for alt in _levels(views):
-        for pair in _overlapping_at(footprints(views, sensors, alt, reach, area), sensors, options):
+        for pair in _overlapping_at(Footprints(views, alt, reach, area), views, options):
             if pair.views not in best or pair.overlap > best[pair.views].overlap:
                 best[pair.views] = pair
-    return [best[views] for views in sorted(best)]
+    return [best[pair] for pair in sorted(best)]
 
 
-def _overlapping_at(prints: Footprints, sensors: Sequence[SensorModel], options: TieOptions) -> list[Pair]:
+def _overlapping_at(prints: Footprints, views: Sequence[View], options: TieOptions) -> list[Pair]:
     outlines = np.array(prints.outlines, dtype=object)
     first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
     pairs = []
@@ -164,9 +116,8 @@ def _overlapping_at(prints: Footprints, sensors: Sequence[SensorModel], options:
         overlap = common.area / max(min(outlines[i].area, outlines[j].area), 1e-9)
         if not overlap >= max(options.min_overlap, 1e-9):
             continue
-        middle = common.point_on_surface()
-        ground = np.array([*prints.lonlat(np.array([middle.x, middle.y])), prints.alt])
-        angle = float(convergence_angle(sensors[i], sensors[j], ground))
+        ground = prints.ground(common.point_on_surface())
+        angle = float(convergence_angle(views[i].sensor, views[j].sensor, ground))
         if options.min_angle <= angle <= options.max_angle:
             pairs.append(Pair((i, j), float(overlap), angle))
     return pairs
@@ -176,7 +127,6 @@ def select_pairs(
     views: Sequence[View],
     options: TieOptions,
     *,
-    sensors: Sequence[SensorModel] | None = None,
     only: Sequence[tuple[int, int]] = (),
     area: Area | None = None,
 ) -> list[Pair]:
@@ -190,8 +140,6 @@ def select_pairs(
         At least two.
     options : TieOptions
         `min_overlap`, `min_angle`, `max_angle`, `neighbours`.
-    sensors : sequence of SensorModel, optional
-        Corrected cameras to use instead of the views' own.
     only : sequence of (int, int)
         These pairs, all that overlap, and no others.
     area : Area, optional
@@ -211,9 +159,8 @@ def select_pairs(
     """
     if len(views) < 2:
         raise TiePointError(f"{len(views)} image given: tie points need at least two that overlap")
-    cameras = [view.sensor for view in views] if sensors is None else sensors
     wanted = {(min(pair), max(pair)) for pair in only}
-    pairs = _candidates(views, cameras, options, wanted, area)
+    pairs = _candidates(views, options, wanted, area)
     where = "between them" + (" among the listed pairs" if wanted else "")
     where += " inside the area of interest" if area is not None else ""
     require_connected(
@@ -229,13 +176,12 @@ def select_pairs(
 
 def _candidates(
     views: Sequence[View],
-    cameras: Sequence[SensorModel],
     options: TieOptions,
     wanted: set[tuple[int, int]],
     area: Area | None,
 ) -> list[Pair]:
     """Pairs that overlap, of those wanted (none: all); with grown outlines where that leaves something out."""
-    pairs = overlapping_pairs(views, cameras, options, area=area)
+    pairs = _overlapping(views, options, area=area)
     pairs = [pair for pair in pairs if not wanted or pair.views in wanted]
     known = {pair.views for pair in pairs}
     partners = np.bincount([i for pair in known for i in pair], minlength=len(views))
@@ -243,7 +189,7 @@ def _candidates(
     lonely |= ~np.isin(np.arange(len(views)), connected_groups(len(views), sorted(known))[0])
     if not (wanted - known if wanted else lonely.any()):
         return pairs
-    grown = overlapping_pairs(views, cameras, options, options.search, area)  # a camera may be wrong by more
+    grown = _overlapping(views, options, options.search, area)  # a camera may be wrong by more
     for pair in grown:
         worth = pair.views in wanted if wanted else lonely[list(pair.views)].any()
         if worth and pair.views not in known:
@@ -274,17 +220,7 @@ def _best(pairs: Sequence[Pair], num_views: int, neighbours: int) -> list[Pair]:
 
 
 def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], why: str) -> None:
-    """Raise DisconnectedError unless the links connect all views.
-
-    Parameters
-    ----------
-    views : sequence of View
-        All views.
-    links : sequence of (int, int)
-        Pairs that are tied.
-    why : str
-        What is missing between the groups and what to do.
-    """
+    """Raise DisconnectedError unless the links connect all views; `why` says what is missing and what to do."""
     groups = connected_groups(len(views), links)
     if len(groups) < 2:
         return
@@ -296,52 +232,28 @@ def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], w
     raise DisconnectedError(f"the images fall into {len(groups)} groups ({listed}): {why}", names)
 
 
-def shared_boxes(
-    views: Sequence[View],
-    pairs: Sequence[Pair],
-    boxes: Sequence[Sequence[Box]],
-    options: TieOptions,
-    *,
-    sensors: Sequence[SensorModel] | None = None,
-    area: Area | None = None,
-) -> list[BoolArray]:
-    """Which windows of the views a partner may see at some altitude: only those are worth reading.
+def shared_tiles(
+    views: Sequence[View], pairs: Sequence[Pair], options: TieOptions, area: Area | None = None
+) -> list[list[Box]]:
+    """The tiles of every view that a partner in `pairs` may see at some altitude: only those are worth reading.
 
-    Parameters
-    ----------
-    views : sequence of View
-        The images.
-    pairs : sequence of Pair
-        Who is whose partner.
-    boxes : sequence of sequence of Box
-        Windows of every view.
-    options : TieOptions
-        `search`: how far the cameras may be wrong.
-    sensors : sequence of SensorModel, optional
-        Corrected cameras to use instead of the views' own.
-    area : Area, optional
-        What lies outside is not worth reading either.
-
-    Returns
-    -------
-    masks : list of (B,)
-        One a view.
+    The cameras may be wrong by `options.search`; what lies outside the area is not worth reading either.
     """
-    cameras = [view.sensor for view in views] if sensors is None else sensors
+    boxes = [tiles(view.size, options) for view in views]
+    seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]
     for pair in pairs:
         i, j = pair.views
         partners[i].append(j)
         partners[j].append(i)
-    masks = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     for alt in _levels(views):
-        prints = footprints(views, cameras, alt, options.search, area)
+        prints = Footprints(views, alt, options.search, area)
         for i, of_view in enumerate(boxes):
-            seen = shapely.union_all([prints.outlines[j] for j in partners[i]])
+            partly = shapely.union_all([prints.outlines[j] for j in partners[i]])
             corners = np.array([[(c, r), (c + w, r), (c + w, r + h), (c, r + h)] for c, r, w, h in of_view])
-            ground = cameras[i].localize(corners.reshape(-1, 4, 2) - 0.5, np.array(alt))
+            ground = views[i].sensor.localize(corners - 0.5, np.array(alt))
             unknown = ~np.isfinite(ground).all(axis=(1, 2))
             ground[unknown] = 0.0
             windows = shapely.polygons(prints.plane(ground[..., :2]))
-            masks[i] |= unknown | np.asarray(shapely.intersects(windows, seen))
-    return masks
+            seen[i] |= unknown | np.asarray(shapely.intersects(windows, partly))
+    return [list(compress(*both)) for both in zip(boxes, seen, strict=True)]

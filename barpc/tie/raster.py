@@ -15,6 +15,7 @@ from barpc.errors import ImageError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
 from barpc.scene import BoolArray
+from barpc.tie.options import TieOptions
 
 FloatImage = npt.NDArray[np.float32]
 Pixels = npt.NDArray[np.float32] | npt.NDArray[np.float64]
@@ -76,28 +77,10 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
 
 
 def read_pixels(path: str | os.PathLike[str], box: Box, band: int = 1) -> tuple[Pixels, BoolArray]:
-    """Pixels of a window and which of them mean something.
+    """Pixels (height, width) of a window as stored, 0 where invalid, and which of them mean something.
 
-    Parameters
-    ----------
-    path : path
-        Raster file.
-    box : Box
-        Window, inside the raster.
-    band : int
-        Band, from 1.
-
-    Returns
-    -------
-    pixels : (height, width)
-        Values as stored; 0 where invalid.
-    valid : (height, width)
-        False at nodata, masked, non-finite and saturated pixels, and in undeclared zero borders.
-
-    Raises
-    ------
-    ImageError
-        The file cannot be read, has no such band, or holds complex numbers.
+    They do not at nodata, masked, non-finite and saturated pixels, and in undeclared zero borders. ImageError where the
+    file cannot be read, has no such band (from 1), or holds complex numbers.
     """
     with open_raster(path) as dataset:
         check_band(dataset, path, band)
@@ -123,26 +106,14 @@ def _read(dataset: Any, box: Box, band: int) -> tuple[Pixels, BoolArray]:
     if np.issubdtype(raw.dtype, np.integer):
         valid &= raw < np.iinfo(raw.dtype).max
         if dataset.nodata is None:  # zeros without a name: a border where they stand together
+            cv2.setNumThreads(1)  # the work is spread by processes
             zeros = cv2.morphologyEx((raw == 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
             valid &= zeros == 0
     return np.where(valid, pixels, pixels.dtype.type(0.0)), valid
 
 
 def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | None:
-    """The stretch of a raster from blocks spread over it; None where nothing varies.
-
-    Parameters
-    ----------
-    path : path
-        Raster file.
-    band : int
-        Band, from 1.
-
-    Returns
-    -------
-    stretch : Stretch or None
-        Between the 0.5 and 99.5 percentiles of the valid pixels.
-    """
+    """The stretch of a raster, the 0.5 and 99.5 percentiles of blocks spread over it; None where nothing varies."""
     found: list[Array] = []
     with open_raster(path) as dataset:
         check_band(dataset, path, band)
@@ -168,3 +139,13 @@ def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
     left, top = max(0, col - margin), max(0, row - margin)
     right, bottom = min(size[0], col + width + margin), min(size[1], row + height + margin)
     return left, top, max(0, right - left), max(0, bottom - top)
+
+
+def tiles(size: tuple[int, int], options: TieOptions) -> list[Box]:
+    """Boxes that cover an image of `size` (width, height) without overlap, cut at whole cells."""
+    edges = []
+    for length in size:
+        step = -(-length // -(-length // options.tile))  # equal tiles, none larger than asked
+        step = -(-step // options.cell) * options.cell
+        edges.append([(start, min(step, length - start)) for start in range(0, length, step)])
+    return [(col, row, width, height) for row, height in edges[1] for col, width in edges[0]]

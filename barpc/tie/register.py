@@ -9,7 +9,7 @@ the derivative is that of the reference, so one small pseudo-inverse a match ser
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -58,56 +58,27 @@ class Registration:
     ok: BoolArray
 
 
-@dataclass(frozen=True, eq=False)
-class Task:
-    """Observations of one view to be registered to patches of another.
-
-    Parameters
-    ----------
-    paths : two str
-        Rasters of the reference and of the other view.
-    sizes : two (width, height)
-        Of the rasters [px].
-    band : int
-        Band, from 1.
-    reference : (N, 2)
-        Whole pixels in the reference view.
-    start : (N, 2)
-        Where they are about, in the other view [px].
-    linear : (N, 2, 2)
-        d(other)/d(reference).
-    patch : int
-        Side of the patches [px], odd.
-    """
-
-    paths: tuple[str, str]
-    sizes: tuple[tuple[int, int], tuple[int, int]]
-    band: int
-    reference: Array
-    start: Array
-    linear: Array
-    patch: int
-
-
-def register_task(task: Task) -> Registration:
-    """Read what a task needs of both images, and register."""
+def register_places(
+    files: tuple[tuple[str, tuple[int, int]], tuple[str, tuple[int, int]]],
+    band: int,
+    reference: Array,
+    start: Array,
+    linear: Array,
+    patch: int,
+) -> Registration:
+    """Read what is needed of two images, each a path and its size, and register as `register` does."""
     cv2.setNumThreads(1)
-    margin = task.patch + _TAPS + int(_REACH)
-    images = []
-    for path, size, xy in zip(task.paths, task.sizes, (task.reference, task.start), strict=True):
+    margin = patch + _TAPS + int(_REACH)
+    images, valid, origins = [], [], []
+    for (path, size), xy in zip(files, (reference, start), strict=True):
         box = _around(xy, margin, size)
-        pixels, valid = read_pixels(path, box, task.band)
-        images.append((levelled(pixels, valid), valid, np.array(box[:2], dtype=np.float64)))
-    (first, valid_first, origin_first), (second, valid_second, origin_second) = images
-    found = register(
-        (first, second),
-        (valid_first, valid_second),
-        task.reference - origin_first,
-        task.start - origin_second,
-        task.linear,
-        task.patch,
-    )
-    return Registration(found.xy + origin_second, found.correlation, found.sigma, found.ok)
+        pixels, usable = read_pixels(path, box, band)
+        images.append(levelled(pixels, usable))
+        valid.append(usable)
+        origins.append(np.array(box[:2], dtype=np.float64))
+    places = reference - origins[0], start - origins[1]
+    found = register((images[0], images[1]), (valid[0], valid[1]), *places, linear, patch)
+    return replace(found, xy=found.xy + origins[1])
 
 
 def _around(xy: Array, margin: int, size: tuple[int, int]) -> Box:
@@ -139,23 +110,14 @@ def register(
 
     Parameters
     ----------
-    images : two (height, width) arrays
-        Reference image, other image.
-    valid : two (height, width) masks
-        Pixels that mean something: a patch holds no others.
-    reference : (N, 2)
-        Centres in the reference image, whole pixels.
-    start : (N, 2)
-        First guess in the other image [px].
+    images, valid : two (height, width) arrays
+        Reference and other image, and the pixels that mean something: a patch holds no others.
+    reference, start : (N, 2)
+        Centres in the reference image, whole pixels; where they are about in the other one [px].
     linear : (N, 2, 2)
         First guess of d(other)/d(reference).
     patch : int
         Side of the patches [px], odd.
-
-    Returns
-    -------
-    registration : Registration
-        In the coordinates of `images`.
     """
     fine = _upsampled(images[1])
     best = Registration(
@@ -245,17 +207,8 @@ class _Template:
         values, deviation = self._normalized(self._image[rows, cols])
         by_col, by_row = self._by_col[rows, cols] / deviation, self._by_row[rows, cols] / deviation
         x, y = (self._col / self._half).astype(np.float32), (self._row / self._half).astype(np.float32)
-        columns = [
-            by_col,
-            by_row,
-            by_col * x,
-            by_col * y,
-            by_row * x,
-            by_row * y,
-            values,
-            np.ones_like(values),
-        ]
-        jacobian = np.stack(columns, axis=1)
+        affine = [by_col, by_row, by_col * x, by_col * y, by_row * x, by_row * y]
+        jacobian = np.stack([*affine, values, np.ones_like(values)], axis=1)
         weighted = jacobian * self._weight
         normal = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
         normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)

@@ -258,7 +258,7 @@ def test_help_imports_nothing_heavy():
     code = (
         "import sys\nfrom barpc.cli import main\n"
         "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "heavy = {'numpy', 'scipy', 'cv2', 'rasterio', 'matplotlib', 'distributed', 'rich'} & set(sys.modules)\n"
+        "heavy = {'numpy', 'scipy', 'cv2', 'rasterio', 'matplotlib', 'distributed'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -68,9 +68,10 @@ def test_a_file_left_out_ends_with_3(pristine, tmp_path):  # noqa: F811
 
 
 def test_a_fit_that_misses_its_tolerance_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
-    given = ("adjust", *pristine, "--matches", ties, "--tolerance", "1e-15", "-o")
+    (tmp_path / "o.toml").write_text("[fit]\ntolerance = 1e-15\n")
+    given = ("adjust", *pristine, "--matches", ties, "--options", tmp_path / "o.toml", "-o")
     assert command(*given, tmp_path / "none").code == 1
-    assert_told(command(*given, tmp_path / "out", "--force"), "not adjusted", "one RPC cannot hold")
+    assert_told(command(*given, tmp_path / "out", "--keep-going"), "not adjusted", "one RPC cannot hold")
 
 
 @pytest.mark.parametrize("fault", ["rejected", "stranger"])
@@ -136,7 +137,7 @@ def test_no_control_character_of_a_file_reaches_the_terminal(debug, crops, tmp_p
         ("info", f"{ESC}.tif"),
         ("adjust", *crops, f"--{ESC}"),
         (ESC,),
-        ("match", *crops, "--dask", ESC, *out),
+        ("match", *crops, "-j", ESC, *out),
     ):
         said = command(*debug, *args)
         assert said.code in (1, 2), said

@@ -35,7 +35,7 @@ def table(path: Path, camera: Camera, noise: float = 0.0) -> Path:
 def test_examples_in_the_help_stand_on_lines_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("fit", "--help") == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
-    assert "barpc fit points.csv -o points.RPB --tolerance 1" in lines
+    assert "barpc fit points.csv,size=20000:19000 -o points.RPB --tolerance 1" in lines
 
 
 def test_points_become_an_rpc_file_that_reads_back(
@@ -62,7 +62,7 @@ def test_a_miss_exits_3_and_writes_nothing_unless_forced(
     assert run("fit", noisy, "-o", out) == 3
     assert not out.exists()
     assert "nothing written" in capsys.readouterr().err
-    assert run("fit", noisy, "-o", out, "--force") == 3
+    assert run("fit", noisy, "-o", out, "--keep-going") == 3
     assert out.exists()
     assert run("fit", noisy, "-o", out, "--overwrite", "--tolerance", "2") == 0
 
@@ -72,9 +72,9 @@ def test_an_rpc_file_is_refitted_over_another_altitude_range(
 ) -> None:
     write_rpc(camera.rpc, tmp_path / "a_RPC.TXT")
     assert run("fit", tmp_path / "a_RPC.TXT", "-o", tmp_path / "b.RPB") == 1
-    assert "--size" in capsys.readouterr().err
-    size = ("--size", 20000, 19000)
-    assert run("fit", tmp_path / "a_RPC.TXT", *size, "--alt-range", 200, 2200, "-o", tmp_path / "b.RPB") == 0
+    assert "size=" in capsys.readouterr().err
+    sized = f"{tmp_path / 'a_RPC.TXT'},size=20000:19000"
+    assert run("fit", sized, "--alt-range", 200, 2200, "-o", tmp_path / "b.RPB") == 0
     assert "within tolerance" in capsys.readouterr().out
     refitted = read_rpc(tmp_path / "b.RPB")
     assert [refitted.ground_offset[2], refitted.ground_scale[2]] == [1200.0, 1000.0]
@@ -101,12 +101,16 @@ def test_a_source_that_cannot_be_fitted_is_one_line_and_exit_1(
 
 def test_real_sources(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = shared_data / "optical" / "phr_triplet_north" / "img_01.tif"
-    assert run("fit", image, "-o", tmp_path / "img.vrt", "--space", "ground", "--nodes", "uniform") == 0
+    (tmp_path / "fit.toml").write_text('[fit]\nspace = "ground"\nnodes = "uniform"\n')
+    assert run("fit", image, "-o", tmp_path / "img.vrt", "--options", tmp_path / "fit.toml") == 0
     assert run("fit", shared_data / "physical" / "GRID_P1BP--2017092838284574CP.tif") == 0
     radar = sorted((shared_data / "sar").glob("s1a-iw1-slc-vv-20210216*.xml"))[0]
-    assert run("fit", radar, "-o", tmp_path / "iw1_RPC.TXT", "--method", "lcurve") == 0
+    (tmp_path / "fit.toml").write_text('[fit]\nmethod = "lcurve"\n')
+    assert run("fit", radar, "-o", tmp_path / "iw1_RPC.TXT", "--options", tmp_path / "fit.toml") == 0
     capsys.readouterr()
-    assert run("fit", image, "--alt-range", 100, 400, "--for-format", "nitf", "--json") == 0
+    (tmp_path / "fit.toml").write_text('[fit]\nprecision = "nitf"\n')
+    narrow = ("--alt-range", 100, 400, "--options", tmp_path / "fit.toml", "--json")
+    assert run("fit", image, *narrow) == 0
     assert max(json.loads(capsys.readouterr().out)["max_ckp"]) <= 1e-3
 
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import io
 import json
+import logging
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from barpc.cli import main
+from barpc.cli.main import MOVED
+from barpc.cli.progress import progress_bars
 from barpc.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.geometry import triangulate
@@ -136,32 +140,88 @@ def test_triangulate_from_a_table_skips_what_an_image_does_not_see(image, other,
     assert run("triangulate", image, "--at", 1, 2) == 2
 
 
-def test_angle_of_two_images(image, other, capsys):
-    assert run("angle", image, other, "--json") == 0
-    report = json.loads(capsys.readouterr().out)
-    assert [view["name"] for view in report["views"]] == ["scene", "other"]
-    (pair,) = report["pairs"]
-    assert pair["b_over_h"] == pytest.approx(2 * np.tan(np.radians(pair["convergence"]) / 2))
-    assert 1 < pair["convergence"] < 60
-    assert run("angle", image) == 0
-    assert "incidence" in capsys.readouterr().out
+def test_info_tells_the_angle_between_several_images(image, other, capsys):
+    assert run("info", image, other, "--json") == 0
+    first, second = json.loads(capsys.readouterr().out)
+    (pair,) = first["pairs"]
+    assert pair["with"] == "other"
+    assert second["pairs"] == []
+    assert pair["b_over_h"] == pytest.approx(2 * np.tan(np.radians(pair["convergence_deg"]) / 2))
+    assert 1 < pair["convergence_deg"] < 60
+    assert run("info", image, other) == 0
+    assert "pairs: with other, convergence_deg " in capsys.readouterr().out
+    assert run("info", image, "--at", 5.5, 43.3, 100, "--json") == 0
+    (elsewhere,) = json.loads(capsys.readouterr().out)
+    assert elsewhere["incidence_deg"] != first["incidence_deg"]
+    assert run("info") == 2
 
 
-def test_footprint_is_geojson_with_a_polygon_an_image(image, other, tmp_path, capsys):
-    assert run("footprint", image, other) == 0
+def test_footprint_is_geojson_with_a_polygon_an_image(image, other, capsys):
+    assert run("info", "--footprint", image, other) == 0
     document = json.loads(capsys.readouterr().out)
+    assert document["type"] == "FeatureCollection"
     assert [f["properties"]["name"] for f in document["features"]] == ["scene", "other"]
-    assert run("footprint", image, "-o", tmp_path / "f.geojson") == 0
-    assert json.loads((tmp_path / "f.geojson").read_text())["type"] == "FeatureCollection"
-    assert run("footprint", image, "-o", tmp_path / "f.geojson") == 1  # exists
-    assert run("footprint", image, "-o", tmp_path / "f.geojson", "--overwrite") == 0
+    assert run("info", "--footprint", image, "--alt", 50) == 0
+    higher = json.loads(capsys.readouterr().out)["features"][0]
+    assert higher["properties"]["alt"] == 50.0
+    assert higher["geometry"] != document["features"][0]["geometry"]
 
 
 def test_an_rpc_file_has_no_size_and_asks_for_it(tmp_path, capsys):
     write_rpc(make_rpc(), tmp_path / "a.RPB")
-    assert run("footprint", tmp_path / "a.RPB") == 2
-    assert "--size" in capsys.readouterr().err
-    assert run("footprint", tmp_path / "a.RPB", "--size", 2000, 1900) == 0
+    assert run("info", "--footprint", tmp_path / "a.RPB") == 1
+    assert "size=" in capsys.readouterr().err
+    assert run("info", "--footprint", f"{tmp_path / 'a.RPB'},size=2000:1900") == 0
+
+
+def test_the_installation_is_examined(capsys):
+    assert run("info", "--doctor", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["ok"]
+
+
+@pytest.mark.parametrize("former", MOVED)
+def test_what_was_said_otherwise_says_how_now_and_does_nothing_else(former, image, capsys):
+    verb = [former, image] if not former.startswith("-") else ["triangulate", image, former]
+    assert run(*verb) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert MOVED[former] in captured.err
+    assert len(captured.err.splitlines()) == 1
+
+
+class Terminal(io.StringIO):
+    """What stderr is when somebody looks."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_progress_is_drawn_for_a_terminal_only(quiet, monkeypatch):
+    monkeypatch.setattr("sys.stderr", Terminal() if not quiet else io.StringIO())
+    with progress_bars(False) as progress:
+        for stage, total in (("detect", 3), ("match", 2), ("detect", 3)):  # a second pass begins again
+            for done in range(1, total + 1):
+                progress(stage, done, total)
+    drawn = sys.stderr.getvalue()
+    assert [f"{stage:<22}" in drawn for stage in ("detect", "match")] == [not quiet] * 2
+    assert [drawn.count("3/3") > 0, drawn.count("2/2") > 0] == [not quiet] * 2
+    assert drawn.count("\n") == (0 if quiet else 3)
+
+
+def test_general_flags_stand_before_and_after_the_verb(image, tmp_path, capsys, monkeypatch):
+    levels: list[int] = []
+    monkeypatch.setattr(logging, "basicConfig", lambda **given: levels.append(given["level"]))
+    points = ("localize", image, "1e12", "0")
+    for words in (("-vv", *points), (*points, "-vv"), (points[0], "-v", *points[1:], "--verbose")):
+        assert run(*words) == 3
+        assert levels.pop() == logging.DEBUG
+    for words in (("-q", "fit", image), ("fit", image, "-q"), ("fit", "--quiet", image)):
+        capsys.readouterr()
+        assert run(*words) == 0
+        assert capsys.readouterr().out == ""
+    assert run("info", tmp_path / "no.tif", "--debug") == 1
+    assert "Traceback" in capsys.readouterr().err
 
 
 def test_info_says_where_the_rpc_comes_from_and_what_was_passed_over(image, capsys):
@@ -189,14 +249,14 @@ def test_convert_can_be_told_the_pixel_convention(tmp_path, capsys):
     (tmp_path / "RPC_S6.XML").write_text(dimap_v2(make_rpc()))
     for convention, shift in (("auto", 0), ("0", 1), ("0.5", 0.5)):
         target = tmp_path / f"{convention}.geom"
-        assert run("convert", tmp_path / "RPC_S6.XML", target, "--pixel-convention", convention) == 0
+        assert run("convert", f"{tmp_path / 'RPC_S6.XML'},first_pixel={convention}", target) == 0
         np.testing.assert_allclose(read_rpc(target).image_offset, make_rpc().image_offset + shift, atol=1e-9)
     assert run("convert", tmp_path / "RPC_S6.XML", tmp_path / "c.doc") == 1
     assert "choose one of" in capsys.readouterr().err
 
 
-def test_crop_by_window_and_by_box(image, tmp_path, capsys):
-    assert run("crop", image, tmp_path / "w.tif", "--window", 50, 60, 100, 80) == 0
+def test_convert_cuts_by_window_and_by_box(image, tmp_path, capsys):
+    assert run("convert", image, tmp_path / "w.tif", "--window", 50, 60, 100, 80) == 0
     rpc = read_rpc(image)
     np.testing.assert_allclose(
         read_rpc(tmp_path / "w.tif").image_offset, rpc.image_offset - [50, 60], atol=1e-9
@@ -205,7 +265,7 @@ def test_crop_by_window_and_by_box(image, tmp_path, capsys):
     west, east = sorted(corners[:, 0])
     south, north = sorted(corners[:, 1])
     box = ("--bbox", west, south, east, north, "--alt", 200)
-    assert run("crop", image, tmp_path / "b.tif", *box, "--json") == 0
+    assert run("convert", image, tmp_path / "b.tif", *box, "--json") == 0
     window = json.loads(capsys.readouterr().out.splitlines()[-1])["window"]
     assert window[0] <= 100
     assert window[0] + window[2] >= 200
@@ -214,14 +274,14 @@ def test_crop_by_window_and_by_box(image, tmp_path, capsys):
     assert window[2] < 130
     with open_raster(tmp_path / "b.tif") as crop:
         assert (crop.width, crop.height) == (window[2], window[3])
-    assert run("crop", image, tmp_path / "x.tif", "--bbox", 0, 0, 1, 1) == 2
-    assert run("crop", image, tmp_path / "x.tif") == 2
-    assert run("crop", image, tmp_path / "x.tif", "--window", 590, 0, 100, 80) == 1
+    assert run("convert", image, tmp_path / "x.tif", "--bbox", 0, 0, 1, 1) == 2
+    assert run("convert", image) == 2
+    assert run("convert", image, tmp_path / "x.tif", "--window", 590, 0, 100, 80) == 1
     assert not (tmp_path / "x.tif").exists()
 
 
 @pytest.mark.parametrize("carrier", ["vrt", "copy"])
-def test_apply_gives_images_other_rpcs_and_proves_it(carrier, image, tmp_path, capsys):
+def test_convert_gives_images_other_rpcs_and_proves_it(carrier, image, tmp_path, capsys):
     better = read_rpc(image).crop(0.25, -0.5)
     write_rpc(better, tmp_path / "rpcs" / "scene_RPC.TXT")
     before = image.read_bytes()
@@ -235,7 +295,7 @@ def test_apply_gives_images_other_rpcs_and_proves_it(carrier, image, tmp_path, c
         "--rpc-format",
         "txt,geom",
     )
-    assert run("apply", image, *args, "--json") == 0
+    assert run("convert", image, *args, "--json") == 0
     readings = json.loads(capsys.readouterr().out)
     assert all(reading["max_px"] <= 1e-9 for reading in readings)
     assert {Path(reading["path"]).suffix for reading in readings} == {
@@ -251,62 +311,62 @@ def test_apply_gives_images_other_rpcs_and_proves_it(carrier, image, tmp_path, c
     }
     assert image.read_bytes() == before
     assert list(image.parent.iterdir()) == [image]
-    assert run("apply", image, *args) == 1  # exists
+    assert run("convert", image, *args) == 1  # exists
 
 
-def test_apply_names_what_hides_the_rpc_beside_the_input_and_in_the_new_folder(image, tmp_path, capsys):
+def test_convert_names_what_hides_the_rpc_beside_the_input_and_in_the_new_folder(image, tmp_path, capsys):
     rpc = read_rpc(image)
     write_rpc(rpc.crop(5, 5), image.with_suffix(".RPB"))
     write_rpc(rpc.crop(5, 5), tmp_path / "out" / "scene.RPB")
     write_rpc(rpc, tmp_path / "new.geom")
     assert (
-        run("apply", image, "--rpc", tmp_path / "new.geom", "-o", tmp_path / "out", "--images", "copy") == 3
+        run("convert", image, "--rpc", tmp_path / "new.geom", "-o", tmp_path / "out", "--images", "copy") == 3
     )
     error = capsys.readouterr().err
     assert "scene.RPB hides an RPC put into the image" in error
     assert f"{tmp_path / 'out' / 'scene.RPB'} hides the RPC of" in error
 
 
-def test_apply_reports_a_file_that_a_tool_cannot_read_as_valid_json(image, tmp_path, capsys, monkeypatch):
+def test_convert_reports_a_file_that_a_tool_cannot_read_as_valid_json(image, tmp_path, capsys, monkeypatch):
     from barpc import handoff
 
     def broken(path):
         raise RuntimeError("no such\nfield")
 
-    monkeypatch.setitem(handoff.CONSUMERS, "gdal", handoff.Consumer((".vrt",), "rasterio", broken))
+    monkeypatch.setitem(handoff.CONSUMERS, "gdal", handoff.Consumer("rasterio", broken))
     write_rpc(read_rpc(image), tmp_path / "a.geom")
-    assert run("apply", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--json") == 3
+    assert run("convert", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--json") == 3
     rows = {row["consumer"]: row for row in json.loads(capsys.readouterr().out)}
     assert rows["gdal"]["max_px"] is None
     assert rows["gdal"]["note"] == "RuntimeError: no such field"
     assert rows["barpc"]["max_px"] == 0.0
 
 
-def test_apply_refuses_the_images_own_folder_and_missing_rpcs(image, tmp_path, capsys):
+def test_convert_refuses_the_images_own_folder_and_missing_rpcs(image, tmp_path, capsys):
     write_rpc(read_rpc(image), tmp_path / "a.geom")
-    assert run("apply", image, "--rpc", tmp_path / "a.geom", "-o", image.parent) == 1
+    assert run("convert", image, "--rpc", tmp_path / "a.geom", "-o", image.parent) == 1
     assert "choose a new one" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
-    assert run("apply", image, "--rpc", tmp_path / "empty", "-o", tmp_path / "out") == 1
+    assert run("convert", image, "--rpc", tmp_path / "empty", "-o", tmp_path / "out") == 1
     assert "no RPC of scene.tif there" in capsys.readouterr().err
     assert (
-        run("apply", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--rpc-format", "doc") == 2
+        run("convert", image, "--rpc", tmp_path / "a.geom", "-o", tmp_path / "out", "--rpc-format", "doc")
+        == 2
     )
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("verb", ["info", "project", "localize", "footprint", "angle", "triangulate"])
+@pytest.mark.parametrize("verb", ["info", "project", "localize", "triangulate", "convert"])
 def test_a_file_that_is_missing_is_one_line_and_exit_code_1(verb, tmp_path, capsys):
-    extra = ["--points", tmp_path / "p.csv"] if verb in ("project", "localize", "triangulate") else []
+    extra = [tmp_path / "x.RPB"] if verb == "convert" else []
+    extra += ["--points", tmp_path / "p.csv"] if verb in ("project", "localize", "triangulate") else []
     assert run(verb, tmp_path / "nothing.tif", *extra) == 1
     error = capsys.readouterr().err
     assert "nothing.tif: no such file" in error
     assert len(error.splitlines()) == 1
 
 
-@pytest.mark.parametrize(
-    "verb", ["info", "project", "localize", "footprint", "angle", "triangulate", "convert", "crop", "apply"]
-)
+@pytest.mark.parametrize("verb", ["info", "project", "localize", "triangulate", "convert", "report"])
 def test_every_verb_explains_itself(verb, capsys):
     assert run(verb, "--help") == 0
     assert "Example" in capsys.readouterr().out

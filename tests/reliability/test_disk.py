@@ -112,15 +112,15 @@ def test_a_read_only_disk_is_named(crops, small_disk):
     assert_one_line(barpc("adjust", *crops, "-o", disk / "out"), 1, str(disk), "Read-only")
 
 
-@pytest.mark.parametrize("verb", ["crop", "convert", "apply"])
+@pytest.mark.parametrize("verb", ["convert --window", "convert", "convert -o"])
 def test_other_verbs_notice_a_full_disk_too(crops, tmp_path, small_disk, verb):
     disk = small_disk(8)
     (disk / "filler").write_bytes(b"\1" * 8 * KIB)
     before = hashes(crops)
     said = {
-        "crop": lambda: barpc("crop", crops[0], disk / "crop.tif", "--window", 0, 0, 200, 200),
+        "convert --window": lambda: barpc("convert", crops[0], disk / "crop.tif", "--window", 0, 0, 200, 200),
         "convert": lambda: barpc("convert", crops[0], disk / "x_RPC.TXT"),
-        "apply": lambda: barpc("apply", crops[0], "--rpc", crops[1], "-o", disk / "applied"),
+        "convert -o": lambda: barpc("convert", crops[0], "--rpc", crops[1], "-o", disk / "applied"),
     }[verb]()
     assert_one_line(said, 1)
     assert [path.name for path in disk.rglob("*") if path.is_file()] == ["filler"]

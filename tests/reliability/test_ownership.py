@@ -158,8 +158,7 @@ def test_a_converted_rpc_is_written_beside_its_image_and_another_one_only_when_t
     said = barpc("convert", crops[1], target)
     assert_one_line(said, 1, "view_00_RPC.TXT", "view_00.tif", "--overwrite")
     assert_one_line(barpc("fit", image, "-o", target), 1, "view_00_RPC.TXT", "view_00.tif", "--overwrite")
-    assert_one_line(barpc("crop", image, target, "--window", 0, 0, 64, 64), 1, "view_00.tif")
-    assert_one_line(barpc("footprint", image, "-o", target), 1, "view_00.tif")
+    assert_one_line(barpc("convert", image, target, "--window", 0, 0, 64, 64), 1, "view_00.tif")
     assert hashes([image.parent]) == before
     said = barpc("convert", crops[1], target, "--overwrite")
     assert said.code == 0
@@ -171,22 +170,22 @@ def test_a_converted_rpc_is_written_beside_its_image_and_another_one_only_when_t
 
 
 @pytest.mark.parametrize("end", ["_RPC.TXT", ".RPB", ".geom"])
-@pytest.mark.parametrize("verb", ["convert", "fit", "footprint", "crop"])
+@pytest.mark.parametrize("verb", ["convert", "fit", "convert --window"])
 def test_the_vendor_s_file_of_an_input_is_never_replaced(crops, verb, end):
     vendor = crops[0].with_name(f"view_00{end}")
     write_rpc(read_rpc(crops[0]), vendor)
     before = hashes([crops[0].parent])
-    more = {"convert": [crops[0], vendor], "crop": [crops[0], vendor, "--window", 0, 0, 64, 64]}
+    more = {"convert": [crops[0], vendor], "convert --window": [crops[0], vendor, "--window", 0, 0, 64, 64]}
     for target in (vendor, crops[0]):
         words = [str(target) if word == vendor else word for word in more.get(verb, [crops[0], "-o", vendor])]
-        said = barpc(verb, *words, "--overwrite")
+        said = barpc(verb.split()[0], *words, "--overwrite")
         assert_one_line(said, 1, target.name, "never replaced")
         assert hashes([crops[0].parent]) == before
 
 
-def test_apply_replaces_its_own_files_only(crops, tmp_path):
+def test_convert_replaces_its_own_files_only(crops, tmp_path):
     out = tmp_path / "out"
-    command = ("apply", crops[0], "--rpc", crops[1], "-o", out)
+    command = ("convert", crops[0], "--rpc", crops[1], "-o", out)
     assert barpc(*command).code == 0
     assert_one_line(barpc(*command), 1, "--overwrite")
     assert barpc(*command, "--overwrite").code == 0
@@ -197,17 +196,17 @@ def test_apply_replaces_its_own_files_only(crops, tmp_path):
     assert hashes([out]) == before
 
 
-def test_apply_adds_to_a_folder_and_hides_no_input(crops, tmp_path):
+def test_convert_adds_to_a_folder_and_hides_no_input(crops, tmp_path):
     for image in crops:
-        assert barpc("apply", image, "--rpc", image, "-o", tmp_path / "out").code == 0
+        assert barpc("convert", image, "--rpc", image, "-o", tmp_path / "out").code == 0
     assert len(list((tmp_path / "out").glob("*.vrt"))) == 2
     shutil.copy(crops[0], tmp_path / "copy.tif")
     os.link(crops[0], tmp_path / "linked.tif")
     (tmp_path / "alias").symlink_to(crops[0].parent)
     before = hashes([tmp_path])
-    said = barpc("apply", tmp_path / "alias/view_00.tif", "--rpc", crops[1], "-o", tmp_path / "in")
+    said = barpc("convert", tmp_path / "alias/view_00.tif", "--rpc", crops[1], "-o", tmp_path / "in")
     assert_one_line(said, 1, "in")
-    said = barpc("apply", crops[0], "--rpc", tmp_path / "out", "-o", tmp_path / "out", "--overwrite")
+    said = barpc("convert", crops[0], "--rpc", tmp_path / "out", "-o", tmp_path / "out", "--overwrite")
     assert_one_line(said, 1, "input")
     assert hashes([tmp_path]) == before
 

@@ -15,9 +15,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import AdjustError, ImageError, OutputError
-from barpc.pipeline import crew as crew_module
-from barpc.pipeline.crew import Crew, worker_count
-from barpc.pipeline.parcel import LARGE
+from barpc.pipeline.executor import LARGE, CachingExecutor, Spilled, worker_count
 from barpc.workspace import Workspace
 
 from .conftest import barpc
@@ -111,7 +109,7 @@ def cluster(tmp_path):
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_bytes_also_when_it_loses_a_worker(scene, alone, cluster):
     address, workers = cluster
-    run = [sys.executable, "-m", "barpc", *map(str, command(scene, "dask", "--dask", address))]
+    run = [sys.executable, "-m", "barpc", *map(str, command(scene, "dask", "-j", address))]
     process = subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 600
     while len(list(scene.glob("dask/.barpc/cache/detect_tile/*.npz"))) < 3:
@@ -126,7 +124,7 @@ def test_a_cluster_gives_the_same_bytes_also_when_it_loses_a_worker(scene, alone
     assert outputs(scene / "dask") == alone
 
 
-# -- the crew -----------------------------------------------------------------------------------------
+# -- kept results -----------------------------------------------------------------------------------------
 
 
 def square(number, _pad=None):
@@ -158,15 +156,19 @@ class Recording(ThreadPoolExecutor):
 def test_results_come_back_in_order_and_are_found_the_next_time(tmp_path):
     for _ in range(2):
         with Workspace(tmp_path / "run", overwrite=True) as workspace, Recording() as pool:
-            with Crew(workspace, {}, pool) as crew:
-                futures = [crew.submit(square, n) for n in range(40)]
+            with CachingExecutor(workspace, {}, pool) as caching:
+                futures = [caching.submit(square, n) for n in range(40)]
                 assert [float(future.result()["square"]) for future in futures] == [n**2 for n in range(40)]
     assert pool.batches == []
 
 
 def test_quick_tasks_travel_together(tmp_path):
-    with Workspace(tmp_path / "run") as workspace, Recording() as pool, Crew(workspace, {}, pool) as crew:
-        futures = [crew.submit(square, n) for n in range(400)]
+    with (
+        Workspace(tmp_path / "run") as workspace,
+        Recording() as pool,
+        CachingExecutor(workspace, {}, pool) as caching,
+    ):
+        futures = [caching.submit(square, n) for n in range(400)]
         for future in futures:
             future.result()
     assert sum(pool.batches) == 400
@@ -175,8 +177,12 @@ def test_quick_tasks_travel_together(tmp_path):
 
 
 def test_an_error_goes_to_its_own_task_and_the_others_are_kept(tmp_path):
-    with Workspace(tmp_path / "run") as workspace, Recording() as pool, Crew(workspace, {}, pool) as crew:
-        futures = [crew.submit(refuse, n) for n in range(30)]
+    with (
+        Workspace(tmp_path / "run") as workspace,
+        Recording() as pool,
+        CachingExecutor(workspace, {}, pool) as caching,
+    ):
+        futures = [caching.submit(refuse, n) for n in range(30)]
         with pytest.raises(ImageError, match="damaged"):
             futures[3].result()
         assert [future.result() for future in futures[4:]] == [float(n) for n in range(4, 30)]
@@ -184,17 +190,21 @@ def test_an_error_goes_to_its_own_task_and_the_others_are_kept(tmp_path):
 
 
 def test_a_bug_in_a_worker_says_where(tmp_path):
-    with Workspace(tmp_path / "run") as workspace, Recording() as pool, Crew(workspace, {}, pool) as crew:
+    with (
+        Workspace(tmp_path / "run") as workspace,
+        Recording() as pool,
+        CachingExecutor(workspace, {}, pool) as caching,
+    ):
         with pytest.raises(ZeroDivisionError) as caught:
-            crew.submit(bug, 0).result()
+            caching.submit(bug, 0).result()
     assert any("in bug" in note for note in caught.value.__notes__)
 
 
 def test_a_pool_that_was_shut_down_is_an_error_of_every_task(tmp_path):
     pool = Recording()
     pool.shutdown()
-    with Workspace(tmp_path / "run") as workspace, Crew(workspace, {}, pool) as crew:
-        futures = [crew.submit(square, n) for n in range(3000)]
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        futures = [caching.submit(square, n) for n in range(3000)]
         for future in futures:
             with pytest.raises((RuntimeError, AdjustError)):
                 future.result()
@@ -205,9 +215,13 @@ def test_a_full_disk_reaches_whoever_asks_for_the_result(tmp_path, monkeypatch):
         raise OutputError("the disk is full")
 
     monkeypatch.setattr(Workspace, "store", full)
-    with Workspace(tmp_path / "run") as workspace, Recording() as pool, Crew(workspace, {}, pool) as crew:
+    with (
+        Workspace(tmp_path / "run") as workspace,
+        Recording() as pool,
+        CachingExecutor(workspace, {}, pool) as caching,
+    ):
         with pytest.raises(OutputError, match="full"):
-            crew.submit(square, 2).result()
+            caching.submit(square, 2).result()
 
 
 def test_large_arrays_are_sent_as_paths_and_taken_away(tmp_path):
@@ -220,16 +234,16 @@ def test_large_arrays_are_sent_as_paths_and_taken_away(tmp_path):
             return super().submit(fn, *args)
 
     with Workspace(tmp_path / "run") as workspace, Looking(2) as pool:
-        with Crew(workspace, {}, pool) as crew:
-            futures = [crew.submit(square, n, pad) for n in range(4)]
+        with CachingExecutor(workspace, {}, pool) as caching:
+            futures = [caching.submit(square, n, pad) for n in range(4)]
             assert [float(future.result()["square"]) for future in futures] == [0, 1, 4, 9]
             assert len(list(workspace.cache.glob("arrays/*.npy"))) == 1
         assert not (workspace.cache / "arrays").exists()
-    assert all(isinstance(task, crew_module.Parcel) for task in sent)
+    assert all(isinstance(task, Spilled) for task in sent)
     assert sum(array.nbytes for array in sent[0].small.values()) < 2000
 
 
-def test_a_cluster_is_given_room_to_grow():
+def test_a_cluster_may_grow():
     class Client:
         def nthreads(self):
             return {"a": 1}

@@ -196,7 +196,7 @@ def at_every_output(step: int, folder: Path) -> dict[str, dict[str, int]]:
         "adjust --images copy": ([*adjust, "--images", "copy"], cached),
         "adjust --overwrite": ([*adjust, "--overwrite", "--model", "translation"], first),
         "match": (["-q", "match", *images], cached),
-        "apply": (["-q", "apply", *images, "--rpc", str(first)], empty),
+        "convert": (["-q", "convert", *images, "--rpc", str(first)], empty),
     }
     found = {}
     for name, (command, before) in commands.items():

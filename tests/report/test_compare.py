@@ -61,7 +61,7 @@ def test_runs_of_other_images_are_refused(block_run, antimeridian_run):
 
 
 def test_the_verb_prints_tables_or_json(block_run, check_run):
-    arguments = ["compare", str(check_run.folder), str(block_run.folder)]
+    arguments = ["report", str(check_run.folder), str(block_run.folder)]
     text = CliRunner().invoke(cli, arguments, standalone_mode=False)
     assert "error A [px]  error B [px]" in text.output
     found = CliRunner().invoke(cli, [*arguments, "--json"], standalone_mode=False)

@@ -85,7 +85,7 @@ def test_every_field_may_be_anything(fixture, request, tmp_path):
 @pytest.mark.parametrize("key", ["views", "pairs", "scene", "tracks", "tables", "versions", "stages"])
 def test_what_is_missing_is_named(block_run, tmp_path, key):
     (tmp_path / "summary.json").write_text(json.dumps(changed(block_run.summary, (key,))))
-    for verb in (["report", tmp_path], ["compare", tmp_path, tmp_path]):
+    for verb in (["report", tmp_path], ["report", tmp_path, tmp_path]):
         result = CliRunner().invoke(cli, [str(word) for word in verb])
         assert isinstance(result.exception, InputError)
         assert f"{tmp_path}/summary.json: damaged" in str(result.exception)

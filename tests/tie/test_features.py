@@ -8,9 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, detect
-from barpc.tie.features import quota, tiles
+from barpc.tie.features import quota
+from barpc.tie.raster import tiles
+from barpc.workspace import Workspace
 
 from .conftest import write_image
 
@@ -87,3 +90,12 @@ def test_views_of_one_name_keep_their_own_keypoints(tmp_path, texture) -> None:
     alone = [detect([v])[0] for v in (one, other)]
     for found, expected in zip(detect([one, other]), alone, strict=True):
         np.testing.assert_array_equal(found.xy, expected.xy)
+
+
+def test_keypoints_are_kept_for_a_later_pass_with_another_camera(tmp_path, texture) -> None:
+    first = view(write_image(tmp_path / "a.tif", texture))
+    options = TieOptions(tile=192)
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as executor:
+        for sensor in (None, "corrected"):
+            detect([replace(first, sensor=sensor)], options, executor=executor)
+            assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles(first.size, options))

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from barpc.scene import View
 from barpc.tie import TieOptions
 from barpc.tie.epipolar import Frame
-from barpc.tie.features import Keypoints, Sift, bounded, detect_tile, join, quota, tiles
-from barpc.tie.guided import Band, Guided
-from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch
+from barpc.tie.features import Keypoints, Sift, bounded, detect_tile, join, quota
+from barpc.tie.guided import Guided
+from barpc.tie.matcher import Matches, Prediction
+from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch, tiles
 from tests.tie.conftest import write_image
 
+ACROSS = 4.0
 LINEAR = np.array([[1.1, 0.2], [-0.1, 0.9]])
 
 
@@ -22,7 +25,7 @@ def keypoints(rng: np.random.Generator, xy: np.ndarray, descriptors: np.ndarray)
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[Keypoints, Keypoints, Frame, Band]:
+def pair() -> tuple[Keypoints, Keypoints, Frame]:
     """Five hundred points a side in 300 px; half of B shows what A shows, some twice, a few pixels apart."""
     rng = np.random.default_rng(3)
     described = rng.integers(0, 120, (500, 128)).astype(np.uint8)
@@ -38,11 +41,11 @@ def pair() -> tuple[Keypoints, Keypoints, Frame, Band]:
     a = keypoints(rng, rng.uniform(0, 300, (500, 2)), described)
     slope = rng.uniform(-0.05, 0.05, 500)
     slope[::50] = np.nan
-    where = Frame(np.array([1.0, 0.0]), *predicted.T, slope, np.full(500, 10.0), LINEAR)
-    return a, b, where, Band(rng.uniform(-16, -8, 500), rng.uniform(8, 16, 500), 4.0)
+    before, after = rng.uniform(-16, -8, 500), rng.uniform(8, 16, 500)
+    return a, b, Frame(np.array([1.0, 0.0]), *predicted.T, slope, before, after, LINEAR)
 
 
-def brute(a: Keypoints, b: Keypoints, where: Frame, band: Band) -> dict[tuple[int, int], tuple[float, float]]:
+def brute(a: Keypoints, b: Keypoints, where: Frame) -> dict[tuple[int, int], tuple[float, float]]:
     """Mutual best pairs: (distance, ambiguity), one pair of points after the other."""
     unit = [k.descriptors / np.linalg.norm(k.descriptors.astype(float), axis=1)[:, None] for k in (a, b)]
     likeness = np.full((len(a), len(b)), -np.inf)
@@ -55,7 +58,7 @@ def brute(a: Keypoints, b: Keypoints, where: Frame, band: Band) -> dict[tuple[in
             turn = np.angle(np.exp(1j * (b.angle[j] - expected)))
             zoom = np.log(b.scale[j] / a.scale[i]) - 0.5 * np.log(np.linalg.det(LINEAR))
             if (
-                band.before[i] <= du <= band.after[i] and abs(dw) <= band.across
+                where.before[i] <= du <= where.after[i] and abs(dw) <= ACROSS
                 and abs(turn) <= np.radians(30) and abs(zoom) <= np.log(1.8)
             ):  # fmt: skip
                 likeness[i, j] = unit[0][i] @ unit[1][j]
@@ -74,22 +77,45 @@ def brute(a: Keypoints, b: Keypoints, where: Frame, band: Band) -> dict[tuple[in
     return found
 
 
-def test_the_matcher_finds_what_a_loop_over_all_pairs_finds(pair) -> None:
-    a, b, where, band = pair
-    expected = brute(a, b, where, band)
-    found = Guided().match(a, b, where, band)
-    assert len(expected) > 100
+def guided(a: Keypoints, b: Keypoints, where: Frame, ratio: float, probes: int | None = None) -> Matches:
+    prediction = Prediction(lambda xy: where, ACROSS, list, probes)
+    return Guided(TieOptions(ratio=ratio), (a, b)).match(None, None, prediction)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.85, 0.6])
+def test_the_matcher_finds_what_a_loop_over_all_pairs_finds(pair, ratio) -> None:
+    a, b, where = pair
+    every = brute(a, b, where)
+    expected = {key: distance for key, (distance, ambiguity) in every.items() if ambiguity <= ratio}
+    found = guided(a, b, where, ratio)
+    assert len(every) >= len(expected) > 40
     assert {(int(i), int(j)) for i, j in found.index} == set(expected)
-    for (i, j), distance, ambiguity in zip(found.index, found.distance, found.ambiguity, strict=True):
-        assert (distance, ambiguity) == pytest.approx(expected[int(i), int(j)], abs=2e-3)
+    for (i, j), xy, distance in zip(found.index, found.xy, found.score, strict=True):
+        assert distance == pytest.approx(expected[int(i), int(j)], abs=2e-3)
+        np.testing.assert_array_equal(xy, [a.xy[i], b.xy[j]])
+
+
+def test_where_the_cameras_error_is_looked_for_some_points_and_clear_matches_are_enough(pair) -> None:
+    a, b, where = pair
+    chosen = np.linspace(0, 499, 120).astype(int)
+    clear = brute(a.select(chosen), b, where_of(where, chosen))
+    for ratio, bound in ((0.95, 0.8), (0.6, 0.6)):
+        expected = {(int(chosen[i]), j) for (i, j), (_, ambiguity) in clear.items() if ambiguity <= bound}
+        found = guided(a, b, where, ratio, probes=120)
+        assert {(int(i), int(j)) for i, j in found.index} == expected
+        assert len(expected) > 10
+
+
+def where_of(where: Frame, rows: np.ndarray) -> Frame:
+    names = ("along", "across", "slope", "before", "after")
+    return replace(where, **{name: getattr(where, name)[rows] for name in names})
 
 
 def test_without_points_there_are_no_matches(pair) -> None:
-    a, b, where, band = pair
+    a, b, where = pair
     nobody = np.empty(0, dtype=np.int64)
-    assert not len(Guided().match(a, b.select(nobody), where, band).index)
-    none = Band(band.before[:0], band.after[:0], 4.0)
-    assert not len(Guided().match(a.select(nobody), b, where.select(nobody), none).index)
+    assert not len(guided(a, b.select(nobody), where, 1.0))
+    assert not len(guided(a.select(nobody), b, where_of(where, nobody), 1.0))
 
 
 # --- keypoints ---------------------------------------------------------------------------------------------
@@ -152,11 +178,10 @@ def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path)
     data = (rng.integers(0, 2, (40, 40)).repeat(8, 0).repeat(8, 1) * 800 + 100).astype(np.uint16)
     data[:, 250:] = 0
     path = write_image(tmp_path / "a.tif", data, nodata=0)
-    view = View("a", str(path), (320, 320), None, (0.0, 1.0))  # type: ignore[arg-type]
     options = TieOptions(keypoints_per_cell=10_000, tile=160, cell=32)
     stretch = sample_stretch(path)
     assert stretch is not None
-    found = [detect_tile(view, box, stretch, options) for box in tiles((320, 320), options)]
+    found = [detect_tile(str(path), (320, 320), box, stretch, options) for box in tiles((320, 320), options)]
     for (col, row, width, height), part in zip(tiles((320, 320), options), found, strict=True):
         assert (part.xy >= [col - 0.5, row - 0.5]).all()
         assert (part.xy < [col + width - 0.5, row + height - 0.5]).all()

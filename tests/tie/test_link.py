@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 
 from barpc.scene import Tracks
-from barpc.tie import Matches, common_tracks, link, thin
+from barpc.tie import Matches, common_tracks, thin
+from barpc.tie import link as link_pairs
 
 PLACES = np.random.default_rng(0).uniform(0, 100, (4, 10, 2))
 
 
-def matches(i: int, j: int, *index: tuple[int, int], sigma: float = 0.2) -> Matches:
+def matches(i: int, j: int, *index: tuple[int, int], sigma: float = 0.2) -> tuple[tuple[int, int], Matches]:
     rows = np.array(index, dtype=np.int64).reshape(-1, 2)
     xy = np.stack([PLACES[i][rows[:, 0]], PLACES[j][rows[:, 1]]], axis=1)
-    return Matches((i, j), rows, xy, np.full(len(rows), sigma))
+    return (i, j), Matches(xy, np.zeros(len(rows)), rows, sigma)
+
+
+def link(*found: tuple[tuple[int, int], Matches]) -> Tracks:
+    return link_pairs([pair for pair, _ in found], [m for _, m in found])
 
 
 def as_sets(tracks: Tracks) -> set[frozenset[tuple[int, float, float]]]:
@@ -25,14 +30,14 @@ def as_sets(tracks: Tracks) -> set[frozenset[tuple[int, float, float]]]:
 
 
 def test_matches_that_share_a_keypoint_become_one_track() -> None:
-    tracks = link([10] * 4, [matches(0, 1, (3, 4)), matches(1, 2, (4, 5)), matches(2, 3, (5, 6), (1, 1))])
+    tracks = link(matches(0, 1, (3, 4)), matches(1, 2, (4, 5)), matches(2, 3, (5, 6), (1, 1)))
     assert tracks.num_points == 2
     assert sorted(np.bincount(tracks.point)) == [2, 4]
     np.testing.assert_array_equal(tracks.xy[tracks.view == 0], [PLACES[0, 3]])
 
 
 def test_a_track_that_meets_a_view_twice_is_thrown_away() -> None:
-    tracks = link([10] * 4, [matches(0, 1, (3, 4), (1, 1)), matches(1, 2, (4, 5)), matches(0, 2, (9, 5))])
+    tracks = link(matches(0, 1, (3, 4), (1, 1)), matches(1, 2, (4, 5)), matches(0, 2, (9, 5)))
     assert as_sets(tracks) == {frozenset([(0, *PLACES[0, 1]), (1, *PLACES[1, 1])])}
 
 
@@ -42,20 +47,20 @@ def test_the_order_of_the_pairs_does_not_matter() -> None:
         matches(1, 2, *((k, k) for k in range(3, 9)), sigma=0.1),
         matches(0, 2, (9, 9)),
     ]
-    first, second = link([10] * 4, pairs), link([10] * 4, pairs[::-1])
+    first, second = link(*pairs), link(*pairs[::-1])
     for name in ("view", "point", "xy", "sigma"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
 def test_rows_of_a_track_stand_together_with_views_ascending() -> None:
-    tracks = link([10] * 4, [matches(2, 3, (1, 1), (2, 2)), matches(0, 3, (5, 2)), matches(0, 1, (5, 5))])
+    tracks = link(matches(2, 3, (1, 1), (2, 2)), matches(0, 3, (5, 2)), matches(0, 1, (5, 5)))
     assert (np.diff(tracks.point) >= 0).all()
     assert (np.diff(tracks.view)[np.diff(tracks.point) == 0] > 0).all()
 
 
 def test_no_matches_make_no_tracks() -> None:
-    assert link([10, 10], []).num_points == 0
-    assert link([10, 10], [matches(0, 1)]).num_points == 0
+    assert link().num_points == 0
+    assert link(matches(0, 1)).num_points == 0
 
 
 def many(count: int, views: int = 2, crowd: float = 1.0) -> Tracks:

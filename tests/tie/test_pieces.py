@@ -15,15 +15,24 @@ from barpc.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import TieOptions, TieResult, find_tracks, select_pairs
 from barpc.tie import find as find_module
-from barpc.tie.epipolar import Affine, Frame, agreeing, frame, linear_map, mad, robust_affine
-from barpc.tie.features import Keypoints, detect_tile, tiles
+from barpc.tie.epipolar import (
+    Affine,
+    Frame,
+    agreeing,
+    common_range,
+    frame,
+    grouped,
+    linear_map,
+    mad,
+    robust_affine,
+)
+from barpc.tie.features import detect_tile, join
 from barpc.tie.find import require_known
-from barpc.tie.guided import Band, Candidates
-from barpc.tie.link import thin
-from barpc.tie.matching import _Search, common_range
+from barpc.tie.matcher import Matches, Prediction
+from barpc.tie.matching import MATCHERS, _Search
 from barpc.tie.pairs import Pair
-from barpc.tie.raster import sample_stretch
-from barpc.tie.refine import _grouped, _shared, references
+from barpc.tie.raster import sample_stretch, tiles
+from barpc.tie.tracks import _shared, references, thin
 from tests.tie.conftest import Rendered, write_image
 from tests.tie.test_pairs import METRE, camera, views
 
@@ -124,8 +133,7 @@ def _offset(scene: Rendered) -> tuple[float, float]:
     xy = rng.uniform(20, 280, (200, 2))
     alt = float(np.nanmean(scene.altitude[0]))
     seen = two.project(one.localize(xy, np.full(200, alt)))
-    where = frame(*(view.sensor for view in scene.views), xy, common_range(*scene.views))
-    along, across = np.median(where.errors(np.arange(200), seen), axis=0)
+    along, across = np.median(frame(*scene.views, xy).errors(seen), axis=0)
     return float(along), float(across)
 
 
@@ -154,9 +162,9 @@ def test_tiles_are_as_large_as_asked_for(scene: Rendered) -> None:
     }
     assert max(w for _, _, w, _ in boxes) == 256
     assert sum(w * h for _, _, w, h in boxes) == 700_000
-    small = detect_tile(
-        scene.views[0], (0, 0, 128, 128), sample_stretch(scene.views[0].path, 1), TieOptions(tile=128)
-    )
+    view = scene.views[0]
+    stretch = sample_stretch(view.path, 1)
+    small = detect_tile(view.path, view.size, (0, 0, 128, 128), stretch, TieOptions(tile=128))
     assert (small.xy < 128).all()
 
 
@@ -192,7 +200,7 @@ def test_a_view_gets_as_many_partners_as_asked_for() -> None:
 
 def test_the_search_reaches_as_far_as_asked_for(scene: Rendered) -> None:
     """The second camera is 80 px wrong across the epipolar lines."""
-    where = frame(*(v.sensor for v in scene.views), np.array([[150.0, 150.0]]), common_range(*scene.views))
+    where = frame(*scene.views, np.array([[150.0, 150.0]]))
     aside = np.array([-where.axis[1], where.axis[0]]) * 80.0
     second = scene.views[1]
     wrong = [scene.views[0], replace(second, sensor=second.sensor.crop(*-aside))]
@@ -261,27 +269,26 @@ def test_a_frame_predicts_where_a_point_lies_at_any_altitude(scene: Rendered) ->
     one, two = (view.sensor for view in scene.views)
     xy = np.random.default_rng(0).uniform(0, 300, (50, 2))
     low, high = common_range(*scene.views)
-    where = frame(one, two, xy, (low, high))
+    where = frame(*scene.views, xy)
     assert np.hypot(*where.axis) == pytest.approx(1.0)
     for alt in np.linspace(low, high, 5):
         seen = two.project(one.localize(xy, np.full(50, alt)))
-        errors = where.errors(np.arange(50), seen)
-        expected = where.reach * (2 * (alt - low) / (high - low) - 1)
+        errors = where.errors(seen)
+        expected = where.after * (2 * (alt - low) / (high - low) - 1)
         np.testing.assert_allclose(errors[:, 0], expected, atol=0.02)
         np.testing.assert_allclose(errors[:, 1], 0, atol=0.05)
-    moved = where.moved(3.0, -2.0).errors(np.arange(50), seen) - where.errors(np.arange(50), seen)
-    np.testing.assert_allclose(moved[:, 0], -3.0, atol=1e-9)
-    np.testing.assert_allclose(moved[:, 1], 2.0 + 3.0 * where.slope, atol=1e-9)
-    some = np.array([7, 3])
-    np.testing.assert_allclose(
-        where.select(some).errors(np.array([0, 1]), seen[some]), where.errors(some, seen[some])
-    )
+    np.testing.assert_array_equal(where.before, -where.after)
+    moved = where.moved(-2.0).errors(seen) - where.errors(seen)
+    np.testing.assert_allclose(moved, [[0.0, 2.0]] * 50, atol=1e-9)
+    turned = frame(*scene.views, xy[:7], np.array([0.0, 1.0]))
+    np.testing.assert_array_equal(turned.axis, [0.0, 1.0])
+    np.testing.assert_allclose(turned.errors(turned.place(where.after[:7]))[:, 1], 0, atol=1e-9)
 
 
 def test_the_linear_map_is_the_central_difference_at_one_altitude(scene: Rendered) -> None:
     one, two = (view.sensor for view in scene.views)
-    xy, alt = np.array([[100.0, 200.0], [30.0, 40.0]]), np.array([200.0, 260.0])
-    found = linear_map(one, two, xy, alt)
+    xy, alt = np.array([[100.0, 200.0], [30.0, 40.0]]), np.full(2, np.mean(common_range(*scene.views)))
+    found = linear_map(*scene.views, xy)
     for axis in (0, 1):
         step = np.eye(2)[axis]
         high, low = (two.project(one.localize(xy + s * step, alt)) for s in (0.5, -0.5))
@@ -358,11 +365,11 @@ def test_the_variance_of_a_registration_is_shared_by_both_ends() -> None:
     np.testing.assert_array_equal(found.xy[[0, 3]], np.rint(tracks.xy[[0, 3]]))
 
 
-def test_rows_are_grouped_by_equal_keys() -> None:
+def test_rows_aregrouped_by_equal_keys() -> None:
     a, b = np.array([1, 0, 1, 1, 0]), np.array([2, 5, 2, 1, 5])
-    groups = _grouped(a, b)
+    groups = grouped(a, b)
     assert [group.tolist() for group in groups] == [[1, 4], [3], [0, 2]]
-    assert _grouped(a[:0], b[:0]) == []
+    assert grouped(a[:0], b[:0]) == []
 
 
 def test_tracks_must_tie_every_pair_after_registration() -> None:
@@ -379,17 +386,33 @@ def test_tracks_must_tie_every_pair_after_registration() -> None:
 
 
 class Scripted:
-    """A matcher that knows its answers: distances in the true band, and in the bands to either side."""
+    """A matcher that knows its answers: scores in the true band, and in the bands to either side."""
 
-    def __init__(self, true: list[float], aside: tuple[list[float], list[float]]) -> None:
-        self.true, self.aside, self.asked = np.array(true), aside, []
+    detects = True
 
-    def match(self, a: Any, b: Any, where: Any, band: Band) -> Candidates:
-        shift = float(where.across[0])
+    def __init__(self, true: list[float], aside: tuple[list[float], list[float]] = ([], [])) -> None:
+        self.true, self.aside, self.asked = true, aside, []
+        self.places = np.random.default_rng(0).uniform(0, 999, (100, 2, 2))
+
+    def match(self, a: Any, b: Any, prediction: Prediction) -> Matches:
+        shift = float(prediction.at(np.zeros((1, 2))).across[0])
         self.asked.append(shift)
-        distance = self.true if shift == 0 else np.array(self.aside[int(shift > 0)])
-        index = np.stack([np.arange(len(distance))] * 2, axis=1)
-        return Candidates(index, distance, np.full(len(distance), 0.5))
+        score = np.array(self.true if shift == 0 else self.aside[int(shift > 0)])
+        return Matches.of_places(self.places[: len(score)], score)
+
+
+@pytest.fixture
+def search(monkeypatch) -> Callable[[Scripted], _Search]:
+    def made(matcher: Scripted) -> _Search:
+        monkeypatch.setitem(MATCHERS, "scripted", lambda *_: matcher)
+        return _Search(
+            tuple(views(camera(0.0), camera(0.0))), (join([]), join([])), TieOptions(matcher="scripted")
+        )
+
+    return made
+
+
+FLAT = Prediction(lambda xy: Frame(np.array([1.0, 0.0]), *(np.zeros(len(xy)),) * 5, np.eye(2)), 3.0, list)
 
 
 @pytest.mark.parametrize(
@@ -403,45 +426,33 @@ class Scripted:
         (([0.001] * 9, []), 0.04, 0, 0.0),
     ],
 )
-def test_as_many_matches_are_trusted_as_the_bands_aside_allow(aside, share, count, stated) -> None:
-    """A hundred matches at distances 0.01 to 1; what lies in a shifted band is half of what is false."""
-    rng = np.random.default_rng(0)
-    points = Keypoints(rng.uniform(0, 999, (100, 2)), *(np.ones(100),) * 3, np.ones((100, 128), np.uint8))
-    where = Frame(np.array([1.0, 0.0]), *(np.zeros(100),) * 4, np.eye(2))
+def test_as_many_matches_are_trusted_as_the_bands_aside_allow(search, aside, share, count, stated) -> None:
+    """A hundred matches of scores 0.01 to 1; what lies in a shifted band is half of what is false."""
     matcher = Scripted([0.01 * k for k in range(1, 101)], aside)
-    search = _Search(points, points, matcher, TieOptions())
-    found, control = search.trusted(where, Band(np.zeros(100), np.zeros(100), 3.0), share)
+    found, control = search(matcher).trusted(FLAT, share)
     assert len(found) == count
     assert control == pytest.approx(stated)
     assert matcher.asked == [0.0, -12.0, 12.0]  # twice the band's half width and six pixels more
 
 
-def test_only_unambiguous_matches_count_and_each_place_once() -> None:
-    xy = np.array([[0.0, 0.0], [0.3, 0.2], [50.0, 0.0], [90.0, 0.0]])
-    points = Keypoints(xy, *(np.ones(4),) * 3, np.ones((4, 128), np.uint8))
-
-    class Answers:
-        def match(self, *_: Any) -> Candidates:
-            index = np.array([[0, 0], [1, 1], [2, 2], [3, 3]])
-            return Candidates(index, np.array([0.4, 0.3, 0.2, 0.1]), np.array([0.85, 0.8, 0.851, 0.1]))
-
-    search = _Search(points, points, Answers(), TieOptions(ratio=0.85))
-    where = Frame(np.array([1.0, 0.0]), *(np.zeros(4),) * 4, np.eye(2))
-    index, distance = search.unambiguous(where, Band(np.zeros(4), np.zeros(4), 1.0))
-    assert index.tolist() == [[3, 3], [1, 1]]  # 0 and 1 are one place, the better stays
-    assert distance.tolist() == [0.1, 0.3]
+def test_the_best_come_first_and_each_place_once(search) -> None:
+    matcher = Scripted([0.4, 0.3, 0.2, 0.1])
+    matcher.places = (
+        np.array([[0.0, 0.0], [0.3, 0.2], [50.0, 0.0], [90.0, 0.0]]).repeat(2, 0).reshape(4, 2, 2)
+    )
+    found = search(matcher)._distinct(FLAT)
+    assert found.xy[:, 0, 0].tolist() == [90.0, 50.0, 0.3]  # the first two are one place, the better stays
+    assert found.score.tolist() == [0.1, 0.2, 0.3]
 
 
 def test_a_frames_linear_map_is_that_of_the_middle_of_the_points_that_are_seen(scene: Rendered) -> None:
-    one, two = (view.sensor for view in scene.views)
     xy = np.random.default_rng(0).uniform(100, 5000, (51, 2))
-    limits = common_range(*scene.views)
     xy[:3] = np.nan
     with np.errstate(all="ignore"):
-        where = frame(one, two, xy, limits)
-    expected = linear_map(one, two, np.median(xy[3:], axis=0), 0.5 * sum(limits))
+        where = frame(*scene.views, xy)
+    expected = linear_map(*scene.views, np.median(xy[3:], axis=0))
     np.testing.assert_array_equal(where.linear, expected)
-    assert np.abs(linear_map(one, two, np.zeros(2), 0.5 * sum(limits)) - expected).max() > 1e-7
+    assert np.abs(linear_map(*scene.views, np.zeros(2)) - expected).max() > 1e-7
     assert np.isnan(where.slope[:3]).all()
     assert np.isfinite(where.slope[3:]).all()
 
@@ -453,7 +464,7 @@ def test_cells_hold_the_first_quota_of_as_many_observations_as_are_kept(monkeypa
         seen.append((cell, cells))
         return np.ones(tracks.num_points, dtype=bool)
 
-    monkeypatch.setattr(sys.modules["barpc.tie.link"], "_fill", fill)
+    monkeypatch.setattr(sys.modules["barpc.tie.tracks"], "_fill", fill)
     tracks = _tracks(*[(v, p) for p in range(30) for v in (0, 1)])
     thin(tracks, [(1000, 800), (700, 700)], 20)
     ((cell, count),) = seen

@@ -10,15 +10,13 @@ import pytest
 from barpc.scene import Tracks, View
 from barpc.tie import TieOptions, TieResult, common_tracks, detect, find_tracks, match, select_pairs
 from barpc.tie.epipolar import Affine, agreeing, frame, mad, robust_affine
-from barpc.tie.matching import common_range
 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 
 
 def across(views: list[View], i: int, j: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Distance of points of view j from the epipolar lines of points of view i [px]."""
-    where = frame(views[i].sensor, views[j].sensor, first, common_range(views[i], views[j]))
-    return where.errors(np.arange(len(first)), second)[:, 1]
+    return frame(views[i], views[j], first).errors(second)[:, 1]
 
 
 def fit(views: list[View], tracks: Tracks, i: int, j: int) -> tuple[Affine, np.ndarray]:
@@ -35,8 +33,9 @@ def raw_spread(triplet, ventoux) -> dict[str, float]:
     found = {}
     for views in (triplet, ventoux):
         pairs, options = select_pairs(views, TieOptions()), TieOptions()
-        for matches, report in match(views, detect(views, options), pairs, options):
-            errors = across(views, *matches.pair, matches.xy[:, 0], matches.xy[:, 1])
+        matched = match(views, detect(views, options), pairs, options)
+        for pair, (matches, report) in zip(pairs, matched, strict=True):
+            errors = across(views, *pair.views, matches.xy[:, 0], matches.xy[:, 1])
             found["-".join(report.names)] = mad(agreeing(matches.xy[:, 0], errors)[1])
     return found
 

@@ -1,11 +1,12 @@
 """Who works on the tasks: an executor that remembers results, and keeps only a few tasks in flight.
 
-The stages hand their tasks (per tile, per pair) to any `concurrent.futures.Executor`. `Crew` is one: it
-looks each task up among the kept results first, gives the rest to the executor behind it (or works on them
+The stages hand their tasks (per tile, per pair) to any `concurrent.futures.Executor`. `CachingExecutor` is one:
+it looks each task up among the kept results first, gives the rest to the executor behind it (or works on them
 itself, when asked for the result), and keeps what comes back as soon as it comes back. So a run that was
-interrupted goes on where it was, and a thousand pairs do not stand pickled in a queue. Tasks that are quick
-travel together: what a task costs on the way (0.2 ms to a process, 10 ms over dask) is paid once for half a
-second of work.
+interrupted goes on where it was, and a thousand pairs do not stand pickled in a queue. Quick tasks travel in
+batches: what a task costs on the way (0.2 ms to a process, 10 ms over dask) is paid once for half a second of
+work. Large arrays (the keypoints of a view go to all its pairs) are spilled once into the run folder, which all
+workers see as they see the images, and sent as paths: what dask scatters dies with the worker that holds it.
 """
 
 from __future__ import annotations
@@ -13,28 +14,29 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import shutil
 import threading
 import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from barpc.errors import AdjustError, BarpcError
-from barpc.pipeline.parcel import Parcel, Shelf
-from barpc.record import from_record, to_record
-from barpc.tie.work import one_thread
+from barpc.errors import AdjustError, BarpcError, InputError
+from barpc.record import Record, from_record, to_record
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
 
 BATCH_SECONDS = 0.5
 """Work that is handed in at a time [s], as far as there are tasks for all workers."""
+LARGE = 1 << 20
+"""Arrays of so many bytes are sent as paths."""
 _PER_WORKER = 3  # batches in flight for each worker: enough that none waits
 _CLUSTER = 32  # workers of a cluster, at least: it may grow when there is work
 _LOST = ("KilledWorker", "FutureCancelledError")  # of distributed, which may not be installed
@@ -52,8 +54,8 @@ def worker_count(executor: Executor | None) -> int:
     return int(getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
 
 
-class Crew(Executor):
-    """An executor with a memory.
+class CachingExecutor(Executor):
+    """An executor that keeps results.
 
     Parameters
     ----------
@@ -64,28 +66,22 @@ class Crew(Executor):
     executor : Executor, optional
         Works on the tasks; None: they are worked on in this process, one after the other, when their result
         is asked for.
-    workers : int, optional
-        How many workers the executor has; by default it is asked.
     """
 
     def __init__(
-        self,
-        workspace: Workspace,
-        fingerprints: Mapping[str, str],
-        executor: Executor | None = None,
-        workers: int | None = None,
+        self, workspace: Workspace, fingerprints: Mapping[str, str], executor: Executor | None = None
     ) -> None:
         self.workspace, self._fingerprints = workspace, dict(fingerprints)
         self.executor = executor
-        self._limit = _PER_WORKER * max(worker_count(executor) if workers is None else workers, 1)
+        self._limit = _PER_WORKER * worker_count(executor)
         self._lock = threading.Lock()
-        self._landing = threading.RLock()  # held while results are kept: `shutdown` waits for it
+        self._storing = threading.RLock()  # while results are kept: `shutdown` waits for it
         self._waiting: deque[_Task] = deque()
         self._in_flight = 0
         self._open = True
         self._seconds: dict[Function, float] = {}
         self._digests: dict[int, tuple[object, str]] = {}
-        self._shelf = Shelf(workspace)
+        self._spilled = workspace.cache / "arrays"
 
     def submit(self, fn: Function, /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Hand in `fn(*args)`; its result is looked up, or made when its turn comes."""
@@ -95,16 +91,16 @@ class Crew(Executor):
         if self.executor is not None:
             with self._lock:
                 self._waiting.append(task)
-            self._pump()
+            self._send()
         return task
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Nothing is handed out or kept from now on; the executor behind is left as it is."""
-        with self._landing:
+        with self._storing:
             self._open = False
             self._waiting.clear()
             self._digests.clear()
-            self._shelf.clear()
+            shutil.rmtree(self._spilled, ignore_errors=True)
 
     def key(self, fn: Function, args: tuple[Any, ...]) -> str:
         """The key under which the result of a task is kept."""
@@ -131,20 +127,36 @@ class Crew(Executor):
 
     # -- handing out -------------------------------------------------------------------------------
 
-    def _pump(self) -> None:
+    def _send(self) -> None:
         """Give waiting tasks to the executor while few are in flight."""
         while batch := self._next_batch():
             try:
-                tasks = [self._shelf.packed(task.args, self._digest) for task in batch]
-                future = self._executor().submit(work_off, batch[0].fn, tasks)
-            except (RuntimeError, OSError) as error:  # the pool is broken or shut down; no room on the shelf
-                self._settle(batch, [(0.0, None, _explained(error))] * len(batch))
+                tasks = [self._spill(task.args) for task in batch]
+                assert self.executor is not None
+                future = self.executor.submit(run_batch, batch[0].fn, tasks)
+            except (RuntimeError, OSError) as error:  # the pool is broken or shut down; the disk is full
+                self._resolve(batch, [(0.0, None, _explained(error))] * len(batch))
             else:
-                future.add_done_callback(partial(self._landed, batch))
+                future.add_done_callback(partial(self._completed, batch))
 
-    def _executor(self) -> Executor:
-        assert self.executor is not None
-        return self.executor
+    def _spill(self, args: tuple[Any, ...]) -> tuple[Any, ...] | Spilled:
+        """Arguments as they are, or without the large arrays among them, which a file of the run folder keeps."""
+        try:
+            record = to_record(args)
+        except TypeError:  # something that is not kept as a record, such as a user's own sensor
+            return args
+        large = {}
+        for name, array in record.items():
+            if array.nbytes >= LARGE:
+                digest = hashlib.sha256(self._digest(array).encode()).hexdigest()
+                path = self._spilled / f"{digest[:32]}.npy"
+                if not path.exists():
+                    with self.workspace.keeping(path) as partial_file, partial_file.open("wb") as file:
+                        np.save(file, array, allow_pickle=False)
+                large[name] = str(path)
+        if not large:
+            return args
+        return Spilled({name: array for name, array in record.items() if name not in large}, large)
 
     def _next_batch(self) -> list[_Task]:
         """Waiting tasks of one function that have no kept result; they count as in flight, empty does not."""
@@ -180,7 +192,7 @@ class Crew(Executor):
 
     # -- taking back -------------------------------------------------------------------------------
 
-    def _landed(self, batch: Sequence[_Task], future: Future[Any]) -> None:
+    def _completed(self, batch: Sequence[_Task], future: Future[Any]) -> None:
         try:
             outcomes: list[Outcome] = future.result()
         except BaseException as error:  # noqa: BLE001  (goes to whoever asks for the result)
@@ -188,23 +200,23 @@ class Crew(Executor):
         else:
             seconds = sum(outcome[0] for outcome in outcomes) / len(outcomes)
             self._seconds[batch[0].fn] = 0.5 * (self._seconds.get(batch[0].fn, seconds) + seconds)
-        self._settle(batch, outcomes)
-        self._pump()
+        self._resolve(batch, outcomes)
+        self._send()
 
-    def _settle(self, batch: Sequence[_Task], outcomes: Sequence[Outcome]) -> None:
+    def _resolve(self, batch: Sequence[_Task], outcomes: Sequence[Outcome]) -> None:
         with self._lock:
             self._in_flight -= 1
-        with self._landing:
+        with self._storing:
             for task, (_, value, error) in zip(batch, outcomes, strict=True):
-                task.land(value, error, keep=self._open)
+                task.finish(value, error, keep=self._open)
 
 
 class _Task(Future[Any]):
-    """One task of a crew: found, in flight, or to be done when asked for."""
+    """One task: found, in flight, or to be done when asked for."""
 
-    def __init__(self, crew: Crew, fn: Function, args: tuple[Any, ...]) -> None:
+    def __init__(self, owner: CachingExecutor, fn: Function, args: tuple[Any, ...]) -> None:
         super().__init__()
-        self._crew, self.fn, self.args = crew, fn, args
+        self._owner, self.fn, self.args = owner, fn, args
         self._key = ""
 
     def begin(self) -> bool:
@@ -220,12 +232,12 @@ class _Task(Future[Any]):
             self.set_result(value)
         return not found
 
-    def land(self, value: Any, error: BaseException | None, *, keep: bool = True) -> None:
+    def finish(self, value: Any, error: BaseException | None, *, keep: bool = True) -> None:
         """Take the outcome, and keep a result for the next time."""
         self.args = ()
         try:
             if error is None and keep:
-                self._crew.workspace.store(self._stage, self._key, to_record(value))
+                self._owner.workspace.store(self._stage, self._key, to_record(value))
         except Exception as failed:  # noqa: BLE001  (a full disk: goes to whoever asks for the result)
             error = failed
         if error is None:
@@ -235,8 +247,8 @@ class _Task(Future[Any]):
 
     def result(self, timeout: float | None = None) -> Any:
         """The result, worked out here where there is no executor."""
-        if self._crew.executor is None and not self.done() and self.begin():
-            self.land(self.fn(*self.args), None)
+        if self._owner.executor is None and not self.done() and self.begin():
+            self.finish(self.fn(*self.args), None)
         return super().result(timeout)
 
     @property
@@ -244,8 +256,8 @@ class _Task(Future[Any]):
         return self.fn.__name__.strip("_")
 
     def _look_up(self) -> tuple[bool, Any]:
-        self._key = self._crew.key(self.fn, self.args)
-        record = self._crew.workspace.load(self._stage, self._key)
+        self._key = self._owner.key(self.fn, self.args)
+        record = self._owner.workspace.load(self._stage, self._key)
         if record is None:
             return False, None
         try:
@@ -255,16 +267,43 @@ class _Task(Future[Any]):
             return False, None
 
 
-def work_off(fn: Function, tasks: Sequence[tuple[Any, ...] | Parcel]) -> list[Outcome]:
+@dataclass(frozen=True)
+class Spilled:
+    """The arguments of a task whose large arrays lie in files.
+
+    Parameters
+    ----------
+    small : dict of str to ndarray
+        What `to_record` made of them, without the large arrays.
+    large : mapping of str to str
+        Name of each large array -> its file.
+    """
+
+    small: Record
+    large: Mapping[str, str]
+
+    def load(self) -> tuple[Any, ...]:
+        """The arguments; InputError where the worker does not see the run folder."""
+        try:
+            arrays = {name: np.load(path, allow_pickle=False) for name, path in self.large.items()}
+        except OSError as error:
+            raise InputError(
+                f"{error.filename}: a worker cannot read it; images and run folder must be on a disk that all "
+                "workers see under the same path"
+            ) from error
+        arguments: tuple[Any, ...] = from_record({**self.small, **arrays})
+        return arguments
+
+
+def run_batch(fn: Function, tasks: Sequence[tuple[Any, ...] | Spilled]) -> list[Outcome]:
     """Work on a batch, in a worker: one task's error leaves the others their results."""
-    one_thread()
     outcomes: list[Outcome] = []
     for task in tasks:
         start = time.perf_counter()
         value: Any = None
         error: Exception | None = None
         try:
-            value = fn(*(task.unpacked() if isinstance(task, Parcel) else task))
+            value = fn(*(task.load() if isinstance(task, Spilled) else task))
         except Exception as caught:  # noqa: BLE001  (raised again where the result is asked for)
             error = caught
             if not isinstance(caught, BarpcError):
@@ -278,9 +317,9 @@ def _explained(error: BaseException) -> BaseException:
     lost = isinstance(error, (BrokenExecutor, CancelledError)) or type(error).__name__ in _LOST
     if not lost:
         return error
-    told = AdjustError(
+    died = AdjustError(
         "a worker process died (out of memory?): what was finished is kept, so run the same command again, "
         "perhaps with a smaller -j"
     )
-    told.__cause__ = error
-    return told
+    died.__cause__ = error
+    return died

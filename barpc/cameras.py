@@ -1,0 +1,260 @@
+"""The one door through which cameras come in: an image, an RPC file, a radar product, a grid of ground points.
+
+`OPENERS` is the table of kinds. A file may be given with choices behind commas: ``product.SAFE,swath=iw1,pol=vv``,
+``image.tif,camera=rpcs/image.RPB``, ``METADATA.XML,band=2,size=1000:900``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from barpc.errors import ImageError, InputError
+from barpc.pointio.tables import Correspondences, correspondence_kind, read_correspondences, read_grid
+from barpc.raster import open_raster
+from barpc.rpcio import read_rpc_source
+from barpc.sensor import SensorModel
+from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.geometry import altitude_range
+from barpc.sensor.rpc import RPC
+from barpc.sidefile import IMAGE, read_head
+
+_HEAD = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera and where it came from.
+
+    Parameters
+    ----------
+    model : SensorModel
+        The camera itself.
+    path : Path
+        The file that holds it: what was given, or a file beside it.
+    format : str
+        What that file is: ``tag``, ``nitf``, a row of `barpc.rpcio.FORMATS`, or another row of `OPENERS`.
+    size : (int, int) or None
+        Width, height [px] of the image; None where nothing states them.
+    alt_range : (float, float)
+        The altitudes [m above the ellipsoid] that it is made for.
+    notes : tuple of str
+        What the user should know.
+    """
+
+    model: SensorModel
+    path: Path
+    format: str
+    size: tuple[int, int] | None
+    alt_range: tuple[float, float]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rpc(self) -> RPC:
+        """The model where it is an RPC; InputError where it is not."""
+        if isinstance(self.model, RPC):
+            return self.model
+        raise InputError(
+            f"{self.path}: a camera of the kind {self.format}, no RPC; make one with 'barpc fit'"
+        )
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """The image's size [px]; InputError where it is not known."""
+        if self.size is None:
+            raise InputError(
+                f"{self.path}: a camera without its image; give the size: FILE,size=WIDTH:HEIGHT"
+            )
+        return self.size
+
+    @property
+    def altitude(self) -> float:
+        """The middle of its altitudes [m]."""
+        return (self.alt_range[0] + self.alt_range[1]) / 2
+
+
+Reader = Callable[[str], Any]
+
+
+@dataclass(frozen=True)
+class Opener:
+    """One kind of camera files.
+
+    Parameters
+    ----------
+    sniff : callable
+        (path, its first 4096 bytes - none of a folder -, choices) -> whether it is of this kind.
+    open : callable
+        (path, **choices) -> Camera.
+    choices : mapping of str to callable
+        What may be given behind the file, and how its text is read (ValueError: not so).
+    """
+
+    sniff: Callable[[Path, bytes, Mapping[str, Any]], bool]
+    open: Callable[..., Camera]
+    choices: Mapping[str, Reader] = field(default_factory=dict)
+
+
+def open_camera(spec: str | Path, **choices: Any) -> Camera:
+    """Open a camera, whatever it is.
+
+    Parameters
+    ----------
+    spec : str or Path
+        A file or folder, perhaps with choices behind it: ``,name=value``. A file whose whole name is this goes
+        first.
+    **choices
+        The same as values; they go before those in `spec`. For every kind: ``camera`` (the file with the camera of
+        the image `spec`), ``size`` (width, height). RPC: ``first_pixel`` (the coordinate that the file gives to
+        the centre of the first pixel), ``band``. Sentinel-1: those of `sentinel1.open_product`. Localisation
+        grid: ``altitudes`` of its layers.
+
+    Returns
+    -------
+    camera : Camera
+
+    Raises
+    ------
+    InputError
+        A choice that this kind of camera does not have, or no value of it.
+    ImageError, RpcError
+        No such file, none of the kinds, or a damaged one.
+    """
+    path, texts = split_spec(spec)
+    size, holder = (
+        choices.pop("size", texts.pop("size", None)),
+        choices.pop("camera", texts.pop("camera", None)),
+    )
+    file = path if holder is None else Path(holder)
+    head = b"" if file.is_dir() else read_head(file, IMAGE, _HEAD)
+    name, opener = next(
+        (n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, {**texts, **choices})
+    )
+    for key in (*texts, *choices):
+        if key not in opener.choices:
+            known = ", ".join(("camera", "size", *opener.choices))
+            raise InputError(f"{file}: {key} is no choice for the kind {name}; known are {known}")
+    read = {key: _read(opener.choices[key], key, text, file) for key, text in texts.items()}
+    camera = opener.open(file, **{**read, **choices})
+    if isinstance(size, str):
+        size = _read(_size, "size", size, file)
+    elif size is None:  # of the image's own pixels; those of a grid are not the image's
+        size = _pixels(path) if holder is not None or camera.size is None else None
+    return camera if size is None else replace(camera, size=size)
+
+
+def split_spec(spec: str | Path) -> tuple[Path, dict[str, str]]:
+    """A file and the choices given behind it, as texts."""
+    name, texts = os.fspath(spec), dict[str, str]()
+    known = {"camera", "size", *(key for opener in OPENERS.values() for key in opener.choices)}
+    last = re.compile(rf"(.*),({'|'.join(sorted(known))})=(.*)", re.DOTALL)
+    while not os.path.lexists(name) and (found := last.fullmatch(name)):
+        name, key, text = found.groups()
+        texts.setdefault(key, text)
+    return Path(name), texts
+
+
+def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, int] | None]:
+    """The points of a table or of a localisation grid, and the image size given behind it; None of a camera."""
+    path, texts = split_spec(spec)
+    if path.is_dir() or b"<adsHeader>" in read_head(path, IMAGE, _HEAD):
+        return None, None
+    altitudes = _read(_numbers, "altitudes", texts["altitudes"], path) if "altitudes" in texts else None
+    if set(texts) - {"size", "altitudes"} or correspondence_kind(path, altitudes) is None:
+        return None, None
+    size = _read(_size, "size", texts["size"], path) if "size" in texts else None
+    return read_correspondences(path, altitudes=altitudes), size
+
+
+def _read(reader: Reader, key: str, text: str, file: Path) -> Any:
+    try:
+        return reader(text)
+    except (ValueError, KeyError) as error:
+        raise InputError(f"{file}: {key}={text} cannot be read") from error
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, height = (int(part) for part in text.split(":"))
+    if min(width, height) < 1:
+        raise ValueError(text)
+    return width, height
+
+
+def _pixels(path: Path) -> tuple[int, int] | None:
+    """Width and height [px] of a raster; None of another file."""
+    try:
+        with open_raster(path) as dataset:
+            return int(dataset.width), int(dataset.height)
+    except ImageError:
+        return None
+
+
+# --- RPC --------------------------------------------------------------------------------------------------
+
+
+def _open_rpc(path: Path, first_pixel: float | None = None, band: int = 1) -> Camera:
+    source = read_rpc_source(path, first_pixel=first_pixel, band=band)
+    return Camera(source.rpc, source.path, source.format, None, altitude_range(source.rpc), source.notes)
+
+
+def _convention(text: str) -> float | None:
+    return {"auto": None, "0": 0.0, "0.5": 0.5, "1": 1.0}[text]
+
+
+# --- Sentinel-1 -------------------------------------------------------------------------------------------
+
+
+def _is_sentinel1(path: Path, head: bytes, _choices: Mapping[str, Any]) -> bool:
+    """A product folder or zip, its manifest, or an annotation."""
+    return path.is_dir() or path.suffix.lower() in (".safe", ".zip") or b"<adsHeader>" in head
+
+
+def _open_sentinel1(path: Path, pol: str | None = None, **choices: Any) -> Camera:
+    from barpc.sensor.sentinel1 import open_product
+
+    model = open_product(path, polarisation=pol, **choices)
+    return Camera(model, path, "sentinel-1", model.size, model.alt_range)
+
+
+def _bistatic(text: str) -> str:
+    return {"annotated": "annotated", "full": "full"}[text]
+
+
+def _yes(text: str) -> bool:
+    return {"yes": True, "no": False}[text]
+
+
+# --- localisation grid ------------------------------------------------------------------------------------
+
+
+def _is_grid(path: Path, head: bytes, choices: Mapping[str, Any]) -> bool:
+    if head[:2] not in (b"II", b"MM"):
+        return False
+    return "altitudes" in choices or correspondence_kind(path) == "grid"
+
+
+def _open_grid(path: Path, altitudes: list[float] | None = None) -> Camera:
+    nodes = read_grid(path, altitudes)
+    grid = DirectGrid.from_points(nodes.ground, nodes.image)
+    size = (max(1, int(grid.cols[-1]) + 1), max(1, int(grid.rows[-1]) + 1))  # an image that begins at (0, 0)
+    return Camera(grid, path, "grid", size, (float(grid.alts[0]), float(grid.alts[-1])))
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(part) for part in text.split(":")]
+
+
+OPENERS: dict[str, Opener] = {
+    "rpc": Opener(lambda _path, _head, _choices: True, _open_rpc, {"first_pixel": _convention, "band": int}),
+    "grid": Opener(_is_grid, _open_grid, {"altitudes": _numbers}),
+    "sentinel-1": Opener(
+        _is_sentinel1,
+        _open_sentinel1,
+        {"swath": str, "pol": str, "burst": int, "orbit": str, "atmosphere": _yes, "bistatic": _bistatic},
+    ),
+}
+"""Kind -> how it is told from others and opened. The last row that knows a file has it; the first takes any."""

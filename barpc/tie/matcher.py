@@ -1,0 +1,118 @@
+"""What a matcher is given, and what it gives back.
+
+A matcher is a class of one file and one row in `barpc.tie.matching.MATCHERS`: `match(a, b, prediction)` looks
+for points of view A in view B. A view has a path to read pixels from and the camera; the prediction says where
+in B any point of A may lie. What is found goes, whatever found it, the same way: bands that hold no true match
+tell how many are false, a robust fit throws out what does not lie on the epipolar lines, matches that share a
+point are linked into tracks, and these are registered to sub-pixel places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol
+
+import numpy as np
+
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray, View
+from barpc.tie.epipolar import Frame
+from barpc.tie.features import Keypoints
+from barpc.tie.options import TieOptions
+from barpc.tie.raster import Box
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where points of A may lie in B.
+
+    Parameters
+    ----------
+    where : callable
+        Points of A (N, 2) [px] -> their `Frame`; its axis is the same for all predictions of a pair.
+    half_width : float
+        How far across the epipolar lines to look [px].
+    windows : callable
+        () -> the windows of A that B may see, as far as the cameras may be wrong.
+    probes : int, optional
+        So many points of A are enough, spread evenly, and only clear matches count: the cameras' error is looked
+        for. None: all points.
+    aside : float
+        How far the bands are moved across the epipolar lines [px].
+    """
+
+    where: Callable[[Array], Frame]
+    half_width: float
+    windows: Callable[[], Sequence[Box]]
+    probes: int | None = None
+    aside: float = 0.0
+
+    def at(self, xy: Array) -> Frame:
+        """The frame of points of A (N, 2) [px]; NaN: nowhere."""
+        return self.where(xy).moved(self.aside)
+
+    def chosen(self, count: int) -> IntArray:
+        """Indices of the points that are wanted of `count`, ascending."""
+        return np.linspace(0, count - 1, min(count, self.probes or count)).astype(np.int64)
+
+    def holds(self, xy: Array) -> BoolArray:
+        """Which matches (M, 2, 2) lie in the bands: for a matcher that looks everywhere."""
+        where = self.at(xy[:, 0])
+        along, across = where.errors(xy[:, 1]).T
+        inside: BoolArray = (along >= where.before) & (along <= where.after)
+        inside &= np.abs(across) <= self.half_width
+        return inside
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Points of two views that show the same ground.
+
+    Parameters
+    ----------
+    xy : (M, 2, 2)
+        col, row in the first and in the second view [px].
+    score : (M,)
+        How unlike the two places look: 0 or more, comparable among all calls for a pair.
+    index : (M, 2)
+        Number of the point in the first and in the second view. Matches of two pairs that give a point of their
+        common view the same number belong to one track.
+    sigma : float
+        Standard deviation of each coordinate [px], measured once the matches are verified.
+    """
+
+    xy: Array
+    score: Array
+    index: IntArray
+    sigma: float = float("nan")
+
+    def __len__(self) -> int:
+        """Number of matches M."""
+        return len(self.xy)
+
+    @staticmethod
+    def of_places(xy: Array, score: Array) -> Matches:
+        """Matches whose points are numbered by the pixel in which they lie."""
+        pixel = np.rint(xy).astype(np.int64)
+        return Matches(xy, score, (pixel[..., 1] << 32) + pixel[..., 0])
+
+    def select(self, keep: IntArray | BoolArray) -> Matches:
+        """The matches of a mask or of indices."""
+        return replace(self, xy=self.xy[keep], score=self.score[keep], index=self.index[keep])
+
+
+NO_MATCHES = Matches(np.empty((0, 2, 2)), np.empty(0), np.empty((0, 2), dtype=np.int64))
+
+
+class Matcher(Protocol):
+    """Made for a pair of views, and asked several times: about wide bands, narrow ones, and ones moved aside."""
+
+    detects: ClassVar[bool]
+    """Whether it wants the views' keypoints: they are found once a view, for all its pairs."""
+
+    def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None: ...
+
+    def match(self, a: View, b: View, prediction: Prediction) -> Matches:
+        """The unambiguous matches inside the bands of the prediction, and no others; in any order."""
+        ...

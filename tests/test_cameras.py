@@ -1,0 +1,244 @@
+"""The one door for cameras: every kind goes through every verb, and a new kind is one row."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import barpc
+from barpc import cameras
+from barpc.cameras import OPENERS, Camera, Opener, open_camera
+from barpc.cli import main
+from barpc.errors import InputError
+from barpc.geodesy import (
+    Array,
+    ecef_from_ground,
+    ecef_from_ground_jacobian,
+    enu_basis,
+    ground_from_ecef,
+)
+from barpc.rpcio import read_rpc, write_rpc
+from barpc.sensor import SensorModel
+from tests.rpcio.conftest import make_rpc, write_image
+from tests.sensor.conftest import MODELS
+
+SAMPLES = sorted((Path(__file__).parents[1] / "data_samples").glob("*.tif"))
+
+
+def run(*args: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(arg) for arg in args])
+    return int(stop.value.code or 0)
+
+
+# --- a camera that barpc does not know: an aerial frame camera, in one class and one row --------------------
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A pinhole that looks straight down: one instant, one focal length [px]."""
+
+    lon: float
+    lat: float
+    alt: float
+    focal: float
+    size: tuple[int, int]
+
+    def _pose(self) -> tuple[Array, Array]:
+        """Its place (3,) [m], ECEF, and the axes (3, 3): rows along columns, along rows, towards the ground."""
+        ground = np.array([self.lon, self.lat, self.alt])
+        east, north, up = enu_basis(ground)
+        return ecef_from_ground(ground), np.stack([east, -north, -up])
+
+    def _inside(self, ground: Array) -> tuple[Array, Array]:
+        place, axes = self._pose()
+        return (ecef_from_ground(ground) - place) @ axes.T, axes
+
+    def project(self, ground: Array) -> Array:
+        seen, _ = self._inside(np.asarray(ground, dtype=np.float64))
+        with np.errstate(all="ignore"):
+            image = self.focal * seen[..., :2] / seen[..., 2:]
+        return np.where(seen[..., 2:] > 0, image + (np.array(self.size) - 1) / 2, np.nan)
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        ground = np.asarray(ground, dtype=np.float64)
+        (seen, axes), by_ground = self._inside(ground), ecef_from_ground_jacobian(ground)
+        x, y, z = np.moveaxis(seen, -1, 0)
+        zero = np.zeros_like(z)
+        by_seen = self.focal * np.stack(
+            [np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], -2
+        )
+        return self.project(ground), by_seen @ axes @ by_ground
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        image, alt = np.asarray(image, dtype=np.float64), np.asarray(alt, dtype=np.float64)
+        place, axes = self._pose()
+        offset = (image - (np.array(self.size) - 1) / 2) / self.focal
+        ray = np.concatenate([offset, np.ones((*offset.shape[:-1], 1))], axis=-1) @ axes
+        depth = np.broadcast_to(self.alt - alt, ray.shape[:-1]).astype(np.float64)
+        for _ in range(8):  # the ray's altitude is nearly linear in its length
+            ground = ground_from_ecef(place + depth[..., None] * ray)
+            depth = depth + (ground[..., 2] - alt)
+        return np.concatenate([ground[..., :2], np.broadcast_to(alt, ray.shape[:-1])[..., None]], axis=-1)
+
+
+def _open_frame(path: Path, higher: float = 0.0) -> Camera:
+    values = json.loads(path.read_text())["frame"]
+    size = (values["size"][0], values["size"][1])
+    model = Frame(values["lon"], values["lat"], values["alt"] + higher, values["focal"], size)
+    return Camera(model, path, "frame", model.size, (-100.0, 400.0))
+
+
+@pytest.fixture
+def frame(tmp_path, monkeypatch):
+    row = Opener(lambda _path, head, _choices: head.startswith(b'{"frame"'), _open_frame, {"higher": float})
+    monkeypatch.setitem(OPENERS, "frame", row)
+    path = tmp_path / "frame.json"
+    values = {"lon": 5.4, "lat": 43.2, "alt": 3000.0, "focal": 6000.0, "size": [4000, 3000]}
+    path.write_text(json.dumps({"frame": values}))
+    return path
+
+
+def test_a_new_sensor_goes_through_every_verb_by_one_row(frame, tmp_path, capsys):
+    model = open_camera(frame).model
+    assert isinstance(model, SensorModel)
+    assert run("localize", frame, 100, 200, "--alt", 50, "--json") == 0
+    (ground,) = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(model.project([ground["lon"], ground["lat"], 50.0]), [100, 200], atol=1e-3)
+    assert run("project", frame, ground["lon"], ground["lat"], 50, "--json") == 0
+    (image,) = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose([image["col"], image["row"]], [100, 200], atol=1e-3)
+    assert run("info", frame, "--json") == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert report["rpc"] == f"frame in {frame}"
+    assert report["altitude_range_m"] == [-100.0, 400.0]
+    assert report["gsd_m"]["col"] == pytest.approx((3000 - 150) / 6000, rel=1e-3)
+    assert report["incidence_deg"] < 0.1
+    assert run("info", f"{frame},higher=1000", "--json") == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert report["gsd_m"]["col"] == pytest.approx((4000 - 150) / 6000, rel=1e-3)
+    out = tmp_path / "out" / "frame_RPC.TXT"
+    assert run("fit", frame, "-o", out) == 0
+    capsys.readouterr()
+    points = model.localize([[0.0, 0.0], [3999.0, 0.0], [2000.0, 1500.0]], np.array([0.0, 100.0, 300.0]))
+    np.testing.assert_allclose(read_rpc(out).project(points), model.project(points), atol=1e-3)
+
+
+def test_a_camera_that_is_no_rpc_says_so_where_an_rpc_is_needed(frame, tmp_path, capsys):
+    assert run("convert", frame, tmp_path / "a.RPB") == 1
+    assert "barpc fit" in capsys.readouterr().err
+    assert not (tmp_path / "a.RPB").exists()
+
+
+def test_a_localisation_grid_is_a_camera(tmp_path, monkeypatch):
+    case = MODELS["localisation grid"]()
+    monkeypatch.setattr(cameras, "read_grid", lambda path, altitudes: _nodes(case.model))
+    monkeypatch.setattr(cameras, "correspondence_kind", lambda path: "grid")
+    path = write_image(tmp_path / "grid.tif")
+    camera = open_camera(path)
+    assert camera.format == "grid"
+    assert camera.model == case.model
+    assert camera.alt_range == (-100.0, 1100.0)
+    assert camera.size == (20501, 19301)
+
+
+def _nodes(grid):
+    from barpc.pointio.tables import Correspondences
+
+    alt, row, col = np.meshgrid(grid.alts, grid.rows, grid.cols, indexing="ij")
+    ground = np.concatenate([grid.lonlat, alt[..., None]], axis=-1)
+    return Correspondences(ground.reshape(-1, 3), np.stack([col, row], axis=-1).reshape(-1, 2))
+
+
+def test_a_radar_product_and_a_vendor_s_grid_go_through_the_verbs(shared_data, tmp_path, capsys):
+    radar = sorted((shared_data / "sar").glob("s1a-iw1-slc-vv-20210216*.xml"))[0]
+    grid = shared_data / "physical" / "GRID_P1BP--2017092838284574CP.tif"
+    for source, kind in ((radar, "sentinel-1"), (grid, "grid")):
+        camera = open_camera(source)
+        assert camera.format == kind
+        middle = (np.array(camera.extent) - 1) / 2
+        assert run("localize", source, *middle, "--json") == 0
+        (ground,) = json.loads(capsys.readouterr().out)
+        assert run("project", source, ground["lon"], ground["lat"], ground["alt"], "--json") == 0
+        (image,) = json.loads(capsys.readouterr().out)
+        np.testing.assert_allclose([image["col"], image["row"]], middle, atol=2e-3)
+        assert run("info", source, "--json") == 0
+        assert json.loads(capsys.readouterr().out)[0]["footprint"]["type"] == "Polygon"
+
+
+# --- what may stand behind a file ---------------------------------------------------------------------------
+
+
+def test_the_camera_of_an_image_may_lie_anywhere(tmp_path):
+    image = write_image(tmp_path / "scene.tif", shape=(1, 40, 60))
+    write_rpc(make_rpc(), tmp_path / "elsewhere" / "other.RPB")
+    camera = open_camera(f"{image},camera={tmp_path / 'elsewhere' / 'other.RPB'}")
+    assert camera.model == make_rpc()
+    assert camera.size == (60, 40)
+    assert camera.path == tmp_path / "elsewhere" / "other.RPB"
+
+
+def test_a_file_whose_name_looks_like_choices_is_a_file(tmp_path):
+    write_rpc(make_rpc(), tmp_path / "a,size=3:4.RPB")
+    camera = open_camera(tmp_path / "a,size=3:4.RPB")
+    assert (camera.model, camera.size) == (make_rpc(), None)
+    assert open_camera(f"{tmp_path / 'a,size=3:4.RPB'},size=5:6").size == (5, 6)
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        ("swath=iw1", "swath is no choice for the kind rpc"),
+        ("size=3", "size=3 cannot be read"),
+        ("size=3:0", "size=3:0 cannot be read"),
+        ("first_pixel=2", "first_pixel=2 cannot be read"),
+        ("band=x", "band=x cannot be read"),
+    ],
+)
+def test_a_choice_that_does_not_go_with_the_camera_names_the_file(choice, words, tmp_path):
+    write_rpc(make_rpc(), tmp_path / "a.RPB")
+    with pytest.raises(InputError, match=words) as error:
+        open_camera(f"{tmp_path / 'a.RPB'},{choice}")
+    assert "a.RPB" in str(error.value)
+
+
+# --- a run with cameras of one's own ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Own:
+    """Somebody's own model: an RPC that hides behind the three methods."""
+
+    inner: barpc.RPC
+
+    def project(self, ground: Array) -> Array:
+        return self.inner.project(ground)
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        return self.inner.project_jacobian(ground)
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        return self.inner.localize(image, alt)
+
+
+def test_views_with_one_s_own_model_are_adjusted_as_files_are(tmp_path):
+    from barpc.pipeline import load_views
+
+    views = load_views(SAMPLES[:2]).views
+    views = [replace(v, sensor=replace(v.sensor, err_bias=None)) for v in views]  # what only an RPC can state
+    own = [replace(v, sensor=Own(v.sensor)) for v in views]
+    files = barpc.adjust(views, tmp_path / "files")
+    mine = barpc.adjust(own, tmp_path / "mine")
+    assert [view.path for view in mine.views] == [str(path) for path in SAMPLES[:2]]
+    for view, expected in zip(mine.views, files.views, strict=True):
+        points = expected.sensor.localize([[0.0, 0.0], [300.0, 900.0]], np.array([200.0, 250.0]))
+        np.testing.assert_allclose(view.sensor.project(points), expected.sensor.project(points), atol=1e-4)
+    assert mine.summary["views"][0]["rpc_source"]["format"] == "given"
+    assert barpc.check(mine.views).passed
+    wrong = replace(own[0], size=(3, 4))
+    with pytest.raises(InputError, match="view says"):
+        barpc.check([wrong, own[1]])

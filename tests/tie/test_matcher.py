@@ -1,0 +1,121 @@
+"""Any matcher goes through the whole stage: dense correlation, one that looks everywhere, one that guesses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+import cv2
+import numpy as np
+import pytest
+
+from barpc.errors import TiePointError
+from barpc.tie import Keypoints, Matches, TieOptions, common_tracks, find_tracks
+from barpc.tie.epipolar import frame
+from barpc.tie.matcher import Prediction
+from barpc.tie.matching import MATCHERS
+from barpc.tie.raster import levelled, read_pixels
+
+HALF = 8
+STEP = 12
+
+
+class Correlated:
+    """Normalised correlation on a grid of A, pixel by pixel of each point's band in B."""
+
+    detects: ClassVar[bool] = False
+
+    def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None:
+        assert [len(k) for k in keypoints] == [0, 0]
+        self.band = options.band
+
+    def match(self, a, b, prediction: Prediction) -> Matches:
+        first, second = (levelled(*read_pixels(v.path, (0, 0, *v.size), self.band)) for v in (a, b))
+        grid = [
+            (x, y)
+            for col, row, width, height in prediction.windows()
+            for y in range(max(row, HALF), min(row + height, a.size[1] - HALF), STEP)
+            for x in range(max(col, HALF), min(col + width, a.size[0] - HALF), STEP)
+        ]
+        points = np.array(grid, dtype=np.float64)[prediction.chosen(len(grid))]
+        where = prediction.at(points)
+        ends = np.stack([where.place(where.before), where.place(where.after)])
+        low, high = ends.min(axis=0) - prediction.half_width, ends.max(axis=0) + prediction.half_width
+        low = np.maximum(np.floor(low).astype(int), HALF)
+        high = np.minimum(np.ceil(high).astype(int), np.array(b.size) - HALF - 1)
+        found, score = [], []
+        for (x, y), (left, top), (right, bottom) in zip(points.astype(int), low, high, strict=True):
+            if right <= left or bottom <= top:
+                found.append((np.nan, np.nan))
+                score.append(2.0)
+                continue
+            patch = first[y - HALF : y + HALF + 1, x - HALF : x + HALF + 1]
+            place = second[top - HALF : bottom + HALF + 1, left - HALF : right + HALF + 1]
+            likeness = cv2.matchTemplate(place, patch, cv2.TM_CCOEFF_NORMED)
+            row, col = np.unravel_index(likeness.argmax(), likeness.shape)
+            found.append((left + col, top + row))
+            score.append(1.0 - likeness[row, col])
+        xy = np.stack([points, np.array(found, dtype=np.float64)], axis=1)
+        good = np.flatnonzero((np.array(score) < 0.3) & prediction.holds(xy))
+        return Matches.of_places(xy[good], np.array(score)[good])
+
+
+class Everywhere(Correlated):
+    """Looks once, in a wide band, and asks of what it found what was predicted."""
+
+    def match(self, a, b, prediction: Prediction) -> Matches:
+        if not hasattr(self, "found"):
+            self.found = super().match(a, b, replace(prediction, probes=None, half_width=90.0))
+        return self.found.select(prediction.holds(self.found.xy))
+
+
+class Guessing(Correlated):
+    """Any place in the band, with any score."""
+
+    def match(self, a, b, prediction: Prediction) -> Matches:
+        rng = np.random.default_rng(0)
+        points = rng.uniform(50, 550, (2000, 2)).round()
+        where = prediction.at(points)
+        along = rng.uniform(where.before, where.after)
+        aside = rng.uniform(-1, 1, len(points)) * prediction.half_width
+        xy = np.stack([points, where.moved(aside).place(along)], axis=1)
+        return Matches.of_places(xy, rng.uniform(0, 1, len(points)))
+
+
+@pytest.fixture(params=[Correlated, Everywhere])
+def matcher(request, monkeypatch) -> str:
+    monkeypatch.setitem(MATCHERS, "another", request.param)
+    return "another"
+
+
+def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(render, matcher) -> None:
+    scene = render(views=3)
+    result = find_tracks(scene.views, TieOptions(matcher=matcher))
+    tracks = result.tracks
+    assert result.keypoints == (0, 0, 0)
+    assert all(report.status == "ok" and report.control_share <= 0.01 for report in result.pairs)
+    assert (np.bincount(tracks.point) == 3).sum() > 200
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        first, second = common_tracks(tracks, i, j)
+        errors = scene.errors(i, j, first, second)
+        assert len(first) > 300
+        assert 1.4826 * np.median(np.abs(errors), axis=0).max() <= 0.06
+        assert (np.abs(errors).max(axis=1) > 1.0).mean() <= 0.02
+
+
+def test_a_matcher_that_guesses_is_not_believed(render, monkeypatch) -> None:
+    monkeypatch.setitem(MATCHERS, "another", Guessing)
+    with pytest.raises(TiePointError, match=r"no common offset|too few matches"):
+        find_tracks(render(views=2).views, TieOptions(matcher="another"))
+
+
+def test_a_place_along_the_line_has_no_error_across_it(render) -> None:
+    first, second = render(views=2).views
+    xy = np.random.default_rng(0).uniform(0, 599, (50, 2))
+    where, along = frame(first, second, xy), np.linspace(-30, 30, 50)
+    np.testing.assert_allclose(where.errors(where.place(along)), np.stack([along, 0 * along], 1), atol=1e-9)
+    np.testing.assert_allclose(
+        where.place(where.after),
+        second.sensor.project(first.sensor.localize(xy, np.full(50, first.alt_range[1]))),
+        atol=1e-6,
+    )
