@@ -147,11 +147,10 @@ def _oddity(name: str, adjustment: Adjustment) -> str:
         )
     if smooth.found(SMOOTH_LEFT)[i] or smooth.shared[i] > SMOOTH_LEFT:
         along = "along the rows" if smooth.by_row[i] > 0.5 else "over the image"
-        return (
-            f"an error of {max(smooth.rms[i], smooth.shared[i]):.2f} px that changes {along} is left, which no "
-            "rotation, translation and drift follow: attitude jitter, optics, or an image that was resampled "
-            "(--model affine)"
-        )
+        why = "attitude jitter, optics, or an image that was resampled (--model affine)"
+        if adjustment.options.drift == 0:
+            why = "a drift was not allowed (--drift 0)"
+        return f"an error of {max(smooth.rms[i], smooth.shared[i]):.2f} px that changes {along} is left: {why}"
     return ""
 
 
