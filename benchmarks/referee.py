@@ -532,8 +532,25 @@ def run(scene: Scene, **options: Any) -> tuple[tuple[SensorModel, ...], Any]:
             paths.append(path)
         write_matches(folder / "ties.npz", scene.tracks, [view.name for view in scene.views])
         given = {"images": "none", "matches": str(folder / "ties.npz"), **options}
+        if scene.gcps is not None:
+            (folder / "points.gcp").write_text(_gcp_text(scene))
+            given["gcp"] = [str(folder / "points.gcp")]
         result = barpc.adjust(paths, folder / "out", with_values(RunOptions(), given))
     return tuple(view.sensor for view in result.views), result.summary
+
+
+def _gcp_text(scene: Scene) -> str:
+    """Control points as ASP writes them: id lat lon alt sigmas, then image col row sigmas of every view."""
+    gcps = scene.gcps
+    assert gcps is not None
+    lines = []
+    for g, (name, (lon, lat, alt)) in enumerate(zip(gcps.names, gcps.lonlatalt.tolist(), strict=True)):
+        words = [name, repr(lat), repr(lon), repr(alt), *map(repr, gcps.sigma[g].tolist())]
+        for k in np.flatnonzero(gcps.point == g):
+            col, row = gcps.xy[k].tolist()
+            words += [scene.views[gcps.view[k]].path, repr(col), repr(row), "0.3", "0.3"]
+        lines.append(" ".join(words))
+    return "\n".join(lines) + "\n"
 
 
 def referee(case: Case, options: AdjustOptions | None = None, relief: Any = None) -> Verdict:

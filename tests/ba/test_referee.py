@@ -1,0 +1,132 @@
+"""Full scenes flown by errors that are not the adjustment's: what is corrected, and what is said of the rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions
+from benchmarks.referee import Case, Errors, cases, judge, make, referee, referee_run, solve
+
+SEEDS = (0, 1, 2)
+TABLE = cases()
+
+
+def hills(lon, lat):
+    """Relief that needs no file: valleys and ridges of some hundred metres."""
+    x, y = (lon - 5.45) * 79e3, (lat - 44.5) * 111e3
+    waves = [
+        np.sin(x / s + p) * np.cos(y / (1.3 * s) - p) * s / 12.0
+        for s, p in ((4000, 0.3), (1500, 1.1), (400, 2.0))
+    ]
+    return 900.0 + sum(waves)
+
+
+def verdicts(name, **options):
+    return [referee(replace(TABLE[name], seed=seed), AdjustOptions(**options), hills) for seed in SEEDS]
+
+
+def median(found, value):
+    return float(np.median([value(v) for v in found]))
+
+
+@pytest.mark.parametrize(
+    ("name", "across", "shape"),
+    [
+        ("no drift", 0.015, 0.2),
+        ("drift 0.3", 0.03, 0.7),
+        ("drift 1", 0.03, 2.0),
+        ("drift 3", 0.03, 5.0),
+        ("quadratic 1", 0.05, 2.0),
+        ("drift 1, 2 views", 0.03, 4.0),
+        ("drift 1, 6 views", 0.03, 0.7),
+        ("drift 1, 5k rows", 0.04, 2.0),
+        ("drift 1, 40k rows", 0.03, 2.0),
+        ("3 x the prior", 0.03, 0.5),
+    ],
+)
+def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, shape):
+    found = verdicts(name)
+    assert median(found, lambda v: v.before.across) > 5.0
+    assert median(found, lambda v: v.after.across) < across
+    assert median(found, lambda v: v.after.shape) < shape
+    assert median(found, lambda v: v.lost) <= (
+        0.015 if name.startswith("quadratic") else 0.01
+    )  # right tie points
+
+
+def test_without_a_drift_in_the_model_the_same_scene_is_not_met():
+    assert median(verdicts("drift 1", drift=0), lambda v: v.after.across) > 0.15
+
+
+def test_the_drift_is_learnt_as_large_as_it_is():
+    sizes = {name: [solve(make(replace(TABLE[name], seed=s), hills))[1].prior.drift_sigma[0] for s in SEEDS]
+             for name in ("no drift", "drift 1", "drift 3")}  # fmt: skip
+    quiet, one, three = (float(np.median(sizes[name])) for name in sizes)
+    assert quiet < 0.25
+    assert 0.25 < one < 1.2  # 0.7 m is flown, of which half is seen
+    assert 0.8 < three < 3.5
+
+
+def test_priors_three_times_too_narrow_are_widened_and_the_stated_place_with_them():
+    found = verdicts("3 x the prior")
+    told = verdicts("3 x the prior", learn_priors=False)
+    assert median(found, lambda v: v.sigma[2]) > 2 * median(told, lambda v: v.sigma[2])
+    assert median(found, lambda v: v.nees) < 0.5 * median(told, lambda v: v.nees)
+
+
+def test_priors_that_hold_are_left_as_they_are():
+    true = Case("as stated", Errors(attitude=5e-6, position=1.0))
+    scales = [solve(make(replace(true, seed=seed), hills))[1].prior.scale for seed in range(6)]
+    assert np.median(scales) == 1.0
+    assert np.max(scales) < 1.5
+
+
+@pytest.mark.parametrize("wrong", [(0, 200.0, 0.0), (1, 200.0, 0.0), (0, 0.0, 800.0), (2, -200.0, 100.0)])
+def test_one_wrong_rpc_of_three_is_named_and_the_place_of_the_scene_still_covered(wrong):
+    named = []
+    for seed in SEEDS:
+        scene = make(replace(TABLE["no drift"], wrong=wrong, seed=seed), hills)
+        sensors, found = solve(scene)
+        after = judge(scene, sensors)
+        named.append(found.prior.odd[wrong[0]])
+        assert found.prior.scale[wrong[0]] == found.prior.scale.max() > 3
+        assert after.across < 0.05
+        assert (
+            np.abs(after.move) <= 4 * found.gauge.sigma
+        ).all()  # the others are twice as far off as stated, too
+
+
+def test_two_views_that_contradict_each_other_are_both_widened_and_none_is_named():
+    pair = replace(TABLE["no drift, 2 views"], wrong=(0, 400.0, 0.0))
+    _, found = solve(make(pair, hills))
+    assert not found.prior.odd.any()
+    assert (found.prior.scale > 3).all()
+
+
+def test_forty_percent_of_a_view_moved_together_is_left_out():
+    found = verdicts("40 % moved")
+    assert median(found, lambda v: v.after.across) < 0.05
+    assert median(found, lambda v: v.caught) > 0.99
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "word"),
+    [
+        ("no drift", "good", ""),
+        ("drift 3", "good", ""),
+        ("jitter 0.5 at 1 Hz", "look", "jitter"),
+        ("jitter 0.1 at 5 Hz", "look", "jitter"),
+        ("clouds 60 %", "look", "rejected"),
+        ("RPC 200 px wrong", "look", "farther off than stated"),
+    ],
+)
+def test_what_is_said_is_true(name, status, word):
+    found = referee_run(replace(TABLE[name], seed=1), hills)
+    assert found.status == status
+    assert found.code == (0 if status == "good" else 3)
+    assert word in " ".join(found.words)
+    if status == "good":
+        assert found.after.across < 0.15
