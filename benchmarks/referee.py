@@ -549,7 +549,8 @@ def _gcp_text(scene: Scene) -> str:
         for k in np.flatnonzero(gcps.point == g):
             col, row = gcps.xy[k].tolist()
             words += [scene.views[gcps.view[k]].path, repr(col), repr(row), "0.3", "0.3"]
-        lines.append(" ".join(words))
+        if (gcps.point == g).any():
+            lines.append(" ".join(words))
     return "\n".join(lines) + "\n"
 
 
