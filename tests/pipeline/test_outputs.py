@@ -12,7 +12,7 @@ import pytest
 from barpc import handoff
 from barpc.errors import OutputError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
-from barpc.handoff import Consumer, Reading, control_grid, difference, verify
+from barpc.handoff import CONSUMERS, Consumer, Reading, control_grid, difference, verify
 from barpc.pipeline import outputs
 from barpc.pipeline.outputs import REOPENED, file_names, refuse_shadows, write_view
 from barpc.rpcio import read_rpc, write_rpc
@@ -170,13 +170,15 @@ def test_the_largest_error_of_all_points_is_what_counts(tmp_path, monkeypatch) -
         "corner": Consumer("numpy", one_corner),
         "nan": Consumer("numpy", no_number),
         "absent": Consumer("no_such_package", no_number),
+        "barpc": CONSUMERS["barpc"],
     }
     monkeypatch.setattr(handoff, "CONSUMERS", consumers)
     monkeypatch.setattr(
         handoff, "_readers", lambda path: [name for name in consumers if consumers[name].installed]
     )
     write_rpc(rpc, tmp_path / "A_RPC.TXT")
-    corner, nan = verify([tmp_path / "A_RPC.TXT"], rpc, SIZE, ALTITUDES)
+    corner, nan, own = verify([tmp_path / "A_RPC.TXT"], rpc, SIZE, ALTITUDES)
+    assert own.passed
     assert (corner.consumer, corner.note) == ("corner", "")
     assert corner.max_error == pytest.approx(5.0)
     assert not nan.passed
