@@ -33,6 +33,8 @@ SCIPY_UNKNOWNS = 200
 _XTOL = 1e-12
 _ROUNDING = 1e-9
 """A cost does not fall any more where the step promises less than this fraction."""
+_LOST = 1e-6
+"""Nor where it promises less than this one, and no damping however strong makes it fall."""
 
 
 @dataclass(frozen=True)
@@ -223,9 +225,9 @@ def _levenberg_marquardt(
             state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
             reduced, before = trial, gain if not damping else np.inf
             damping = damping / 10.0 if damping > 1e-8 else 0.0
-        elif gain <= _ROUNDING * state.cost:
+        elif gain <= (_ROUNDING if damping < 1e8 else _LOST) * state.cost:
             return Minimum(state, reduced, status=_status(state, "what a step gains is lost in rounding"))
-        elif damping > 1e8:
+        elif damping >= 1e8:
             raise AdjustError(f"no step lowers the cost {state.cost:.6g}: the solution is not usable")
         else:
             damping = max(10.0 * damping, 1e-6)

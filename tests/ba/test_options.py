@@ -95,7 +95,7 @@ ROWS = [
     Row("dem_for_all", False, True, off_dem, -1, rest={"dem_sigma": 0.5}, dem=400.0),
     Row("min_convergence", 0.01, 90.0, lambda found: 1 + found.held.sum(), 1, 10.0),
     Row("max_steps", 1, 30, steps, 1, rest={"loss": "linear", "tolerance": 1e-15, "solver": "sparse"}),
-    Row("tolerance", 1e-14, 0.9, steps, -1, rest={"loss": "linear", "solver": "sparse"}),
+    Row("tolerance", 1e-14, 1e-2, steps, -1, rest={"loss": "linear", "solver": "sparse"}),
 ]
 ELSEWHERE = {
     "min_observations": "test_a_view_needs_as_many_observations_as_asked_for",

@@ -363,7 +363,7 @@ def _ground_range(root: Element, name: str) -> GroundRange | None:
     if len({len(c) for c in forward}) > 1 or len({len(c) for c in backward}) > 1:
         raise RpcFormatError(f"{name}: ground range polynomials of different lengths")
     time = np.array([f.time("azimuthTime") for f in fields], dtype="datetime64[ns]")
-    if len(time) > 1 and not (np.diff(time) > np.timedelta64(0)).all():
+    if len(time) > 1 and not (np.diff(time) > np.timedelta64(0, "ns")).all():
         raise RpcFormatError(f"{name}: the times of the ground range polynomials do not rise")
     slant, ground = (np.array([f.numbers(tag)[0] for f in fields]) for tag in ("sr0", "gr0"))
     return GroundRange(time, slant, ground, np.array(forward), np.array(backward))
