@@ -231,8 +231,9 @@ def test_options_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
 
 
 def test_options_at_the_end_of_their_range_are_taken() -> None:
-    TieOptions(patch=9, tile=128, cell=8, min_matches=4, min_overlap=0.0, min_angle=0.0, ratio=1.0)
-    TieOptions(min_overlap=1.0, min_correlation=0.99, band=1)
+    low = TieOptions(patch=9, tile=128, cell=8, min_matches=4, min_overlap=0.0, min_angle=0.0, ratio=1.0)
+    assert (low.patch, low.ratio) == (9, 1.0)
+    assert TieOptions(min_overlap=1.0, min_correlation=0.99, band=1).min_overlap == 1.0
 
 
 # --- pairs -------------------------------------------------------------------------------------------------
