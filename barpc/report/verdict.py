@@ -170,7 +170,8 @@ def _block_reasons(run: Run) -> list[str]:
         )
     if noise > NOISE_LIMIT:
         out.append(
-            f"Tie points scatter {noise:.1f} times as much as stated: the matches are worse than they seem."
+            f"Tie points scatter {noise:.1f} times as much as stated: wrong matches, or errors that these unknowns "
+            "cannot follow."
         )
     with np.errstate(all="ignore"):
         moved = np.abs(gauge.shift) / gauge.sigma

@@ -112,7 +112,7 @@ def _schur(matrix: np.ndarray, gradient: np.ndarray, size: int) -> tuple[np.ndar
     return matrix[:size, :size] - pull @ matrix[size:, :size], gradient[:size] - pull @ gradient[size:]
 
 
-def _close(found: np.ndarray, expected: np.ndarray, rtol: float = 1e-5) -> None:
+def _assert_close(found: np.ndarray, expected: np.ndarray, rtol: float = 1e-5) -> None:
     np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol * np.abs(expected).max())
 
 
@@ -126,8 +126,8 @@ def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_pro
     reduced = case.reduced
     expected, slope = _schur(matrix, gradient, size)
     found = reduced.matrix if isinstance(reduced.matrix, np.ndarray) else reduced.matrix.toarray()
-    _close(found, expected, 3e-5)
-    _close(reduced.gradient, slope, 3e-5)
+    _assert_close(found, expected, 3e-5)
+    _assert_close(reduced.gradient, slope, 3e-5)
     assert reduced.cost == pytest.approx(cost, rel=1e-7)
     moved = np.linalg.solve(matrix[size:, size:], gradient[size:])
     assert reduced.gain == pytest.approx(gradient[size:] @ moved, rel=1e-5)
@@ -138,8 +138,8 @@ def test_pieces_of_any_size_make_the_same_system(case, monkeypatch):
     monkeypatch.setattr(normal, "CHUNK", 3)
     monkeypatch.setattr("barpc.ba.cameras.CHUNK", 5)
     pieces = case.reduced
-    _close(pieces.matrix, whole.matrix, 1e-12)
-    _close(pieces.gradient, whole.gradient, 1e-9)
+    _assert_close(pieces.matrix, whole.matrix, 1e-12)
+    _assert_close(pieces.gradient, whole.gradient, 1e-9)
 
 
 def test_one_step_is_the_gauss_newton_step_of_the_whole(case):
@@ -147,14 +147,14 @@ def test_one_step_is_the_gauss_newton_step_of_the_whole(case):
     whole = -np.linalg.solve(matrix, gradient)
     step, gain, _ = camera_step(case.problem, case.reduced)
     size = case.params.size
-    _close(step.ravel(), whole[:size], 1e-4)
-    _close(case.reduced.point_step(step).ravel(), whole[size:], 1e-4)
+    _assert_close(step.ravel(), whole[:size], 1e-4)
+    _assert_close(case.reduced.point_step(step).ravel(), whole[size:], 1e-4)
     assert gain == pytest.approx(-gradient @ whole, rel=1e-5)
     projected = case.problem.linearise(case.params, case.points)
     state = Minimum(_state(case), case.reduced).state
     moved = gauss_newton(case.problem, state, case.weight, case.problem.linearise(case.params, case.points))
     assert projected.image.shape == (2, len(case.plain.view))
-    _close(moved.params - case.params, whole[:size].reshape(case.params.shape), 1e-4)
+    _assert_close(moved.params - case.params, whole[:size].reshape(case.params.shape), 1e-4)
     assert moved.cost == pytest.approx(cost + gradient @ whole, rel=1e-5)
 
 
@@ -168,7 +168,7 @@ def test_damping_adds_its_part_of_the_diagonal(case):
     expected, slope = _schur(matrix, gradient, size)
     step, _, _ = camera_step(case.problem, case.reduced, damping=0.4)
     wanted = -np.linalg.solve(expected + 0.4 * np.diag(np.diag(expected)), slope)
-    _close(step.ravel(), wanted, 1e-4)
+    _assert_close(step.ravel(), wanted, 1e-4)
 
 
 def test_fixed_views_do_not_move_and_have_no_variance():
@@ -179,11 +179,11 @@ def test_fixed_views_do_not_move_and_have_no_variance():
     whole = np.zeros(len(matrix))
     whole[free] = -np.linalg.solve(matrix[np.ix_(free, free)], gradient[free])
     step, _, _ = camera_step(held.problem, held.reduced)
-    _close(step.ravel(), whole[:24], 1e-4)
+    _assert_close(step.ravel(), whole[:24], 1e-4)
     covariance = Minimum(_state(held), held.reduced).covariance(held.problem.free)
     inverse = np.zeros_like(matrix)
     inverse[np.ix_(free, free)] = np.linalg.inv(matrix[np.ix_(free, free)])
-    _close(covariance.full, inverse[:24, :24], 1e-4)
+    _assert_close(covariance.full, inverse[:24, :24], 1e-4)
     assert not covariance.full[12:18].any()
 
 
@@ -192,7 +192,7 @@ def test_points_alone_take_the_gauss_newton_step_of_their_own_blocks(case):
     size = case.params.size
     projected = case.problem.project_points(case.params, case.points)
     moved = case.problem.triangulate(case.points, projected, case.weight) - case.points
-    _close(moved.ravel(), -np.linalg.solve(matrix[size:, size:], gradient[size:]), 1e-5)
+    _assert_close(moved.ravel(), -np.linalg.solve(matrix[size:, size:], gradient[size:]), 1e-5)
 
 
 def test_covariances_are_blocks_of_the_inverse_of_the_whole(case):
@@ -200,17 +200,17 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole(case):
     inverse = np.linalg.inv(matrix)
     size, q = case.params.size, case.params.shape[1]
     covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
-    _close(covariance.view(1, 3), inverse[q : 2 * q, 3 * q : 4 * q], 1e-4)
-    _close(covariance.view(2), inverse[2 * q : 3 * q, 2 * q : 3 * q], 1e-4)
-    _close(covariance.full, inverse[:size, :size], 1e-4)
-    _close(covariance.view(0, 2), inverse[:q, 2 * q : 3 * q], 1e-4)
+    _assert_close(covariance.view(1, 3), inverse[q : 2 * q, 3 * q : 4 * q], 1e-4)
+    _assert_close(covariance.view(2), inverse[2 * q : 3 * q, 2 * q : 3 * q], 1e-4)
+    _assert_close(covariance.full, inverse[:size, :size], 1e-4)
+    _assert_close(covariance.view(0, 2), inverse[:q, 2 * q : 3 * q], 1e-4)
     index = np.array([1, 5, 7, 10])
     of_points = covariance.points(index)
     for p, found in zip(index, of_points, strict=True):
         place = size + 3 * p + np.arange(3)
-        _close(found, inverse[np.ix_(place, place)], 1e-4)
+        _assert_close(found, inverse[np.ix_(place, place)], 1e-4)
     pair = np.r_[q : 2 * q, 3 * q : 4 * q]
-    _close(covariance.joint(np.array([1, 3])), inverse[np.ix_(pair, pair)], 1e-4)
+    _assert_close(covariance.joint(np.array([1, 3])), inverse[np.ix_(pair, pair)], 1e-4)
 
 
 def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(case):
@@ -240,9 +240,9 @@ def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(
     np.testing.assert_allclose(report.motion_sigma, np.sqrt(np.diag(expected)), rtol=1e-4)
     np.testing.assert_allclose(report.sigma, report.motion_sigma[:3])
     assert report.radius == pytest.approx(radius, rel=1e-9)
-    _close(report.shift, enu @ (case.points - before)[index].mean(axis=0), 1e-6)
+    _assert_close(report.shift, enu @ (case.points - before)[index].mean(axis=0), 1e-6)
     rebuilt = sum(np.outer(mode.motion, mode.motion) for mode in report.modes)
-    _close(rebuilt, expected, 1e-4)
+    _assert_close(rebuilt, expected, 1e-4)
     sigmas = [mode.sigma for mode in report.modes]
     np.testing.assert_allclose(sigmas, np.sqrt(np.linalg.eigvalsh(expected)[::-1]), rtol=1e-3)
     for mode in report.modes:
@@ -278,9 +278,9 @@ def test_a_joint_prior_of_an_earlier_block_adds_its_information():
     information = np.asarray(first.covariance.reduced.matrix)
     expected = np.zeros((24, 24))
     expected[:18, :18] = information - np.diag(1.0 / old_sigma**2)
-    _close(a.matrix - b.matrix, expected, 1e-8)
+    _assert_close(a.matrix - b.matrix, expected, 1e-8)
     slope = np.r_[information @ offset - params[:3].ravel() / old_sigma**2, np.zeros(6)]
-    _close(a.gradient - b.gradient, slope, 1e-8)
+    _assert_close(a.gradient - b.gradient, slope, 1e-8)
     cost = offset @ information @ offset - ((params[:3].ravel() / old_sigma) ** 2).sum()
     assert a.cost - b.cost == pytest.approx(cost, rel=1e-8)
 
