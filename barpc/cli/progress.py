@@ -72,7 +72,7 @@ def _cluster(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise InputError("-j with an address needs the extra: pip install 'barpc[cluster]'") from error
+        raise InputError(f"-j {address}: an address needs the extra: pip install 'barpc[cluster]'") from error
     try:
         client = Client(address, timeout=20)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
