@@ -146,6 +146,7 @@ class Case:
     rows: int = 20000
     cols: int = 20000
     pitch: tuple[float, ...] = (-12.0, 0.0, 12.0)
+    roll: float = 4.0
     gsd: float = 0.5
     tracks: int = 3000
     noise: float = 0.1
@@ -281,7 +282,7 @@ def _fly(
 ) -> tuple[SensorModel, Flown, tuple[float, float]]:
     """The delivered RPC of a view, and the camera that took it."""
     pitch = case.pitch[index]
-    across = 4.0 * np.sin(2.4 * index + 0.6)
+    across = case.roll * np.sin(2.4 * index + 0.6)
     tangent = np.tan(np.radians([pitch, across]))
     heading = Look().heading
     look = Look(

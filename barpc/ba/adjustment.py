@@ -224,8 +224,11 @@ def _start(
     points[~np.isfinite(points)] = 0.0
     control = [] if gcps is None else [ground_control(gcps, block.num_tracks + np.arange(len(gcps.names)))]
     projected = problem.project_points(params, points)
-    weak = convergence_angles(problem.structure, projected, points) < np.radians(options.min_convergence)
-    heights = Heights(tuple(control), weak, np.arange(block.num_tracks), block.alt_range, options, dem)
+    seen = np.bincount(block.point, minlength=block.num_points) > 0
+    angles = convergence_angles(problem.structure, projected, points)
+    weak = seen & (angles < np.radians(options.min_convergence))
+    tracks = np.flatnonzero(seen[: block.num_tracks])
+    heights = Heights(tuple(control), weak, tracks, block.alt_range, options, dem)
     weight = block.use / block.sigma
     for _ in range(_FIRST_STEPS):
         points = heights.hold(problem, points).triangulate(points, projected, weight)

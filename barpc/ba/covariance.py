@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg as la
 
 from barpc.ba.linear import Factor
 from barpc.ba.normal import Reduced, solve_transposed
@@ -77,6 +78,25 @@ class Covariance:
             sensitivity = -inverse[n] @ self.reduced.cross[rows].transpose(1, 0, 2).reshape(3, -1)
             cameras = self.joint(structure.view[rows])
             out[n] = inverse[n] @ inverse[n].T + sensitivity @ cameras @ sensitivity.T
+        return out if self.reduced.common is None else self._with_common(index, inverse, out)
+
+    def _with_common(self, index: IntArray, inverse: Array, out: Array) -> Array:
+        """`out` where points share errors, which move with every camera."""
+        structure, common, q = self.reduced.structure, self.reduced.common, self.num_unknowns
+        assert common is not None
+        place = {int(p): n for n, p in enumerate(common.index)}
+        for n, p in enumerate(index):
+            if int(p) not in place:
+                continue
+            shared = (
+                -inverse[n] @ la.solve_triangular(common.upper, common.cross[place[int(p)]].T, trans="T").T
+            )
+            rows = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
+            sensitivity = -shared @ common.by_camera
+            for k in rows:
+                at = structure.view[k] * q
+                sensitivity[:, at : at + q] -= inverse[n] @ self.reduced.cross[k]
+            out[n] = inverse[n] @ inverse[n].T + shared @ shared.T + sensitivity @ self.solve(sensitivity.T)
         return out
 
     def joint(self, views: IntArray) -> Array:

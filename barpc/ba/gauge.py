@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as la
 
 from barpc.ba.covariance import Covariance
 from barpc.ba.normal import solve_lower
@@ -89,14 +90,18 @@ def gauge_report(covariance: Covariance, points: Array, before: Array, use: Bool
     enu = enu_basis(ground_from_ecef(middle))
     local = (points[use] - middle) @ enu.T
     radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
-    by_unknown = _motion_by_unknowns(covariance, local / radius, enu, use)
-    motion_covariance = by_unknown @ covariance.solve(by_unknown.T)
+    by_unknown, own = _motion_by_unknowns(covariance, local / radius, enu, use, use.sum() / len(index))
+    motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
     return GaugeReport(enu @ shift_of_all, sigma[:3], sigma, _modes(motion_covariance), radius)
 
 
-def _motion_by_unknowns(covariance: Covariance, local: Array, enu: Array, use: BoolArray) -> Array:
-    """(7, N q): the scene's motions by the camera unknowns, points at their optimum."""
+def _motion_by_unknowns(
+    covariance: Covariance, local: Array, enu: Array, use: BoolArray, share: float
+) -> tuple[Array, Array]:
+    """The scene's motions by the camera unknowns (7, N q), and their covariance (7, 7) where the cameras are known,
+    of points that are a `share` of those that count.
+    """
     reduced = covariance.reduced
     structure = reduced.structure
     count, q = len(MOTIONS), covariance.num_unknowns
@@ -112,7 +117,16 @@ def _motion_by_unknowns(covariance: Covariance, local: Array, enu: Array, use: B
     bounds = np.searchsorted(rows, structure.bounds)
     filled = np.flatnonzero(np.diff(bounds))
     by_unknown[filled] = -np.add.reduceat(products.reshape(-1, q * count), bounds[filled], axis=0)
-    return by_unknown.reshape(-1, q, count).transpose(2, 0, 1).reshape(count, -1)
+    flat = whitened[index].reshape(-1, count)
+    by_camera, own = (
+        by_unknown.reshape(-1, q, count).transpose(2, 0, 1).reshape(count, -1),
+        share * flat.T @ flat,
+    )
+    if reduced.common is not None:
+        moved = np.einsum("qic,qim->cm", whitened[reduced.common.index], reduced.common.cross)
+        shared = -la.solve_triangular(reduced.common.upper, moved.T, trans="T").T
+        by_camera, own = by_camera - shared @ reduced.common.by_camera, own + shared @ shared.T
+    return by_camera, own
 
 
 def _motion_of_points(local: Array) -> Array:

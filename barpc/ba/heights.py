@@ -17,6 +17,7 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.scene import BoolArray, IntArray
 
 _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
+_TOGETHER = 0.25  # of that spread: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
 
 
 def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:
@@ -75,13 +76,15 @@ class Heights:
         if not len(index):
             return None
         if dem is not None:
-            return terrain_heights(points, index, dem, options.dem_sigma)
+            return terrain_heights(points, index, dem, options.dem_sigma, options.dem_bias_sigma)
         others = self.tracks[~weak]
         if len(others) >= 10:
             low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
-            return flat_heights(points, index, float(middle), max(float(high - low), _FLAT_SIGMA))
-        low, high = self.alt_range
-        return flat_heights(points, index, 0.5 * (low + high), max(0.5 * (high - low), _FLAT_SIGMA))
+        else:
+            low, high = self.alt_range
+            middle = 0.5 * (low + high)
+        sigma = max(float(high - low) * (1.0 if len(others) >= 10 else 0.5), _FLAT_SIGMA)
+        return flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)
 
     def warn(self) -> None:
         """Say that tracks are held in height without a DEM."""

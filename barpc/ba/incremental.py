@@ -14,7 +14,6 @@ import numpy as np
 import scipy.linalg as la
 
 from barpc.ba.blocks import CameraPrior, JointPrior
-from barpc.ba.solve import free_part
 from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.record import load_npz
@@ -106,15 +105,13 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
     BlockPrior
     """
     covariance, n = adjustment.covariance, len(adjustment.names)
-    part = free_part(covariance.free, covariance.reduced.matrix)
-    dense = part if isinstance(part, np.ndarray) else part.toarray()
     views = np.flatnonzero(covariance.free.reshape(n, -1)[:, 0])
     return BlockPrior(
         tuple(adjustment.names[v] for v in views),
         adjustment.options.model,
         adjustment.cameras.unknowns.drift,
         adjustment.params[views],
-        dense,
+        covariance.reduced.plain(covariance.free),
         adjustment.cameras.unknowns.center[views],
     )
 

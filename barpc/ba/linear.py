@@ -40,8 +40,8 @@ class Factor:
     method: str
 
 
-def factorize(matrix: Matrix, damping: float = 0.0) -> Factor:
-    """Factorise S + damping diag(S).
+def factorize(matrix: Matrix, damping: float = 0.0, less: Array | None = None) -> Factor:
+    """Factorise S + damping diag(S) - B^T B.
 
     Parameters
     ----------
@@ -49,6 +49,8 @@ def factorize(matrix: Matrix, damping: float = 0.0) -> Factor:
         Symmetric, positive definite.
     damping : float
         Relative to the diagonal.
+    less : (m, n) or None
+        B, a few rows (Woodbury's formula).
 
     Returns
     -------
@@ -61,6 +63,8 @@ def factorize(matrix: Matrix, damping: float = 0.0) -> Factor:
     AdjustError
         The matrix is not finite.
     """
+    if less is not None:
+        return _updated(factorize(matrix, damping), less)
     diagonal = matrix.diagonal()
     if not np.isfinite(diagonal).all():
         raise AdjustError(
@@ -85,6 +89,19 @@ def factorize(matrix: Matrix, damping: float = 0.0) -> Factor:
         _LOG.warning("sparse factorisation failed (%s): going on by conjugate gradients", error)
         return _iterative(sparse)
     return Factor(lu.solve, "sparse")
+
+
+def _updated(factor: Factor, less: Array) -> Factor:
+    """The factor of S - B^T B from that of S."""
+    pulled = factor.solve(np.ascontiguousarray(less.T))
+    small = la.cho_factor(np.eye(len(less)) - less @ pulled)
+
+    def solve(b: Array) -> Array:
+        first = factor.solve(b)
+        solved: Array = first + pulled @ la.cho_solve(small, less @ first)
+        return solved
+
+    return Factor(solve, factor.method)
 
 
 def _banded(matrix: sp.csc_array, order: IntArray) -> Factor | None:

@@ -2,7 +2,8 @@
 
 With whitened derivatives A_k by the point and B_k by the view's unknowns, V_p = sum A^T A = L L^T and
 Y_k = L^-1 A_k^T B_k, the camera matrix is S = diag(sum B^T B) - sum_p Y^T Y and its gradient
-g = sum B^T r - sum Y^T h, where h_p = L^-1 sum A^T r.
+g = sum B^T r - sum Y^T h, where h_p = L^-1 sum A^T r. Errors that heights have in common are eliminated after the
+points: they couple all cameras, so that what they take off S stays apart from it where S is sparse.
 """
 
 from __future__ import annotations
@@ -11,11 +12,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as la
 import scipy.sparse as sp
 
-from barpc.ba.linear import Matrix
+from barpc.ba.blocks import PointPrior
+from barpc.ba.linear import Factor, Matrix, factorize
 from barpc.ba.structure import Structure
 from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
 
 CHUNK = 8192
 """Observations, or pairs of them, multiplied at a time."""
@@ -28,25 +32,57 @@ TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
 
 
 @dataclass(frozen=True)
+class Common:
+    """Errors that points have in common, eliminated after the points.
+
+    Parameters
+    ----------
+    index : (Q,)
+        The points.
+    cross : (Q, 3, m)
+        L^-1 times the points' second derivative with the errors.
+    upper : (m, m)
+        U of their matrix U^T U once the points are eliminated.
+    by_camera : (m, N q)
+        U^-T times their second derivative with the cameras.
+    half : (m,)
+        U^-T times their gradient.
+    """
+
+    index: IntArray
+    cross: Array
+    upper: Array
+    by_camera: Array
+    half: Array
+
+    def step(self, step: Array) -> Array:
+        """The move of the errors (m,) that goes with a step (N q,) of the camera unknowns."""
+        moved: Array = -la.solve_triangular(self.upper, self.half + self.by_camera @ step)
+        return moved
+
+
+@dataclass(frozen=True)
 class Reduced:
     """The linearised problem with its points eliminated.
 
     Parameters
     ----------
     matrix : (N q, N q) array or sparse
-        S.
+        S; where it is sparse, without what the common errors take off it.
     gradient : (N q,)
         g: derivative of half the cost by the camera unknowns, points at their (linear) optimum.
     cost : float
         Sum of squared whitened residuals.
     gain : float
-        What moving the points alone would take off the cost: sum |h|^2.
+        What moving the points (and common errors) alone would take off the cost: sum |h|^2.
     lower : (6, P)
         L: its elements 00, 10, 20, 11, 21, 22.
     half : (P, 3)
         h.
     cross : (K, 3, q)
         Y.
+    common : Common or None
+        Errors that the points have in common.
     """
 
     structure: Structure
@@ -57,6 +93,25 @@ class Reduced:
     lower: Array
     half: Array
     cross: Array
+    common: Common | None = None
+
+    def plain(self, free: BoolArray) -> Array:
+        """S (n, n) as an array, of the unknowns that are free (N q,)."""
+        if isinstance(self.matrix, np.ndarray):
+            return self.matrix if free.all() else self.matrix[np.ix_(free, free)]
+        matrix: Array = self.matrix.tocsr()[free][:, free].toarray()
+        return (
+            matrix
+            if self.common is None
+            else matrix - self.common.by_camera[:, free].T @ self.common.by_camera[:, free]
+        )
+
+    def factor(self, free: BoolArray, damping: float = 0.0) -> Factor:
+        """The factorised S, of the unknowns that are free (N q,)."""
+        if isinstance(self.matrix, np.ndarray):
+            return factorize(self.plain(free), damping)
+        matrix = self.matrix if free.all() else self.matrix.tocsr()[free][:, free]
+        return factorize(matrix, damping, None if self.common is None else self.common.by_camera[:, free])
 
     def point_step(self, step: Array) -> Array:
         """The move of the points (P, 3) [m] that goes with a step (N, q) of the camera unknowns."""
@@ -65,7 +120,10 @@ class Reduced:
         for v, (start, stop) in enumerate(zip(structure.bounds[:-1], structure.bounds[1:], strict=True)):
             rows = self.cross[start:stop].reshape(-1, step.shape[1])
             moved[:, start:stop] = (rows @ step[v]).reshape(-1, 3).T
-        return -solve_transposed(self.lower, self.half.T + structure.sum_points(moved)).T
+        half = self.half.T + structure.sum_points(moved)
+        if self.common is not None:
+            half[:, self.common.index] += (self.common.cross @ self.common.step(step.ravel())).T
+        return -solve_transposed(self.lower, half).T
 
 
 def reduce_normal(
@@ -77,6 +135,7 @@ def reduce_normal(
     point_gradient: Array,
     camera_diagonal: Array,
     camera_gradient: Array,
+    point_prior: PointPrior | None = None,
 ) -> Reduced:
     """Eliminate the points of a linearised problem.
 
@@ -92,6 +151,8 @@ def reduce_normal(
         What priors add to V (elements as in `Reduced.lower`) and to the points' gradient.
     camera_diagonal, camera_gradient : (N, q)
         What priors add to the diagonal of S and to g.
+    point_prior : PointPrior or None
+        Whose common errors are to be eliminated, too.
 
     Returns
     -------
@@ -106,16 +167,45 @@ def reduce_normal(
     gradient = camera_gradient + structure.sum_views(slope)
     diagonal = _diagonal_blocks(structure, by_unknown, cross)
     diagonal[:, np.arange(q), np.arange(q)] += camera_diagonal
-    matrix = _assemble(structure, diagonal, _pair_blocks(structure, cross))
+    matrix, slope_all = _assemble(structure, diagonal, _pair_blocks(structure, cross)), gradient.ravel()
+    gain = float((half**2).sum())
+    common = None
+    if point_prior is not None and point_prior.common.shape[2]:
+        common = _common(structure, point_prior, lower, half, cross)
+        slope_all = slope_all - common.by_camera.T @ common.half
+        gain += float(common.half @ common.half)
+        if isinstance(matrix, np.ndarray):
+            matrix = matrix - common.by_camera.T @ common.by_camera
     return Reduced(
-        structure,
-        matrix,
-        gradient.ravel(),
-        float((residual**2).sum()),
-        float((half**2).sum()),
-        lower,
-        half.T,
-        cross,
+        structure, matrix, slope_all, float((residual**2).sum()), gain, lower, half.T, cross, common
+    )
+
+
+def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:
+    """Common errors of the points of a prior; their gradient vanishes before the points move, as they are the best."""
+    index, m = prior.index, prior.common.shape[2]
+    by_point = np.swapaxes(prior.rows, 1, 2) @ -prior.common
+    whitened = np.stack([solve_lower(lower[:, index], by_point[:, :, j].T).T for j in range(m)], axis=2)
+    flat = whitened.reshape(-1, m)
+    upper = la.cholesky(prior.information() - flat.T @ flat)
+    place = np.full(structure.num_points, -1)
+    place[index] = np.arange(len(index))
+    at = place[structure.point]
+    rows = np.flatnonzero(at >= 0)
+    products = np.zeros((len(at), m * cross.shape[2]))
+    products[rows] = (np.swapaxes(whitened[at[rows]], 1, 2) @ cross[rows]).reshape(
+        len(rows), products.shape[1]
+    )
+    by_camera = (
+        -structure.sum_views(products.T).reshape(structure.num_views, m, -1).swapaxes(0, 1).reshape(m, -1)
+    )
+    gradient = -np.einsum("qim,iq->m", whitened, half[:, index])
+    return Common(
+        index,
+        whitened,
+        upper,
+        la.solve_triangular(upper, by_camera, trans="T"),
+        la.solve_triangular(upper, gradient, trans="T"),
     )
 
 

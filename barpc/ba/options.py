@@ -66,7 +66,10 @@ class AdjustOptions:
     view_weights : mapping of str to float
         Relative weight of a view's observations (1 where absent): their sigmas are divided by it.
     dem_sigma : float
-        Standard deviation of the DEM [m].
+        Standard deviation of single heights of the DEM [m].
+    dem_bias_sigma : float
+        Standard deviation of what all of its heights are wrong by together (a geoid left out: 20 m and more),
+        and of its slopes at the scene's edges [m].
     dem_for_all : bool
         Hold every track to the DEM; otherwise only those seen under too small an angle.
     min_convergence : float
@@ -100,6 +103,7 @@ class AdjustOptions:
     fixed: tuple[str, ...] = ()
     view_weights: Mapping[str, float] = field(default_factory=dict)
     dem_sigma: float = 10.0
+    dem_bias_sigma: float = 20.0
     dem_for_all: bool = False
     min_convergence: float = 1.0
     min_observations: int = 4
@@ -116,7 +120,14 @@ class AdjustOptions:
         _one_of("drift", self.drift, (None, 0, 1, 2))
         if self.drift and "rotation" not in self.model:
             raise InputError(f"drift {self.drift} needs a model with a rotation, not {self.model!r}")
-        for name in ("sigma_attitude", "sigma_position", "sigma_drift", "sigma_shift", "dem_sigma"):
+        for name in (
+            "sigma_attitude",
+            "sigma_position",
+            "sigma_drift",
+            "sigma_shift",
+            "dem_sigma",
+            "dem_bias_sigma",
+        ):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise InputError(f"{name} must be positive, found {value}")

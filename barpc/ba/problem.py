@@ -73,9 +73,7 @@ class Problem:
         cost = float((self.camera_prior.residual(params) ** 2).sum())
         if self.joint_prior is not None:
             cost += float((self.joint_prior.residual(params) ** 2).sum())
-        if self.point_prior is not None:
-            cost += float((self.point_prior.residual(points) ** 2).sum())
-        return cost
+        return cost if self.point_prior is None else cost + self.point_prior.cost(points)
 
     def cost(self, params: Array, points: Array, whitened: Array) -> float:
         """The whole sum of squares, of whitened residuals (2, K) and the priors'."""
@@ -125,6 +123,7 @@ class Problem:
             *self._point_terms(points),
             jacobian**2,
             jacobian * self.camera_prior.residual(params),
+            self.point_prior,
         )
         reduced = replace(reduced, cost=reduced.cost + self.prior_cost(params, points))
         return self._add_joint(reduced, params)
@@ -175,8 +174,7 @@ class Problem:
         if isinstance(matrix, np.ndarray):
             matrix = matrix.copy()
             matrix[np.ix_(prior.index, prior.index)] += information
-        else:
-            row, col = np.meshgrid(prior.index, prior.index, indexing="ij")
-            extra = sp.coo_array((information.ravel(), (row.ravel(), col.ravel())), shape=matrix.shape)
-            return replace(reduced, matrix=sp.csr_array(matrix) + sp.csr_array(extra), gradient=gradient)
-        return replace(reduced, matrix=matrix, gradient=gradient)
+            return replace(reduced, matrix=matrix, gradient=gradient)
+        row, col = np.meshgrid(prior.index, prior.index, indexing="ij")
+        extra = sp.coo_array((information.ravel(), (row.ravel(), col.ravel())), shape=matrix.shape)
+        return replace(reduced, matrix=sp.csr_array(matrix) + sp.csr_array(extra), gradient=gradient)

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 
 from barpc.ba.cameras import Projected
 from barpc.ba.covariance import Covariance
-from barpc.ba.linear import Factor, Matrix, factorize
+from barpc.ba.linear import Factor
 from barpc.ba.normal import Reduced
 from barpc.ba.problem import Problem
 from barpc.errors import AdjustError
@@ -91,7 +91,7 @@ class Minimum:
         factor = self.factor
         if factor is None:
             try:
-                factor = factorize(free_part(free, self.reduced.matrix))
+                factor = self.reduced.factor(free)
             except np.linalg.LinAlgError as error:
                 raise AdjustError(
                     f"the normal equations are not positive definite at the solution ({error}): do the tie points "
@@ -177,21 +177,11 @@ def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tup
     free = problem.free
     step = np.zeros(len(free))
     gradient = reduced.gradient[free]
-    factor = factorize(free_part(free, reduced.matrix), damping)
+    factor = reduced.factor(free, damping)
     solution = factor.solve(gradient)
     step[free] = -solution
     gain = reduced.gain + float(gradient @ solution)
     return step.reshape(problem.structure.num_views, -1), gain, factor
-
-
-def free_part(free: BoolArray, matrix: Matrix) -> Matrix:
-    """A matrix (N q, N q) restricted to the unknowns that are free (N q,)."""
-    if free.all():
-        return matrix
-    if isinstance(matrix, np.ndarray):
-        return matrix[np.ix_(free, free)]
-    keep = np.flatnonzero(free)
-    return matrix.tocsr()[keep][:, keep]
 
 
 def _levenberg_marquardt(
@@ -256,9 +246,7 @@ class _Compressed:
         self._compress()
 
     def _cholesky(self) -> Array:
-        matrix = free_part(self.problem.free, self.reduced.matrix)
-        dense = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
-        upper: Array = la.cholesky(dense, check_finite=False)
+        upper: Array = la.cholesky(self.reduced.plain(self.problem.free), check_finite=False)
         return upper
 
     def _compress(self) -> None:

@@ -17,10 +17,10 @@ from scipy.stats import chi2
 
 from barpc.ba.blocks import CameraPrior
 from barpc.ba.covariance import Covariance
-from barpc.ba.linear import Matrix, factorize
+from barpc.ba.linear import factorize
 from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
-from barpc.ba.solve import Minimum, free_part
+from barpc.ba.solve import Minimum
 from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
@@ -87,14 +87,14 @@ class _Around:
         now, reduced, start = self.problem.camera_prior, self.minimum.reduced, self.minimum.state.params
         free = self.problem.free
         change = np.where(free, (1.0 / prior.sigma**2 - 1.0 / now.sigma**2).ravel(), 0.0)
-        matrix = dense(reduced.matrix)
-        matrix[np.diag_indices(len(free))] += change
-        part = dense(free_part(free, matrix))
+        given = reduced.plain(np.ones_like(free))
+        matrix = given + np.diag(change)
+        part = matrix[np.ix_(free, free)]
         covariance = Covariance(replace(reduced, matrix=matrix), factorize(part), free)
         offset = (start - now.mean).ravel()
         step = -covariance.solve(change * offset)
         moved = offset + step
-        cost = float(step @ (reduced.matrix @ step) + change @ moved**2)
+        cost = float(step @ (given @ step) + change @ moved**2)
         held = free & np.isfinite(prior.sigma.ravel())
         volume = float(np.linalg.slogdet(part)[1]) + 2.0 * float(np.log(prior.sigma.ravel()[held]).sum())
         return -0.5 * (cost + volume), start + step.reshape(start.shape), covariance
@@ -285,11 +285,6 @@ class Variances:
             )
             factors[degree] = np.sqrt((_STRENGTH + total) / (_STRENGTH + float(known[:, part].sum())))
         return factors
-
-
-def dense(matrix: Matrix) -> Array:
-    """A copy of a matrix as a plain array."""
-    return matrix.copy() if isinstance(matrix, np.ndarray) else np.asarray(matrix.toarray())
 
 
 def same_prior(a: CameraPrior, b: CameraPrior, share: float) -> bool:

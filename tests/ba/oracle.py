@@ -59,7 +59,8 @@ class Plain:
     sigma: np.ndarray
     camera_sigma: np.ndarray
     gcps: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list)  # point, lonlatalt, sigma
-    planes: list[tuple[int, Any, float]] = field(default_factory=list)  # point, lon lat -> alt, sigma
+    planes: list[tuple[int, Any, float]] = field(default_factory=list)  # point, point -> height above, sigma
+    design: np.ndarray | None = None  # common errors of these heights, a column each [m]
 
     def __post_init__(self) -> None:
         middle = [
@@ -88,8 +89,12 @@ class Plain:
         rows.append((params / self.camera_sigma).ravel())
         for p, lonlatalt, sigma in self.gcps:
             rows.append(enu_of(*lonlatalt[:2]) @ (points[p] - ecef_of(lonlatalt)) / sigma)
-        for p, plane, sigma in self.planes:
-            rows.append([plane(points[p]) / sigma])
+        if self.planes:
+            heights = np.array([float(plane(points[p])[()]) for p, plane, _ in self.planes])
+            covariance = np.diag([sigma**2 for _, _, sigma in self.planes])
+            if self.design is not None:
+                covariance = covariance + self.design @ self.design.T
+            rows.append(np.linalg.solve(np.linalg.cholesky(covariance), heights))
         return np.concatenate(rows)
 
     def jacobian(self, params: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions
+from barpc.ba import AdjustOptions, adjust_tracks
 from benchmarks.referee import Case, Errors, cases, judge, make, referee, referee_run, solve
 
 SEEDS = (0, 1, 2)
@@ -130,3 +130,35 @@ def test_what_is_said_is_true(name, status, word):
     assert word in " ".join(found.words)
     if status == "good":
         assert found.after.across < 0.15
+
+
+def weak_pair(angle, seed):
+    """Two views whose rays meet under `angle` [deg], flown with the errors that the priors state."""
+    pitch = (-0.44 * angle, 0.44 * angle)
+    errors = Errors(attitude=7.2e-6, position=5.0)
+    return make(Case("weak pair", errors, pitch=pitch, roll=0.0, tracks=600, seed=seed), hills)
+
+
+def heights_of(scenes, dem=None):
+    """Errors of the scenes' heights, and what was stated [m]."""
+    found = [adjust_tracks(scene.views, scene.tracks, dem=dem) for scene in scenes]
+    errors = [judge(scene, f.sensors).move[2] for scene, f in zip(scenes, found, strict=True)]
+    return np.array(errors), np.array([f.gauge.sigma[2] for f in found])
+
+
+@pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
+@pytest.mark.parametrize("angle", [0.2, 0.5, 0.9, 1.1, 1.3, 1.5])
+def test_what_is_stated_of_weak_heights_is_as_large_as_it_is(angle):
+    true, said = heights_of([weak_pair(angle, seed) for seed in range(12)])
+    assert 0.5 < np.sqrt((said**2).mean() / (true**2).mean()) < 2.0
+
+
+@pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
+@pytest.mark.parametrize("bias", [0.0, 30.0])
+def test_heights_of_a_dem_are_wrong_together(bias):
+    true, said = heights_of(
+        [weak_pair(0.6, seed) for seed in range(3)], dem=lambda lon, lat: hills(lon, lat) + bias
+    )
+    assert (np.abs(true) < 2 * said).all()
+    np.testing.assert_allclose(true, bias, atol=2.0)  # nothing else tells: the scene stands on the DEM
+    assert (said < 25.0).all()
