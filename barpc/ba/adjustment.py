@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,8 +14,9 @@ from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import agreeing
 from barpc.ba.gauge import gauge_report
 from barpc.ba.heights import Heights, convergence_angles
+from barpc.ba.heldout import HeldOut, keep_out, measure
 from barpc.ba.incremental import BlockPrior, apply_prior
-from barpc.ba.options import AdjustOptions, prior_sigmas
+from barpc.ba.options import AUTO, GEOMETRIC, AdjustOptions, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Observations, Outcome, revived, run_rounds
@@ -24,7 +25,7 @@ from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
 from barpc.ba.variances import Variances
-from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 
 SMOOTH_LEAST = 0.06
@@ -33,6 +34,9 @@ SMOOTH_LEAST = 0.06
 _MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
 _BETTER = 0.8  # of the noise
+_MUCH_BETTER = (
+    0.7  # of the error on tracks that took no part: another model is worth what it may do to heights
+)
 
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
 
@@ -84,13 +88,90 @@ def adjust_tracks(
     """
     start = time.process_time()
     options = AdjustOptions() if options is None else options
-    views = tuple(views)
-    block = join(views, tracks, gcps, options)
+    block = join(tuple(views), tracks, gcps, options)
+    found = _solve(
+        block,
+        replace(options, model=GEOMETRIC if options.model == AUTO else options.model),
+        gcps,
+        dem,
+        centers,
+        prior,
+    )
+    found.heights.warn()
+    bend = None
+    if options.model == AUTO and options.drift is None and prior is None and found.has_trend(block):
+        flat = _solve(block, replace(options, model="affine"), gcps, dem, None, None)
+        if flat.error < _MUCH_BETTER * found.error:
+            bend, found = _bend(flat.final.points, found.final.points, flat.seen & found.seen), flat
+    return _adjustment(found, block, tracks, gcps, options, bend, start)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """A block solved with one model.
+
+    Parameters
+    ----------
+    problem : Problem
+        As it was solved last.
+    state : State
+        Where it started: delivered cameras, points triangulated with them.
+    before : (2, K)
+        Residuals there [px].
+    heights : Heights
+        What holds points.
+    outcome : Outcome
+        Of the rounds.
+    held_out : HeldOut
+        What the tracks say that took no part.
+    """
+
+    problem: Problem
+    state: State
+    before: Array
+    heights: Heights
+    outcome: Outcome
+    held_out: HeldOut
+
+    @property
+    def final(self) -> State:
+        """The minimum."""
+        return self.outcome.minimum.state
+
+    @property
+    def seen(self) -> BoolArray:
+        """Points (P,) with an observation that was kept."""
+        seen = np.zeros(self.problem.structure.num_points, dtype=bool)
+        seen[self.problem.structure.point[self.outcome.inlier]] = True
+        return seen
+
+    @property
+    def error(self) -> float:
+        """Observed over stated standard deviation of the tracks that took no part, all views alike."""
+        noise = self.held_out.noise[np.isfinite(self.held_out.noise)]
+        return float(np.sqrt((noise**2).mean())) if len(noise) else np.nan
+
+    def has_trend(self, block: Block) -> bool:
+        """Whether something is left that another model may follow."""
+        use = block.use & ~self.held_out.rows
+        left = bool(self.outcome.smooth.found(SMOOTH_LEAST).any())
+        return left or _is_suspect(self.outcome, self.problem.structure, use)
+
+
+def _solve(
+    block: Block,
+    options: AdjustOptions,
+    gcps: GroundPoints | None,
+    dem: Terrain | None,
+    centers: Array | None,
+    prior: BlockPrior | None,
+) -> _Solution:
+    """Rounds with the model of the options, again from an agreement or with more drift where they ask for it."""
     problem = make_problem(block, options, centers, prior)
-    drift = problem.cameras.unknowns.drift
     state, heights = _start(problem, block, options, gcps, dem)
-    heights.warn()
     before = problem.residuals(state.params, state.points)
+    rows = keep_out(block, problem.structure) if options.hold_out else np.zeros_like(block.use)
+    block = replace(block, use=block.use & ~rows)
     outcome = _rounds(problem, block, state, options, heights, block.use)
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
@@ -98,44 +179,66 @@ def adjust_tracks(
         again = _rounds(problem, block, state, options, heights, agree)
         if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
+    drift = problem.cameras.unknowns.drift
     if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
         bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
         there, _ = revived(
             problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
         )
-        there = replace(there, params=np.hstack([there.params, np.zeros((len(views), 3))]))
+        there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
         problem, outcome = bent, _rounds(bent, block, there, options, heights, outcome.inlier, outcome.noise)
     final = outcome.minimum.state
-    covariance = outcome.minimum.covariance(problem.free)
-    seen = np.zeros(block.num_points, dtype=bool)
-    seen[block.point[outcome.inlier]] = True
-    gauge = gauge_report(covariance, final.points, state.points, seen)
-    cameras = problem.cameras
+    return _Solution(problem, state, before, heights, outcome, measure(problem, final, block.sigma, rows))
+
+
+def _bend(points: Array, others: Array, both: BoolArray) -> float:
+    """RMS of the differences in height [m], after their mean."""
+    up = enu_basis(ground_from_ecef(points[both]))[:, 2]
+    return float(((points[both] - others[both]) * up).sum(axis=1).std())
+
+
+def _adjustment(
+    found: _Solution,
+    block: Block,
+    tracks: Tracks,
+    gcps: GroundPoints | None,
+    options: AdjustOptions,
+    bend: float | None,
+    start: float,
+) -> Adjustment:
+    """What is handed out, in the order of the tracks given."""
+    outcome, final, seen, kept_out = found.outcome, found.final, found.seen, found.held_out
+    covariance = outcome.minimum.covariance(found.problem.free)
+    cameras = found.problem.cameras
+    residual = outcome.residual.copy()
+    residual[:, kept_out.rows] = kept_out.residual
+    out = np.zeros(block.num_points, dtype=bool)
+    out[block.point[kept_out.rows]] = True
+    steps = len(final.history) - outcome.passes
+    status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
     return Adjustment(
         names=block.names,
-        sensors=cameras.unknowns.corrected(final.params, views),
+        sensors=cameras.unknowns.corrected(final.params, block.views),
         params=final.params,
-        points=np.where(seen[:, None], final.points, np.nan)[: block.num_tracks],
-        residuals_before=block.in_order(before.T)[: len(tracks)],
-        residuals=block.in_order(outcome.residual.T)[: len(tracks)],
+        points=np.where((seen | out)[:, None], kept_out.points, np.nan)[: block.num_tracks],
+        residuals_before=block.in_order(found.before.T)[: len(tracks)],
+        residuals=block.in_order(residual.T)[: len(tracks)],
         inlier=block.in_order(outcome.inlier)[: len(tracks)],
+        held_out=block.in_order(kept_out.rows)[: len(tracks)],
+        held_out_rms=kept_out.rms,
+        held_out_noise=kept_out.noise,
         view=tracks.view,
         noise=outcome.noise,
         cost_history=final.history,
-        steps=len(final.history) - outcome.passes,
-        status="; ".join(
-            [
-                f"{outcome.passes} passes of cutting",
-                outcome.minimum.status,
-                f"{covariance.factor.method} factorisation",
-            ]
-        ),
+        steps=steps,
+        status=status,
         cameras=cameras,
         covariance=covariance,
-        gauge=gauge,
+        gauge=gauge_report(covariance, final.points, found.state.points, seen),
         prior=outcome.prior,
         smooth=outcome.smooth,
-        held=heights.weak[: block.num_tracks],
+        bend=bend,
+        held=found.heights.weak[: block.num_tracks],
         left_out=block.left_out,
         gcp_inlier=block.in_order(outcome.inlier)[len(tracks) :],
         gcp_residuals=_gcp_residuals(final.points[block.num_tracks :], gcps),

@@ -8,6 +8,7 @@ metres (see `Unknowns`), so that all of them weigh about the same.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Literal
 
@@ -65,6 +66,12 @@ class Cameras:
         self.unknowns = unknowns
         self.is_rpc = np.array([isinstance(sensor, RPC) for sensor in self.sensors])
         self._stack = _RpcStack(self.sensors)
+
+    def seeing(self, row: Array) -> Cameras:
+        """The same views for other observations, of rows (K,) [px]."""
+        cameras = copy(self)
+        cameras.row = row
+        return cameras
 
     def project(
         self,

@@ -17,7 +17,9 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.scene import BoolArray, IntArray
 
 _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
-_TOGETHER = 0.25  # of that spread: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
+_TOGETHER = (
+    0.25  # of that spread: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
+)
 
 
 def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:

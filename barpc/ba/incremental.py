@@ -108,7 +108,7 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
     views = np.flatnonzero(covariance.free.reshape(n, -1)[:, 0])
     return BlockPrior(
         tuple(adjustment.names[v] for v in views),
-        adjustment.options.model,
+        adjustment.cameras.unknowns.model,
         adjustment.cameras.unknowns.drift,
         adjustment.params[views],
         covariance.reduced.plain(covariance.free),

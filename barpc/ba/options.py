@@ -13,8 +13,11 @@ from barpc.geodesy import Array
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
 
-MODELS = ("rotation+translation", "rotation", "translation", "shift", "shift-drift", "affine")
-"""Unknowns of a view; the last three act in the image and are there for comparison."""
+AUTO, GEOMETRIC = "auto", "rotation+translation"
+
+MODELS = (AUTO, GEOMETRIC, "rotation", "translation", "shift", "shift-drift", "affine")
+"""Unknowns of a view; the last three act in the image. "auto": a rotation and translation; an affine in the
+image where that leaves a trend which the affine takes away."""
 
 DEFAULT_ACCURACY = 5.0
 """Horizontal standard deviation [m] of a camera that does not state its own (Pleiades: CE90 8.5 m = 4 m)."""
@@ -76,6 +79,8 @@ class AdjustOptions:
         Tracks whose rays meet under a smaller angle [deg] are held in height.
     min_observations : int
         A view with fewer observations stops the run.
+    hold_out : bool
+        Keep a tenth of the tracks out, to measure the result on.
     keep_largest : bool
         Go on with the largest group of views where they are not all connected.
     solver : str
@@ -88,7 +93,7 @@ class AdjustOptions:
         Camera centre: "line" or "projective" (see `barpc.sensor.geometry.camera_center`).
     """
 
-    model: str = "rotation+translation"
+    model: str = AUTO
     drift: int | None = None
     sigma_attitude: float | None = None
     sigma_position: float | None = None
@@ -107,6 +112,7 @@ class AdjustOptions:
     dem_for_all: bool = False
     min_convergence: float = 1.0
     min_observations: int = 4
+    hold_out: bool = True
     keep_largest: bool = False
     solver: str = "auto"
     max_steps: int = 30
@@ -118,7 +124,7 @@ class AdjustOptions:
         _one_of("loss", self.loss, tuple(LOSSES))
         _one_of("solver", self.solver, ("auto", "scipy", "sparse"))
         _one_of("drift", self.drift, (None, 0, 1, 2))
-        if self.drift and "rotation" not in self.model:
+        if self.drift and self.model != AUTO and "rotation" not in self.model:
             raise InputError(f"drift {self.drift} needs a model with a rotation, not {self.model!r}")
         for name in (
             "sigma_attitude",

@@ -38,6 +38,10 @@ class Adjustment:
         an earlier block as it left them), points triangulated with them.
     inlier : (K,)
         Observations that were kept.
+    held_out : (K,)
+        Observations that took no part, to be measured on; their residuals are those of points triangulated anew.
+    held_out_rms, held_out_noise : (N,)
+        What their medians say of every view: root mean square residual [px], and over what is stated; NaN without any.
     view : (K,)
         The tracks' views.
     noise : float
@@ -58,6 +62,9 @@ class Adjustment:
         How the corrections compare with the priors given, and what the priors became.
     smooth : SmoothTest
         What is smooth in the residuals that are left.
+    bend : float or None
+        Where the data chose an affine in the image: how much heights differ from those of a rotation and
+        translation [m], RMS after their mean.
     held : (P,)
         Tracks held in height because their rays meet under too small an angle.
     left_out : tuple of str
@@ -79,6 +86,9 @@ class Adjustment:
     residuals_before: Array
     residuals: Array
     inlier: BoolArray
+    held_out: BoolArray
+    held_out_rms: Array
+    held_out_noise: Array
     view: IntArray
     noise: float
     cost_history: tuple[float, ...]
@@ -89,6 +99,7 @@ class Adjustment:
     gauge: GaugeReport
     prior: PriorTest
     smooth: SmoothTest
+    bend: float | None
     held: BoolArray
     left_out: tuple[str, ...]
     gcp_inlier: BoolArray

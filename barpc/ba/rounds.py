@@ -20,7 +20,7 @@ from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
-_MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
+MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
 _LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that they stay below, about
 _LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
 _SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
@@ -266,7 +266,7 @@ def _robust(
     s = observations.squared(residual, counted)
     for _ in range(_ROBUST_ROUNDS):
         least = float(np.sqrt(np.quantile(s[use], _LOW) / _LOW)) if use.any() else 1.0
-        noise = max(float(np.sqrt(_median(s, counted) / _MEDIAN)), least, _LEAST_NOISE)
+        noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, _LEAST_NOISE)
         if scale <= 3.6 * noise:
             break
         clean = noise < _AS_STATED and float((s[use] > (_CLEAN * noise) ** 2).mean()) < _FEW

@@ -154,7 +154,7 @@ def _correction(run: Run, adjustment: Adjustment, i: int) -> dict[str, Any]:
     sensor = adjustment.sensors[i]
     correction, covariance = adjustment.corrections[i], adjustment.covariance.view(i)
     out: dict[str, Any] = {
-        "model": adjustment.options.model,
+        "model": adjustment.cameras.unknowns.model,
         "unknowns": adjustment.params[i],
         "sigma": np.sqrt(np.maximum(np.diag(covariance), 0.0)),
         "center_shift_px": None,
@@ -164,7 +164,7 @@ def _correction(run: Run, adjustment: Adjustment, i: int) -> dict[str, Any]:
         return {**out, "shift_px": correction.shift, "slope": correction.slope}
     assert isinstance(sensor, Corrected)
     middle = sensor.sensor.localize((np.array(run.views[i].size) - 1) / 2, np.array(run.altitude))
-    shift, sigma = shift_in_image(sensor, covariance, adjustment.options.model, middle)
+    shift, sigma = shift_in_image(sensor, covariance, adjustment.cameras.unknowns.model, middle)
     return {
         **out,
         "center_shift_px": shift,
