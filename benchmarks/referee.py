@@ -561,7 +561,7 @@ def referee(case: Case, options: AdjustOptions | None = None, relief: Any = None
     start = time.process_time()
     sensors, found = solve(scene, options)
     cpu = time.process_time() - start
-    rejected = ~found.inlier
+    rejected = ~(found.inlier | found.held_out)
     if os.environ.get("REFEREE_TALK"):
         print(
             case.name,

@@ -16,7 +16,7 @@ from barpc.ba.gauge import gauge_report
 from barpc.ba.heights import Heights, convergence_angles
 from barpc.ba.heldout import HeldOut, keep_out, measure
 from barpc.ba.incremental import BlockPrior, apply_prior
-from barpc.ba.options import AUTO, GEOMETRIC, AdjustOptions, prior_sigmas
+from barpc.ba.options import AUTO, AdjustOptions, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Observations, Outcome, revived, run_rounds
@@ -89,17 +89,10 @@ def adjust_tracks(
     start = time.process_time()
     options = AdjustOptions() if options is None else options
     block = join(tuple(views), tracks, gcps, options)
-    found = _solve(
-        block,
-        replace(options, model=GEOMETRIC if options.model == AUTO else options.model),
-        gcps,
-        dem,
-        centers,
-        prior,
-    )
+    found = _solve(block, options, gcps, dem, centers, prior)
     found.heights.warn()
     bend = None
-    if options.model == AUTO and options.drift is None and prior is None and found.has_trend(block):
+    if options.model == AUTO and options.drift is None and prior is None and found.has_trend:
         flat = _solve(block, replace(options, model="affine"), gcps, dem, None, None)
         if flat.error < _MUCH_BETTER * found.error:
             bend, found = _bend(flat.final.points, found.final.points, flat.seen & found.seen), flat
@@ -151,11 +144,11 @@ class _Solution:
         noise = self.held_out.noise[np.isfinite(self.held_out.noise)]
         return float(np.sqrt((noise**2).mean())) if len(noise) else np.nan
 
-    def has_trend(self, block: Block) -> bool:
-        """Whether something is left that another model may follow."""
-        use = block.use & ~self.held_out.rows
+    @property
+    def has_trend(self) -> bool:
+        """Whether something is left that another model may follow: smooth, or in what was cut."""
         left = bool(self.outcome.smooth.found(SMOOTH_LEAST).any())
-        return left or _is_suspect(self.outcome, self.problem.structure, use)
+        return left or self.error > _MUCH_NOISE * self.outcome.noise
 
 
 def _solve(
@@ -253,7 +246,7 @@ def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
         return options.drift
     if prior is not None:
         return prior.drift
-    return int("rotation" in options.model)
+    return int("rotation" in options.first_model)
 
 
 def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
@@ -295,11 +288,11 @@ def make_problem(
     drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
         centers = _known_centers(block, options, centers, prior)
-    unknowns = make_unknowns(views, options.model, drift, centers, options.center_method)
+    unknowns = make_unknowns(views, options.first_model, drift, centers, options.center_method)
     sigma = prior_sigmas(views, options, drift)
     on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma), None
     if prior is not None:
-        on_cameras, jointly = apply_prior(prior, block.names, options.model, drift, on_cameras)
+        on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras)
     return Problem(
         Cameras(views, unknowns, block.xy[1]),
         make_structure(block.view, block.point, len(views), block.num_points),
@@ -313,7 +306,7 @@ def make_problem(
 def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior) -> Array:
     """Camera centres (N, 3) [m]: the earlier block's where it had them."""
     if centers is None:
-        centers = make_unknowns(block.views, options.model, 0, None, options.center_method).center
+        centers = make_unknowns(block.views, options.first_model, 0, None, options.center_method).center
     known = dict(zip(prior.names, prior.center, strict=True))
     return np.array([known.get(name, center) for name, center in zip(block.names, centers, strict=True)])
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.block import Block
+from barpc.ba.loss import geman_mcclure
 from barpc.ba.problem import Problem
 from barpc.ba.rounds import MEDIAN, Observations
 from barpc.ba.solve import State
@@ -22,7 +23,9 @@ from barpc.scene import BoolArray
 _EVERY = 10
 _LEAST = 100  # observations of a view, or its tracks are all needed
 _CELLS = 8  # a side of an image
-_STEPS = 3
+_STEPS = 5
+_WIDE = 4.0  # sigmas
+_FEW = 20  # observations of a view that tell nothing by themselves
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +41,7 @@ class HeldOut:
     points : (P, 3)
         All points, those triangulated anew, ECEF [m].
     noise : (N,)
-        Observed over stated standard deviation of every view's; NaN without any.
+        Observed over stated standard deviation of every view's; NaN with too few.
     rms : (N,)
         The same as a root mean square of residuals [px].
     """
@@ -78,16 +81,18 @@ def measure(problem: Problem, state: State, sigma: Array, rows: BoolArray) -> He
         xy=xy,
         point_prior=None,
     )
-    points, weight = state.points[index], 1.0 / sigma[rows]
-    for _ in range(_STEPS):
-        points = part.triangulate(points, part.project_points(state.params, points), weight)
+    observations = Observations(part, sigma[rows], 0.0, np.ones(len(view), dtype=bool))
+    points, counted = state.points[index], np.ones(len(view))
+    for step in range(_STEPS):
+        projected = part.project_points(state.params, points)
+        if step > 1:  # of three views that do not agree two may
+            counted = geman_mcclure(((projected.image - xy) ** 2).sum(axis=0) / (_WIDE * sigma[rows]) ** 2)[1]
+        points = part.triangulate(points, projected, np.sqrt(counted) / sigma[rows])
     residual = part.residuals(state.params, points)
-    every = np.ones(len(view))
-    observations = Observations(part, sigma[rows], 0.0, every > 0)
-    squared = observations.squared(residual, every)
-    expected = observations.sigma**2 * observations.freedom(every)
+    squared = observations.squared(residual, counted)
+    expected = observations.sigma**2 * observations.freedom(counted)
     noise, rms = np.full(views, np.nan), np.full(views, np.nan)
-    for v in np.unique(view):
+    for v in np.flatnonzero(np.bincount(view, minlength=views) >= _FEW):
         of_view = view == v
         noise[v] = np.sqrt(np.median(squared[of_view]) / MEDIAN)
         rms[v] = noise[v] * np.sqrt(expected[of_view].mean())

@@ -124,7 +124,7 @@ class AdjustOptions:
         _one_of("loss", self.loss, tuple(LOSSES))
         _one_of("solver", self.solver, ("auto", "scipy", "sparse"))
         _one_of("drift", self.drift, (None, 0, 1, 2))
-        if self.drift and self.model != AUTO and "rotation" not in self.model:
+        if self.drift and "rotation" not in self.first_model:
             raise InputError(f"drift {self.drift} needs a model with a rotation, not {self.model!r}")
         for name in (
             "sigma_attitude",
@@ -137,6 +137,11 @@ class AdjustOptions:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise InputError(f"{name} must be positive, found {value}")
+
+    @property
+    def first_model(self) -> str:
+        """The model to start with."""
+        return GEOMETRIC if self.model == AUTO else self.model
 
 
 def _one_of(name: str, value: object, allowed: tuple[object, ...]) -> None:
@@ -154,13 +159,13 @@ def prior_sigmas(views: tuple[View, ...], options: AdjustOptions, drift: int) ->
     """Prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px)."""
     stated = np.array([stated_accuracy(view) for view in views])
     parts = []
-    if "rotation" in options.model:
+    if "rotation" in options.first_model:
         parts.append(np.tile(_given(options.sigma_attitude, stated), (1, 3)))
-    if "translation" in options.model:
+    if "translation" in options.first_model:
         parts.append(np.tile(_given(options.sigma_position, stated), (1, 3)))
     parts += [np.full((len(views), 3), options.sigma_drift or DRIFT_SIGMA)] * drift
     if not parts:
-        size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.model]
+        size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
         parts.append(np.full((len(views), size), options.sigma_shift))
     return np.hstack(parts)
 

@@ -107,6 +107,7 @@ ROWS = [
     Row("tolerance", 1e-14, 1e-2, steps, -1, rest={"loss": "linear", "solver": "sparse"}),
 ]
 ELSEWHERE = {
+    "hold_out": "test_a_tenth_of_the_tracks_takes_no_part",
     "min_observations": "test_a_view_needs_as_many_observations_as_asked_for",
     "keep_largest": "test_the_largest_group_goes_on_alone_where_asked",
     "solver": "test_the_solver_that_is_asked_for_is_the_one_that_runs",
@@ -129,6 +130,43 @@ def run(block: Block, dem: float | None = None, **options: Any) -> Adjustment:
         warnings.simplefilter("ignore", BarpcWarning)
         chosen = AdjustOptions(**{**BASE, **options})
         return adjust_tracks(block.views, block.tracks, chosen, dem=terrain, centers=centers_of(block))
+
+
+def test_a_tenth_of_the_tracks_takes_no_part():
+    dirty = simulate_block(4, 1200, seed=21, noise=0.2, outliers=0.1)
+    dirty = replace(dirty, tracks=replace(dirty.tracks, sigma=np.full(len(dirty.tracks), 0.1)))
+    found = run(dirty)
+    every = run(dirty, hold_out=False)
+    assert not every.held_out.any()
+    assert np.isnan(every.held_out_rms).all()
+    out = found.held_out
+    assert not (out & found.inlier).any()
+    tracks = dirty.tracks
+    several = (np.bincount(tracks.point) >= 2).sum()
+    assert len(np.unique(tracks.point[out])) == pytest.approx(0.1 * several, rel=0.05)
+    assert not np.isin(tracks.point[~out], tracks.point[out]).any()  # a track is out in all of its views
+    share = np.bincount(tracks.view[out]) / np.bincount(tracks.view)
+    assert (np.abs(share - 0.1) < 0.03).all()
+    # 0.2 px a coordinate where 0.1 px is stated; of the tracks a quarter holds something wrong, by up to 20 px
+    assert (found.held_out_noise > 1.6).all()
+    assert (found.held_out_noise < 3.2).all()
+    assert (found.held_out_rms < 1.6 * found.rmse()).all()
+    # what took no part tells nothing: spoilt, it changes no camera
+    xy = tracks.xy.copy()
+    xy[out] += 50.0
+    spoilt = run(replace(dirty, tracks=replace(tracks, xy=xy)))
+    np.testing.assert_array_equal(spoilt.params, found.params)
+    assert (spoilt.held_out_noise > 5 * found.held_out_noise).all()
+
+
+def test_a_view_with_few_observations_gives_none_away(dirty):
+    tracks = dirty.tracks
+    first = np.flatnonzero(tracks.view == 0)
+    few = tracks.select(~np.isin(np.arange(len(tracks)), first[60:]))
+    found = run(replace(dirty, tracks=few))
+    assert found.held_out.any()
+    assert not found.held_out[few.view == 0].any()
+    assert np.isnan(found.held_out_noise).all()  # of a few nothing is said
 
 
 def test_every_option_has_a_row():

@@ -21,6 +21,7 @@ OPTIONS = AdjustOptions(
     noise_floor=0.0,
     sigma_attitude=SIGMA_ATTITUDE,
     sigma_position=SIGMA_POSITION,
+    hold_out=False,
     loss="linear",
     estimate_noise=False,
     min_convergence=0.01,
