@@ -89,14 +89,16 @@ def adjust_tracks(
     start = time.process_time()
     options = AdjustOptions() if options is None else options
     block = join(tuple(views), tracks, gcps, options)
-    found = _solve(block, options, gcps, dem, centers, prior)
+    rows = keep_out(block) if options.hold_out else np.zeros_like(block.use)
+    inner, outer = block.without(rows), block.without(~rows)
+    found = _solve(inner, outer, options, gcps, dem, centers, prior)
     found.heights.warn()
     bend = None
     if options.model == AUTO and options.drift is None and prior is None and found.has_trend:
-        flat = _solve(block, replace(options, model="affine"), gcps, dem, None, None)
-        if flat.error < _MUCH_BETTER * found.error:
+        flat = _solve(inner, outer, replace(options, model="affine"), gcps, dem, None, None)
+        if flat.after.error < _MUCH_BETTER * found.after.error:
             bend, found = _bend(flat.final.points, found.final.points, flat.seen & found.seen), flat
-    return _adjustment(found, block, tracks, gcps, options, bend, start)
+    return _adjustment(found, inner, outer, gcps, options, bend, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +117,8 @@ class _Solution:
         What holds points.
     outcome : Outcome
         Of the rounds.
-    held_out : HeldOut
-        What the tracks say that took no part.
+    start, after : HeldOut
+        What the tracks that took no part say before and after.
     """
 
     problem: Problem
@@ -124,7 +126,8 @@ class _Solution:
     before: Array
     heights: Heights
     outcome: Outcome
-    held_out: HeldOut
+    start: HeldOut
+    after: HeldOut
 
     @property
     def final(self) -> State:
@@ -139,32 +142,29 @@ class _Solution:
         return seen
 
     @property
-    def error(self) -> float:
-        """Observed over stated standard deviation of the tracks that took no part, all views alike."""
-        noise = self.held_out.noise[np.isfinite(self.held_out.noise)]
-        return float(np.sqrt((noise**2).mean())) if len(noise) else np.nan
-
-    @property
     def has_trend(self) -> bool:
         """Whether something is left that another model may follow: smooth, or in what was cut."""
         left = bool(self.outcome.smooth.found(SMOOTH_LEAST).any())
-        return left or self.error > _MUCH_NOISE * self.outcome.noise
+        return left or self.after.error > _MUCH_NOISE * self.outcome.noise
 
 
 def _solve(
     block: Block,
+    outer: Block,
     options: AdjustOptions,
     gcps: GroundPoints | None,
     dem: Terrain | None,
     centers: Array | None,
     prior: BlockPrior | None,
 ) -> _Solution:
-    """Rounds with the model of the options, again from an agreement or with more drift where they ask for it."""
+    """Rounds with the model of the options, again from an agreement or with more drift where they ask for it.
+
+    Measured on the observations of `outer`.
+    """
     problem = make_problem(block, options, centers, prior)
     state, heights = _start(problem, block, options, gcps, dem)
     before = problem.residuals(state.params, state.points)
-    rows = keep_out(block, problem.structure) if options.hold_out else np.zeros_like(block.use)
-    block = replace(block, use=block.use & ~rows)
+    start = measure(problem, state.params, outer)
     outcome = _rounds(problem, block, state, options, heights, block.use)
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
@@ -180,8 +180,8 @@ def _solve(
         )
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
         problem, outcome = bent, _rounds(bent, block, there, options, heights, outcome.inlier, outcome.noise)
-    final = outcome.minimum.state
-    return _Solution(problem, state, before, heights, outcome, measure(problem, final, block.sigma, rows))
+    after = measure(problem, outcome.minimum.state.params, outer)
+    return _Solution(problem, state, before, heights, outcome, start, after)
 
 
 def _bend(points: Array, others: Array, both: BoolArray) -> float:
@@ -193,37 +193,41 @@ def _bend(points: Array, others: Array, both: BoolArray) -> float:
 def _adjustment(
     found: _Solution,
     block: Block,
-    tracks: Tracks,
+    outer: Block,
     gcps: GroundPoints | None,
     options: AdjustOptions,
     bend: float | None,
     start: float,
 ) -> Adjustment:
     """What is handed out, in the order of the tracks given."""
-    outcome, final, seen, kept_out = found.outcome, found.final, found.seen, found.held_out
+    outcome, final, seen = found.outcome, found.final, found.seen
     covariance = outcome.minimum.covariance(found.problem.free)
     cameras = found.problem.cameras
-    residual = outcome.residual.copy()
-    residual[:, kept_out.rows] = kept_out.residual
-    out = np.zeros(block.num_points, dtype=bool)
-    out[block.point[kept_out.rows]] = True
-    steps = len(final.history) - outcome.passes
+    points = np.where(seen[:, None], final.points, np.nan)
+    points[found.after.index] = found.after.points
+    inlier = block.in_order(outcome.inlier)
+    ties = slice(0, len(inlier) - (0 if gcps is None else len(gcps.view)))
+    view = np.maximum(block.in_order(block.view), outer.in_order(outer.view))[ties]
+    before, after = (
+        (block.in_order(inside.T) + outer.in_order(outside.residual.T))[ties]
+        for inside, outside in ((found.before, found.start), (outcome.residual, found.after))
+    )
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
     return Adjustment(
         names=block.names,
         sensors=cameras.unknowns.corrected(final.params, block.views),
         params=final.params,
-        points=np.where((seen | out)[:, None], kept_out.points, np.nan)[: block.num_tracks],
-        residuals_before=block.in_order(found.before.T)[: len(tracks)],
-        residuals=block.in_order(residual.T)[: len(tracks)],
-        inlier=block.in_order(outcome.inlier)[: len(tracks)],
-        held_out=block.in_order(kept_out.rows)[: len(tracks)],
-        held_out_rms=kept_out.rms,
-        held_out_noise=kept_out.noise,
-        view=tracks.view,
+        points=points[: block.num_tracks],
+        residuals_before=before,
+        residuals=after,
+        inlier=inlier[ties],
+        held_out=outer.in_order(np.ones(len(outer.view), dtype=bool))[ties],
+        held_out_rms=found.after.rms,
+        held_out_noise=found.after.noise,
+        view=view,
         noise=outcome.noise,
         cost_history=final.history,
-        steps=steps,
+        steps=len(final.history) - outcome.passes,
         status=status,
         cameras=cameras,
         covariance=covariance,
@@ -233,7 +237,7 @@ def _adjustment(
         bend=bend,
         held=found.heights.weak[: block.num_tracks],
         left_out=block.left_out,
-        gcp_inlier=block.in_order(outcome.inlier)[len(tracks) :],
+        gcp_inlier=inlier[ties.stop :],
         gcp_residuals=_gcp_residuals(final.points[block.num_tracks :], gcps),
         seconds=time.process_time() - start,
         options=options,

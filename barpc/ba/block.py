@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -39,8 +39,8 @@ class Block:
         Row of each observation in the tracks, then in the GCPs, as given.
     use : (K,)
         False for observations in views that are left out.
-    num_tracks, num_points : int
-        Tracks; tracks and GCPs.
+    num_tracks, num_points, num_rows : int
+        Tracks; tracks and GCPs; rows given.
     left_out : tuple of str
         Views outside the largest group.
     """
@@ -54,6 +54,7 @@ class Block:
     use: BoolArray
     num_tracks: int
     num_points: int
+    num_rows: int
     left_out: tuple[str, ...]
 
     @property
@@ -66,9 +67,22 @@ class Block:
         """Lowest and highest altitude [m] that any view is used for."""
         return min(v.alt_range[0] for v in self.views), max(v.alt_range[1] for v in self.views)
 
+    def without(self, rows: BoolArray) -> Block:
+        """The block without some of its observations (K,)."""
+        keep = ~rows
+        return replace(
+            self,
+            view=self.view[keep],
+            point=self.point[keep],
+            xy=np.ascontiguousarray(self.xy[:, keep]),
+            sigma=self.sigma[keep],
+            order=self.order[keep],
+            use=self.use[keep],
+        )
+
     def in_order(self, rows: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
-        """Rows (K, ...) back in the order they were given."""
-        out = np.empty_like(rows)
+        """Rows (K, ...) back in the order they were given; zeros for those that the block is without."""
+        out = np.zeros((self.num_rows, *rows.shape[1:]), rows.dtype)
         out[self.order] = rows
         return out
 
@@ -144,6 +158,7 @@ def join(views: tuple[View, ...], tracks: Tracks, gcps: GroundPoints | None, opt
         use[order],
         tracks.num_points,
         num_points,
+        len(order),
         left_out,
     )
 

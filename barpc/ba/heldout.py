@@ -15,10 +15,9 @@ from barpc.ba.block import Block
 from barpc.ba.loss import geman_mcclure
 from barpc.ba.problem import Problem
 from barpc.ba.rounds import MEDIAN, Observations
-from barpc.ba.solve import State
-from barpc.ba.structure import Structure, make_structure
+from barpc.ba.structure import counting_sort, make_structure
 from barpc.geodesy import Array
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, IntArray
 
 _EVERY = 10
 _LEAST = 100  # observations of a view, or its tracks are all needed
@@ -34,32 +33,37 @@ class HeldOut:
 
     Parameters
     ----------
-    rows : (H,)
-        Their observations, sorted by view.
     residual : (2, H)
-        Projected - observed [px], points triangulated by the adjusted cameras.
-    points : (P, 3)
-        All points, those triangulated anew, ECEF [m].
+        Projected - observed [px], points triangulated by the cameras.
+    index, points : (Q,), (Q, 3)
+        Their points, ECEF [m].
     noise : (N,)
         Observed over stated standard deviation of every view's; NaN with too few.
     rms : (N,)
         The same as a root mean square of residuals [px].
     """
 
-    rows: BoolArray
     residual: Array
+    index: IntArray
     points: Array
     noise: Array
     rms: Array
 
+    @property
+    def error(self) -> float:
+        """Observed over stated standard deviation, all views alike; NaN where none is known."""
+        noise = self.noise[np.isfinite(self.noise)]
+        return float(np.sqrt((noise**2).mean())) if len(noise) else np.nan
 
-def keep_out(block: Block, structure: Structure) -> BoolArray:
+
+def keep_out(block: Block) -> BoolArray:
     """Observations (K,) of about every tenth track, evenly over pairs of views and their images."""
-    use = np.bincount(block.point[block.use], minlength=block.num_points)
-    few = structure.sum_views(block.use[None].astype(np.float64))[:, 0] < _LEAST
+    few = np.bincount(block.view[block.use], minlength=len(block.views)) < _LEAST
     needed = np.bincount(block.point[few[block.view] | ~block.use], minlength=block.num_points)
-    tracks = np.flatnonzero((use >= 2) & (needed == 0) & (np.arange(block.num_points) < block.num_tracks))
-    first, last = (structure.by_point[structure.point_bounds[tracks + n] - n] for n in (0, 1))
+    by_point, bounds = counting_sort(block.point, block.num_points)
+    is_track = np.arange(block.num_points) < block.num_tracks
+    tracks = np.flatnonzero((np.diff(bounds) >= 2) & (needed == 0) & is_track)
+    first, last = (by_point[bounds[tracks + n] - n] for n in (0, 1))
     size = np.array([view.size for view in block.views], dtype=np.float64)
     cell = np.floor(block.xy[:, first] / size[block.view[first]].T * _CELLS)
     order = np.lexsort((tracks, *cell, block.view[last], block.view[first]))
@@ -68,34 +72,31 @@ def keep_out(block: Block, structure: Structure) -> BoolArray:
     return chosen[block.point]
 
 
-def measure(problem: Problem, state: State, sigma: Array, rows: BoolArray) -> HeldOut:
-    """The observations `rows` (K,), of standard deviations `sigma` (K,) [px], under the cameras of a state."""
-    structure = problem.structure
-    index, point = np.unique(structure.point[rows], return_inverse=True)
-    view, xy = structure.view[rows], problem.xy[:, rows]
-    views = structure.num_views
+def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
+    """The observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
+    views = len(block.views)
+    index, point = np.unique(block.point, return_inverse=True)
     part = replace(
         problem,
-        cameras=problem.cameras.seeing(xy[1]),
-        structure=make_structure(view, point, views, len(index)),
-        xy=xy,
+        cameras=problem.cameras.seeing(block.xy[1]),
+        structure=make_structure(block.view, point, views, len(index)),
+        xy=block.xy,
         point_prior=None,
     )
-    observations = Observations(part, sigma[rows], 0.0, np.ones(len(view), dtype=bool))
-    points, counted = state.points[index], np.ones(len(view))
+    observations = Observations(part, block.sigma, 0.0, np.ones(len(point), dtype=bool))
+    points, counted = block.first_points(None)[index], np.ones(len(point))
     for step in range(_STEPS):
-        projected = part.project_points(state.params, points)
+        projected = part.project_points(params, points)
         if step > 1:  # of three views that do not agree two may
-            counted = geman_mcclure(((projected.image - xy) ** 2).sum(axis=0) / (_WIDE * sigma[rows]) ** 2)[1]
-        points = part.triangulate(points, projected, np.sqrt(counted) / sigma[rows])
-    residual = part.residuals(state.params, points)
+            wide = (_WIDE * block.sigma) ** 2
+            counted = geman_mcclure(((projected.image - block.xy) ** 2).sum(axis=0) / wide)[1]
+        points = part.triangulate(points, projected, np.sqrt(counted) / block.sigma)
+    residual = part.residuals(params, points)
     squared = observations.squared(residual, counted)
-    expected = observations.sigma**2 * observations.freedom(counted)
+    expected = block.sigma**2 * observations.freedom(counted)
     noise, rms = np.full(views, np.nan), np.full(views, np.nan)
-    for v in np.flatnonzero(np.bincount(view, minlength=views) >= _FEW):
-        of_view = view == v
-        noise[v] = np.sqrt(np.median(squared[of_view]) / MEDIAN)
-        rms[v] = noise[v] * np.sqrt(expected[of_view].mean())
-    moved = state.points.copy()
-    moved[index] = points
-    return HeldOut(rows, residual, moved, noise, rms)
+    for v in np.flatnonzero(np.bincount(block.view, minlength=views) >= _FEW):
+        rows = slice(*part.structure.bounds[v : v + 2])
+        noise[v] = np.sqrt(np.median(squared[rows]) / MEDIAN)
+        rms[v] = noise[v] * np.sqrt(expected[rows].mean())
+    return HeldOut(residual, index, points, noise, rms)

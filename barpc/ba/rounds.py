@@ -196,7 +196,7 @@ def run_rounds(
     elif robust:
         start = problem.with_camera_prior(variances.for_search())
         state, residual, counted, noise = _robust(start, observations, state, projected, use, options, smooth)
-        floor = smooth.test(residual, use).rms
+        floor = smooth.test(residual, use, neighbours=False).rms
     while True:
         if robust and projected is None and use.sum() < (1.0 - _MANY_CUT) * everything.sum():
             state, residual = revived(problem, state, residual, use, everything / observations.sigma)
@@ -230,7 +230,7 @@ def run_rounds(
         if robust:
             scatter = _scatter(problem, observations, smooth, state, residual, counted)
             noise = observations.noise(scatter, use, problem, smooth.parameters(counted))
-            floor = smooth.test(residual, use).rms
+            floor = smooth.test(residual, use, neighbours=False).rms
         else:
             noise = observations.noise(residual, use, problem)
         _LOG.info("pass %d: %d of %d observations, noise %.3f", passes, use.sum(), len(use), noise)

@@ -91,8 +91,10 @@ class Smooth:
         """How many coefficients `part` fits."""
         return 2 * _TERMS * sum(1 for _ in self._views(weight))
 
-    def test(self, residual: Array, use: BoolArray) -> SmoothTest:
-        """Whether the residuals (2, K) [px] of the observations in use hold more than scatter."""
+    def test(self, residual: Array, use: BoolArray, neighbours: bool = True) -> SmoothTest:
+        """Whether the residuals (2, K) [px] of the observations in use hold more than scatter; without `neighbours`
+        what is too fine for the smooth part is not looked for.
+        """
         n = self.structure.num_views
         rms, significance, by_row, shared = np.zeros(n), np.ones(n), np.full(n, np.nan), np.zeros(n)
         weight = use.astype(np.float64)
@@ -109,7 +111,8 @@ class Smooth:
             rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / (0.5 * count))
             along = (coefficients[:, :SPLINES] @ self._basis[:SPLINES, rows]) * weight[rows]
             by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)
-            shared[v] = self._shared(rows, residual, use)
+            if neighbours:
+                shared[v] = self._shared(rows, residual, use)
         return SmoothTest(rms, significance, by_row, shared)
 
     def _shared(self, rows: slice, residual: Array, use: BoolArray) -> float:
