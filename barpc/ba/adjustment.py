@@ -11,7 +11,7 @@ import numpy as np
 from barpc.ba.block import Block, join
 from barpc.ba.blocks import CameraPrior, Terrain, ground_control
 from barpc.ba.cameras import Cameras
-from barpc.ba.consensus import agreeing
+from barpc.ba.consensus import agreeing, two_groups
 from barpc.ba.gauge import gauge_report
 from barpc.ba.heights import Heights, convergence_angles
 from barpc.ba.heldout import HeldOut, keep_out, measure
@@ -202,6 +202,7 @@ def _adjustment(
     """What is handed out, in the order of the tracks given."""
     outcome, final, seen = found.outcome, found.final, found.seen
     covariance = outcome.minimum.covariance(found.problem.free)
+    projected = found.problem.project_points(final.params, final.points)
     cameras = found.problem.cameras
     points = np.where(seen[:, None], final.points, np.nan)
     points[found.after.index] = found.after.points
@@ -235,6 +236,7 @@ def _adjustment(
         prior=outcome.prior,
         smooth=outcome.smooth,
         bend=bend,
+        two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier),
         held=found.heights.weak[: block.num_tracks],
         left_out=block.left_out,
         gcp_inlier=inlier[ties.stop :],

@@ -8,6 +8,8 @@ whose offsets lie on one plane is looked for, and an observation that most of it
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from barpc.ba.cameras import Projected
@@ -19,6 +21,75 @@ _TRIALS = 150
 _LEAST = 30  # matches of a pair that is looked at
 _NEAR = 10.0  # sigmas: what a plane cannot follow of a drift and of relief
 _STEPS = 3
+
+_GROUPED = 100  # matches of a pair that may fall into two groups
+_BIMODAL = 0.45  # Sarle's coefficient: 1/3 for a normal distribution, 5/9 for a uniform one
+_APART = 2.0  # standard deviations between two groups
+_SMALLER = 0.05  # part of the smaller one
+_EVIDENT = 15.0  # gain in log-likelihood over one group
+
+
+@dataclass(frozen=True)
+class TwoGroups:
+    """A pair of views whose tie points fall into two groups: which of them is right, the pair does not tell.
+
+    Parameters
+    ----------
+    views : tuple of int
+        The pair.
+    share : float
+        Part of the matches in the smaller group.
+    apart : float
+        Across the epipolar lines [px].
+    """
+
+    views: tuple[int, int]
+    share: float
+    apart: float
+
+
+def two_groups(
+    structure: Structure, residual: Array, projected: Projected, use: BoolArray
+) -> tuple[TwoGroups, ...]:
+    """Pairs of views whose offsets across the epipolar lines (observations in use) have two centres."""
+    rows = np.flatnonzero(use[structure.first] & use[structure.second])
+    offset = _across(residual, projected.by_point, structure.first[rows], structure.second[rows])
+    bounds = np.searchsorted(rows, structure.pair_bounds)
+    found = []
+    for pair, start, stop in zip(structure.pair_view.tolist(), bounds[:-1], bounds[1:], strict=True):
+        if stop - start < _GROUPED:
+            continue
+        z = offset[start:stop] - offset[start:stop].mean()
+        square = (z**2).mean()
+        if ((z**3).mean() ** 2 / square**3 + 1.0) < _BIMODAL * (z**4).mean() / square**2:
+            continue
+        share, apart, gain = _mixture(z)
+        if share > _SMALLER and gain > _EVIDENT:
+            found.append(TwoGroups((pair[0], pair[1]), share, apart))
+    return tuple(found)
+
+
+def _mixture(z: Array) -> tuple[float, float, float]:
+    """Two normal distributions of one width in values of mean 0: part of the smaller, distance of the centres (0 if
+    they are not apart), gain in log-likelihood over one.
+    """
+    centers, sigma, part = np.quantile(z, [0.1, 0.9]), 0.5 * z.std(), 0.5
+    likelihood = np.ones_like(z)
+    for _ in range(50):
+        density = np.array([part, 1.0 - part])[:, None] * np.exp(-0.5 * ((z - centers[:, None]) / sigma) ** 2)
+        likelihood = density.sum(axis=0) + 1e-300
+        first, second = density / likelihood
+        part = float(first.mean())
+        if not 0.0 < part < 1.0:
+            return 0.0, 0.0, 0.0
+        centers = np.array([(first * z).sum() / first.sum(), (second * z).sum() / second.sum()])
+        sigma = np.sqrt((first * (z - centers[0]) ** 2 + second * (z - centers[1]) ** 2).mean())
+    one = -0.5 * len(z) - len(z) * np.log(z.std())
+    gain = float(np.log(likelihood).sum() - len(z) * np.log(sigma) - one)
+    apart = float(centers[1] - centers[0])
+    if apart < _APART * sigma:
+        return 0.0, 0.0, gain
+    return min(part, 1.0 - part), apart, gain
 
 
 def agreeing(

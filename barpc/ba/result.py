@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barpc.ba.cameras import Cameras
+from barpc.ba.consensus import TwoGroups
 from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import GaugeReport
 from barpc.ba.options import AdjustOptions
@@ -65,6 +66,8 @@ class Adjustment:
     bend : float or None
         Where the data chose an affine in the image: how much heights differ from those of a rotation and
         translation [m], RMS after their mean.
+    two_groups : tuple of TwoGroups
+        Pairs of views whose tie points fall into two groups.
     held : (P,)
         Tracks held in height because their rays meet under too small an angle.
     left_out : tuple of str
@@ -100,6 +103,7 @@ class Adjustment:
     prior: PriorTest
     smooth: SmoothTest
     bend: float | None
+    two_groups: tuple[TwoGroups, ...]
     held: BoolArray
     left_out: tuple[str, ...]
     gcp_inlier: BoolArray
