@@ -31,6 +31,7 @@ from barpc.scene import BoolArray, GroundPoints, Tracks, View
 SMOOTH_LEAST = 0.06
 """Smooth residuals below this [px] are left alone: two views share what one is wrong by."""
 
+_TREND = 0.03  # px: another model is tried
 _MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
 _BETTER = 0.8  # of the noise
@@ -144,7 +145,7 @@ class _Solution:
     @property
     def has_trend(self) -> bool:
         """Whether something is left that another model may follow: smooth, or in what was cut."""
-        left = bool(self.outcome.smooth.found(SMOOTH_LEAST).any())
+        left = bool(self.outcome.smooth.found(_TREND).any())
         return left or self.after.error > _MUCH_NOISE * self.outcome.noise
 
 
