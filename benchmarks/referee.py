@@ -56,7 +56,7 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.dem import Dem
 from barpc.fit import fit_rpc
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
-from barpc.scene import GroundPoints, Tracks, View
+from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve
 from barpc.sensor.geometry import triangulate
@@ -572,7 +572,9 @@ def referee(case: Case, options: AdjustOptions | None = None, relief: Any = None
             found.status,
             len(found.cost_history),
         )
-    return _verdict(scene, sensors, found.gauge.sigma, found.gauge.shift, rejected, "", 0, (), cpu)
+    return _verdict(
+        scene, sensors, found.gauge.sigma, found.gauge.shift, rejected, "", 0, (), cpu, ~found.held_out
+    )
 
 
 def referee_run(case: Case, relief: Any = None, **options: Any) -> Verdict:
@@ -593,6 +595,7 @@ def referee_run(case: Case, relief: Any = None, **options: Any) -> Verdict:
         code,
         (summary["headline"], *summary["verdict"]),
         cpu,
+        np.ones(len(scene.tracks), dtype=bool),
     )
     return replace(verdict, lost=lost)
 
@@ -607,6 +610,7 @@ def _verdict(
     code: int,
     words: tuple[str, ...],
     cpu: float,
+    seen: BoolArray,
 ) -> Verdict:
     before, after = judge(scene, [view.sensor for view in scene.views]), judge(scene, sensors)
     ratio = np.array(after.move) / np.array(sigma)
@@ -619,7 +623,7 @@ def _verdict(
         tuple(float(s) for s in shift),  # type: ignore[arg-type]
         float(np.mean(ratio**2)),
         float(rejected[good].mean()),
-        float(rejected[scene.bad].mean()) if scene.bad.any() else float("nan"),
+        float(rejected[scene.bad & seen].mean()) if scene.bad.any() else float("nan"),
         status,
         code,
         words,

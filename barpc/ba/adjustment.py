@@ -202,6 +202,7 @@ def _adjustment(
 ) -> Adjustment:
     """What is handed out, in the order of the tracks given."""
     outcome, final, seen = found.outcome, found.final, found.seen
+    whole = np.bincount(block.point[block.use & ~outcome.inlier], minlength=block.num_points) == 0
     covariance = outcome.minimum.covariance(found.problem.free)
     projected = found.problem.project_points(final.params, final.points)
     cameras = found.problem.cameras
@@ -233,7 +234,7 @@ def _adjustment(
         status=status,
         cameras=cameras,
         covariance=covariance,
-        gauge=gauge_report(covariance, final.points, found.state.points, seen),
+        gauge=gauge_report(covariance, final.points, found.state.points, seen, whole),
         prior=outcome.prior,
         smooth=outcome.smooth,
         bend=bend,

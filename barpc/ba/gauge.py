@@ -66,7 +66,9 @@ class GaugeReport:
     radius: float
 
 
-def gauge_report(covariance: Covariance, points: Array, before: Array, use: BoolArray) -> GaugeReport:
+def gauge_report(
+    covariance: Covariance, points: Array, before: Array, use: BoolArray, whole: BoolArray
+) -> GaugeReport:
     """The report for an adjustment.
 
     Parameters
@@ -77,12 +79,15 @@ def gauge_report(covariance: Covariance, points: Array, before: Array, use: Bool
         ECEF [m], after and before.
     use : (P,)
         Points that count.
+    whole : (P,)
+        Those of them that lost no observation: where the others stood before is not where their last ones put them.
 
     Returns
     -------
     GaugeReport
     """
-    shift_of_all = (points[use] - before[use]).mean(axis=0)
+    moved = use & whole if (use & whole).any() else use
+    shift_of_all = (points[moved] - before[moved]).mean(axis=0)
     index = np.flatnonzero(use)
     use = np.zeros_like(use)
     use[index[:: len(index) // _SAMPLE + 1]] = True

@@ -238,7 +238,7 @@ def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(
     use = np.ones(len(case.points), dtype=bool)
     use[4] = False
     covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
-    report = gauge_report(covariance, case.points, before, use)
+    report = gauge_report(covariance, case.points, before, use, use)
     index = np.flatnonzero(use)
     middle = case.points[index].mean(axis=0)
     lon, lat, _ = ground_of(middle)
