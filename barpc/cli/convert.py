@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 import numpy as np
 
 from barpc.cameras import Camera, open_camera, split_spec
-from barpc.cli.points import as_json, check_target
-from barpc.cli.terminal import echo, say, tell_gate
-from barpc.errors import InputError
+from barpc.cli.terminal import as_json, echo, say, tell_gate
+from barpc.errors import InputError, OutputError
 from barpc.handoff import Reading, refuse_hiding, unverified, verify
 from barpc.plain import plain_path
 from barpc.raster import open_raster
-from barpc.rpcio import CARRIERS, WRITABLE, find_rpc, shadows, write_camera, write_crop, write_rpc
+from barpc.rpcio import (
+    CARRIERS,
+    FORMATS,
+    WRITABLE,
+    find_rpc,
+    hidden_by,
+    shadows,
+    sidecars,
+    write_camera,
+    write_crop,
+    write_rpc,
+)
 from barpc.sensor.geometry import image_border
+from barpc.sensor.rpc import RPC
 from barpc.workspace import Workspace
 
 Window = tuple[int, int, int, int]
@@ -48,7 +61,7 @@ Box = tuple[float, float, float, float]
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing file, or files of an earlier run.")
 @as_json
-def command(
+def convert(
     files: tuple[str, ...],
     out_dir: str | None,
     rpcs: str | None,
@@ -94,6 +107,39 @@ def command(
 
 
 # --- one file ---------------------------------------------------------------------------------------------
+
+
+def check_target(
+    target: str | Path, sources: Sequence[str | Path], overwrite: bool, rpc: RPC | None = None
+) -> None:
+    """Raise if a file to be written is an input, or would be read in place of the RPC that an image has.
+
+    Parameters
+    ----------
+    target : path
+        The file to be written.
+    sources : sequence of path
+        What was given; the RPC files beside it belong to it.
+    overwrite : bool
+        An image may get another RPC; that is said. An input is never replaced.
+    rpc : RPC, optional
+        What the file will hold: where the image has the same, nothing changes for it.
+    """
+    target = Path(target)
+    inputs = {p.resolve() for s in sources for p in (Path(s), *(sidecar.path for sidecar in sidecars(s)))}
+    if os.path.lexists(target) and target.resolve() in inputs:
+        raise OutputError(f"{target}: belongs to the input and is never replaced; give another name")
+    text = FORMATS["txt"].write
+    assert text is not None
+    for _, image, now in hidden_by([target]):
+        if rpc is not None and text(rpc) == text(now):
+            continue
+        if not overwrite:
+            raise OutputError(
+                f"{target}: would be read in place of the RPC that {image} has; give another folder or name, or "
+                "--overwrite if that is meant"
+            )
+        say(f"{target} is read in place of the RPC that {image} had")
 
 
 def _convert(

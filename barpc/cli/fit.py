@@ -48,7 +48,7 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
 @click.pass_obj
-def command(
+def fit(
     obj: dict[str, Any],
     /,
     source: str,
@@ -74,7 +74,7 @@ def command(
 
     image = str(split_spec(source)[0])
     if output is not None:
-        from barpc.cli.points import check_target
+        from barpc.cli.convert import check_target
 
         check_target(output, [image], overwrite)
     fit, tolerance = _fit(source, flags)

@@ -18,12 +18,12 @@ from typing import Any
 import click
 
 from barpc import __version__
+from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
 from barpc.cli.terminal import Formatter, echo, say
 from barpc.errors import BarpcError, BarpcWarning
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
-EXIT_GATE = 3
 EXIT_INTERRUPTED = 130
 
 _NO_ARGUMENTS: Any = getattr(click.exceptions, "NoArgsIsHelpError", click.exceptions.Exit)  # not in click 8.1
@@ -41,7 +41,12 @@ COMMANDS = {
     "convert": "Write RPCs in other formats, cut out windows, hand images over.",
     "report": "Make report.html of a finished run again, or compare two runs.",
 }
-"""Verb -> its line in `barpc --help`; the code is `barpc.cli.<verb>.command`."""
+"""Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
+_MODULES = {
+    "match": "adjust",
+    "check": "adjust",
+    **dict.fromkeys(("project", "localize", "triangulate"), "points"),
+}
 
 MOVED = {
     "angle": "info IMAGE IMAGE",
@@ -68,17 +73,15 @@ MOVED = {
     **{
         flag: f"{option} of a file given with --options"
         for flag, option in (
-            ("--detector", "[tie] detector"),
             ("--max-pairwise-matches", "[tie] points_per_image"),
             ("--min-overlap", "[tie] min_overlap"),
-            ("--min-triangulation-angle", "[tie] min_angle"),
+            ("--min-triangulation-angle", "[tie] angles"),
             ("--num-passes", "num_passes"),
             ("--loss", "[adjust] loss"),
             ("--robust-threshold", "[adjust] robust_threshold"),
-            ("--center", "[adjust] center_method"),
             ("--tolerance", "[fit] tolerance"),
             ("--method", "[fit] method"),
-            ("--joint", "[fit] joint"),
+            ("--joint", "[fit] method"),
             ("--grid", "[fit] grid"),
             ("--space", "[fit] space"),
             ("--nodes", "[fit] nodes"),
@@ -108,7 +111,8 @@ class Verbs(click.Group):
         """Import the verb's module and hand out its command."""
         if cmd_name not in COMMANDS:
             return None
-        command: click.Command = import_module(f"barpc.cli.{cmd_name}").command
+        module = import_module(f"barpc.cli.{_MODULES.get(cmd_name, cmd_name)}")
+        command: click.Command = getattr(module, cmd_name)
         command.help = _kept_lines(command.help)
         return command
 

@@ -1,124 +1,111 @@
-"""Options that several verbs share: their flags, and how flags and an options file fill a RunOptions."""
+"""The flags that set options, made of the declarations in `barpc.options`, and those of every run."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin
 
 import click
 
-if TYPE_CHECKING:
-    from barpc.pipeline.options import RunOptions
+from barpc.errors import InputError
+from barpc.options import Declared, RunOptions, checked, declared, read_options, with_values
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-
-class Flag:
-    """A flag and the field of RunOptions that it sets.
-
-    Parameters
-    ----------
-    name : str
-        As typed.
-    target : str
-        The field, with its table before a dot.
-    help : str
-        A sentence.
-    **kwargs
-        For `click.option`.
-    """
-
-    def __init__(self, name: str, target: str, help: str, **kwargs: Any) -> None:
-        self.target = target
-        self.parameter = "flag_" + target.replace(".", "_")
-        if kwargs.get("is_flag"):
-            kwargs["default"] = None  # not given: the options file decides
-        self.decorate = click.option(name, self.parameter, help=help, **kwargs)
-
-
-COUNT = click.IntRange(1)
-TIE_FLAGS = (
-    Flag("--band", "tie.band", "Band of multi-band images, from 1.", type=COUNT),
-    Flag(
-        "--matches", "matches", "Tie points (CSV, npz, ASP text) to use instead of matching.", metavar="FILE"
-    ),
-    Flag("--overlap-list", "overlap_list", "Match only these pairs: two image names a line.", metavar="FILE"),
-    Flag("--aoi", "aoi", "Tie points only inside: polygons in lon/lat (GeoJSON).", metavar="FILE"),
-    Flag("--ip-per-image", "tie.keypoints_per_image", "Keypoints an image, at most.", type=COUNT),
-    Flag("--search", "tie.search", "How far an RPC may be wrong.", type=float, metavar="PX"),
-)
-ADJUSTMENT_FLAGS = (
-    Flag(
-        "--model",
-        "adjust.model",
-        "Unknowns: rotation+translation, rotation, translation, shift, shift-drift or affine.",
-        metavar="NAME",
-    ),
-    Flag(
-        "--drift",
-        "adjust.drift",
-        "Degree of the rotation along the rows.  [default: 1, and 2 where the residuals ask for it]",
-        type=click.IntRange(0, 2),
-    ),
-    Flag(
-        "--sigma-attitude",
-        "adjust.sigma_attitude",
-        "Prior of the rotation, metres on the ground.",
-        type=float,
-        metavar="M",
-    ),
-    Flag("--sigma-position", "adjust.sigma_position", "Prior of the translation.", type=float, metavar="M"),
-    Flag(
-        "--fixed", "adjust.fixed", "A view that keeps its camera (repeatable).", multiple=True, metavar="NAME"
-    ),
-    Flag("--gcp", "gcp", "Ground control points: .gcp, GeoJSON, image tags.", multiple=True, metavar="FILE"),
-    Flag(
-        "--check-points",
-        "check_points",
-        "Ground points measured after the adjustment, not used in it.",
-        multiple=True,
-        metavar="FILE",
-    ),
-    Flag(
-        "--fixed-run",
-        "fixed_run",
-        "Go on from an earlier run: its views keep what it knows about them.",
-        metavar="DIR",
-    ),
-    Flag("--dem", "dem", "Terrain heights that hold weakly seen tie points.", metavar="FILE"),
-    Flag("--dem-sigma", "adjust.dem_sigma", "Standard deviation of the DEM.", type=float, metavar="M"),
-    Flag("--geoid", "geoid", "Geoid grid for a DEM of orthometric heights.", metavar="FILE"),
-)
-RUN_FLAGS = (
-    Flag("--overwrite", "overwrite", "Replace the results of an earlier run.", is_flag=True),
-    Flag(
-        "--images",
-        "images",
-        "Carry the new RPC in a small VRT that points at the image, in a full copy, or not.  [default: vrt]",
-        type=click.Choice(["vrt", "copy", "none"]),
-    ),
-    Flag(
-        "--rpc-format",
-        "rpc_formats",
-        "RPC files to write, of those that 'barpc convert --help' lists.",
-    ),
-    Flag(
-        "--keep-going",
-        "keep_going",
-        "Leave bad files out, keep the largest connected group, write RPCs that miss the tolerance; exit 3.",
-        is_flag=True,
-    ),
-)
-MATCH_FLAGS = tuple(flag for flag in RUN_FLAGS if flag.target in ("overwrite", "keep_going"))
-_BY_PARAMETER = {flag.parameter: flag for flag in (*TIE_FLAGS, *ADJUSTMENT_FLAGS, *RUN_FLAGS)}
+TIE_FLAGS = {
+    "--band": "tie.band",
+    "--matches": "matches",
+    "--overlap-list": "overlap_list",
+    "--aoi": "aoi",
+    "--ip-per-image": "tie.keypoints_per_image",
+    "--search": "tie.search",
+}
+ADJUSTMENT_FLAGS = {
+    "--model": "adjust.model",
+    "--drift": "adjust.drift",
+    "--sigma-attitude": "adjust.sigma_attitude",
+    "--sigma-position": "adjust.sigma_position",
+    "--fixed": "adjust.fixed",
+    "--gcp": "gcp",
+    "--check-points": "check_points",
+    "--fixed-run": "fixed_run",
+    "--dem": "dem",
+    "--dem-sigma": "adjust.dem_sigma",
+    "--geoid": "geoid",
+}
+MATCH_FLAGS = {"--overwrite": "overwrite", "--keep-going": "keep_going"}
+RUN_FLAGS = {**MATCH_FLAGS, "--images": "images", "--rpc-format": "rpc_formats"}
+"""Flag -> the field of RunOptions that it sets, with its table before a dot."""
 
 
-def with_flags(*flags: Flag) -> Callable[[Function], Function]:
+def field_of(target: str) -> Declared:
+    """What is declared of a field, by its name with its table before a dot."""
+    *table, name = target.split(".")
+    record = type(declared(RunOptions)[table[0]].default) if table else RunOptions
+    return declared(record)[name]
+
+
+class _Value(click.ParamType):  # type: ignore[type-arg]  # newer versions of click have an argument
+    """A value of a flag, as its field takes it: one of those that may stand several times, several at once."""
+
+    def __init__(self, target: str) -> None:
+        one = field_of(target)
+        self.field, self.rule, self.kind = target.rpartition(".")[2], one.rule, one.kind
+        if get_origin(self.kind) is tuple and not self.rule.rows:
+            self.kind = get_args(self.kind)[0]
+        listed = "" if self.rule.rows else "|".join(map(str, self.rule.choices(self.kind)))
+        plain = self.rule.unit or getattr(self.kind, "__name__", "")
+        self.name = "NAMES" if self.rule.rows else f"[{listed}]" if listed else plain.upper()
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """What stands for the value in the help."""
+        return self.name
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The field's value of a text."""
+        try:
+            if get_origin(self.kind) is tuple:
+                value = [name.strip() for name in value.split(",")]
+            elif self.kind in (int, float):
+                value = self.kind(value)
+        except ValueError:
+            pass  # said by what follows
+        try:
+            return checked(self.field, self.kind, self.rule, value)
+        except InputError as error:
+            self.fail(str(error), param, ctx)
+
+
+def flag(name: str, target: str) -> Callable[[Function], Function]:
+    """The click option that sets a field: its type, range, choices, help and default are the field's own."""
+    one, parameter = field_of(target), "flag_" + target.replace(".", "_")
+    if one.kind is bool:
+        return click.option(
+            name, parameter, help=one.rule.help, is_flag=True, default=None
+        )  # the file decides
+    several = get_origin(one.kind) is tuple
+    notes = [f"default: {_shown(one.default)}"] if one.default not in (None, ()) else []
+    if one.kind in (int, float) and (bounds := replace(one.rule, unit="").bounds()):
+        notes.append(bounds.strip())
+    how = " Names of 'barpc convert --help', commas between." if one.rule.rows else " (repeatable)"
+    text = one.rule.help + (how if several else "")
+    text += f"  [{'; '.join(notes)}]" if notes else ""
+    return click.option(
+        name, parameter, help=text, type=_Value(target), multiple=several and not one.rule.rows
+    )
+
+
+def _shown(default: Any) -> str:
+    return ",".join(default) if isinstance(default, tuple) else str(default)
+
+
+def with_flags(flags: Mapping[str, str]) -> Callable[[Function], Function]:
     """Give a verb these flags, and those of every run: image and options files, workers, JSON."""
 
     def decorate(function: Function) -> Function:
-        for option in (*_RUN_OPTIONS[::-1], *(flag.decorate for flag in flags[::-1])):
+        for option in (*_RUN_OPTIONS[::-1], *(flag(*row) for row in reversed(tuple(flags.items())))):
             function = option(function)
         return function
 
@@ -163,18 +150,12 @@ def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
 
 def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOptions:
     """Defaults, then the options file, then the flags that were given."""
-    from barpc.pipeline.options import RunOptions, read_options, with_values
-
     options = RunOptions() if options_file is None else read_options(options_file)
     values: dict[str, Any] = {}
-    for parameter, value in flags.items():
+    for target in (*TIE_FLAGS.values(), *ADJUSTMENT_FLAGS.values(), *RUN_FLAGS.values()):
+        value = flags.get("flag_" + target.replace(".", "_"))
         if value is None or value == ():
             continue
-        target = _BY_PARAMETER[parameter].target
-        *table, field = target.split(".")
-        place = values.setdefault(table[0], {}) if table else values
-        if target == "rpc_formats":
-            value = [name.strip() for name in value.split(",")]
-        place[field] = list(value) if isinstance(value, tuple) else value
-    result: RunOptions = with_values(options, values, "command line")
-    return result
+        *table, name = target.split(".")
+        (values.setdefault(table[0], {}) if table else values)[name] = value
+    return with_values(options, values, "command line")

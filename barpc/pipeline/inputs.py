@@ -12,7 +12,7 @@ import numpy as np
 from barpc.ba import BlockPrior
 from barpc.dem import Dem
 from barpc.errors import InputError
-from barpc.pipeline.options import RunOptions
+from barpc.options import RunOptions
 from barpc.pointio.gcp import read_gcps
 from barpc.pointio.names import ViewNames
 from barpc.scene import BoolArray, GroundPoints, Tracks, View

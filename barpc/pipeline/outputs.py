@@ -12,9 +12,9 @@ import numpy as np
 from barpc.errors import OutputError
 from barpc.fit import RpcFit
 from barpc.handoff import verify
+from barpc.options import RunOptions
 from barpc.owned import own_files
 from barpc.pipeline.inputs import PRIOR
-from barpc.pipeline.options import RunOptions
 from barpc.report import Run
 from barpc.report.page import can_render, report_html
 from barpc.report.tables import TABLES

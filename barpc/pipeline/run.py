@@ -15,9 +15,9 @@ from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.handoff import refuse_hiding, unverified
+from barpc.options import RunOptions
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
-from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import Image, LoadedViews, image_path, load_views
 from barpc.plain import plain_path
@@ -26,7 +26,7 @@ from barpc.pointio.names import pair_name, require_pair_names
 from barpc.report import Run, summarize
 from barpc.report.measures import pair_ties
 from barpc.report.page import remake_report
-from barpc.rpcio import WRITABLE, plain_source
+from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class AdjustResult:
     """What a run ends with.
 
@@ -57,6 +57,12 @@ class AdjustResult:
     views: tuple[View, ...]
     run: Run
     summary: dict[str, Any]
+
+    def __repr__(self) -> str:
+        tracks, place = self.run.tracks, self.run.out_dir
+        counts = f"{len(self.views)} views, {tracks.num_points} tie points, {len(tracks)} observations"
+        written = f", in {place if len(place) <= 50 else '...' + place[-47:]}" if place else ""
+        return f"AdjustResult({self.run.kind}: {counts}, {self.summary['status']}{written})"
 
     @property
     def passed(self) -> bool:
@@ -112,35 +118,15 @@ def adjust(
     progress : callable, optional
         `progress(stage, done, total)`.
 
-    Returns
-    -------
-    AdjustResult
-
     Raises
     ------
     BarpcError
         See `barpc.errors`; nothing is written then.
     """
-    options = options or RunOptions()
-    unknown = [name for name in options.rpc_formats if name not in WRITABLE]
-    if unknown:
-        raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(WRITABLE)}")
-    plain_path(Path(out_dir).absolute())
+    options, folder = options or RunOptions(), Path(out_dir)
+    plain_path(folder.absolute())
     loaded = _load(images, options)
-    if options.stop_after == "matching":
-        require_pair_names([view.name for view in loaded.views])
-    if options.images == "vrt":
-        for view in loaded.views:
-            plain_source(view.path)  # refuses what no VRT can point at, before any work
-    keep = {
-        Path(path)
-        for view, source in zip(loaded.views, loaded.sources, strict=True)
-        for path in (view.path, source.path)
-    }
-    keep |= set(input_files(options))
-    names = output_names(loaded.views, options, Path(out_dir))
-    refuse_hiding(Path(out_dir), names, keep)
-    refuse_shadows(Path(out_dir), names)
+    names, keep = _files(loaded, options, folder)
     with Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names) as workspace:
         with _caching(loaded, workspace, executor) as caching:
             run = _solve(loaded, options, workspace, caching, progress)
@@ -155,9 +141,8 @@ def adjust(
         summary = summarize(run)
         write_tables(workspace, run, summary)
         workspace.remove_stale()
-    views = (
-        replace(view, sensor=sensor) for view, sensor in zip(run.views, run.after or run.before, strict=True)
-    )
+    sensors = run.after or run.before
+    views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
     return AdjustResult(_as_given(views, images), run, summary)
 
 
@@ -186,6 +171,22 @@ def _load(images: Sequence[Image], options: RunOptions) -> LoadedViews:
         plain_path(path)
     least = 1 if options.gcp else 2  # one image and control points are enough
     return load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
+
+
+def _files(loaded: LoadedViews, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
+    """The files that a run writes and those that it must keep; what stands in the way is refused before any work."""
+    views = loaded.views
+    if options.stop_after == "matching":
+        require_pair_names([view.name for view in views])
+    if options.images == "vrt":
+        for view in views:
+            plain_source(view.path)
+    keep = {Path(view.path) for view in views} | {Path(source.path) for source in loaded.sources}
+    keep |= set(input_files(options))
+    names = output_names(views, options, folder)
+    refuse_hiding(folder, names, keep)
+    refuse_shadows(folder, names)
+    return names, keep
 
 
 def _caching(loaded: LoadedViews, workspace: Workspace, executor: Executor | None) -> CachingExecutor:
@@ -230,17 +231,16 @@ def _adjusted(run: Run, options: RunOptions, given: Given) -> tuple[Run, Adjustm
     if given.prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, given.prior.names)))
     gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
-    centers = tuple(_center(view, options) for view in run.views)
-    ecef = np.array([center.ecef for center in centers])
-    adjusting = replace(options.adjust, keep_largest=options.keep_going or options.adjust.keep_largest)
+    centers = tuple(_center(view) for view in run.views)
     adjustment = adjust_tracks(
         run.views,
         run.tracks,
-        adjusting,
+        options.adjust,
         gcps,
         given.dem,
-        centers=ecef,
+        centers=np.array([center.ecef for center in centers]),
         prior=given.prior,
+        keep_largest=options.keep_going,
     )
     return replace(run, centers=centers, gcps=gcps, check_points=checks), adjustment
 
@@ -269,7 +269,7 @@ def _with_ties(
     try:
         ties = find_tracks(views, options.tie, **given)
     except DisconnectedError as error:
-        if not (options.keep_going or options.adjust.keep_largest) or len(error.groups[0]) < 2:
+        if not options.keep_going or len(error.groups[0]) < 2:
             raise
         kept = _only(run, frozenset(error.groups[0]))
         logger.warning("%d of %d images are tied together and kept", len(kept.views), len(run.views))
@@ -301,13 +301,10 @@ def _only(run: Run, names: frozenset[str]) -> Run:
     )
 
 
-def _center(view: View, options: RunOptions) -> CameraCenter:
-    method: Any = options.adjust.center_method
-    center = camera_center(view.sensor, view.size, view.alt_range, method)
-    if center.method != method:
-        logger.warning(
-            "%s: the camera centre is not to be had from its RPC; a nominal one is used", view.name
-        )
+def _center(view: View) -> CameraCenter:
+    center = camera_center(view.sensor, view.size, view.alt_range)
+    if center.method == "nominal":
+        logger.warning("%s: its RPC does not tell the camera centre; a nominal one is used", view.name)
     return center
 
 

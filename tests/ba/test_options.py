@@ -13,7 +13,7 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.block import join
-from barpc.ba.options import prior_sigmas, stated_accuracy
+from barpc.ba.priors import prior_sigmas, stated_accuracy
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks

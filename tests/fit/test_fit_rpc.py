@@ -11,7 +11,7 @@ import pytest
 
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, Normalization, fit_rpc, fit_rpc_points
-from barpc.fit.options import PRECISIONS
+from barpc.fit.precision import PRECISIONS
 from barpc.fit.points import check_points, control_points
 from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.fit import Normalization
-from barpc.fit.options import PRECISIONS
+from barpc.fit.precision import PRECISIONS
 from barpc.fit.solve import corner, expected_size, noise_scaled, penalized, solution
 from barpc.fit.system import ALL, Problem
 from barpc.geodesy import Array

@@ -11,7 +11,7 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.gauge import MOTIONS, Mode
 from barpc.errors import BarpcWarning
 from barpc.fit import FitOptions
-from barpc.pipeline.options import RunOptions
+from barpc.options import RunOptions
 from barpc.report import Run, summarize
 from barpc.report.verdict import metres, mode_in_words
 
