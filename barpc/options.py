@@ -142,27 +142,33 @@ def wanted(kind: Any, rule: Rule) -> str:
         return f"{count}, each {wanted(parts[0], rule)}"
     if choices := rule.choices(kind):
         return f"one of {', '.join(map(str, choices))}"
-    words = {bool: "true or false", int: "a whole number", float: "a number", str: rule.unit or "text"}
+    words = {
+        bool: "true or false",
+        int: "a whole number",
+        float: "a number",
+        str: f"a {rule.unit}" if rule.unit else "text",
+    }
     return words.get(kind, f"of class {kind.__name__}") + (rule.bounds() if kind in (int, float) else "")
 
 
 def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
     """A value as its field holds it; InputError names the field where it is of another type or out of range."""
-    parts = get_args(kind)
-    if get_origin(kind) is Mapping and isinstance(value, Mapping):
-        return {str(key): checked(f"{name}.{key}", parts[1], rule, item) for key, item in value.items()}
-    if get_origin(kind) is tuple and isinstance(value, (list, tuple)):
-        if parts[-1] is ... or len(parts) == len(value):
+    parts, found = get_args(kind), None
+    if get_origin(kind) is Mapping:
+        if isinstance(value, Mapping):
+            return {str(key): checked(f"{name}.{key}", parts[1], rule, item) for key, item in value.items()}
+    elif get_origin(kind) is tuple:
+        if isinstance(value, (list, tuple)) and (parts[-1] is ... or len(parts) == len(value)):
             return tuple(checked(name, parts[0], rule, item) for item in value)
     elif choices := rule.choices(kind):
-        if type(value) in (str, int) and value in choices:
-            return value
-        raise InputError(f"{name} {value!r} is not one of {', '.join(map(str, choices))}")
+        if type(value) not in (str, int) or value not in choices:
+            raise InputError(f"{name} {value!r} is not one of {', '.join(map(str, choices))}")
+        found = value
     else:
         found = _plain(kind, rule, value)
-        if found is not None:
-            return found
-    raise InputError(f"{name} must be {wanted(kind, rule)}, found {value!r}")
+    if found is None:
+        raise InputError(f"{name} must be {wanted(kind, rule)}, found {value!r}")
+    return found
 
 
 def _plain(kind: Any, rule: Rule, value: Any) -> Any:
