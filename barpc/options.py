@@ -25,6 +25,7 @@ T = TypeVar("T")
 Record = TypeVar("Record", bound="Options")
 
 Nodes = Literal["uniform", "chebyshev"]
+Model = Literal["rotation+translation", "rotation", "translation", "shift", "shift-drift", "affine"]
 
 _MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
 _SHORT = reprlib.Repr()
@@ -202,10 +203,7 @@ class TieOptions(Options):
         100_000, "Keypoints an image, at most; its cells hold fewer where more would be found.", least=1
     )
     min_overlap: float = option(
-        0.05,
-        "Share of the smaller footprint that a pair of views must have in common.",
-        least=0,
-        most=1,
+        0.05, "Share of the smaller footprint that a pair of views must have in common.", least=0, most=1
     )
     angles: tuple[float, float] = option(
         (0.0, 60.0), "Smallest and largest convergence angle of a pair.", unit="deg", least=0, most=180
@@ -235,10 +233,8 @@ class TieOptions(Options):
 class AdjustOptions(Options):
     """How the adjustment runs."""
 
-    model: Literal["rotation+translation", "rotation", "translation", "shift", "shift-drift", "affine"] = (
-        option(
-            "rotation+translation", "Unknowns of each view; the last three act in the image, for comparison."
-        )
+    model: Model = option(
+        "rotation+translation", "Unknowns of each view; the last three act in the image, for comparison."
     )
     drift: int | None = option(
         None,
@@ -280,9 +276,7 @@ class AdjustOptions(Options):
         least=0,
     )
     loss: str = option(
-        "geman_mcclure",
-        "Robust loss of the first rounds; `linear` skips them.",
-        rows="barpc.ba.loss.LOSSES",
+        "geman_mcclure", "Robust loss of the first rounds; `linear` skips them.", rows="barpc.ba.loss.LOSSES"
     )
     robust_threshold: float = option(
         4.0, "Observations beyond so many standard deviations are cut after the robust rounds.", above=0
@@ -290,20 +284,14 @@ class AdjustOptions(Options):
     estimate_noise: bool = option(True, "Scale the observations' sigmas by what the residuals show.")
     fixed: tuple[str, ...] = option((), "A view that keeps the camera it came with.", unit="name")
     view_weights: Mapping[str, float] = option(
-        {},
-        "Weight of a view's observations (1 where absent): their sigmas are divided by it.",
-        above=0,
+        {}, "Weight of a view's observations (1 where absent): their sigmas are divided by it.", above=0
     )
     dem_sigma: float = option(10.0, "Standard deviation of the DEM.", unit="m", above=0)
     dem_for_all: bool = option(
         False, "Hold every track to the DEM; otherwise only those seen under too small an angle."
     )
     min_convergence: float = option(
-        1.0,
-        "Tracks whose rays meet under a smaller angle are held in height.",
-        unit="deg",
-        least=0,
-        most=180,
+        1.0, "Tracks whose rays meet under a smaller angle are held in height.", unit="deg", least=0, most=180
     )
     solver: Literal["auto", "scipy", "sparse"] = option(
         "auto",
@@ -388,9 +376,7 @@ class RunOptions(Options):
     )
     gcp: tuple[str, ...] = option((), "Ground control points: .gcp, GeoJSON, image tags.", unit="file")
     check_points: tuple[str, ...] = option(
-        (),
-        "Ground points that stay out of the adjustment and are measured after it.",
-        unit="file",
+        (), "Ground points that stay out of the adjustment and are measured after it.", unit="file"
     )
     fixed_run: str | None = option(
         None,

@@ -42,12 +42,7 @@ Box = tuple[float, float, float, float]
 @click.option(
     "--rpc", "rpcs", metavar="PATH", help="With -o: an RPC file, or a folder of them by image name."
 )
-@click.option(
-    "--images",
-    "carrier",
-    type=click.Choice(["vrt", "copy"]),
-    help="With -o: what is written.  [default: vrt]",
-)
+@click.option("--images", "carrier", type=click.Choice(["vrt", "copy"]), help="With -o.  [default: vrt]")
 @click.option(
     "--rpc-format",
     "formats",
@@ -99,10 +94,21 @@ def convert(
     check_target(
         target, [split_spec(source)[0], camera.path], overwrite, None if window or bbox else camera.rpc
     )
+    image = split_spec(source)[0]
     if window or bbox:
-        _crop(camera, source, target, _window(camera, window, bbox, alt), overwrite, as_json)
+        window = _window(camera, window, bbox, alt)
+        write_crop(camera.rpc, image, target, window, overwrite=overwrite)
+        text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
+        echo(json.dumps({"path": target, "window": window}) if as_json else text)
+        return 0
+    if formats is None:
+        write_camera(camera.rpc, target, image, overwrite=overwrite)
     else:
-        _convert(camera, source, target, formats, overwrite, as_json)
+        write_rpc(camera.rpc, target, format=formats, overwrite=overwrite)
+    row = {"source": str(camera.path), "format": camera.format, "target": target}
+    echo(json.dumps(row) if as_json else f"{camera.path} ({camera.format}) -> {target}")
+    for note in () if as_json else camera.notes:
+        say(note)
     return 0
 
 
@@ -140,27 +146,6 @@ def check_target(
                 "--overwrite if that is meant"
             )
         say(f"{target} is read in place of the RPC that {image} had")
-
-
-def _convert(
-    camera: Camera, source: str, target: str, name: str | None, overwrite: bool, as_json: bool
-) -> None:
-    if name is None:
-        write_camera(camera.rpc, target, split_spec(source)[0], overwrite=overwrite)
-    else:
-        write_rpc(camera.rpc, target, format=name, overwrite=overwrite)
-    if as_json:
-        echo(json.dumps({"source": str(camera.path), "format": camera.format, "target": target}))
-    else:
-        echo(f"{camera.path} ({camera.format}) -> {target}")
-        for note in camera.notes:
-            say(note)
-
-
-def _crop(camera: Camera, source: str, target: str, window: Window, overwrite: bool, as_json: bool) -> None:
-    write_crop(camera.rpc, split_spec(source)[0], target, window, overwrite=overwrite)
-    text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
-    echo(json.dumps({"path": target, "window": window}) if as_json else text)
 
 
 def _window(camera: Camera, window: Window | None, bbox: Box | None, alt: float | None) -> Window:
@@ -201,7 +186,8 @@ def _hand_off(
     _check(files, folder, formats)
     sources = images if rpcs is None else [_rpc_file(Path(rpcs), file) for file in files]
     cameras = [open_camera(source) for source in sources]
-    names = [_names(file, carrier, formats) for file in files]
+    ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
+    names = [[file.stem + end for end in ends] for file in files]
     together = [name for row in names for name in row]
     inputs = [*files, *(camera.path for camera in cameras)]
     refuse_hiding(folder, together, inputs)
@@ -213,16 +199,15 @@ def _hand_off(
                 with workspace.output(name) as partial:
                     write_camera(camera.rpc, partial, file, place=folder / name, overwrite=True)
             written = [folder / name for name in row]
-            readings += verify(written, camera.rpc, _size(file), camera.alt_range)
+            with open_raster(file) as dataset:
+                size = dataset.width, dataset.height
+            readings += verify(written, camera.rpc, size, camera.alt_range)
             reasons += _shadow_reasons(file, written)
     _tell(readings, as_json)
     for sentence in unverified([folder / name for name in names[0]]):
         say(sentence)
-    reasons += [
-        f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}."
-        for r in readings
-        if not r.passed
-    ]
+    off = [reading for reading in readings if not reading.passed]
+    reasons += [f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}." for r in off]
     return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
 
 
@@ -231,36 +216,17 @@ def _tell(readings: list[Reading], as_json: bool) -> None:
         for r in readings:
             echo(f"{r.path}: {r.consumer} {r.note or f'{r.max_error:.1e} px'}")
         return
-    echo(
-        json.dumps(
-            [
-                {
-                    "path": str(r.path),
-                    "consumer": r.consumer,
-                    "max_px": None if r.note else r.max_error,
-                    "note": r.note,
-                }
-                for r in readings
-            ]
-        )
-    )
+    keys = ("path", "consumer", "max_px", "note")
+    rows = [(str(r.path), r.consumer, None if r.note else r.max_error, r.note) for r in readings]
+    echo(json.dumps([dict(zip(keys, row, strict=True)) for row in rows]))
 
 
 def _shadow_reasons(image: Path, written: list[Path]) -> list[str]:
     """What lies beside a new file and hides its RPC; what lies beside the image is only said."""
     for sidecar in shadows(image):
         say(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
-    return [
-        f"{sidecar.path} hides the RPC of {written[0]}: move it away."
-        for sidecar in shadows(written[0])
-        if sidecar.path not in written
-    ]
-
-
-def _size(image: Path) -> tuple[int, int]:
-    """Width and height of an image [px]."""
-    with open_raster(image) as dataset:
-        return dataset.width, dataset.height
+    hiding = [sidecar.path for sidecar in shadows(written[0]) if sidecar.path not in written]
+    return [f"{path} hides the RPC of {written[0]}: move it away." for path in hiding]
 
 
 def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
@@ -275,12 +241,6 @@ def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
         raise InputError(f"several images named {twins[0]}: apply them one folder at a time")
     if any(image.resolve().parent == folder.resolve() for image in images):
         raise InputError(f"{folder}: the folder of the images; choose a new one")
-
-
-def _names(image: Path, carrier: str, formats: list[str]) -> list[str]:
-    """What is written for an image: the raster, then a file for each format."""
-    ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
-    return [image.stem + end for end in ends]
 
 
 def _rpc_file(rpcs: Path, image: Path) -> str:

@@ -20,7 +20,6 @@ from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.terminal import as_json, echo
 from barpc.errors import RpcError
 from barpc.fit.certificate import smallest_denominator
-from barpc.geodesy import Array
 from barpc.geojson import collection, feature, polygon
 from barpc.sensor.geometry import (
     camera_center,
@@ -107,20 +106,15 @@ def _outlines(images: Sequence[str], cameras: Sequence[Camera], alt: float | Non
     return collection(features)
 
 
-def _center(camera: Camera, alt: float | None) -> Array:
-    """The ground point (3,) in the middle of the image."""
-    middle = (np.array(camera.extent) - 1) / 2
-    return camera.model.localize(middle, np.asarray(camera.altitude if alt is None else alt))
-
-
 def _pairs(
     images: Sequence[str], cameras: Sequence[Camera], i: int, alt: float | None, at: tuple[float, ...] | None
 ) -> list[dict[str, Any]]:
-    """What an image and each later one see together: the angle between their rays, and B/H."""
-    point = _center(cameras[i], alt) if at is None else np.array(at)
+    """What an image and each later one see together at its centre: the angle between their rays, and B/H."""
+    first, height = cameras[i], np.asarray(cameras[i].altitude if alt is None else alt)
+    point = first.model.localize((np.array(first.extent) - 1) / 2, height) if at is None else np.array(at)
     rows = []
     for image, camera in list(zip(images, cameras, strict=True))[i + 1 :]:
-        angle = float(convergence_angle(cameras[i].model, camera.model, point))
+        angle = float(convergence_angle(first.model, camera.model, point))
         ratio = 2 * float(np.tan(np.radians(angle) / 2))
         rows.append({"with": split_spec(image)[0].stem, "convergence_deg": angle, "b_over_h": ratio})
     return rows
@@ -189,7 +183,7 @@ def _text(value: Any) -> str:
 
 # --- the installation -------------------------------------------------------------------------------------
 
-_REQUIRED = (
+_REQUIRED = [
     "numpy",
     "scipy",
     "opencv-python-headless",
@@ -198,15 +192,15 @@ _REQUIRED = (
     "click",
     "filelock",
     "fastjsonschema",
-)
+]
 _OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
 
 
-def _version(package: str) -> str | None:
+def _version(package: str, missing: str) -> str:
     try:
         return version(package)
     except PackageNotFoundError:
-        return None
+        return missing
 
 
 def _fit_an_rpc() -> str:
@@ -253,11 +247,9 @@ _CHECKS: dict[str, Callable[[], str]] = {
 def _examine(as_json: bool) -> int:
     """Print the versions of what barpc stands on, try each part once, and give the exit code."""
     versions = {"barpc": __version__, "python": platform.python_version()}
-    versions |= {name: _version(name) or "MISSING" for name in _REQUIRED}
-    versions |= {
-        name: _version(name) or f"not installed (pip install 'barpc[{extra}]')"
-        for name, extra in _OPTIONAL.items()
-    }
+    versions |= {name: _version(name, "MISSING") for name in _REQUIRED}
+    for name, extra in _OPTIONAL.items():
+        versions[name] = _version(name, f"not installed (pip install 'barpc[{extra}]')")
     results = {}
     for name, check in _CHECKS.items():
         try:
@@ -267,10 +259,10 @@ def _examine(as_json: bool) -> int:
     good = all(result["ok"] for result in results.values()) and "MISSING" not in versions.values()
     if as_json:
         echo(json.dumps({"versions": versions, "checks": results, "ok": good}, indent=1))
-    else:
-        for name, found in versions.items():
-            echo(f"{name:<24} {found}")
-        for name, result in results.items():
-            echo(f"{'ok  ' if result['ok'] else 'FAIL'} {name}: {result['found']}")
-        echo(f"platform: {platform.platform()}, {sys.executable}", err=True)
+        return 0 if good else 1
+    for name, found in versions.items():
+        echo(f"{name:<24} {found}")
+    for name, result in results.items():
+        echo(f"{'ok  ' if result['ok'] else 'FAIL'} {name}: {result['found']}")
+    echo(f"platform: {platform.platform()}, {sys.executable}", err=True)
     return 0 if good else 1

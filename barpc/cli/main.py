@@ -179,7 +179,7 @@ cli.help = _kept_lines(cli.help)
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the console script: runs a verb and turns errors into one line and an exit code."""
+    """Run a verb, and turn errors into one line and an exit code."""
     argv = sys.argv[1:] if args is None else args
     for name in _THREADS:  # sums keep their order whatever the machine; -j spreads the work
         os.environ.setdefault(name, "1")
@@ -230,11 +230,7 @@ def _interruptible() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-
-    def stop(_number: int, _frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
@@ -242,17 +238,11 @@ def _interruptible() -> Iterator[None]:
 
 
 def _log_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: object = None,
-    line: str | None = None,
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, *_more: object
 ) -> None:
     """A warning as one line of the log: barpc's own always, those of libraries with -v."""
-    own = issubclass(category, BarpcWarning)
     text = " ".join(str(message).split())
-    if own:
+    if issubclass(category, BarpcWarning):
         logging.getLogger("barpc").warning(text)
     else:
         logging.getLogger("py.warnings").info("%s:%d: %s: %s", filename, lineno, category.__name__, text)

@@ -152,7 +152,7 @@ def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOption
     """Defaults, then the options file, then the flags that were given."""
     options = RunOptions() if options_file is None else read_options(options_file)
     values: dict[str, Any] = {}
-    for target in (*TIE_FLAGS.values(), *ADJUSTMENT_FLAGS.values(), *RUN_FLAGS.values()):
+    for target in (*TIE_FLAGS.values(), *ADJUSTMENT_FLAGS.values(), *RUN_FLAGS.values(), "fit.tolerance"):
         value = flags.get("flag_" + target.replace(".", "_"))
         if value is None or value == ():
             continue

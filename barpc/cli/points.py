@@ -141,7 +141,7 @@ def triangulate(
 def read_points(
     numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None
 ) -> Array:
-    """Points from arguments, a CSV file, or standard input ("-").
+    """Points (N, columns) from arguments, a CSV file, or standard input ("-").
 
     Parameters
     ----------
@@ -153,10 +153,6 @@ def read_points(
         Columns.
     fill : float, optional
         Value of the last column where it is not given.
-
-    Returns
-    -------
-    points : (N, len(names))
     """
     if file is not None:
         with nullcontext(sys.stdin) if file == "-" else opened_text(file, TABLE, newline="") as stream:
@@ -206,14 +202,9 @@ def _is_number(text: str) -> bool:
 def _print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_json: bool) -> None:
     """A table of points as CSV with a header, or as a JSON list of objects (null for NaN)."""
     if as_json:
-        rows = [
-            {
-                name: (round(v, d) if np.isfinite(v) else None)
-                for name, v, d in zip(names, row, digits, strict=True)
-            }
-            for row in values.tolist()
-        ]
-        echo(json.dumps(rows))
+        rounded = [[round(v, d) for v, d in zip(row, digits, strict=True)] for row in values.tolist()]
+        plain = [[v if np.isfinite(v) else None for v in row] for row in rounded]
+        echo(json.dumps([dict(zip(names, row, strict=True)) for row in plain]))
         return
     echo(",".join(names))
     for row in values.tolist():

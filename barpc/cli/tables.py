@@ -42,21 +42,14 @@ def print_comparison(comparison: Mapping[str, Any]) -> None:
     """Two runs side by side, on stdout."""
     width = output_width()
     echo(f"A: {comparison['a']}\nB: {comparison['b']}\n")
-    views = [
-        [
-            "image",
-            "points A",
-            "points B",
-            "error A [px]",
-            "error B [px]",
-            "RPCs differ [px]",
-            "without shift [px]",
-        ]
-    ]
+    heads = ["image", "points A", "points B", "error A [px]", "error B [px]", "RPCs differ [px]"]
+    views = [[*heads, "without shift [px]"]]
     for view in comparison["views"]:
         differences = [view["rpc_difference_px"], view["rpc_difference_without_shift_px"]]
         counts, errors = [str(n) for n in view["num_observations"]], [_number(e) for e in view["rmse"]]
-        views.append([view["name"], *counts, *errors, *(_small(d) for d in differences)])
+        views.append(
+            [view["name"], *counts, *errors, *("-" if d is None else f"{d:.2g}" for d in differences)]
+        )
     _echo_table("Reprojection error (RMS) and RPC files", views, width)
     pairs = [["pair", "matches A", "matches B", "offset A [px]", "offset B [px]"]]
     for pair in comparison["pairs"]:
@@ -81,10 +74,6 @@ def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
         All of one length.
     width : int or None
         Columns there are; None: any number.
-
-    Returns
-    -------
-    lines : list of str
 
     Examples
     --------
@@ -121,11 +110,8 @@ def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
 
 
 def _line(row: Sequence[str], widths: Sequence[int]) -> str:
-    cells = [
-        row[0].ljust(widths[0]),
-        *(cell.rjust(size) for cell, size in zip(row[1:], widths[1:], strict=True)),
-    ]
-    return GAP.join(cells).rstrip()
+    numbers = (cell.rjust(size) for cell, size in zip(row[1:], widths[1:], strict=True))
+    return GAP.join([row[0].ljust(widths[0]), *numbers]).rstrip()
 
 
 def _block(heads: Sequence[str], row: Sequence[str]) -> list[str]:
@@ -144,10 +130,6 @@ def _echo_lines(lines: Sequence[str], width: int | None) -> None:
 
 def _number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _small(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2g}"
 
 
 def _views(summary: Summary) -> list[list[str]]:

@@ -23,35 +23,23 @@ PRIOR = "block.npz"
 """The file in a run folder that a later run starts from."""
 
 
-def load_gcps(paths: Sequence[str], names: Sequence[str]) -> GroundPoints | None:
+def load_gcps(paths: Sequence[str], views: Sequence[str]) -> GroundPoints | None:
     """Control points of several files, one after the other; None without files."""
-    parts = [read_gcps(path, names) for path in paths]
+    parts = [read_gcps(path, views) for path in paths]
     if not parts:
         return None
     starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
-    return GroundPoints(
-        names=tuple(name for part in parts for name in part.names),
-        lonlatalt=np.concatenate([part.lonlatalt for part in parts]),
-        sigma=np.concatenate([part.sigma for part in parts]),
-        point=np.concatenate([part.point + start for part, start in zip(parts, starts, strict=True)]),
-        view=np.concatenate([part.view for part in parts]),
-        xy=np.concatenate([part.xy for part in parts]),
-        xy_sigma=np.concatenate([part.xy_sigma for part in parts]),
-        strangers=tuple(dict.fromkeys(name for part in parts for name in part.strangers)),
-    )
+    point = np.concatenate([part.point + start for part, start in zip(parts, starts, strict=True)])
+    columns = ("lonlatalt", "sigma", "view", "xy", "xy_sigma")
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
+    strangers = tuple(dict.fromkeys(name for part in parts for name in part.strangers))
+    names = tuple(name for part in parts for name in part.names)
+    return GroundPoints(names, point=point, **joined, strangers=strangers)
 
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """Side inputs, read before any work starts.
-
-    Parameters
-    ----------
-    dem : Dem or None
-        The terrain, with its geoid.
-    prior : BlockPrior or None
-        What an earlier run knows about its views.
-    """
+    """Side inputs, read before any work starts: the terrain, and what an earlier run knows about its views."""
 
     dem: Dem | None
     prior: BlockPrior | None
@@ -103,14 +91,9 @@ def read_pairs(
     path : path
         The list. Relative paths in it start from where it lies, or from the current folder.
     views : sequence of View
-        The images.
+        The images, whose indices are returned.
     left_out : sequence of path
         Images that a run was given but does not use: their pairs are passed over.
-
-    Returns
-    -------
-    pairs : list of (int, int)
-        Indices of the views.
 
     Raises
     ------
@@ -159,17 +142,10 @@ class _ViewFinder:
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
-    """Tracks that tell something an earlier block did not know.
+    """Tracks that tell something an earlier block, of the views `old` (N,), did not know.
 
     Tracks without a new view are left out. Of those seen in several old views one old observation is kept: how
     these views lie to each other is in the earlier block's normal matrix already.
-
-    Parameters
-    ----------
-    tracks : Tracks
-        Tie points of old and new views.
-    old : (N,)
-        Views of the earlier block.
     """
     is_old = old[tracks.view]
     has_new = np.bincount(tracks.point, ~is_old, minlength=tracks.num_points) > 0

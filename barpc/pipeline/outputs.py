@@ -38,16 +38,10 @@ def write_view(
     ----------
     run : Workspace
         Where to.
-    view : View
-        The image.
-    fit : RpcFit
-        Its refitted RPC.
-    model : SensorModel
-        P_BA, which the files must reproduce.
-    images : {"vrt", "copy", "none"}
-        What carries the RPC.
-    formats : sequence of str
-        RPC files to write, keys of `barpc.rpcio.WRITABLE`.
+    view, fit, model : View, RpcFit, SensorModel
+        The image, its refitted RPC, and P_BA, which the files must reproduce.
+    images, formats : {"vrt", "copy", "none"}, sequence of str
+        What carries the RPC, and the RPC files to write, keys of `barpc.rpcio.WRITABLE`.
 
     Returns
     -------
@@ -116,17 +110,7 @@ def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
 
 
 def write_tables(workspace: Workspace, run: Run, summary: Mapping[str, Any]) -> None:
-    """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete.
-
-    Parameters
-    ----------
-    workspace : Workspace
-        Where to.
-    run : Run
-        What was found.
-    summary : mapping
-        Its summary.
-    """
+    """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete."""
     for name, content in TABLES.items():
         with workspace.output(name) as partial:
             partial.write_bytes(content(run, summary))

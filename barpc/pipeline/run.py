@@ -157,7 +157,7 @@ def check(
     options = options or RunOptions()
     loaded = _load(images, options)
     run = _empty_run("check", loaded, options)
-    run = _with_ties(run, options, executor, progress, None)
+    run = _with_ties(run, options, executor, progress)
     return AdjustResult(_as_given(run.views, images), run, summarize(run))
 
 
@@ -210,23 +210,20 @@ def _solve(
     """Tie points and the adjustment, as often as there are passes."""
     run = _empty_run("adjust", loaded, options)
     given = Given.read(options, run.views)
-    adjustment: Adjustment | None = None
-    passes = 1 if options.matches is not None else options.num_passes
-    for number in range(passes):
+    for number in range(1 if options.matches is not None else options.num_passes):
         again = f" (pass {number + 1})" if number else ""
         with workspace.stage("tie points" + again):
-            run = _with_ties(run, options, executor, progress, adjustment)
+            run = _with_ties(run, options, executor, progress)
         if options.stop_after == "matching":
             _write_matches(run, workspace)
             return replace(run, kind="match")
         with workspace.stage("adjustment" + again):
-            run, adjustment = _adjusted(run, options, given)
-    assert adjustment is not None
-    return replace(run, adjustment=adjustment)
+            run = _adjusted(run, options, given)
+    return run
 
 
-def _adjusted(run: Run, options: RunOptions, given: Given) -> tuple[Run, Adjustment]:
-    """One adjustment, and the run with what went into it."""
+def _adjusted(run: Run, options: RunOptions, given: Given) -> Run:
+    """The run with an adjustment and what went into it."""
     names = [view.name for view in run.views]
     if given.prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, given.prior.names)))
@@ -242,28 +239,22 @@ def _adjusted(run: Run, options: RunOptions, given: Given) -> tuple[Run, Adjustm
         prior=given.prior,
         keep_largest=options.keep_going,
     )
-    return replace(run, centers=centers, gcps=gcps, check_points=checks), adjustment
+    return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment)
 
 
-def _with_ties(
-    run: Run,
-    options: RunOptions,
-    executor: Executor | None,
-    progress: Progress | None,
-    adjustment: Adjustment | None,
-) -> Run:
+def _with_ties(run: Run, options: RunOptions, executor: Executor | None, progress: Progress | None) -> Run:
     """The run with tie points: from a file, or matched, with the corrected cameras in a later pass."""
-    if options.matches is not None:
-        return replace(run, tracks=read_matches(options.matches, [view.name for view in run.views]))
-    if len(run.views) < 2:
-        return run
     views = run.views
-    if adjustment is not None:
-        corrected = zip(views, adjustment.sensors, strict=True)
+    if options.matches is not None:
+        return replace(run, tracks=read_matches(options.matches, [view.name for view in views]))
+    if len(views) < 2:
+        return run
+    if run.adjustment is not None:
+        corrected = zip(views, run.adjustment.sensors, strict=True)
         views = tuple(replace(view, sensor=sensor) for view, sensor in corrected)
     given: dict[str, Any] = {"executor": executor, "progress": progress}
     if options.overlap_list is not None:
-        given["only"] = read_pairs(options.overlap_list, run.views, [path for path, _ in run.left_out])
+        given["only"] = read_pairs(options.overlap_list, views, [path for path, _ in run.left_out])
     if options.aoi is not None:
         given["area"] = read_area(options.aoi)
     try:
@@ -272,8 +263,8 @@ def _with_ties(
         if not options.keep_going or len(error.groups[0]) < 2:
             raise
         kept = _only(run, frozenset(error.groups[0]))
-        logger.warning("%d of %d images are tied together and kept", len(kept.views), len(run.views))
-        return _with_ties(kept, options, executor, progress, None)
+        logger.warning("%d of %d images are tied together and kept", len(kept.views), len(views))
+        return _with_ties(kept, options, executor, progress)
     return replace(run, tracks=ties.tracks, matched=ties.pairs)
 
 
@@ -289,15 +280,16 @@ def _write_matches(run: Run, workspace: Workspace) -> None:
 
 
 def _only(run: Run, names: frozenset[str]) -> Run:
-    """The run without the views that the others are not tied to."""
-    kept = [i for i, view in enumerate(run.views) if view.name in names]
+    """The run as it was loaded, without the views that the others are not tied to."""
     why = "it shares no tie points with the largest group of images"
     dropped = tuple((view.path, why) for view in run.views if view.name not in names)
+    kept = [i for i, view in enumerate(run.views) if view.name in names]
     return replace(
         run,
         views=tuple(run.views[i] for i in kept),
         sources=tuple(run.sources[i] for i in kept),
         left_out=(*run.left_out, *dropped),
+        adjustment=None,
     )
 
 
@@ -311,10 +303,13 @@ def _center(view: View) -> CameraCenter:
 def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress: Progress | None) -> Run:
     """Refit every P_BA first, and write only when all can be written."""
     assert run.adjustment is not None
-    fits: list[RpcFit] = []
+    pairs = list(zip(run.views, run.adjustment.sensors, strict=True))
+    told = progress or (lambda _stage, _done, _total: None)
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
-    for i, (view, model) in enumerate(zip(run.views, run.adjustment.sensors, strict=True)):
+    known = bias if np.isfinite(bias) and bias > 0 else None
+    fits: list[RpcFit] = []
+    for view, model in pairs:
         try:
             fit = fit_rpc(
                 model, view.size, view.alt_range, options=options.fit, strict=not options.keep_going
@@ -322,15 +317,12 @@ def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress
         except FitError as error:
             raise FitError(f"{view.name}: {error}") from error
         rand = view.sensor.err_rand if isinstance(view.sensor, RPC) else None
-        known = bias if np.isfinite(bias) and bias > 0 else None
         fits.append(replace(fit, rpc=replace(fit.rpc, err_bias=known, err_rand=rand)))
-        if progress is not None:
-            progress("fit", i + 1, len(run.views))
-    written = []
-    for i, (view, fit, model) in enumerate(zip(run.views, fits, run.adjustment.sensors, strict=True)):
+        told("fit", len(fits), len(pairs))
+    written: list[Any] = []
+    for (view, model), fit in zip(pairs, fits, strict=True):
         written.append(write_view(workspace, view, fit, model, options.images, options.rpc_formats))
-        if progress is not None:
-            progress("write", i + 1, len(run.views))
+        told("write", len(written), len(pairs))
     for sentence in unverified([workspace.folder / name for name in written[0]]):
         logger.warning(sentence)
     return replace(run, fits=tuple(fits), written=tuple(written))
