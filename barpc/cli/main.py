@@ -19,7 +19,7 @@ import click
 
 from barpc import __version__
 from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
-from barpc.cli.terminal import Formatter, echo, say
+from barpc.cli.terminal import THREADS, Formatter, echo, say
 from barpc.errors import BarpcError, BarpcWarning
 
 EXIT_FAILED = 1
@@ -27,7 +27,7 @@ EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
 
 _NO_ARGUMENTS: Any = getattr(click.exceptions, "NoArgsIsHelpError", click.exceptions.Exit)  # not in click 8.1
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
 
 COMMANDS = {
     "adjust": "Correct the cameras of overlapping images and write fresh RPCs.",
@@ -70,27 +70,12 @@ MOVED = {
     "--keep-largest": "--keep-going",
     "--format": "--rpc-format",
     "--stop-after": "barpc match, or stop_after in a file given with --options",
-    **{
-        flag: f"{option} of a file given with --options"
-        for flag, option in (
-            ("--max-pairwise-matches", "[tie] points_per_image"),
-            ("--min-overlap", "[tie] min_overlap"),
-            ("--min-triangulation-angle", "[tie] angles"),
-            ("--num-passes", "num_passes"),
-            ("--loss", "[adjust] loss"),
-            ("--robust-threshold", "[adjust] robust_threshold"),
-            ("--tolerance", "[fit] tolerance"),
-            ("--method", "[fit] method"),
-            ("--joint", "[fit] method"),
-            ("--grid", "[fit] grid"),
-            ("--space", "[fit] space"),
-            ("--nodes", "[fit] nodes"),
-            ("--for-format", "[fit] precision"),
-            ("--allow-mirrored", "[fit] allow_mirrored"),
-        )
-    },
+    "--max-pairwise-matches": "[tie] points_per_image of a file given with --options",
+    "--min-triangulation-angle": "[tie] angles of a file given with --options",
+    "--joint": "[fit] method of a file given with --options",
+    "--for-format": "[fit] precision of a file given with --options",
 }
-"""Former verb or flag -> how it is said now."""
+"""Former verb or flag -> how it is said now; options that have no flag are found in `barpc.options`."""
 
 _GENERAL = {"-q": "quiet", "--quiet": "quiet", "--debug": "debug", "-v": "verbose", "--verbose": "verbose"}
 
@@ -98,6 +83,18 @@ _GENERAL = {"-q": "quiet", "--quiet": "quiet", "--debug": "debug", "-v": "verbos
 def _kept_lines(text: str | None) -> str | None:
     r"""Turn the written ``\b`` of a raw docstring into the character by which click keeps lines apart."""
     return text and text.replace("\\b\n", "\b\n")
+
+
+def _in_file(flag: str) -> str:
+    """Where an options file says what a flag would, if it is an option."""
+    from barpc.options import Options, RunOptions, declared
+
+    name, top = flag[2:].replace("-", "_"), declared(RunOptions)
+    tables = [
+        (f"[{table}] ", type(one.default)) for table, one in top.items() if isinstance(one.default, Options)
+    ]
+    places = [table for table, record in [("", RunOptions), *tables] if name in declared(record)]
+    return f"{places[0]}{name} of a file given with --options" if places else ""
 
 
 class Verbs(click.Group):
@@ -131,8 +128,8 @@ class Verbs(click.Group):
         known = {flag for parameter in command.params for flag in parameter.opts} if command else set()
         for word in rest[: rest.index("--") if "--" in rest else None]:
             flag = word.split("=")[0]
-            if flag.startswith("-") and flag in MOVED and flag not in known:
-                raise click.UsageError(f"{flag} is said otherwise now: {MOVED[flag]}")
+            if flag.startswith("--") and flag not in known and (now := MOVED.get(flag) or _in_file(flag)):
+                raise click.UsageError(f"{flag} is said otherwise now: {now}")
         return name, command, rest
 
     def _general(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -181,7 +178,7 @@ cli.help = _kept_lines(cli.help)
 def main(args: list[str] | None = None) -> None:
     """Run a verb, and turn errors into one line and an exit code."""
     argv = sys.argv[1:] if args is None else args
-    for name in _THREADS:  # sums keep their order whatever the machine; -j spreads the work
+    for name in THREADS:  # sums keep their order whatever the machine; -j spreads the work
         os.environ.setdefault(name, "1")
     with _interruptible(), warnings.catch_warnings():
         try:
@@ -238,7 +235,12 @@ def _interruptible() -> Iterator[None]:
 
 
 def _log_warning(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, *_more: object
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: object = None,
+    line: str | None = None,
 ) -> None:
     """A warning as one line of the log: barpc's own always, those of libraries with -v."""
     text = " ".join(str(message).split())

@@ -125,13 +125,11 @@ _RUN_OPTIONS = (
     click.option("--image-list", metavar="FILE", help="More image paths from a file, one a line."),
     click.option("--options", "options_file", metavar="FILE", help="Options from a TOML file; flags win."),
     click.option(
-        "-j",
-        "--jobs",
+        *("-j", "--jobs"),
         metavar="N|ADDRESS",
         callback=_jobs,
         default="1",
-        show_default=True,
-        help="Worker processes, or a dask.distributed cluster (tcp://host:8786).",
+        help="Worker processes, or a dask.distributed cluster (tcp://host:8786).  [default: 1]",
     ),
     click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
 )

@@ -10,6 +10,7 @@ import click
 from barpc.plain import visible
 
 EXIT_GATE = 3
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _REASONS = 5  # in the line that says why a run does not pass
 
 as_json = click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")

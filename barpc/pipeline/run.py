@@ -19,7 +19,7 @@ from barpc.options import RunOptions
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
-from barpc.pipeline.views import Image, LoadedViews, image_path, load_views
+from barpc.pipeline.views import Image, image_path, load_views
 from barpc.plain import plain_path
 from barpc.pointio.matches import asp_text, read_matches, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
@@ -125,11 +125,13 @@ def adjust(
     """
     options, folder = options or RunOptions(), Path(out_dir)
     plain_path(folder.absolute())
-    loaded = _load(images, options)
-    names, keep = _files(loaded, options, folder)
+    run = _loaded("adjust", images, options)
+    names, keep = _files(run, options, folder)
     with Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names) as workspace:
-        with _caching(loaded, workspace, executor) as caching:
-            run = _solve(loaded, options, workspace, caching, progress)
+        with workspace.stage("fingerprints"):
+            fingerprints = {view.path: fingerprint(view.path) for view in run.views}
+        with CachingExecutor(workspace, fingerprints, executor) as caching:
+            run = _solve(run, options, workspace, caching, progress)
         if run.adjustment is not None and options.stop_after == "all":
             with workspace.stage("fit and write"):
                 run = _fit_and_write(run, options, workspace, progress)
@@ -155,9 +157,7 @@ def check(
 ) -> AdjustResult:
     """Measure how well the cameras of overlapping images agree; nothing is adjusted or written."""
     options = options or RunOptions()
-    loaded = _load(images, options)
-    run = _empty_run("check", loaded, options)
-    run = _with_ties(run, options, executor, progress)
+    run = _with_ties(_loaded("check", images, options), options, executor, progress)
     return AdjustResult(_as_given(run.views, images), run, summarize(run))
 
 
@@ -166,22 +166,25 @@ def _as_given(views: Iterable[View], images: Sequence[Image]) -> tuple[View, ...
     return tuple(sorted(views, key=lambda view: place[view.path]))
 
 
-def _load(images: Sequence[Image], options: RunOptions) -> LoadedViews:
+def _loaded(kind: str, images: Sequence[Image], options: RunOptions) -> Run:
+    """The run before anything is found."""
     for path in input_files(options):
         plain_path(path)
     least = 1 if options.gcp else 2  # one image and control points are enough
-    return load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
+    loaded = load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
+    none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
+    return Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options)
 
 
-def _files(loaded: LoadedViews, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
+def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
     """The files that a run writes and those that it must keep; what stands in the way is refused before any work."""
-    views = loaded.views
+    views = run.views
     if options.stop_after == "matching":
         require_pair_names([view.name for view in views])
     if options.images == "vrt":
         for view in views:
             plain_source(view.path)
-    keep = {Path(view.path) for view in views} | {Path(source.path) for source in loaded.sources}
+    keep = {Path(view.path) for view in views} | {Path(source.path) for source in run.sources}
     keep |= set(input_files(options))
     names = output_names(views, options, folder)
     refuse_hiding(folder, names, keep)
@@ -189,26 +192,10 @@ def _files(loaded: LoadedViews, options: RunOptions, folder: Path) -> tuple[list
     return names, keep
 
 
-def _caching(loaded: LoadedViews, workspace: Workspace, executor: Executor | None) -> CachingExecutor:
-    with workspace.stage("fingerprints"):
-        fingerprints = {view.path: fingerprint(view.path) for view in loaded.views}
-    return CachingExecutor(workspace, fingerprints, executor)
-
-
-def _empty_run(kind: str, loaded: LoadedViews, options: RunOptions) -> Run:
-    none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
-    return Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options)
-
-
 def _solve(
-    loaded: LoadedViews,
-    options: RunOptions,
-    workspace: Workspace,
-    executor: Executor,
-    progress: Progress | None,
+    run: Run, options: RunOptions, workspace: Workspace, executor: Executor, progress: Progress | None
 ) -> Run:
     """Tie points and the adjustment, as often as there are passes."""
-    run = _empty_run("adjust", loaded, options)
     given = Given.read(options, run.views)
     for number in range(1 if options.matches is not None else options.num_passes):
         again = f" (pass {number + 1})" if number else ""
