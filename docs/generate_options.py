@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from barpc.cli.main import COMMANDS, cli
-from barpc.cli.options import ADJUSTMENT_FLAGS, RUN_FLAGS, TIE_FLAGS
+from barpc.cli.options import ADJUSTMENT, RUN, TIE, flag_name
 from barpc.options import AdjustOptions, FitOptions, Options, RunOptions, TieOptions, declared, wanted
 
 PAGE = Path(__file__).with_name("options.md")
@@ -109,7 +109,7 @@ def help_text(text: str) -> str:
 
 def page() -> str:
     """The whole page."""
-    flags = {target: flag for flag, target in {**TIE_FLAGS, **ADJUSTMENT_FLAGS, **RUN_FLAGS}.items()}
+    flags = {target: flag_name(target) for target in (*TIE, *ADJUSTMENT, *RUN)}
     lines = [HEAD, "## Options of a run"]
     for name, record in TABLES.items():
         lines += option_table(name, record, flags)

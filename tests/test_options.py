@@ -18,7 +18,7 @@ from click.testing import CliRunner
 
 import barpc
 from barpc.cli.main import cli
-from barpc.cli.options import ADJUSTMENT_FLAGS, RUN_FLAGS, TIE_FLAGS, flag, run_options
+from barpc.cli.options import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
 from barpc.errors import InputError
 from barpc.options import (
     AdjustOptions,
@@ -36,8 +36,7 @@ from barpc.options import (
 TABLES: dict[str, type[Options]] = {
     "": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions
 }  # fmt: skip
-FLAGS = {target: name for name, target in {**TIE_FLAGS, **ADJUSTMENT_FLAGS, **RUN_FLAGS}.items()}
-FLAGS["fit.tolerance"] = "--tolerance"
+FLAGS = {target: flag_name(target) for target in (*TIE, *ADJUSTMENT, *RUN, "fit.tolerance")}
 FIELDS = [
     (table, name, one)
     for table, record in TABLES.items()
@@ -177,7 +176,7 @@ def test_there_are_at_most_fifty_and_each_has_a_meaning() -> None:
 def test_a_flag_says_what_is_declared(target: str) -> None:
     table, _, name = target.rpartition(".")
     one = declared(TABLES[table])[name]
-    option = flag(FLAGS[target], target)(lambda: None).__click_params__[0]  # type: ignore[attr-defined]
+    option = flag(target)(lambda: None).__click_params__[0]  # type: ignore[attr-defined]
     assert option.help.startswith(one.rule.help)
     names, text = option.get_help_record(click.Context(click.Command("adjust")))
     if one.rule.unit:

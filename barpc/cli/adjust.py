@@ -10,16 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.options import (
-    ADJUSTMENT_FLAGS,
-    MATCH_FLAGS,
-    RUN_FLAGS,
-    TIE_FLAGS,
-    image_paths,
-    run_options,
-    with_flags,
-)
+from barpc.cli.options import ADJUSTMENT, MATCH, RUN, TIE, image_paths, run_options, with_flags
 from barpc.cli.progress import executor_for, progress_bars
+from barpc.cli.tables import print_summary
 from barpc.cli.terminal import echo, tell_gate
 
 if TYPE_CHECKING:
@@ -32,7 +25,7 @@ _out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="F
 @click.command("adjust")
 @_images
 @_out_dir
-@with_flags({**RUN_FLAGS, **TIE_FLAGS, **ADJUSTMENT_FLAGS})
+@with_flags(*RUN, *TIE, *ADJUSTMENT)
 @click.pass_obj
 def adjust(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
     r"""Correct the cameras of overlapping images and write fresh RPCs.
@@ -55,7 +48,7 @@ def adjust(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flag
 @click.command("match")
 @_images
 @_out_dir
-@with_flags({**MATCH_FLAGS, **TIE_FLAGS})
+@with_flags(*MATCH, *TIE)
 @click.pass_obj
 def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
     r"""Match tie points and stop, for `barpc adjust --matches` and other tools.
@@ -75,7 +68,7 @@ def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags
 @click.command("check")
 @_images
 @click.option("--against", metavar="PATH", help="Compare with this RPC (one image), or those of this folder.")
-@with_flags(TIE_FLAGS)
+@with_flags(*TIE)
 @click.pass_obj
 def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, **flags: Any) -> int:
     r"""Measure how well the cameras of overlapping images agree, without adjusting or writing anything.
@@ -111,8 +104,6 @@ def _run(
     if flags["as_json"]:
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
-        from barpc.cli.tables import print_summary
-
         print_summary(result.summary)
     return 0 if result.passed else tell_gate(result.summary["headline"], result.summary["reasons"])
 

@@ -120,16 +120,8 @@ def check_target(
 ) -> None:
     """Raise if a file to be written is an input, or would be read in place of the RPC that an image has.
 
-    Parameters
-    ----------
-    target : path
-        The file to be written.
-    sources : sequence of path
-        What was given; the RPC files beside it belong to it.
-    overwrite : bool
-        An image may get another RPC; that is said. An input is never replaced.
-    rpc : RPC, optional
-        What the file will hold: where the image has the same, nothing changes for it.
+    The RPC files beside the sources belong to them; none is ever replaced. With `overwrite` an image may get another
+    RPC, and that is said; where it is the `rpc` that the file will hold, nothing changes for it.
     """
     target = Path(target)
     inputs = {p.resolve() for s in sources for p in (Path(s), *(sidecar.path for sidecar in sidecars(s)))}
@@ -184,8 +176,9 @@ def _hand_off(
     """Write images with their RPCs, open every file as its readers do, and say what they see."""
     files = [split_spec(image)[0] for image in images]
     _check(files, folder, formats)
-    sources = images if rpcs is None else [_rpc_file(Path(rpcs), file) for file in files]
-    cameras = [open_camera(source) for source in sources]
+    if rpcs is not None:
+        images = tuple(str(find_rpc(Path(rpcs), f)) if Path(rpcs).is_dir() else rpcs for f in files)
+    cameras = [open_camera(image) for image in images]
     ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
     names = [[file.stem + end for end in ends] for file in files]
     together = [name for row in names for name in row]
@@ -241,7 +234,3 @@ def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
         raise InputError(f"several images named {twins[0]}: apply them one folder at a time")
     if any(image.resolve().parent == folder.resolve() for image in images):
         raise InputError(f"{folder}: the folder of the images; choose a new one")
-
-
-def _rpc_file(rpcs: Path, image: Path) -> str:
-    return str(find_rpc(rpcs, image) if rpcs.is_dir() else rpcs)

@@ -12,7 +12,6 @@ from barpc.cli.options import flag, run_options
 from barpc.cli.terminal import as_json, echo, tell_gate
 
 if TYPE_CHECKING:
-    from barpc.cameras import Camera
     from barpc.fit import RpcFit
 
 _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third of the accuracy
@@ -39,7 +38,7 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
     help="Margin below and above the DEM.",
 )
 @click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
-@flag("--tolerance", "fit.tolerance")
+@flag("fit.tolerance")
 @click.option("--options", "options_file", metavar="FILE", help="TOML file; its table [fit] counts here.")
 @click.option("--keep-going", is_flag=True, help="Write the RPC although it misses the tolerance; exit 3.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
@@ -95,7 +94,9 @@ def fit(
 def _fit(source: str, flags: dict[str, Any]) -> tuple[RpcFit, float]:
     """The fit and the tolerance [px] that it is to meet."""
     from barpc.cameras import open_camera, read_points, split_spec
+    from barpc.dem import Dem
     from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
+    from barpc.fit.points import terrain_range
 
     options = run_options(flags, flags["options_file"]).fit
     points, size = read_points(source)
@@ -106,17 +107,12 @@ def _fit(source: str, flags: dict[str, Any]) -> tuple[RpcFit, float]:
     camera = open_camera(source)
     if split_spec(source)[1].get("swath", "").lower() == "mosaic" and options.grid == FitOptions().grid:
         options = replace(options, grid=_MOSAIC_GRID)
-    alt_range = flags["alt_range"] or (_dem_range(camera, flags) if flags["dem"] else camera.alt_range)
+    alt_range = flags["alt_range"] or camera.alt_range
+    if flags["dem"] and not flags["alt_range"]:
+        terrain = Dem.open(flags["dem"], flags["geoid"])
+        alt_range = terrain_range(camera.model, camera.extent, alt_range, terrain, flags["dem_margin"])
     fit = fit_rpc(camera.model, camera.extent, alt_range, options=options, strict=False)
     return fit, options.tolerance
-
-
-def _dem_range(camera: Camera, flags: dict[str, Any]) -> tuple[float, float]:
-    from barpc.dem import Dem
-    from barpc.fit.points import terrain_range
-
-    terrain = Dem.open(flags["dem"], flags["geoid"])
-    return terrain_range(camera.model, camera.extent, camera.alt_range, terrain, flags["dem_margin"])
 
 
 def _write(fit: RpcFit, source: str, output: str, overwrite: bool) -> str:

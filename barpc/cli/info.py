@@ -21,13 +21,7 @@ from barpc.cli.terminal import as_json, echo
 from barpc.errors import RpcError
 from barpc.fit.certificate import smallest_denominator
 from barpc.geojson import collection, feature, polygon
-from barpc.sensor.geometry import (
-    camera_center,
-    convergence_angle,
-    footprint,
-    ground_sample_distance,
-    view_angles,
-)
+from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC
 
 
@@ -98,7 +92,7 @@ def _outlines(images: Sequence[str], cameras: Sequence[Camera], alt: float | Non
     features = []
     for image, camera in zip(images, cameras, strict=True):
         height = camera.altitude if alt is None else alt
-        ring = footprint(camera.model, camera.extent, height)
+        ring = geometry.footprint(camera.model, camera.extent, height)
         if not np.isfinite(ring).all():
             raise RpcError(f"{image}: no ground point at its image's border at {height:g} m")
         path = split_spec(image)[0]
@@ -114,7 +108,7 @@ def _pairs(
     point = first.model.localize((np.array(first.extent) - 1) / 2, height) if at is None else np.array(at)
     rows = []
     for image, camera in list(zip(images, cameras, strict=True))[i + 1 :]:
-        angle = float(convergence_angle(first.model, camera.model, point))
+        angle = float(geometry.convergence_angle(first.model, camera.model, point))
         ratio = 2 * float(np.tan(np.radians(angle) / 2))
         rows.append({"with": split_spec(image)[0].stem, "convergence_deg": angle, "b_over_h": ratio})
     return rows
@@ -156,10 +150,10 @@ def _geometry(
     report: dict[str, Any] = {"size_px": list(size), "center_deg": center[:2].tolist()}
     if not np.isfinite(center).all():
         return report | {"problem": "no ground point at the image's centre"}
-    incidence, azimuth = view_angles(model, center if at is None else np.array(at))
-    metres = ground_sample_distance(model, middle, alt)
-    stand = camera_center(model, size, camera.alt_range)
-    ring = footprint(model, size, alt)
+    incidence, azimuth = geometry.view_angles(model, center if at is None else np.array(at))
+    metres = geometry.ground_sample_distance(model, middle, alt)
+    stand = geometry.camera_center(model, size, camera.alt_range)
+    ring = geometry.footprint(model, size, alt)
     return report | {
         "incidence_deg": float(incidence),
         "azimuth_deg": float(azimuth),

@@ -23,7 +23,6 @@ from barpc.cli.terminal import THREADS, Formatter, echo, say
 from barpc.errors import BarpcError, BarpcWarning
 
 EXIT_FAILED = 1
-EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
 
 _NO_ARGUMENTS: Any = getattr(click.exceptions, "NoArgsIsHelpError", click.exceptions.Exit)  # not in click 8.1
@@ -89,11 +88,12 @@ def _in_file(flag: str) -> str:
     """Where an options file says what a flag would, if it is an option."""
     from barpc.options import Options, RunOptions, declared
 
-    name, top = flag[2:].replace("-", "_"), declared(RunOptions)
-    tables = [
-        (f"[{table}] ", type(one.default)) for table, one in top.items() if isinstance(one.default, Options)
-    ]
-    places = [table for table, record in [("", RunOptions), *tables] if name in declared(record)]
+    name = flag[2:].replace("-", "_")
+    tables: dict[str, type[Options]] = {"": RunOptions}
+    for table, one in declared(RunOptions).items():
+        if isinstance(one.default, Options):
+            tables[f"[{table}] "] = type(one.default)
+    places = [table for table, record in tables.items() if name in declared(record)]
     return f"{places[0]}{name} of a file given with --options" if places else ""
 
 
@@ -128,8 +128,10 @@ class Verbs(click.Group):
         known = {flag for parameter in command.params for flag in parameter.opts} if command else set()
         for word in rest[: rest.index("--") if "--" in rest else None]:
             flag = word.split("=")[0]
-            if flag.startswith("--") and flag not in known and (now := MOVED.get(flag) or _in_file(flag)):
-                raise click.UsageError(f"{flag} is said otherwise now: {now}")
+            if flag.startswith("--") and flag not in known:
+                now = MOVED.get(flag) or ("--options" in known and _in_file(flag))
+                if now:
+                    raise click.UsageError(f"{flag} is said otherwise now: {now}")
         return name, command, rest
 
     def _general(self, ctx: click.Context, args: list[str]) -> list[str]:

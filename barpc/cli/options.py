@@ -14,30 +14,20 @@ from barpc.options import Declared, RunOptions, checked, declared, read_options,
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-TIE_FLAGS = {
-    "--band": "tie.band",
-    "--matches": "matches",
-    "--overlap-list": "overlap_list",
-    "--aoi": "aoi",
-    "--ip-per-image": "tie.keypoints_per_image",
-    "--search": "tie.search",
-}
-ADJUSTMENT_FLAGS = {
-    "--model": "adjust.model",
-    "--drift": "adjust.drift",
-    "--sigma-attitude": "adjust.sigma_attitude",
-    "--sigma-position": "adjust.sigma_position",
-    "--fixed": "adjust.fixed",
-    "--gcp": "gcp",
-    "--check-points": "check_points",
-    "--fixed-run": "fixed_run",
-    "--dem": "dem",
-    "--dem-sigma": "adjust.dem_sigma",
-    "--geoid": "geoid",
-}
-MATCH_FLAGS = {"--overwrite": "overwrite", "--keep-going": "keep_going"}
-RUN_FLAGS = {**MATCH_FLAGS, "--images": "images", "--rpc-format": "rpc_formats"}
-"""Flag -> the field of RunOptions that it sets, with its table before a dot."""
+TIE = ("tie.band", "matches", "overlap_list", "aoi", "tie.keypoints_per_image", "tie.search")
+ADJUSTMENT = (
+    *("adjust.model", "adjust.drift", "adjust.sigma_attitude", "adjust.sigma_position", "adjust.fixed"),
+    *("gcp", "check_points", "fixed_run", "dem", "adjust.dem_sigma", "geoid"),
+)
+MATCH = ("overwrite", "keep_going")
+RUN = (*MATCH, "images", "rpc_formats")
+"""Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
+_NAMES = {"tie.keypoints_per_image": "--ip-per-image", "rpc_formats": "--rpc-format"}
+
+
+def flag_name(target: str) -> str:
+    """The flag that sets a field."""
+    return _NAMES.get(target) or "--" + target.rpartition(".")[2].replace("_", "-")
 
 
 def field_of(target: str) -> Declared:
@@ -78,9 +68,9 @@ class _Value(click.ParamType):  # type: ignore[type-arg]  # newer versions of cl
             self.fail(str(error), param, ctx)
 
 
-def flag(name: str, target: str) -> Callable[[Function], Function]:
+def flag(target: str) -> Callable[[Function], Function]:
     """The click option that sets a field: its type, range, choices, help and default are the field's own."""
-    one, parameter = field_of(target), "flag_" + target.replace(".", "_")
+    one, name, parameter = field_of(target), flag_name(target), "flag_" + target.replace(".", "_")
     if one.kind is bool:
         return click.option(
             name, parameter, help=one.rule.help, is_flag=True, default=None
@@ -101,11 +91,11 @@ def _shown(default: Any) -> str:
     return ",".join(default) if isinstance(default, tuple) else str(default)
 
 
-def with_flags(flags: Mapping[str, str]) -> Callable[[Function], Function]:
-    """Give a verb these flags, and those of every run: image and options files, workers, JSON."""
+def with_flags(*targets: str) -> Callable[[Function], Function]:
+    """Give a verb the flags of these fields, and those of every run: image and options files, workers, JSON."""
 
     def decorate(function: Function) -> Function:
-        for option in (*_RUN_OPTIONS[::-1], *(flag(*row) for row in reversed(tuple(flags.items())))):
+        for option in (*_RUN_OPTIONS[::-1], *map(flag, targets[::-1])):
             function = option(function)
         return function
 
@@ -150,7 +140,7 @@ def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOption
     """Defaults, then the options file, then the flags that were given."""
     options = RunOptions() if options_file is None else read_options(options_file)
     values: dict[str, Any] = {}
-    for target in (*TIE_FLAGS.values(), *ADJUSTMENT_FLAGS.values(), *RUN_FLAGS.values(), "fit.tolerance"):
+    for target in (*TIE, *ADJUSTMENT, *RUN, "fit.tolerance"):
         value = flags.get("flag_" + target.replace(".", "_"))
         if value is None or value == ():
             continue

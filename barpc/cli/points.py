@@ -143,16 +143,8 @@ def read_points(
 ) -> Array:
     """Points (N, columns) from arguments, a CSV file, or standard input ("-").
 
-    Parameters
-    ----------
-    numbers : sequence of float
-        Arguments, a multiple of the number of columns.
-    file : str or None
-        CSV with a header that has the columns, or without one in their order; blanks separate, too.
-    names : sequence of str
-        Columns.
-    fill : float, optional
-        Value of the last column where it is not given.
+    A file has a header with the columns' names, or their order; blanks separate, too. `fill` is the value of the last
+    column where it is not given.
     """
     if file is not None:
         with nullcontext(sys.stdin) if file == "-" else opened_text(file, TABLE, newline="") as stream:
@@ -175,11 +167,12 @@ def _table(lines: Iterable[str], file: str, names: Sequence[str], fill: float | 
             raise InputError(f"{file}: columns {', '.join(names)} expected, found {', '.join(header)}")
     points = np.empty((len(rows), len(names)))
     for i, row in enumerate(rows):
-        for j, column in enumerate(columns):
-            missing = column < 0 or column >= len(row)
-            if missing and not (fill is not None and j == len(names) - 1):
+        texts = [row[column] if 0 <= column < len(row) else None for column in columns]
+        if fill is not None and texts[-1] is None:
+            texts[-1] = str(fill)
+        for j, text in enumerate(texts):
+            if text is None:
                 raise InputError(f"{file}: point {i + 1} has {len(row)} columns, expected {', '.join(names)}")
-            text = str(fill) if missing else row[column]
             if not _is_number(text):
                 raise InputError(f"{file}: point {i + 1}: {text!r} is no number")
             points[i, j] = float(text)

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -21,7 +21,7 @@ from barpc.plain import visible
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
 
-Progress = Callable[[str, int, int], None]
+    from barpc.tie.tasks import Progress
 
 
 @contextmanager

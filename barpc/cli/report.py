@@ -31,13 +31,12 @@ def report(run_dir: str, other: str | None, as_json: bool) -> int:
 
         echo(remake_report(run_dir))
         return 0
+    from barpc.cli.tables import print_comparison
     from barpc.report.compare import compare_runs
 
     comparison = compare_runs(run_dir, other)
     if as_json:
         echo(json.dumps(comparison, indent=1))
     else:
-        from barpc.cli.tables import print_comparison
-
         print_comparison(comparison)
     return 0

@@ -68,12 +68,7 @@ def output_width() -> int | None:
 def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
     r"""Lines of a table whose first row are the heads and whose first column is text, the others numbers.
 
-    Parameters
-    ----------
-    table : sequence of rows
-        All of one length.
-    width : int or None
-        Columns there are; None: any number.
+    The table has `width` columns on the terminal; None: any number.
 
     Examples
     --------
@@ -95,7 +90,8 @@ def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
     narrow = [max(map(len, [*head.split(), *column])) for head, *column in zip(*table, strict=True)]
     room = width - sum(narrow[1:]) - len(GAP) * (len(heads) - 1)
     if room < min(narrow[0], NARROWEST):
-        return [line for row in rows for line in _block(heads, row)]
+        cells = ((f"  {head}: {cell}" for head, cell in zip(heads[1:], row[1:], strict=True)) for row in rows)
+        return [line for row, block in zip(rows, cells, strict=True) for line in (row[0], *block)]
     widths = [min(narrow[0], room), *narrow[1:]]
     broken = [textwrap.wrap(head, size) for head, size in zip(heads, widths, strict=True)]
     depth = max(map(len, broken))
@@ -112,10 +108,6 @@ def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
 def _line(row: Sequence[str], widths: Sequence[int]) -> str:
     numbers = (cell.rjust(size) for cell, size in zip(row[1:], widths[1:], strict=True))
     return GAP.join([row[0].ljust(widths[0]), *numbers]).rstrip()
-
-
-def _block(heads: Sequence[str], row: Sequence[str]) -> list[str]:
-    return [row[0], *(f"  {head}: {cell}" for head, cell in zip(heads[1:], row[1:], strict=True))]
 
 
 def _echo_table(title: str, table: Sequence[Sequence[str]], width: int | None) -> None:

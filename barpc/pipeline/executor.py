@@ -258,15 +258,7 @@ class _Task(Future[Any]):
 
 @dataclass(frozen=True)
 class Spilled:
-    """The arguments of a task whose large arrays lie in files.
-
-    Parameters
-    ----------
-    small : dict of str to ndarray
-        What `to_record` made of them, without the large arrays.
-    large : mapping of str to str
-        Name of each large array -> its file.
-    """
+    """The arguments of a task whose large arrays lie in files: what `to_record` made of them, name -> file."""
 
     small: Record
     large: Mapping[str, str]

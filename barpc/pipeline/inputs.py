@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,13 +46,7 @@ class Given:
 
     @classmethod
     def read(cls, options: RunOptions, views: Sequence[View]) -> Given:
-        """Read them all; a file that cannot be used stops the run here, and not after an hour.
-
-        Raises
-        ------
-        InputError
-            A file is missing or does not parse, or a DEM holds no height under any of the views.
-        """
+        """Read them all; a file that cannot be used stops the run here (InputError), and not after an hour."""
         names = [view.name for view in views]
         load_gcps(options.gcp, names)
         load_gcps(options.check_points, names)
@@ -101,7 +95,7 @@ def read_pairs(
         The file cannot be read, a line is not two images of the run, or none is left; the message names it.
     """
     lines = read_names(path, "a list of pairs")
-    find = _ViewFinder(Path(path).parent, views, left_out)
+    find = _finder(Path(path).parent, views, left_out)
     pairs = []
     for number, line in enumerate(lines, start=1):
         try:
@@ -120,25 +114,26 @@ def read_pairs(
     return pairs
 
 
-class _ViewFinder:
-    """Views by what a list calls them: a path, from the list's folder or the current one, or a name."""
+def _finder(
+    folder: Path, views: Sequence[View], left_out: Sequence[str | Path]
+) -> Callable[[str], int | None]:
+    """Index of the view that a list in a folder calls by its path, from there or from here, or by its name.
 
-    def __init__(self, folder: Path, views: Sequence[View], left_out: Sequence[str | Path]) -> None:
-        self._starts = (folder, Path())
-        self._views = ViewNames([view.name for view in views], "the list of pairs")
-        self._left_out = ViewNames([Path(path).name for path in left_out], "")
-        self._places: dict[Path, int | None] = {Path(path).resolve(): None for path in left_out}
-        self._places.update({Path(view.path).resolve(): index for index, view in enumerate(views)})
+    None for an image that was left out; a stranger is an InputError.
+    """
+    names = ViewNames([view.name for view in views], "the list of pairs")
+    without = ViewNames([Path(path).name for path in left_out], "")
+    places: dict[Path, int | None] = {Path(path).resolve(): None for path in left_out}
+    places |= {Path(view.path).resolve(): index for index, view in enumerate(views)}
 
-    def __call__(self, word: str) -> int | None:
-        """Index of a view; None for an image that was left out; InputError for a stranger."""
-        for start in self._starts:
-            place = (start / word).resolve()
-            if place in self._places:
-                return self._places[place]
-        if self._views.find(word) is None and self._left_out.find(word) is not None:
-            return None
-        return self._views.index(word)
+    def find(word: str) -> int | None:
+        for place in ((start / word).resolve() for start in (folder, Path())):
+            if place in places:
+                return places[place]
+        unused = names.find(word) is None and without.find(word) is not None
+        return None if unused else names.index(word)
+
+    return find
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:

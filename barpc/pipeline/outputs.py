@@ -34,19 +34,10 @@ def write_view(
 ) -> dict[str, dict[str, float | str]]:
     """Write one view's corrected RPC, and open every file again as its consumers do.
 
-    Parameters
-    ----------
-    run : Workspace
-        Where to.
-    view, fit, model : View, RpcFit, SensorModel
-        The image, its refitted RPC, and P_BA, which the files must reproduce.
-    images, formats : {"vrt", "copy", "none"}, sequence of str
-        What carries the RPC, and the RPC files to write, keys of `barpc.rpcio.WRITABLE`.
-
     Returns
     -------
     written : dict of str to dict
-        File name, and for each consumer that was tried the largest difference to P_BA [px], or why it does
+        File name, and for each consumer that was tried the largest difference to P_BA, `model` [px], or why it does
         not read the file.
 
     Raises

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,11 +31,10 @@ from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.tie import find_tracks, read_area
+from barpc.tie.tasks import Progress
 from barpc.workspace import Workspace, fingerprint
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -41,17 +41,7 @@ Image = str | Path | View
 
 @dataclass(frozen=True, eq=False)
 class LoadedViews:
-    """Views, where their cameras came from, and what was left out.
-
-    Parameters
-    ----------
-    views : tuple of View
-        In the order of their names.
-    sources : tuple of Camera
-        One a view.
-    left_out : tuple of (str, str)
-        Path and reason of each file that was left out.
-    """
+    """Views in the order of their names, where their cameras came from, path and reason of what was left out."""
 
     views: tuple[View, ...]
     sources: tuple[Camera, ...]
@@ -152,14 +142,7 @@ def _altitudes(camera: Camera) -> tuple[float, float]:
 class Twins:
     """Finds an image that was given before: the same file, the same camera, or the same pixels.
 
-    Parameters
-    ----------
-    band : int
-        The band whose pixels are compared, from 1.
-
-    Notes
-    -----
-    Pixels are compared as decoded values, so that copies in another compression, layout, number type or
+    Pixels of a band are compared as decoded values, so that copies in another compression, layout, number type or
     behind a VRT are found. Three small windows of each image are read; images in which these agree are then
     read whole, each once. An image in which nothing varies, in these and in 36 more, is compared with none. The
     work is linear in the number of images.
@@ -171,15 +154,7 @@ class Twins:
         self._alike: dict[Hashable, str | None] = {}
 
     def add(self, view: View) -> None:
-        """Take a view in.
-
-        Raises
-        ------
-        InputError
-            It is an image that was taken in before; the message names both.
-        ImageError
-            Its pixels cannot be read.
-        """
+        """Take a view in; InputError names both where it was taken in before."""
         file = Path(view.path).stat()
         marks: dict[Hashable, str] = {
             (file.st_dev, file.st_ino): "is the same file as {}",
@@ -200,9 +175,9 @@ class Twins:
     def _pixels(self, view: View) -> Hashable | None:
         """A mark of the whole image where another is like it in the samples; None for the first of its like."""
         with open_raster(view.path) as image:
-            sampled = _digest(image, self._band, _samples(*view.size), vary=True)
+            sampled = _digest(image, self._band, _samples(*view.size))
             if sampled is None:  # fill, perhaps: the rest is asked before anything is read whole
-                sampled = _digest(image, self._band, _samples(*view.size, _MORE), vary=True)
+                sampled = _digest(image, self._band, _samples(*view.size, _MORE))
             if sampled is None:
                 return None
             like = (view.size, sampled)
@@ -229,13 +204,11 @@ def _whole(image: Any, band: int) -> bytes | None:
     block = image.block_shapes[band - 1][0]
     rows = max(1, _CHUNK // (image.width * block)) * block  # whole blocks, so that each is decoded once
     tops = range(0, image.height, rows)
-    return _digest(
-        image, band, [Window(0, top, image.width, min(rows, image.height - top)) for top in tops], vary=True
-    )
+    return _digest(image, band, [Window(0, top, image.width, min(rows, image.height - top)) for top in tops])
 
 
-def _digest(image: Any, band: int, windows: list[Window], *, vary: bool = False) -> bytes | None:
-    """A hash of pixels; None where they should vary and do not."""
+def _digest(image: Any, band: int, windows: list[Window]) -> bytes | None:
+    """A hash of pixels; None where nothing varies."""
     found = blake2b(digest_size=16)
     low = high = np.nan
     for window in windows:
@@ -243,7 +216,7 @@ def _digest(image: Any, band: int, windows: list[Window], *, vary: bool = False)
             row = _numbers(raw)
             found.update(row.tobytes())
             low, high = np.fmin(low, np.fmin.reduce(row)), np.fmax(high, np.fmax.reduce(row))
-    return found.digest() if high > low or not vary else None
+    return found.digest() if high > low else None
 
 
 def _numbers(raw: Any) -> Any:
