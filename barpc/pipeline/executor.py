@@ -208,7 +208,7 @@ class _Task(Future[Any]):
     def __init__(self, owner: CachingExecutor, fn: Function, args: tuple[Any, ...]) -> None:
         super().__init__()
         self._owner, self.fn, self.args = owner, fn, args
-        self._key = ""
+        self._key, self._stage = "", fn.__name__.strip("_")
 
     def begin(self) -> bool:
         """Whether there is work to do: it was not cancelled, and no result is kept."""
@@ -241,10 +241,6 @@ class _Task(Future[Any]):
         if self._owner.executor is None and not self.done() and self.begin():
             self.finish(self.fn(*self.args), None)
         return super().result(timeout)
-
-    @property
-    def _stage(self) -> str:
-        return self.fn.__name__.strip("_")
 
     def _look_up(self) -> tuple[bool, Any]:
         self._key = self._owner.key(self.fn, self.args)

@@ -82,10 +82,7 @@ class AdjustResult:
     def report(self) -> Path:
         """Make report.html of this run again (extra `report`), from the files in its folder; its path.
 
-        Raises
-        ------
-        InputError
-            The run wrote no files (a check), or jinja2 is not installed.
+        A run that wrote no files (a check), or jinja2 that is not installed, is an InputError.
         """
         if not self.run.out_dir:
             raise InputError("a check writes no files, so there is nothing to make a report of")
