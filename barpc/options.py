@@ -68,13 +68,11 @@ class Rule:
 
     def bounds(self) -> str:
         """The bounds and the unit in words, with a blank before them."""
+        ends = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
+        words = " and ".join(f"{word} {value:g}" for word, value in ends.items() if value is not None)
         if self.least is not None and self.most is not None:
-            words = f" from {self.least:g} to {self.most:g}"
-        else:
-            ends = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
-            said = (f"{word} {value:g}" for word, value in ends.items() if value is not None)
-            words = " ".join(["", " and ".join(said)]).rstrip()
-        return words + (f" [{self.unit}]" if self.unit else "")
+            words = f"from {self.least:g} to {self.most:g}"
+        return (f" {words}" if words else "") + (f" [{self.unit}]" if self.unit else "")
 
     def choices(self, kind: Any) -> tuple[Any, ...]:
         """The values allowed where they are listed: of a Literal, or the rows of a table; else none."""
@@ -89,9 +87,11 @@ class Rule:
 def option(default: T, help: str, **rule: Any) -> T:
     """A field of an option record: its default, its meaning, and the rest of its `Rule`."""
     metadata = {"rule": Rule(" ".join(help.split()), **rule)}
-    if isinstance(default, dict):
-        return field(default_factory=lambda: type(default)(default), metadata=metadata)
-    return field(default=default, metadata=metadata)
+    given: dict[str, Any] = (
+        {"default_factory": default.copy} if isinstance(default, dict) else {"default": default}
+    )
+    made: T = field(**given, metadata=metadata)
+    return made
 
 
 @dataclass(frozen=True)
