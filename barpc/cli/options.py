@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any, TypeVar, get_origin
 
 import click
 
@@ -15,10 +16,9 @@ from barpc.options import Declared, RunOptions, checked, declared, read_options,
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 TIE = ("tie.band", "matches", "overlap_list", "aoi", "tie.keypoints_per_image", "tie.search")
-ADJUSTMENT = (
-    *("adjust.model", "adjust.drift", "adjust.sigma_attitude", "adjust.sigma_position", "adjust.fixed"),
-    *("gcp", "check_points", "fixed_run", "dem", "adjust.dem_sigma", "geoid"),
-)
+CAMERA = ("adjust.model", "adjust.drift", "adjust.sigma_attitude", "adjust.sigma_position", "adjust.fixed")
+GROUND = ("gcp", "check_points", "fixed_run", "dem", "adjust.dem_sigma", "geoid")
+ADJUSTMENT = (*CAMERA, *GROUND)
 MATCH = ("overwrite", "keep_going")
 RUN = (*MATCH, "images", "rpc_formats")
 """Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
@@ -37,54 +37,36 @@ def field_of(target: str) -> Declared:
     return declared(record)[name]
 
 
-class _Value(click.ParamType):  # type: ignore[type-arg]  # newer versions of click have an argument
-    """A value of a flag, as its field takes it: one of those that may stand several times, several at once."""
-
-    def __init__(self, target: str) -> None:
-        one = field_of(target)
-        self.field, self.rule, self.kind = target.rpartition(".")[2], one.rule, one.kind
-        if get_origin(self.kind) is tuple and not self.rule.rows:
-            self.kind = get_args(self.kind)[0]
-        listed = "" if self.rule.rows else "|".join(map(str, self.rule.choices(self.kind)))
-        plain = self.rule.unit or getattr(self.kind, "__name__", "")
-        self.name = "NAMES" if self.rule.rows else f"[{listed}]" if listed else plain.upper()
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        """What stands for the value in the help."""
-        return self.name
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The field's value of a text."""
-        try:
-            if get_origin(self.kind) is tuple:
-                value = [name.strip() for name in value.split(",")]
-            elif self.kind in (int, float):
-                value = self.kind(value)
-        except ValueError:
-            pass  # said by what follows
-        try:
-            return checked(self.field, self.kind, self.rule, value)
-        except InputError as error:
-            self.fail(str(error), param, ctx)
-
-
 def flag(target: str) -> Callable[[Function], Function]:
     """The click option that sets a field: its type, range, choices, help and default are the field's own."""
-    one, name, parameter = field_of(target), flag_name(target), "flag_" + target.replace(".", "_")
-    if one.kind is bool:
-        return click.option(
-            name, parameter, help=one.rule.help, is_flag=True, default=None
-        )  # the file decides
-    several = get_origin(one.kind) is tuple
+    one, name = field_of(target), flag_name(target)
+    rule, kind, parameter = one.rule, one.kind, "flag_" + target.replace(".", "_")
+    if kind is bool:  # None: the options file decides
+        return click.option(name, parameter, help=rule.help, is_flag=True, default=None)
+    several = get_origin(kind) is tuple
+
+    def convert(_context: click.Context, _parameter: click.Parameter, value: Any) -> Any:
+        if value is None or value == ():
+            return None
+        if rule.rows:
+            value = [word.strip() for word in value.split(",")] if several else value
+        elif kind in (int, float):
+            with suppress(ValueError):  # a text is refused by what follows
+                value = kind(value)
+        try:
+            return checked(target.rpartition(".")[2], kind, rule, value)
+        except InputError as error:
+            raise click.BadParameter(str(error)) from error
+
+    listed = "" if rule.rows else "|".join(map(str, rule.choices(kind)))
+    metavar = "NAMES" if rule.rows else f"[{listed}]" if listed else (rule.unit or kind.__name__).upper()
     notes = [f"default: {_shown(one.default)}"] if one.default not in (None, ()) else []
-    if one.kind in (int, float) and (bounds := replace(one.rule, unit="").bounds()):
+    if kind in (int, float) and (bounds := replace(rule, unit="").bounds()):
         notes.append(bounds.strip())
-    how = " Names of 'barpc convert --help', commas between." if one.rule.rows else " (repeatable)"
-    text = one.rule.help + (how if several else "")
-    text += f"  [{'; '.join(notes)}]" if notes else ""
-    return click.option(
-        name, parameter, help=text, type=_Value(target), multiple=several and not one.rule.rows
-    )
+    how = " Names of 'barpc convert --help', commas between." if rule.rows else " (repeatable)"
+    text = rule.help + (how if several else "") + (f"  [{'; '.join(notes)}]" if notes else "")
+    repeats = several and not rule.rows
+    return click.option(name, parameter, help=text, metavar=metavar, callback=convert, multiple=repeats)
 
 
 def _shown(default: Any) -> str:
@@ -115,7 +97,8 @@ _RUN_OPTIONS = (
     click.option("--image-list", metavar="FILE", help="More image paths from a file, one a line."),
     click.option("--options", "options_file", metavar="FILE", help="Options from a TOML file; flags win."),
     click.option(
-        *("-j", "--jobs"),
+        "-j",
+        "--jobs",
         metavar="N|ADDRESS",
         callback=_jobs,
         default="1",
@@ -142,7 +125,7 @@ def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOption
     values: dict[str, Any] = {}
     for target in (*TIE, *ADJUSTMENT, *RUN, "fit.tolerance"):
         value = flags.get("flag_" + target.replace(".", "_"))
-        if value is None or value == ():
+        if value is None:
             continue
         *table, name = target.split(".")
         (values.setdefault(table[0], {}) if table else values)[name] = value

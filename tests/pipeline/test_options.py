@@ -232,3 +232,10 @@ def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene:
 def test_options_that_contradict_each_other_are_refused(given: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         RunOptions(**given)
+
+
+def test_a_result_prints_its_counts(run: Run) -> None:
+    found = run("a" * 200, stop_after="adjustment")
+    assert len(repr(found)) < 150
+    assert repr(found).startswith(f"AdjustResult(adjust: 3 views, {found.tracks.num_points} tie points, ")
+    assert found.summary["status"] in repr(found)
