@@ -12,7 +12,7 @@ import numpy as np
 from barpc.ba import BlockPrior
 from barpc.dem import Dem
 from barpc.errors import InputError
-from barpc.options import RunOptions
+from barpc.options import RunOptions, declared
 from barpc.pointio.gcp import read_gcps
 from barpc.pointio.names import ViewNames
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
@@ -69,10 +69,12 @@ def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
 
 def input_files(options: RunOptions) -> list[Path]:
     """Every file that the options name; none of them is ever written."""
-    ties = (options.matches, options.overlap_list, options.aoi)
-    named = [*options.gcp, *options.check_points, options.dem, options.geoid, *ties]
-    prior = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
-    return [*(Path(path) for path in named if path is not None), *prior]
+    found = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
+    for name, one in declared(RunOptions).items():
+        value = getattr(options, name)
+        if one.rule.unit == "file" and value is not None:
+            found += [Path(path) for path in (value if isinstance(value, tuple) else (value,))]
+    return found
 
 
 def read_pairs(
