@@ -101,7 +101,7 @@ class Curve(Frozen):
     @property
     def degree(self) -> int:
         """Degree of the polynomials."""
-        return self.coeffs.shape[1] - 1
+        return int(self.coeffs.shape[1]) - 1
 
     def __call__(self, time: Array) -> tuple[Array, Array]:
         """Values (3, N) and their derivatives by time (3, N) at times (N,) [s]."""

@@ -142,7 +142,7 @@ def ground_sample_distance(sensor: SensorModel, image: Array, alt: npt.ArrayLike
         np.asarray(image)[..., None, :] + steps, np.asarray(alt, dtype=np.float64)[..., None]
     )
     ecef = ecef_from_ground(ground)
-    return np.linalg.norm(ecef[..., 1:, :] - ecef[..., :1, :], axis=-1)
+    return np.asarray(np.linalg.norm(ecef[..., 1:, :] - ecef[..., :1, :], axis=-1))
 
 
 def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:

@@ -18,7 +18,8 @@ from barpc.fit import fit_rpc
 from barpc.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit, wrap_longitude
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Correction, rotation_matrix
+from barpc.sensor.corrected import Correction
+from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC
 from barpc.simulate.orbit import fly, looks

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -19,6 +20,7 @@ import numpy.typing as npt
 from barpc.errors import RpcFormatError
 from barpc.geodesy import Array
 from barpc.safexml import parse_xml
+from barpc.sensor.curve import MARGIN
 
 TimeArray = npt.NDArray[np.datetime64]
 
@@ -66,6 +68,29 @@ class Burst:
     last_valid: npt.NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class BurstRows:
+    """Where a burst stands in the stitched frame.
+
+    Parameters
+    ----------
+    first_line : int
+        Of the burst in the measurement file.
+    first_row : int
+        Frame row of that line.
+    start, stop : int
+        Frame rows [start, stop) that are taken from this burst.
+    offset : float
+        What rounding the burst's time to a row left [rows]: 1e-3, up to 0.15 before 2016.
+    """
+
+    first_line: int
+    first_row: int
+    start: int
+    stop: int
+    offset: float
+
+
 @dataclass(frozen=True, eq=False)
 class GroundRange:
     """Slant range to ground range, as polynomials listed in time (`coordinateConversion`).
@@ -74,15 +99,14 @@ class GroundRange:
     ----------
     time : (M,)
         datetime64[ns].
-    slant_origin, ground_origin : (M,)
-        `sr0`, `gr0` [m].
+    slant_origin : (M,)
+        `sr0` [m].
     ground_from_slant, slant_from_ground : (M, K)
-        Ascending powers of (slant - slant_origin), of (ground - ground_origin) [m].
+        Ascending powers of (slant - sr0), of (ground - gr0) [m].
     """
 
     time: TimeArray
     slant_origin: Array
-    ground_origin: Array
     ground_from_slant: Array
     slant_from_ground: Array
 
@@ -168,6 +192,11 @@ class Annotation:
     pulse_interval: float
     bistatic_applied: bool
 
+    @property
+    def kind(self) -> str:
+        """What it is, for messages."""
+        return f"a {self.mode} {self.product_type} of {self.swath}"
+
     def line_time(self, line: Array) -> TimeArray:
         """Annotated times (...), datetime64[ns], of lines (...) of the measurement file."""
         start, rest = np.array([self.first_line_time]), np.asarray(line, dtype=np.float64)
@@ -181,6 +210,29 @@ class Annotation:
         return times
 
 
+def burst_rows(annotation: Annotation) -> list[BurstRows]:
+    """Where the bursts of a TOPS SLC swath stand in the stitched frame; overlaps are cut at their middle.
+
+    Raises
+    ------
+    RpcFormatError
+        Bursts out of order, or one without a valid line.
+    """
+    since = [seconds(b.time, annotation.first_line_time) for b in annotation.bursts]
+    exact = [float(time / annotation.azimuth_time_interval) for time in since]
+    first = [round(row) for row in exact]
+    valid = [np.flatnonzero(b.first_valid >= 0) for b in annotation.bursts]
+    if any(not len(v) for v in valid) or any(b <= a for a, b in pairwise(first)):
+        raise RpcFormatError(f"{annotation.name}: bursts out of order, or one without valid lines")
+    spans = [(row + int(v[0]), row + int(v[-1]) + 1) for row, v in zip(first, valid, strict=True)]
+    cuts = [(a[1] + b[0]) // 2 for a, b in pairwise(spans)]
+    starts, stops = [spans[0][0], *cuts], [*cuts, spans[-1][1]]
+    return [
+        BurstRows(k * annotation.lines_per_burst, first[k], starts[k], stops[k], exact[k] - first[k])
+        for k in range(len(first))
+    ]
+
+
 def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation:
     """Read a Sentinel-1 product annotation.
 
@@ -190,10 +242,6 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
         ``annotation/s1a-iw1-slc-vv-....xml`` of a product.
     name : str, optional
         What to call it in messages.
-
-    Returns
-    -------
-    annotation : Annotation
 
     Raises
     ------
@@ -236,31 +284,15 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
     )
 
 
-def read_orbit_file(
-    path: Path, mission: str, window: tuple[np.datetime64, np.datetime64], margin: float
-) -> StateVectors:
-    """The state vectors of a precise or restituted orbit file (``.EOF``) around a time.
-
-    Parameters
-    ----------
-    path : Path
-        ``S1A_OPER_AUX_POEORB_....EOF``.
-    mission : str
-        Mission of the annotation, as "S1A".
-    window : (datetime64, datetime64)
-        First and last time of the image.
-    margin : float
-        Vectors so far beyond the window are returned too [s].
-
-    Returns
-    -------
-    states : StateVectors
+def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
+    """The state vectors of a precise or restituted orbit file (``S1A_OPER_AUX_POEORB_....EOF``) around an image.
 
     Raises
     ------
     RpcFormatError
         Not an orbit file, another satellite's, or no vector near that time.
     """
+    mission, start, stop = annotation.mission, annotation.first_line_time, annotation.last_line_time
     root = parse_xml(path, strip_namespaces=True)
     vectors = root.findall("Data_Block/List_of_OSVs/OSV")
     if not vectors:
@@ -273,14 +305,14 @@ def read_orbit_file(
         raise RpcFormatError(f"{path}: state vectors in {frame}, EARTH_FIXED is needed")
     fields = [_Fields(vector, str(path)) for vector in vectors]
     times = np.array([f.time("UTC") for f in fields], dtype="datetime64[ns]")
-    pad = np.timedelta64(int(margin * 1e9), "ns")
-    near = np.flatnonzero((times >= window[0] - pad) & (times <= window[1] + pad))
+    pad = np.timedelta64(int(MARGIN * 1e9), "ns")
+    near = np.flatnonzero((times >= start - pad) & (times <= stop + pad))
     if not len(near):
         raise RpcFormatError(
-            f"{path}: covers {times.min()} to {times.max()}, the image is of {window[0]}; "
+            f"{path}: covers {times.min()} to {times.max()}, the image is of {start}; "
             "take the orbit file of that day"
         )
-    return _states([fields[i] for i in near], "UTC", "XYZ", ("V{}", "{}"), str(path))
+    return _states([fields[i] for i in near], "UTC", ("X", "Y", "Z", "VX", "VY", "VZ"), str(path))
 
 
 def seconds(time: Any, epoch: np.datetime64) -> Any:
@@ -328,14 +360,11 @@ class _Fields:
         return value
 
 
-def _states(
-    vectors: Sequence[_Fields], time: str, axes: str, tags: tuple[str, str], source: str
-) -> StateVectors:
-    """State vectors whose components are named by `tags` (velocity, position) with the axis filled in."""
-    position = [[v.numbers(tags[1].format(axis))[0] for axis in axes] for v in vectors]
-    velocity = [[v.numbers(tags[0].format(axis))[0] for axis in axes] for v in vectors]
+def _states(vectors: Sequence[_Fields], time: str, tags: Sequence[str], source: str) -> StateVectors:
+    """State vectors whose time is named `time`, and x, y, z of position and of velocity by `tags`."""
+    table = np.reshape([[v.numbers(tag)[0] for tag in tags] for v in vectors], (-1, 6))
     times = np.array([v.time(time) for v in vectors], dtype="datetime64[ns]")
-    return StateVectors(times, np.reshape(position, (-1, 3)), np.reshape(velocity, (-1, 3)), source)
+    return StateVectors(times, table[:, :3], table[:, 3:], source)
 
 
 def _annotated_states(root: Element, name: str) -> StateVectors:
@@ -343,7 +372,9 @@ def _annotated_states(root: Element, name: str) -> StateVectors:
     if any(v.text("frame") != "Earth Fixed" for v in vectors):
         raise RpcFormatError(f"{name}: orbit state vectors are not Earth fixed; give an orbit file")
     source = root.findtext("imageAnnotation/processingInformation/orbitSource", "annotation").strip()
-    return _states(vectors, "time", "xyz", ("velocity/{}", "position/{}"), source)
+    return _states(
+        vectors, "time", [f"{part}/{axis}" for part in ("position", "velocity") for axis in "xyz"], source
+    )
 
 
 def _burst(element: Element, name: str) -> Burst:
@@ -365,8 +396,8 @@ def _ground_range(root: Element, name: str) -> GroundRange | None:
     time = np.array([f.time("azimuthTime") for f in fields], dtype="datetime64[ns]")
     if len(time) > 1 and not (np.diff(time) > np.timedelta64(0, "ns")).all():
         raise RpcFormatError(f"{name}: the times of the ground range polynomials do not rise")
-    slant, ground = (np.array([f.numbers(tag)[0] for f in fields]) for tag in ("sr0", "gr0"))
-    return GroundRange(time, slant, ground, np.array(forward), np.array(backward))
+    origin = np.array([f.numbers("sr0")[0] for f in fields])
+    return GroundRange(time, origin, np.array(forward), np.array(backward))
 
 
 def _grid(root: Element, name: str) -> GridPoints:
