@@ -42,14 +42,10 @@ class Motion:
 
     Parameters
     ----------
-    ecef : (3, n)
-        X [m].
-    rotation, translation, center : (m, 3)
-        Rotation vectors [rad], T and C [m] of m views.
-    bounds : (m + 1,)
-        Points of view v are bounds[v] : bounds[v + 1].
-    drift : (3, n) or None
-        Rotation vectors [rad].
+    ecef : (3, n), X [m]
+    rotation, translation, center : (m, 3), rotation vectors [rad], T and C [m] of m views
+    bounds : (m + 1,), points of view v are bounds[v] : bounds[v + 1]
+    drift : (3, n) or None, rotation vectors [rad]
     """
 
     def __init__(
@@ -76,15 +72,12 @@ class Motion:
 
         Parameters
         ----------
-        by_moved : (2, 3, n)
-            Derivatives by the moved points [1/m].
+        by_moved : (2, 3, n), derivatives by the moved points [1/m]
 
         Returns
         -------
-        by_point : (2, 3, n)
-            [1/m], the drift held.
-        by_rotation, by_drift : (2, 3, n)
-            [1/rad]; the second is the first where there is no drift.
+        by_point : (2, 3, n) [1/m], the drift held
+        by_rotation, by_drift : (2, 3, n) [1/rad]; the second is the first where there is no drift
         """
         back = by_moved if self._drift is None else self._drift.back(by_moved)
         by_point = _by_view(self._matrix.swapaxes(1, 2), back, self._bounds)
@@ -254,10 +247,8 @@ class ImageAffine(Frozen):
 
     Parameters
     ----------
-    shift : (2,)
-        col, row [px].
-    slope : (2, 2)
-        Change of (col, row) by (col, row) [px/px].
+    shift : (2,), col, row [px]
+    slope : (2, 2), change of (col, row) by (col, row) [px/px]
     """
 
     shift: Array
@@ -278,10 +269,8 @@ class ImageCorrected:
 
     Parameters
     ----------
-    sensor : SensorModel
-        The model as delivered.
-    correction : ImageAffine
-        What is added to its image points.
+    sensor : SensorModel, the model as delivered
+    correction : ImageAffine, what is added to its image points
     """
 
     sensor: SensorModel

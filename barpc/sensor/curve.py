@@ -35,10 +35,8 @@ class Curve(Frozen):
 
     Parameters
     ----------
-    knots : (M + 1,)
-        Times [s], ascending; piece m holds between knots m and m + 1.
-    coeffs : (M, K, 3)
-        Piece m is the sum over k of coeffs[m, k] (t - knots[m])^k.
+    knots : (M + 1,), times [s], ascending; piece m holds between knots m and m + 1
+    coeffs : (M, K, 3), piece m is the sum over k of coeffs[m, k] (t - knots[m])^k
     """
 
     knots: Array
@@ -69,10 +67,8 @@ class Curve(Frozen):
 
         Parameters
         ----------
-        times : (N,)
-            [s], ascending.
-        values : (N, 3)
-            Positions [m] or rotation vectors [rad].
+        times : (N,) [s], ascending
+        values : (N, 3), positions [m] or rotation vectors [rad]
         degree : int
             3 or 5; less where there are too few samples. A quintic through positions every 10 s is true to
             1e-4 m between them.
@@ -142,17 +138,13 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
     Parameters
     ----------
-    times : (N,)
-        [s], ascending.
-    quaternions : (N, 4)
-        ecef_from_camera, scalar first; of any sign and length but zero.
+    times : (N,) [s], ascending
+    quaternions : (N, 4), ecef_from_camera, scalar first; of any sign and length but zero
 
     Returns
     -------
-    mount : (3, 3)
-        ecef_from_camera at the middle sample.
-    attitude : Curve
-        Rotation vector [rad] in the axes of `mount`: a cubic spline.
+    mount : (3, 3), ecef_from_camera at the middle sample
+    attitude : Curve, rotation vector [rad] in the axes of `mount`: a cubic spline
 
     Raises
     ------
@@ -198,12 +190,9 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
 
     Parameters
     ----------
-    time : (N,)
-        [s from the epoch].
-    position, velocity : (N, 3)
-        ECEF [m, m/s].
-    window : (float, float)
-        First and last time of the image [s]; vectors within `MARGIN` of it are used.
+    time : (N,) [s from the epoch]
+    position, velocity : (N, 3), ECEF [m, m/s]
+    window : (float, float), first and last time of the image [s]; vectors within `MARGIN` of it are used
 
     Raises
     ------
@@ -274,8 +263,7 @@ class Turn:
 
     Parameters
     ----------
-    w : (..., 3, N)
-        Rotation vectors [rad].
+    w : (..., 3, N), rotation vectors [rad]
     """
 
     def __init__(self, w: Array) -> None:

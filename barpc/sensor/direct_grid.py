@@ -22,8 +22,8 @@ CHUNK = 2048
 
 _FAR = 1e9  # px and m: beyond it no node lies
 _STEPS = 8
-_SETTLED = 1e-6  # px: what is left after a step of this size is below rounding
-_SHRINK = 1e-3  # of a step to the next: more asks for new derivatives
+_SETTLED = 1e-5  # px: what is left after a step of this size is below rounding
+_SHRINK = 1e-4  # of a step to the next: more asks for new derivatives
 
 _VALUE, _BY_COL, _BY_ROW, _BY_ALT = (0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)
 
@@ -34,14 +34,10 @@ class DirectGrid(Frozen):
 
     Parameters
     ----------
-    cols : (W,)
-        Columns of the nodes [px], ascending; (0, 0) is the centre of the top-left pixel.
-    rows : (H,)
-        Rows of the nodes [px], ascending.
-    alts : (L,)
-        Altitudes of the layers [m], ascending.
-    lonlat : (L, H, W, 2)
-        lon, lat [deg] of the nodes.
+    cols : (W,), columns of the nodes [px], ascending; (0, 0) is the centre of the top-left pixel
+    rows : (H,), rows of the nodes [px], ascending
+    alts : (L,), altitudes of the layers [m], ascending
+    lonlat : (L, H, W, 2), lon, lat [deg] of the nodes
 
     Raises
     ------
@@ -92,10 +88,8 @@ class DirectGrid(Frozen):
 
         Parameters
         ----------
-        ground : (N, 3)
-            lon, lat [deg], alt [m] of every node.
-        image : (N, 2)
-            col, row [px].
+        ground : (N, 3), lon, lat [deg], alt [m] of every node
+        image : (N, 2), col, row [px]
 
         Raises
         ------

@@ -54,8 +54,7 @@ def footprint(
     Parameters
     ----------
     sensor : SensorModel
-    size : (width, height)
-        [px].
+    size : (width, height) [px]
     alt : float or (4 per_side,)
         Altitude of the ground [m above the ellipsoid].
     per_side : int
@@ -129,10 +128,8 @@ def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
     azimuth : (...)
         Direction to the sensor, clockwise from north [deg, 0 to 360].
     """
-    sight = sight_enu(sensor, ground)
-    incidence = np.degrees(np.arctan2(np.hypot(sight[..., 0], sight[..., 1]), sight[..., 2]))
-    azimuth = np.degrees(np.arctan2(sight[..., 0], sight[..., 1])) % 360.0
-    return incidence, azimuth
+    east, north, up = np.moveaxis(sight_enu(sensor, ground), -1, 0)
+    return np.degrees(np.arctan2(np.hypot(east, north), up)), np.degrees(np.arctan2(east, north)) % 360.0
 
 
 def ground_sample_distance(sensor: SensorModel, image: Array, alt: npt.ArrayLike) -> Array:
@@ -158,12 +155,9 @@ class CameraCenter:
 
     Parameters
     ----------
-    ecef : (3,)
-        [m].
-    altitude : float
-        [m above the ellipsoid].
-    method : str
-        How it was found: "line", "projective", or "nominal" where the first was not plausible.
+    ecef : (3,) [m]
+    altitude : float [m above the ellipsoid]
+    method : str, how it was found: "line", "projective", or "nominal" where the first was not plausible
     """
 
     ecef: Array
@@ -182,8 +176,7 @@ def camera_center(
     Parameters
     ----------
     sensor : SensorModel
-    size : (width, height)
-        [px].
+    size : (width, height) [px]
     alt_range : (low, high)
         Altitudes [m] between which rays are drawn.
     method : {"line", "projective"}
@@ -245,12 +238,11 @@ def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tu
 def _center_nominal(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
     image = np.array([(size[0] - 1) / 2, (size[1] - 1) / 2])
     origin, direction = lines_of_sight(sensor, image, alt_range)
-    up = enu_basis(ground_from_ecef(origin))[2]
-    distance = NOMINAL_ALTITUDE / max(float(direction @ up), 0.3)
-    for _ in range(5):  # the Earth curves away: a few steps along the ray reach the altitude
-        altitude = float(ground_from_ecef(origin + distance * direction)[2])
-        distance += (NOMINAL_ALTITUDE - altitude) / max(float(direction @ up), 0.3)
-    return np.asarray(origin + distance * direction)
+    cosine = max(float(direction @ enu_basis(ground_from_ecef(origin))[2]), 0.3)
+    point = origin
+    for _ in range(6):  # the Earth curves away: a few steps along the ray reach the altitude
+        point = point + (NOMINAL_ALTITUDE - float(ground_from_ecef(point)[2])) / cosine * direction
+    return np.asarray(point)
 
 
 def epipolar_offset(
@@ -269,20 +261,16 @@ def epipolar_offset(
     Parameters
     ----------
     sensor_a, sensor_b : SensorModel
-    image_a, image_b : (N, 2)
-        col, row [px] of the matches.
-    alt : float or (N,)
-        First guess of the altitude [m].
-    steps : int
-        Gauss-Newton steps.
+    image_a, image_b : (N, 2), col, row [px] of the matches
+    alt : float or (N,), first guess of the altitude [m]
+    steps : int, Gauss-Newton steps
 
     Returns
     -------
     offset : (N,)
         Signed distance in image b [px], positive to the right of the direction of rising altitude
         (columns to the right, rows down: clockwise); NaN where the rays are parallel.
-    alt : (N,)
-        The altitudes [m].
+    alt : (N,), the altitudes [m]
     """
     alt = np.array(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(image_a)))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -308,10 +296,8 @@ class Triangulation:
     ----------
     points : (P, 3)
         ECEF [m]; NaN where the rays do not meet (fewer than two, parallel, or outside a model's domain).
-    residuals : (K, 2)
-        Projected - observed [px]; NaN for the rows of such points.
-    ok : (P,)
-        Whether the point is usable.
+    residuals : (K, 2), projected - observed [px]; NaN for the rows of such points
+    ok : (P,), whether the point is usable
     """
 
     points: Array

@@ -83,10 +83,8 @@ class Rational:
 
     Parameters
     ----------
-    coeffs : (4, 20)
-        Numerator and denominator of the first value, then of the second.
-    accuracy : (2,)
-        What `solve` may be off by in each value; rounding comes on top.
+    coeffs : (4, 20), numerator and denominator of the first value, then of the second
+    accuracy : (2,), what `solve` may be off by in each value; rounding comes on top
     """
 
     def __init__(self, coeffs: Array, accuracy: Array) -> None:

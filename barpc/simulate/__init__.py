@@ -33,30 +33,18 @@ class BlockOptions:
 
     Parameters
     ----------
-    per_site : int
-        Views of every site.
-    size : tuple of int
-        Width, height of every image [px].
-    gsd : float
-        Ground sampling distance at nadir [m].
-    overlap : float
-        Part of an image's side that it shares with the next site, at most 0.5.
-    alt_range : tuple of float
-        Altitudes of the ground [m].
-    visible : float
-        Probability that a view that covers a point shows it.
-    attitude : float
-        Standard deviation of each component of the attitude error [rad].
-    position : float
-        Standard deviation of each component of the position error [m].
-    drift : float
-        Standard deviation of each component of the attitude drift over an image's height [rad].
-    noise : float
-        Standard deviation of each image coordinate [px].
-    outliers : float
-        Part of the observations that are wrong.
-    outlier_size : float
-        Wrong observations are off by up to so much in each coordinate [px].
+    per_site : int, views of every site
+    size : tuple of int, width, height of every image [px]
+    gsd : float, ground sampling distance at nadir [m]
+    overlap : float, part of an image's side that it shares with the next site, at most 0.5
+    alt_range : tuple of float, altitudes of the ground [m]
+    visible : float, probability that a view that covers a point shows it
+    attitude : float, standard deviation of each component of the attitude error [rad]
+    position : float, standard deviation of each component of the position error [m]
+    drift : float, standard deviation of each component of the attitude drift over an image's height [rad]
+    noise : float, standard deviation of each image coordinate [px]
+    outliers : float, part of the observations that are wrong
+    outlier_size : float, wrong observations are off by up to so much in each coordinate [px]
     """
 
     per_site: int = 3
@@ -181,14 +169,10 @@ class BlockTruth:
         The exact correction of every view: `Corrected(view.sensor, correction)` is the exact camera but for its drift.
     drift : (V, 3)
         The drift's rotation vector over the height of the image [rad]; it is zero in the middle row.
-    ground : (P, 3)
-        The tracks' ground points; lon, lat [deg], alt [m].
-    outlier : (K,)
-        Which observations are wrong.
-    check_ground : (Q, 3)
-        Held-out ground points; lon, lat [deg], alt [m].
-    check : Tracks
-        Their exact image points in every view that sees them.
+    ground : (P, 3), the tracks' ground points; lon, lat [deg], alt [m]
+    outlier : (K,), which observations are wrong
+    check_ground : (Q, 3), held-out ground points; lon, lat [deg], alt [m]
+    check : Tracks, their exact image points in every view that sees them
     """
 
     corrections: tuple[Correction, ...]
@@ -205,14 +189,10 @@ class Block:
 
     Parameters
     ----------
-    views : tuple of View
-        Without pixels; `sensor` is the delivered RPC.
-    tracks : Tracks
-        Observations with noise and outliers.
-    gcps : GroundPoints
-        Exact ground points with noisy observations; empty unless asked for.
-    truth : BlockTruth
-        What is to be found.
+    views : tuple of View, without pixels; `sensor` is the delivered RPC
+    tracks : Tracks, observations with noise and outliers
+    gcps : GroundPoints, exact ground points with noisy observations; empty unless asked for
+    truth : BlockTruth, what is to be found
     """
 
     views: tuple[View, ...]
@@ -228,8 +208,7 @@ class Block:
 
         Parameters
         ----------
-        sensors : list of SensorModel
-            One a view: delivered, adjusted or refitted cameras.
+        sensors : list of SensorModel, one a view: delivered, adjusted or refitted cameras
         """
         check = self.truth.check
         found = triangulate(sensors, check.view, check.point, check.xy)

@@ -30,12 +30,9 @@ class Look:
 
     Parameters
     ----------
-    incidence : float
-        Angle between the local vertical at the target and the direction to the satellite [deg].
-    azimuth : float
-        Azimuth of the direction from the target to the satellite, clockwise from north [deg].
-    altitude : float
-        Of the satellite above the ellipsoid [m].
+    incidence : float, angle between the local vertical at the target and the direction to the satellite [deg]
+    azimuth : float, azimuth of the direction from the target to the satellite, clockwise from north [deg]
+    altitude : float, of the satellite above the ellipsoid [m]
     heading : float
         Direction of flight at the target, clockwise from north [deg]; 192 is a descending sun-synchronous
         pass in middle latitudes.
@@ -55,12 +52,9 @@ def looks(count: int, turn: float = 0.0, altitude: float = 694e3) -> list[Look]:
 
     Parameters
     ----------
-    count : int
-        Number of views.
-    turn : float
-        Start of the sequence of rolls, in turns.
-    altitude : float
-        Of the satellites above the ellipsoid [m].
+    count : int, number of views
+    turn : float, start of the sequence of rolls, in turns
+    altitude : float, of the satellites above the ellipsoid [m]
     """
     flight = Look().heading
     out = []
@@ -84,14 +78,10 @@ def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbro
 
     Parameters
     ----------
-    target : (3,)
-        Ground point at the image's centre; lon, lat [deg], alt [m].
-    look : Look
-        Where the satellite stands.
-    size : tuple of int
-        Width, height of the image [px].
-    gsd : float
-        Ground sampling distance at nadir [m]; the pixel's angle is gsd / altitude.
+    target : (3,), ground point at the image's centre; lon, lat [deg], alt [m]
+    look : Look, where the satellite stands
+    size : tuple of int, width, height of the image [px]
+    gsd : float, ground sampling distance at nadir [m]; the pixel's angle is gsd / altitude
     """
     place, aim, enu = _standpoint(target, look), ecef_from_ground(target), enu_basis(target)
     heading = np.radians(look.heading)

@@ -89,8 +89,7 @@ def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
 
     Returns
     -------
-    offsets : (S, 2)
-        col, row [px]: whole numbers to within 1e-3 in products since 2016.
+    offsets : (S, 2), col, row [px]: whole numbers to within 1e-3 in products since 2016
 
     Raises
     ------

@@ -35,12 +35,9 @@ class SlantFrame(Frozen):
 
     Parameters
     ----------
-    first_range_time : float
-        Two-way slant range time of column 0 [s].
-    sampling_rate : float
-        Columns a second of two-way time [Hz].
-    interval : float
-        Azimuth time between rows [s].
+    first_range_time : float, two-way slant range time of column 0 [s]
+    sampling_rate : float, columns a second of two-way time [Hz]
+    interval : float, azimuth time between rows [s]
     """
 
     first_range_time: float
@@ -69,18 +66,12 @@ class GroundFrame(Frozen):
 
     Parameters
     ----------
-    interval : float
-        Azimuth time between rows [s].
-    spacing : float
-        Ground range between columns [m].
-    listed : (M,)
-        Times of the polynomials [s from the epoch], ascending.
-    origin : (M,)
-        Slant range origins [m].
-    coeffs : (M, K)
-        Ascending powers of (slant range - origin) [m].
-    slope : float
-        Slant range a ground range at mid swath, roughly: where the inversion starts.
+    interval : float, azimuth time between rows [s]
+    spacing : float, ground range between columns [m]
+    listed : (M,), times of the polynomials [s from the epoch], ascending
+    origin : (M,), slant range origins [m]
+    coeffs : (M, K), ascending powers of (slant range - origin) [m]
+    slope : float, slant range a ground range at mid swath, roughly: where the inversion starts
     """
 
     interval: float
@@ -198,8 +189,7 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
 
     Parameters
     ----------
-    annotation : Annotation
-        One swath, or a GRD.
+    annotation : Annotation, one swath, or a GRD
     form : "annotated" or "full"
         "annotated": that constant, so that the model meets the lines of the product's own grid: 0.04 to
         0.14 line in an SLC, to 0.19 in a GRD (Schubert et al., "Sentinel-1A Product Geolocation Accuracy:

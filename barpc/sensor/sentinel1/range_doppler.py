@@ -27,7 +27,7 @@ from barpc.geodesy import (
     up,
     wrap_longitude,
 )
-from barpc.sensor.curve import Orbit, cross, fit_orbit
+from barpc.sensor.curve import Curve, Orbit, cross, fit_orbit
 from barpc.sensor.sentinel1.annotation import (
     Annotation,
     burst_rows,
@@ -66,14 +66,13 @@ class RangeDoppler(Frozen):
 
     Parameters
     ----------
-    orbit : Orbit
-        Its time counts from `epoch`.
+    orbit : Curve
+        Position of the satellite [m], ECEF; its time counts from `epoch`.
     epoch : datetime64[ns]
         Zero-Doppler time (UTC) of row 0.
     frame : SlantFrame or GroundFrame
         (azimuth time, slant range time) to (col, row).
-    size : (width, height)
-        [px].
+    size : (width, height) [px]
     alt_range : (low, high)
         Altitudes that the image is used for [m above the ellipsoid].
     look : "right" or "left"
@@ -82,7 +81,7 @@ class RangeDoppler(Frozen):
         Smooth corrections between geometry and annotated times; none by default.
     """
 
-    orbit: Orbit
+    orbit: Curve
     epoch: np.datetime64
     frame: Frame
     size: tuple[int, int]
@@ -148,8 +147,7 @@ class RangeDoppler(Frozen):
         -------
         azimuth_time : (...)
             Zero-Doppler time [s from `epoch`]; NaN off the orbit's time span or on the other side.
-        range_time : (...)
-            Two-way slant range time [s].
+        range_time : (...), two-way slant range time [s]
         """
         azimuth_time, range_time = pointwise(
             lambda part: self._geometry(ecef_from_ground(part)).times, CHUNK, [(), ()], ground
@@ -214,14 +212,15 @@ class RangeDoppler(Frozen):
         distance = np.sqrt(_dot(sight, sight))
         sight /= distance
         rate = -distance * _dot(acceleration, sight) - _dot(velocity, velocity)
-        side = self._sign() * _dot(cross(velocity, position), sight)
+        side = _dot(self._aside(position, velocity), sight)
         time[~((time >= low) & (time <= high) & (side < 0) & (step <= _SETTLED))] = np.nan
         times = np.stack([time, distance * (2.0 / SPEED_OF_LIGHT)])
         return _Seen(times, sight, distance, velocity, -velocity / rate)
 
-    def _sign(self) -> float:
-        """Of velocity x position along the look: that vector points right of the track."""
-        return 1.0 if self.look == "right" else -1.0
+    def _aside(self, position: Array, velocity: Array) -> Array:
+        """Vectors (3, N) across the track, to the side that is looked at."""
+        right = cross(velocity, position)
+        return right if self.look == "right" else -right
 
     def _incidence(self, ground: Array) -> list[Array]:
         """`incidence` of points (N, 3)."""
@@ -272,9 +271,9 @@ class RangeDoppler(Frozen):
         time = np.where((times[0] >= low) & (times[0] <= high), times[0], np.nan)
         position, velocity, _ = self.orbit.states(time)
         distance = 0.5 * SPEED_OF_LIGHT * times[1]
-        right = cross(velocity, position)
-        across = self._sign() * right / np.sqrt(_dot(right, right))
-        above = self._sign() * cross(across, velocity)
+        across = self._aside(position, velocity)
+        across /= np.sqrt(_dot(across, across))
+        above = position * _dot(velocity, velocity) - velocity * _dot(velocity, position)
         above /= np.sqrt(_dot(above, above))
         height = ground_from_ecef(position.T)[:, 2]
         radius = np.sqrt(_dot(position, position)) - height + alt
@@ -287,8 +286,8 @@ class RangeDoppler(Frozen):
 
         for _ in range(_ANGLE_STEPS):
             _, ground = at(angle)
-            slope = distance * _dot(up(ground), across * np.cos(angle) + above * np.sin(angle))
-            step = (alt - ground[:, 2]) / slope
+            turned = across * np.cos(angle) + above * np.sin(angle)
+            step = (alt - ground[:, 2]) / (distance * _dot(up(ground), turned))
             angle = angle + step
             if not (np.abs(step).max(initial=0.0, where=np.isfinite(step)) > _ANGLE_SETTLED):
                 break
@@ -370,8 +369,7 @@ def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
 
     Returns
     -------
-    residuals : (G, 2)
-        Range [samples of `range_sampling_rate`], azimuth [lines]: model - grid, geometry only.
+    residuals : (G, 2), range [samples of `range_sampling_rate`], azimuth [lines]: model - grid, geometry only
     """
     grid = annotation.grid
     azimuth_time, range_time = model.azimuth_range(grid.ground)
