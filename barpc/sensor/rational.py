@@ -66,16 +66,12 @@ def monomials(normalized: Array, out: Array | None = None) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Inverse:
-    """A cubic from (col, row, altitude) to (longitude, latitude), and how far one Newton step repairs it.
-
-    `center` and `scale` (3, 1) bring its arguments to -1..1; `safe_step` is the largest step after which
-    the error that is left stays below the accuracy asked for.
-    """
+    """A cubic from (col, row, altitude) to (longitude, latitude), and how far one Newton step repairs it."""
 
     coeffs: Array  # (2, 20)
-    center: Array
+    center: Array  # (3, 1), with `scale` brings its arguments to -1..1
     scale: Array
-    safe_step: float
+    safe_step: float  # the largest after which the error that is left stays below the accuracy asked for
 
 
 class Rational:
@@ -149,8 +145,7 @@ class Rational:
         dy = (a * value[1] - c * value[0]) * det
         x[0] += dx
         x[1] += dy
-        length: Array = np.maximum(np.abs(dx, out=dx), np.abs(dy, out=dy))
-        return length
+        return np.asarray(np.maximum(np.abs(dx, out=dx), np.abs(dy, out=dy)))
 
     @cached_property
     def _inverse(self) -> _Inverse | None:

@@ -257,8 +257,7 @@ class RangeDoppler(Frozen):
 
     def _localize(self, image: Array, alt: Array) -> Array:
         """`localize` of image points (2, N)."""
-        measured = self.frame.times(image)
-        times = measured
+        measured = times = self.frame.times(image)
         ground, sight = self._on_circle(times, alt)
         for _ in range(3 if self.delays else 0):  # delays change by 1e-5 of a step: three rounds are exact
             times = measured - self.delays.shift(times, ground, sight)
@@ -309,16 +308,14 @@ class _Seen:
 
     def sight_by_ecef(self) -> Array:
         """(N, 3, 3): d(sight)/dX, the satellite moving along with the zero-Doppler time."""
-        moved: Array = np.einsum("in,jn->nij", self.velocity, self.time_by_ecef) - np.eye(3)
+        moved = np.einsum("in,jn->nij", self.velocity, self.time_by_ecef) - np.eye(3)
         moved += np.einsum("in,jn->nij", self.sight, self.sight)  # velocity has no part along the sight
-        moved /= self.distance[:, None, None]
-        return moved
+        return np.asarray(moved / self.distance[:, None, None])
 
 
 def _dot(a: Array, b: Array) -> Array:
     """Scalar products (N,) of vectors (3, N)."""
-    product: Array = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return product
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def extent(annotation: Annotation, burst: int | None = None) -> tuple[np.datetime64, int]:
