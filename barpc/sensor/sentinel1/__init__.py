@@ -148,42 +148,29 @@ def open_product(
     RpcFormatError
         Not a Sentinel-1 product.
     """
+    path, name = Path(path), None if swath is None else swath.lower()
+    precise = None if orbit is None else Path(orbit)
     try:
-        return _open(Path(path), swath, polarisation, orbit, burst, atmosphere, bistatic)
+        found = _choose(path, polarisation)
+        if name == MOSAIC:
+            if burst is not None:
+                raise InputError(f"{path}: burst {burst} of the mosaic; choose one swath")
+            swaths = [file.read() for file in found.values()]
+            return mosaic(swaths, orbit=precise, atmosphere=atmosphere, bistatic=bistatic)
+        if name is None and len(found) == 1:
+            name = next(iter(found))
+        if name not in found:
+            wanted = "the product has several swaths" if name is None else f"no swath {name}"
+            choices = [*sorted(found), MOSAIC] if len(found) > 1 else sorted(found)
+            raise InputError(f"{path}: {wanted}; choose one of {', '.join(choices)}")
+        return RangeDoppler.from_annotation(
+            found[name].read(), burst=burst, orbit=precise, atmosphere=atmosphere, bistatic=bistatic
+        )
     except RpcError as error:
-        guilty = Path(path if orbit is None else orbit)
+        guilty = precise or path
         if guilty.name in str(error):
             raise
         raise type(error)(f"{guilty}: {error}") from error
-
-
-def _open(
-    path: Path,
-    swath: str | None,
-    polarisation: str | None,
-    orbit: str | Path | None,
-    burst: int | None,
-    atmosphere: bool,
-    bistatic: Bistatic | None,
-) -> RangeDoppler:
-    found = _choose(path, polarisation)
-    precise = None if orbit is None else Path(orbit)
-    name = None if swath is None else swath.lower()
-    if name == MOSAIC:
-        if burst is not None:
-            raise InputError(f"{path}: burst {burst} of the mosaic; choose one swath")
-        swaths = [file.read() for file in found.values()]
-        return mosaic(swaths, orbit=precise, atmosphere=atmosphere, bistatic=bistatic)
-    if name is None and len(found) == 1:
-        name = next(iter(found))
-    if name not in found:
-        wanted = "the product has several swaths" if name is None else f"no swath {name}"
-        choices = [*sorted(found), MOSAIC] if len(found) > 1 else sorted(found)
-        raise InputError(f"{path}: {wanted}; choose one of {', '.join(choices)}")
-    annotation = found[name].read()
-    return RangeDoppler.from_annotation(
-        annotation, burst=burst, orbit=precise, atmosphere=atmosphere, bistatic=bistatic
-    )
 
 
 @dataclass(frozen=True, order=True)
