@@ -30,7 +30,7 @@ from barpc.geodesy import (
     up,
     wrap_longitude,
 )
-from barpc.sensor.curve import Curve, Turn, cross
+from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
 CHUNK = 4096
 """Points worked on at a time, so that what Newton's method needs stays in cache."""
@@ -96,9 +96,7 @@ class Pushbroom(Frozen):
             raise RpcError(f"pushbroom: line period {self.line_period} s is not positive")
         if np.abs(self.mount @ self.mount.T - np.eye(3)).max() > 1e-9 or np.linalg.det(self.mount) < 0:
             raise RpcError("pushbroom: mount is not a rotation matrix")
-        if not max(self.orbit.knots[0], self.attitude.knots[0]) < min(
-            self.orbit.knots[-1], self.attitude.knots[-1]
-        ):
+        if not self._span[1] - self._span[0] > 2 * EXTRAPOLATION:
             raise RpcError("pushbroom: orbit and attitude share no time")
 
     @property

@@ -27,6 +27,7 @@ from barpc.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
 from barpc.safexml import parse_xml
 from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.curve import Curve
 from barpc.sensor.sentinel1 import (
     RangeDoppler,
     burst_rows,
@@ -204,6 +205,13 @@ def test_whole_microseconds_of_the_state_vectors_do_not_raise_the_degree() -> No
     late = (off * along).sum(axis=1, keepdims=True)
     assert np.abs(late).max() <= 3e-3  # the mean of 17 times, each 3 mm off
     assert np.linalg.norm(off - late * along, axis=1).max() <= 1e-4
+
+
+def test_any_curve_may_be_the_orbit(model: RangeDoppler) -> None:
+    times = np.arange(-60.0, 91.0, 10.0)
+    splined = replace(model, orbit=Curve.through(times, model.orbit(times)[0].T))
+    ground = model.localize(*scatter(model, (0.0, 3000.0), 200))
+    assert np.abs(splined.project(ground) - model.project(ground)).max() <= 1e-4
 
 
 def test_the_order_and_repetition_of_state_vectors_do_not_matter() -> None:
