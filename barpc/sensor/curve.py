@@ -48,12 +48,11 @@ class Curve(Frozen):
         coeffs = self._array("coeffs", (len(knots) - 1, None, 3), RpcError)
         if not (np.diff(knots) > 0).all():
             raise RpcError("Curve knots: they must ascend")
+        power = np.arange(1, coeffs.shape[1])[:, None]
         table = np.zeros((9, coeffs.shape[1], len(coeffs)))  # value, rate, acceleration by power and piece
         table[:3] = coeffs.transpose(2, 1, 0)
-        for rows in (slice(3), slice(3, 6)):
-            table[rows.stop : rows.stop + 3, :-1] = (
-                table[rows, 1:] * np.arange(1, coeffs.shape[1])[None, :, None]
-            )
+        table[3:6, :-1] = table[:3, 1:] * power
+        table[6:, :-1] = table[3:6, 1:] * power
         self._keep("_table", table)
 
     @classmethod
