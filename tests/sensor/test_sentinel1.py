@@ -298,6 +298,12 @@ def test_the_annotated_bistatic_correction_meets_the_lines_of_the_grid(iw1: Prod
         assert 0.04 <= np.abs(plain).max() <= 0.2
 
 
+def test_a_bistatic_correction_completes_that_of_the_processor_only(iw1: Product) -> None:
+    annotation = replace(read_annotation(iw1.xml()), bistatic_applied=False)
+    with pytest.raises(InputError, match="no bistatic correction by the processor"):
+        RangeDoppler.from_annotation(annotation, bistatic="annotated")
+
+
 def test_the_atmosphere_lengthens_the_path_by_its_zenith_delay_over_the_cosine(iw1: Product) -> None:
     annotation = read_annotation(iw1.xml())
     with_air = RangeDoppler.from_annotation(annotation, atmosphere=True)
