@@ -16,7 +16,7 @@ from barpc.ba.gauge import gauge_report
 from barpc.ba.heights import Heights, convergence_angles
 from barpc.ba.heldout import HeldOut, keep_out, measure
 from barpc.ba.incremental import BlockPrior, apply_prior
-from barpc.ba.options import AUTO, AdjustOptions, prior_sigmas
+from barpc.ba.priors import DRIFT_SIGMA, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Observations, Outcome, revived, run_rounds
@@ -25,7 +25,8 @@ from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
 from barpc.ba.variances import Variances
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.options import AUTO, AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 
 SMOOTH_LEAST = 0.06
@@ -34,6 +35,8 @@ SMOOTH_LEAST = 0.06
 _TREND = 0.03  # px: another model is tried
 _MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
+_SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
+_MANY_KEPT = 0.99  # of the observations: the others do not tell in a mean
 _BETTER = 0.8  # of the noise
 _MUCH_BETTER = (
     0.7  # of the error on tracks that took no part: another model is worth what it may do to heights
@@ -51,6 +54,8 @@ def adjust_tracks(
     *,
     centers: Array | None = None,
     prior: BlockPrior | None = None,
+    keep_largest: bool = False,
+    hold_out: bool = True,
 ) -> Adjustment:
     """Correct the cameras of a block so that its tie points agree.
 
@@ -71,6 +76,10 @@ def adjust_tracks(
     prior : BlockPrior or None
         An earlier block, whose views are among these: they start at its corrections, and its joint
         covariance is their prior. `tracks` then holds new observations only.
+    keep_largest : bool
+        Go on with the largest group of views where they are not all connected.
+    hold_out : bool
+        Keep a tenth of the tracks out, to measure the result on.
 
     Returns
     -------
@@ -89,17 +98,19 @@ def adjust_tracks(
     """
     start = time.process_time()
     options = AdjustOptions() if options is None else options
-    block = join(tuple(views), tracks, gcps, options)
-    rows = keep_out(block) if options.hold_out else np.zeros_like(block.use)
+    block = join(tuple(views), tracks, gcps, options, keep_largest)
+    rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     inner, outer = block.without(rows), block.without(~rows)
     found = _solve(inner, outer, options, gcps, dem, centers, prior)
     found.heights.warn()
-    bend = None
-    if options.model == AUTO and options.drift is None and prior is None and found.has_trend:
-        flat = _solve(inner, outer, replace(options, model="affine"), gcps, dem, None, None)
-        if flat.after.error < _MUCH_BETTER * found.after.error:
-            bend, found = _bend(flat.final.points, found.final.points, flat.seen & found.seen), flat
-    return _adjustment(found, inner, outer, gcps, options, bend, start)
+    in_space = None
+    if options.model == AUTO and options.drift is None and prior is None:
+        skew = found.is_skew
+        if skew or found.has_trend:
+            in_image = _solve(inner, outer, replace(options, model="affine"), gcps, dem, None, None)
+            if in_image.after.error < (1.0 if skew else _MUCH_BETTER) * found.after.error:
+                in_space, found = found.after.whole_rms, in_image
+    return _adjustment(found, inner, outer, gcps, options, in_space, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +153,33 @@ class _Solution:
         seen[self.problem.structure.point[self.outcome.inlier]] = True
         return seen
 
+    def first_points(self, block: Block) -> Array:
+        """Where the delivered cameras put the points (P, 3) [m] if what was cut is seen where it should be."""
+        points, kept = self.state.points, self.outcome.inlier
+        if kept.sum() < _MANY_KEPT * block.use.sum():
+            problem, final, delivered = self.problem, self.final, self.problem.camera_prior.mean
+            mended = replace(problem, xy=problem.residuals(final.params, final.points) + problem.xy)
+            for _ in range(_FIRST_STEPS + 1):
+                projected = problem.project_points(delivered, points)
+                points = mended.triangulate(points, projected, block.use / block.sigma)
+        return points
+
     @property
     def has_trend(self) -> bool:
         """Whether something is left that another model may follow: smooth, or in what was cut."""
         left = bool(self.outcome.smooth.found(_TREND).any())
         return left or self.after.error > _MUCH_NOISE * self.outcome.noise
+
+    @property
+    def is_skew(self) -> bool:
+        """Whether the drift that was learnt shears images more than a platform does: one of them was turned."""
+        learnt = self.outcome.prior.drift_sigma
+        if not learnt or learnt[0] < 2.0 * DRIFT_SIGMA:
+            return False
+        problem = self.problem
+        by_point = problem.project_points(self.final.params, self.final.points).by_point
+        pixels = float(np.nanmedian(np.linalg.norm(by_point[1], axis=0)))  # a metre
+        return learnt[0] > _SKEW * float(np.median(problem.cameras.unknowns.row_scale)) / pixels
 
 
 def _solve(
@@ -185,24 +218,17 @@ def _solve(
     return _Solution(problem, state, before, heights, outcome, start, after)
 
 
-def _bend(points: Array, others: Array, both: BoolArray) -> float:
-    """RMS of the differences in height [m], after their mean."""
-    up = enu_basis(ground_from_ecef(points[both]))[:, 2]
-    return float(((points[both] - others[both]) * up).sum(axis=1).std())
-
-
 def _adjustment(
     found: _Solution,
     block: Block,
     outer: Block,
     gcps: GroundPoints | None,
     options: AdjustOptions,
-    bend: float | None,
+    in_space: float | None,
     start: float,
 ) -> Adjustment:
     """What is handed out, in the order of the tracks given."""
     outcome, final, seen = found.outcome, found.final, found.seen
-    whole = np.bincount(block.point[block.use & ~outcome.inlier], minlength=block.num_points) == 0
     covariance = outcome.minimum.covariance(found.problem.free)
     projected = found.problem.project_points(final.params, final.points)
     cameras = found.problem.cameras
@@ -234,10 +260,10 @@ def _adjustment(
         status=status,
         cameras=cameras,
         covariance=covariance,
-        gauge=gauge_report(covariance, final.points, found.state.points, seen, whole),
+        gauge=gauge_report(covariance, final.points, found.first_points(block), seen),
         prior=outcome.prior,
         smooth=outcome.smooth,
-        bend=bend,
+        in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier),
         held=found.heights.weak[: block.num_tracks],
         left_out=block.left_out,
@@ -296,7 +322,7 @@ def make_problem(
     drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
         centers = _known_centers(block, options, centers, prior)
-    unknowns = make_unknowns(views, options.first_model, drift, centers, options.center_method)
+    unknowns = make_unknowns(views, options.first_model, drift, centers)
     sigma = prior_sigmas(views, options, drift)
     on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma), None
     if prior is not None:
@@ -314,7 +340,7 @@ def make_problem(
 def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior) -> Array:
     """Camera centres (N, 3) [m]: the earlier block's where it had them."""
     if centers is None:
-        centers = make_unknowns(block.views, options.first_model, 0, None, options.center_method).center
+        centers = make_unknowns(block.views, options.first_model).center
     known = dict(zip(prior.names, prior.center, strict=True))
     return np.array([known.get(name, center) for name, center in zip(block.names, centers, strict=True)])
 

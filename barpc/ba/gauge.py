@@ -66,9 +66,7 @@ class GaugeReport:
     radius: float
 
 
-def gauge_report(
-    covariance: Covariance, points: Array, before: Array, use: BoolArray, whole: BoolArray
-) -> GaugeReport:
+def gauge_report(covariance: Covariance, points: Array, before: Array, use: BoolArray) -> GaugeReport:
     """The report for an adjustment.
 
     Parameters
@@ -79,15 +77,12 @@ def gauge_report(
         ECEF [m], after and before.
     use : (P,)
         Points that count.
-    whole : (P,)
-        Those of them that lost no observation: where the others stood before is not where their last ones put them.
 
     Returns
     -------
     GaugeReport
     """
-    moved = use & whole if (use & whole).any() else use
-    shift_of_all = (points[moved] - before[moved]).mean(axis=0)
+    shift_of_all = (points[use] - before[use]).mean(axis=0)
     index = np.flatnonzero(use)
     use = np.zeros_like(use)
     use[index[:: len(index) // _SAMPLE + 1]] = True

@@ -52,8 +52,17 @@ class HeldOut:
     @property
     def error(self) -> float:
         """Observed over stated standard deviation, all views alike; NaN where none is known."""
-        noise = self.noise[np.isfinite(self.noise)]
-        return float(np.sqrt((noise**2).mean())) if len(noise) else np.nan
+        return _mean_square(self.noise)
+
+    @property
+    def whole_rms(self) -> float:
+        """Root mean square residual of all views alike [px]; NaN where none is known."""
+        return _mean_square(self.rms)
+
+
+def _mean_square(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt((known**2).mean())) if len(known) else np.nan
 
 
 def keep_out(block: Block) -> BoolArray:

@@ -10,14 +10,13 @@ from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import TwoGroups
 from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import GaugeReport
-from barpc.ba.options import AdjustOptions
 from barpc.ba.smooth import SmoothTest
 from barpc.ba.variances import PriorTest
 from barpc.geodesy import Array
+from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.imagespace import ImageAffine, ImageCorrected
+from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +62,9 @@ class Adjustment:
         How the corrections compare with the priors given, and what the priors became.
     smooth : SmoothTest
         What is smooth in the residuals that are left.
-    bend : float or None
-        Where the data chose an affine in the image: how much heights differ from those of a rotation and
-        translation [m], RMS after their mean.
+    in_space_rms : float or None
+        Where the data chose an affine in the image: what rotations, translations and drifts leave of the tracks
+        that took no part [px].
     two_groups : tuple of TwoGroups
         Pairs of views whose tie points fall into two groups.
     held : (P,)
@@ -102,7 +101,7 @@ class Adjustment:
     gauge: GaugeReport
     prior: PriorTest
     smooth: SmoothTest
-    bend: float | None
+    in_space_rms: float | None
     two_groups: tuple[TwoGroups, ...]
     held: BoolArray
     left_out: tuple[str, ...]

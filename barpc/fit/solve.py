@@ -13,15 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from barpc.errors import FitError
-from barpc.fit.options import ALTITUDE_FLOOR, PRECISIONS, FitOptions, Normalization
 from barpc.fit.points import extent
+from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
 from barpc.fit.system import Compressed, IntArray, Problem
 from barpc.geodesy import Array
+from barpc.options import FitOptions
 from barpc.sensor.rpc import MONOMIALS, RPC
 
 _DEGREE = np.array([0, *(len(monomial) for monomial in MONOMIALS[1:])])
@@ -30,20 +32,24 @@ _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
 _SIGMA_STEPS = 2
 _EPS = float(np.finfo(np.float64).eps)
 MAX_PASSES = 20
+TAU = 0.003
+"""Standard deviation that ``ridge`` expects of a denominator coefficient of degree one (no unit)."""
+WEIGHTED = 1
+"""Further passes of ``ridge`` with the residuals weighted by 1 / denominator, where that varies."""
 TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _SAMPLES = 200  # of the L-curve
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
 
-def expected_size(active: IntArray, tau: float) -> Array:
+def expected_size(active: IntArray) -> Array:
     """Size (k,) expected of each unknown; infinite where nothing is expected.
 
-    Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `tau` of degree one, a tenth of it
+    Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
     of degree two, a hundredth of degree three: what vendors' RPCs show, with room.
     """
     degree = _DEGREE[active]
-    return np.concatenate([_NUMERATOR[degree], tau * _DENOMINATOR[degree[1:]]])
+    return np.concatenate([_NUMERATOR[degree], TAU * _DENOMINATOR[degree[1:]]])
 
 
 def penalized(system: Compressed, penalty: Array) -> Compressed:
@@ -262,12 +268,10 @@ def normalization(
     image : (N, 2)
         col, row [px].
     options : FitOptions
-        Its ``normalization`` is taken as it is, its ``precision`` rounds what is found.
+        Its ``precision`` rounds what is found.
     vendor : RPC, optional
         Ground offsets and scales are taken from it.
     """
-    if options.normalization is not None:
-        return options.normalization
     (low, high), (left, right) = extent(ground), extent(image)
     offset, scale = 0.5 * (low + high), 0.5 * (high - low)
     if vendor is not None:
@@ -298,7 +302,7 @@ def solve(
         col, row [px].
     options : FitOptions
         Parameters of the solvers.
-    method : {"ridge", "lcurve", "vendor-denominators"}
+    method : {"ridge", "lcurve", "lcurve-joint", "vendor-denominators"}
         The solver.
     weight : (N,), optional
         Weights of the points (1 / standard deviation).
@@ -339,12 +343,12 @@ def _assembled(
 
 
 def _ridge(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
-    expected = expected_size(problem.active, options.tau)
+    expected = expected_size(problem.active)
     quantize = _quantize(options)
     coeffs, solved, h, passes = np.zeros((4, 20)), [], np.zeros(2), 1
     for axis in range(2):
         denominator = None
-        for done in range(1 + options.weighted):
+        for done in range(1 + WEIGHTED):
             system, sigma = noise_scaled(problem.compressed(axis, denominator), expected)
             pair = problem.expanded(solution(system))
             denominator = pair[1]
@@ -355,12 +359,12 @@ def _ridge(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solutio
             pair if quantize is None else problem.expanded(solution(system, quantize))
         )
         solved.append(system)
-        h[axis] = sigma / options.tau
+        h[axis] = sigma / TAU
     return _assembled(problem, coeffs, solved, h, passes, "ridge")
 
 
-def _lcurve(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
-    groups = [[0, 1]] if options.joint else [[0], [1]]
+def _lcurve(problem: Problem, options: FitOptions, vendor: RPC | None, joint: bool = False) -> Solution:
+    groups = [[0, 1]] if joint else [[0], [1]]
     results = [solve_lcurve(problem, axes) for axes in groups]
     coeffs = np.concatenate([result[0] for result in results])
     solved = [system for result in results for system in result[1]]
@@ -369,7 +373,8 @@ def _lcurve(problem: Problem, options: FitOptions, vendor: RPC | None) -> Soluti
         pairs = [problem.expanded(solution(system, quantize)) for system in solved]
         coeffs = np.concatenate(pairs)
     h = np.broadcast_to([result[2] for result in results], 2).copy()
-    return _assembled(problem, coeffs, solved, h, max(result[3] for result in results), "lcurve")
+    name, passes = "lcurve-joint" if joint else "lcurve", max(result[3] for result in results)
+    return _assembled(problem, coeffs, solved, h, passes, name)
 
 
 def _vendor_denominators(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
@@ -381,7 +386,7 @@ def _vendor_denominators(problem: Problem, options: FitOptions, vendor: RPC | No
         if quantize is not None:
             denominator = quantize(denominator)
         raw = problem.compressed(axis, denominator, free=False)
-        system, _ = noise_scaled(raw, expected_size(problem.active, options.tau)[: len(raw.matrix)])
+        system, _ = noise_scaled(raw, expected_size(problem.active)[: len(raw.matrix)])
         x = solution(system, quantize)
         coeffs[2 * axis : 2 * axis + 2] = problem.expanded(x, denominator)
         solved.append(system)
@@ -391,5 +396,6 @@ def _vendor_denominators(problem: Problem, options: FitOptions, vendor: RPC | No
 _METHODS: dict[str, Callable[[Problem, FitOptions, RPC | None], Solution]] = {
     "ridge": _ridge,
     "lcurve": _lcurve,
+    "lcurve-joint": partial(_lcurve, joint=True),
     "vendor-denominators": _vendor_denominators,
 }

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg.lapack import dtpqrt
 
-from barpc.fit.options import Normalization
+from barpc.fit.precision import Normalization
 from barpc.geodesy import Array, wrap_longitude
 from barpc.sensor.rpc import monomials
 

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from barpc.geodesy import Array
+from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray
-from barpc.tie.options import TieOptions
-from barpc.tie.raster import Box, ByteImage, Stretch, grow, read_pixels
+from barpc.tie.raster import CELL, Box, ByteImage, Stretch, grow, read_pixels
 
+PER_CELL = 40
+"""Strongest keypoints kept in a cell."""
+CONTRAST = 0.01
+"""SIFT's contrast threshold."""
 _MARGIN = 48  # px read around a tile, so that keypoints at its border are those of the whole image
 
 
@@ -61,19 +65,11 @@ def join(parts: Sequence[Keypoints]) -> Keypoints:
     )
 
 
-class Detector(Protocol):
-    """Finds and describes the keypoints of an 8-bit picture."""
-
-    def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
-        """Keypoints for which `keep(xy, scale, response)` is true."""
-        ...
-
-
 class Sift:
     """SIFT (Lowe 2004) with RootSIFT descriptors (Arandjelovic and Zisserman 2012)."""
 
-    def __init__(self, options: TieOptions) -> None:
-        self._sift: Any = cv2.SIFT.create(contrastThreshold=options.contrast)
+    def __init__(self) -> None:
+        self._sift: Any = cv2.SIFT.create(contrastThreshold=CONTRAST)
 
     def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
         """Keypoints for which `keep(xy, scale, response)` is true; only those are described."""
@@ -88,10 +84,6 @@ class Sift:
         root = np.sqrt(raw / np.maximum(np.abs(raw).sum(axis=1, keepdims=True), 1e-9))
         angle = np.radians([k.angle for k in described])
         return Keypoints(xy, scale, angle, response, np.rint(255 * root).astype(np.uint8))
-
-
-DETECTORS: dict[str, Callable[[TieOptions], Detector]] = {"sift": Sift}
-"""Name -> detector."""
 
 
 def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
@@ -122,12 +114,10 @@ def detect_tile(
         inside &= distance[row.clip(0, window[3] - 1), col.clip(0, window[2] - 1)] > np.maximum(3.0, scale)
         chosen = np.zeros(len(xy), dtype=bool)
         index = np.flatnonzero(inside)
-        chosen[
-            index[quota(xy[index] + origin, response[index], options.cell, options.keypoints_per_cell)]
-        ] = True
+        chosen[index[quota(xy[index] + origin, response[index], CELL, PER_CELL)]] = True
         return chosen
 
-    found = DETECTORS[options.detector](options).detect(stretch.apply(pixels, valid), keep)
+    found = Sift().detect(stretch.apply(pixels, valid), keep)
     found = found.select(np.lexsort((found.angle, found.xy[:, 0], found.xy[:, 1])))
     return replace(found, xy=found.xy + origin)
 
@@ -148,10 +138,10 @@ def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
 
 def bounded(keypoints: Keypoints, options: TieOptions) -> Keypoints:
     """At most `keypoints_per_image` keypoints, the strongest of every cell, evenly."""
-    most = options.keypoints_per_cell
+    most = PER_CELL
     while len(keypoints) > options.keypoints_per_image and most > 1:
         most = max(1, int(most * options.keypoints_per_image / len(keypoints)))
-        keypoints = keypoints.select(quota(keypoints.xy, keypoints.response, options.cell, most))
+        keypoints = keypoints.select(quota(keypoints.xy, keypoints.response, CELL, most))
     if len(keypoints) > options.keypoints_per_image:
         strongest = np.argsort(-keypoints.response, kind="stable")[: options.keypoints_per_image]
         keypoints = keypoints.select(np.sort(strongest))

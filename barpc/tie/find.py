@@ -8,17 +8,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.errors import InputError, TiePointError
+from barpc.errors import TiePointError
 from barpc.geodesy import ground_from_ecef
+from barpc.options import TieOptions
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
 from barpc.tie.area import Area
-from barpc.tie.features import DETECTORS, Keypoints, bounded, detect_tile, join
+from barpc.tie.features import Keypoints, bounded, detect_tile, join
 from barpc.tie.matcher import Matches
 from barpc.tie.matching import MATCHERS, PairReport, match_pair
-from barpc.tie.options import Progress, TieOptions, ordered
 from barpc.tie.pairs import Pair, require_connected, select_pairs, shared_tiles
 from barpc.tie.raster import sample_stretch, tiles
+from barpc.tie.tasks import Progress, ordered
 from barpc.tie.tracks import link, refine, thin
 
 _DEFAULTS = TieOptions()
@@ -60,7 +61,7 @@ def detect(
     views : sequence of View
         The images.
     options : TieOptions
-        Band, detector, tiles, quotas.
+        Band, tiles, quotas.
     pairs : sequence of Pair, optional
         As `select_pairs` gave them: tiles that no partner may see are not read. None: all are.
     area : Area, optional
@@ -144,7 +145,6 @@ def find_tracks(
     ImageError
         An image cannot be read.
     """
-    require_known(options)
     pairs = select_pairs(views, options, only=only, area=area)
     keypoints = [join([])] * len(views)
     if MATCHERS[options.matcher].detects:
@@ -160,16 +160,6 @@ def find_tracks(
     tracks = thin(inside(views, tracks, area), sizes, most)
     require_tracks(views, tracks, pairs, reports, options)
     return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
-
-
-def require_known(options: TieOptions) -> None:
-    """Raise InputError unless the detector and the matcher have a row in their tables."""
-    for what, name, table in (
-        ("detector", options.detector, DETECTORS),
-        ("matcher", options.matcher, MATCHERS),
-    ):
-        if name not in table:
-            raise InputError(f"{what} {name!r} is not one of {', '.join(table)}")
 
 
 def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:

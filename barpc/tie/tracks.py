@@ -14,12 +14,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from barpc.geodesy import Array
+from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
 from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, mad
 from barpc.tie.matcher import Matches
-from barpc.tie.options import Progress, TieOptions, ordered
 from barpc.tie.register import Registration, register_places
+from barpc.tie.tasks import Progress, ordered
 
+PATCH = 21
+"""Side of the patches that are registered [px], odd."""
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
 _FLOOR = 0.1  # px across the epipolar line that are always tolerated
@@ -225,7 +228,7 @@ class _Links:
         for part in parts:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
-            tasks.append((images, options.band, origin[part], start[part], linear[part], options.patch))
+            tasks.append((images, options.band, origin[part], start[part], linear[part], PATCH))
         done: list[Registration] = ordered(executor, register_places, tasks, "refine", progress)
         xy, (correlation, sigma) = np.empty((len(self), 2)), np.empty((2, len(self)))
         ok = np.zeros(len(self), dtype=bool)

@@ -110,9 +110,14 @@ def test_forty_percent_of_a_view_moved_together_is_left_out():
     found = verdicts("40 % moved")
     assert median(found, lambda v: v.after.across) < 0.05
     assert median(found, lambda v: v.caught) > 0.99
-    for verdict in found:
-        moved = np.subtract(verdict.after.move, verdict.before.move)
-        np.testing.assert_allclose(verdict.shift, moved, atol=2.0)  # of a stated 23 m
+    clean = verdicts("no drift")
+    for verdict, other in zip(
+        found, clean, strict=True
+    ):  # the same scene: how it moved is not what was moved in it
+        offset = np.abs(np.subtract(verdict.shift, other.shift))
+        assert (
+            offset < [0.5, 0.5, 5.0]
+        ).all()  # 7 m without: pairs of delivered cameras meet at many heights
 
 
 def test_a_pair_whose_tie_points_fall_into_two_groups_says_so():

@@ -9,7 +9,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, pair_heights
 from barpc.ba.incremental import BlockPrior
-from barpc.ba.options import DRIFT_SIGMA
+from barpc.ba.priors import DRIFT_SIGMA
 from barpc.errors import InputError
 from barpc.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import Tracks
@@ -21,7 +21,6 @@ OPTIONS = AdjustOptions(
     noise_floor=0.0,
     sigma_attitude=SIGMA_ATTITUDE,
     sigma_position=SIGMA_POSITION,
-    hold_out=False,
     loss="linear",
     estimate_noise=False,
     min_convergence=0.01,
@@ -153,11 +152,11 @@ def test_views_added_to_an_adjusted_block_end_where_the_joint_adjustment_puts_th
     block = simulate_block(12, 2500, seed=3)
     old, new, _ = _divided(block, 9)
     centers = centers_of(block)
-    first = adjust_tracks(block.views[:9], old, OPTIONS, centers=centers[:9])
+    first = adjust_tracks(block.views[:9], old, OPTIONS, centers=centers[:9], hold_out=False)
     block_prior(first).save(tmp_path / "prior.npz")
     prior = BlockPrior.load(tmp_path / "prior.npz")
-    second = adjust_tracks(block.views, new, OPTIONS, centers=centers, prior=prior)
-    joint = adjust_tracks(block.views, block.tracks, OPTIONS, centers=centers)
+    second = adjust_tracks(block.views, new, OPTIONS, centers=centers, prior=prior, hold_out=False)
+    joint = adjust_tracks(block.views, block.tracks, OPTIONS, centers=centers, hold_out=False)
     sigma = np.sqrt(np.diag(joint.covariance.full)).reshape(joint.params.shape)
     assert (np.abs(second.params - joint.params) / sigma).max() < 0.01
     again = np.sqrt(np.diag(second.covariance.full)).reshape(joint.params.shape)
