@@ -32,6 +32,7 @@ from barpc.owned import own_files
 from barpc.raster import GDAL_OPTIONS
 from barpc.rpcio import Carrier, hidden_by, read_rpc, row_of, sidecars
 from barpc.sensor import SensorModel
+from barpc.sensor.geometry import image_grid
 from barpc.vrt import Vrt, read_vrt
 
 TOLERANCE = 1e-6
@@ -43,14 +44,10 @@ Projection = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Reading:
-    """What one consumer makes of one file.
+    """What one of `CONSUMERS` makes of one file.
 
     Parameters
     ----------
-    path : Path
-        The file.
-    consumer : str
-        A key of `CONSUMERS`.
     max_error : float
         Largest distance to the model over the grid [px]; NaN where it was not read.
     note : str
@@ -69,19 +66,10 @@ class Reading:
 
 
 def control_grid(
-    model: SensorModel,
-    size: tuple[int, int],
-    alt_range: tuple[float, float],
-    nodes: tuple[int, int] = (11, 5),
+    model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> tuple[Array, Array]:
     """Ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
-    col, row, alt = np.meshgrid(
-        np.linspace(0, size[0] - 1, nodes[0]),
-        np.linspace(0, size[1] - 1, nodes[0]),
-        np.linspace(*alt_range, nodes[1]),
-        indexing="ij",
-    )
-    ground = model.localize(np.stack([col.ravel(), row.ravel()], axis=-1), alt.ravel())
+    ground = model.localize(*image_grid(size, alt_range))
     ground = ground[np.isfinite(ground).all(axis=1)]
     return ground, model.project(ground)
 
@@ -91,27 +79,17 @@ def difference(
 ) -> float:
     """Largest distance [px] between two cameras of one image over the image and its altitudes; NaN if blind."""
     ground, image = control_grid(model, size, alt_range)
-    if not len(ground):
-        return float("nan")
-    return float(np.linalg.norm(other.project(ground) - image, axis=1).max())
+    return _largest(other.project, ground, image) if len(ground) else float("nan")
+
+
+def _largest(project: Projection, ground: Array, image: Array) -> float:
+    return float(np.linalg.norm(project(ground) - image, axis=1).max())
 
 
 def refuse_hiding(folder: Path, names: Sequence[str], inputs: Collection[Path]) -> None:
-    """Raise if a new file would be read in place of the RPC of an image that is there.
+    """Raise OutputError if a file to be written would be read in place of the RPC of an image that is there.
 
-    Parameters
-    ----------
-    folder : Path
-        Where files are to be written.
-    names : sequence of str
-        Their names.
-    inputs : collection of Path
-        What is worked on: for these it does not matter whether barpc wrote such a file before.
-
-    Raises
-    ------
-    OutputError
-        Names the file and the image.
+    For the inputs it does not matter whether barpc wrote such a file before.
     """
     own = own_files(folder) if folder.is_dir() else set()
     given = {path.resolve() for path in inputs}
@@ -124,10 +102,7 @@ def refuse_hiding(folder: Path, names: Sequence[str], inputs: Collection[Path]) 
 
 
 def verify(
-    paths: Sequence[Path | str],
-    model: SensorModel,
-    size: tuple[int, int],
-    alt_range: tuple[float, float],
+    paths: Sequence[Path | str], model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]
 ) -> list[Reading]:
     """Open files as their consumers do and compare what they project with the model.
 
@@ -187,10 +162,9 @@ def _reading(
     try:
         with warnings.catch_warnings(), nullcontext(path) if name == "barpc" else _lent(path) as lent:
             warnings.simplefilter("ignore")
-            found = opener(lent)(ground)
+            error = _largest(opener(lent), ground, image)
     except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
         return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
-    error = float(np.linalg.norm(found - image, axis=1).max())
     return Reading(path, name, error, "" if np.isfinite(error) else "it projects to no finite point")
 
 
@@ -250,9 +224,9 @@ def _transformer(rpcs: Any) -> Projection:
 
 
 def _gdal_raster(path: Path) -> Projection:
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), rasterio.Env(**GDAL_OPTIONS):
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.Env(**GDAL_OPTIONS), rasterio.open(path) as dataset:
+        with rasterio.open(path) as dataset:
             if dataset.rpcs is None:
                 raise OutputError("no RPC")
             return _transformer(dataset.rpcs)
@@ -261,12 +235,11 @@ def _gdal_raster(path: Path) -> Projection:
 def _gdal_text(path: Path) -> Projection:
     """GDAL reads text only beside an image: one of a single pixel is lent to it."""
     stem = path.name[: -len("_rpc.txt")] if path.name.lower().endswith("_rpc.txt") else path.stem
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
         image = Path(folder) / f"{stem}.tif"
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(image, "w", driver="GTiff", width=1, height=1, count=1, dtype="uint8") as made:
-                made.write(np.zeros((1, 1, 1), dtype=np.uint8))
+        with rasterio.open(image, "w", driver="GTiff", width=1, height=1, count=1, dtype="uint8") as made:
+            made.write(np.zeros((1, 1, 1), dtype=np.uint8))
         shutil.copy(path, folder)
         return _gdal_raster(image)
 
@@ -309,21 +282,14 @@ def _orthority(path: Path) -> Projection:
 def _keywords(path: Path) -> Projection:
     """An OSSIM keyword list, read as its readers do: every line split at the first colon, all keys asked for."""
     pairs = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
-    rpcs = rasterio.rpc.RPC(
-        **{
-            key: float(pairs[key])
-            for axis in ("line", "samp", "lat", "long", "height")
-            for key in (f"{axis}_off", f"{axis}_scale")
-        },
-        **{
-            f"{axis}_{part}_coeff": [float(pairs[f"{axis}_{part}_coeff_{i:02d}"]) for i in range(20)]
-            for axis in ("line", "samp")
-            for part in ("num", "den")
-        },
-    )
     if pairs["type"].strip() != "ossimRpcModel" or pairs["polynomial_format"].strip() != "B":
         raise OutputError("type or polynomial_format is not what OSSIM expects")
-    return _transformer(rpcs)
+    axes, sets = ("line", "samp", "lat", "long", "height"), ("line_num", "line_den", "samp_num", "samp_den")
+    keys = [f"{axis}_{part}" for axis in axes for part in ("off", "scale")]
+    coefficients = {
+        f"{name}_coeff": [float(pairs[f"{name}_coeff_{i:02d}"]) for i in range(20)] for name in sets
+    }
+    return _transformer(rasterio.rpc.RPC(**{key: float(pairs[key]) for key in keys}, **coefficients))
 
 
 CONSUMERS: dict[str, Consumer] = {

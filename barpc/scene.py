@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from barpc.errors import InputError
 from barpc.frozen import Frozen
@@ -49,6 +51,11 @@ class View(Frozen):
             raise InputError(f"{self.name}: size {self.size} is empty")
         if not (np.isfinite(self.alt_range).all() and self.alt_range[0] <= self.alt_range[1]):
             raise InputError(f"{self.name}: altitude range {self.alt_range} is not an interval")
+
+    @property
+    def altitude(self) -> float:
+        """The middle of its altitudes [m]."""
+        return sum(self.alt_range) / 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +153,19 @@ class GroundPoints(Frozen):
             raise InputError("ground points: an observation names a point that does not exist")
 
 
+def middle_altitude(views: Sequence[View]) -> float:
+    """Mean of the middle altitudes of views [m]: where points that several of them see are looked for first."""
+    return float(np.mean([view.alt_range for view in views]))
+
+
+def connected_labels(num: int, links: npt.ArrayLike) -> IntArray:
+    """Connected component (num,) of each of `num` nodes, numbered by its first node; links (M, 2) join two."""
+    first, second = np.asarray(links, dtype=np.int64).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
+    label: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)
+    return label
+
+
 def connected_groups(num_views: int, pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
     """Connected components of the views, the largest first (then by first view).
 
@@ -161,18 +181,7 @@ def connected_groups(num_views: int, pairs: Sequence[tuple[int, int]]) -> list[l
     groups : list of list of int
         Every view in exactly one group, ascending.
     """
-    parent = list(range(num_views))
-
-    def root(i: int) -> int:
-        while parent[i] != i:
-            parent[i] = parent[parent[i]]
-            i = parent[i]
-        return i
-
-    for a, b in pairs:
-        ra, rb = root(a), root(b)
-        parent[max(ra, rb)] = min(ra, rb)
     groups: dict[int, list[int]] = {}
-    for i in range(num_views):
-        groups.setdefault(root(i), []).append(i)
+    for view, label in enumerate(connected_labels(num_views, pairs).tolist() if num_views else []):
+        groups.setdefault(label, []).append(view)
     return sorted(groups.values(), key=lambda g: (-len(g), g[0]))

@@ -16,7 +16,7 @@ from typing import Any
 
 from barpc.ba import adjust_tracks
 from barpc.fit import fit_rpc
-from barpc.report import Run, summarize
+from barpc.report import Run, Summary, summarize
 from barpc.report.page import report_html
 from barpc.report.tables import TABLES
 from barpc.simulate import simulate_block
@@ -55,7 +55,7 @@ def main() -> None:
         summary_seconds, summary = seconds(lambda run=run: summarize(run), 1)
         with tempfile.TemporaryDirectory() as folder:
 
-            def write(run: Run = run, summary: dict[str, Any] = summary, folder: str = folder) -> None:
+            def write(run: Run = run, summary: Summary = summary, folder: str = folder) -> None:
                 for name, content in TABLES.items():
                     Path(folder, name).write_bytes(content(run, summary))
 
@@ -63,7 +63,7 @@ def main() -> None:
             page_seconds, html = seconds(lambda s=summary, f=folder: report_html(s, f), options.repeats)
         megabytes = len(html.encode()) / 1e6
         print(
-            f"{num_views:6d}  {run.tracks.num_points:7d}  {len(run.tracks):12d}  {len(summary['pairs']):7d}"
+            f"{num_views:6d}  {run.tracks.num_points:7d}  {len(run.tracks):12d}  {len(summary.pairs):7d}"
             f"  {summary_seconds:11.2f}  {tables_seconds:10.2f}  {page_seconds:8.2f}  {megabytes:16.2f}"
         )
         if num_views == 50:

@@ -43,7 +43,7 @@ from barpc.tie import (  # noqa: E402
     refine,
     select_pairs,
 )
-from barpc.tie.epipolar import agreeing, frame, mad  # noqa: E402
+from barpc.tie.epipolar import agreeing, frame, robust_spread  # noqa: E402
 from barpc.tie.raster import read_pixels, sample_stretch  # noqa: E402
 
 
@@ -91,7 +91,7 @@ def stages(views: list[View]) -> float:
 def spread(first: View, second: View, xy_first: np.ndarray, xy_second: np.ndarray) -> float:
     """Robust standard deviation across the epipolar line after an affine fit [px]."""
     across = frame(first, second, xy_first).errors(xy_second)[:, 1]
-    return mad(agreeing(xy_first, across)[1])
+    return robust_spread(agreeing(xy_first, across)[1])
 
 
 def opencv(views: list[View]) -> float:

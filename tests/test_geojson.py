@@ -9,6 +9,7 @@ from shapely.geometry import shape
 
 from barpc.geojson import collection, feature, polygon
 from barpc.sensor.geometry import footprint
+from barpc.simulate.orbit import Look, fly
 from tests.sensor.conftest import make_rpc
 
 
@@ -52,6 +53,19 @@ def test_an_outline_around_a_pole_holds_the_pole(lat, pole):
         assert geometry.area == pytest.approx(3600.0)
         assert geometry.covers(shapely.Point(17.0, (lat + pole) / 2))
         assert not geometry.intersects(shapely.Point(17.0, 0.0))
+
+
+def test_an_image_of_the_pole_holds_the_pole():
+    """Its outline goes once around, which a plain polygon of its corners does not know."""
+    camera = fly(np.array([10.0, 90.0, 0.0]), Look(), (4000, 4000), 0.5)
+    geometry = shape(polygon(footprint(camera, (4000, 4000), 0.0)))
+    assert geometry.is_valid
+    for lon in (-170.0, -90.0, 0.0, 90.0, 170.0):
+        assert geometry.covers(shapely.Point(lon, 89.9999))
+
+
+def test_an_outline_that_misses_the_ground_has_no_geometry():
+    assert polygon(np.array([[0.0, 0.0], [np.nan, 1.0], [1.0, 1.0]])) is None
 
 
 def test_a_camera_across_the_antimeridian_keeps_its_area():

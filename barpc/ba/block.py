@@ -97,7 +97,7 @@ class Block:
         for v, view in enumerate(self.views):
             rows = first[bounds[v] : bounds[v + 1]]
             if len(rows):
-                alt = np.full(len(rows), sum(view.alt_range) / 2.0)
+                alt = np.full(len(rows), view.altitude)
                 points[self.point[rows]] = ecef_from_ground(view.sensor.localize(self.xy[:, rows].T, alt))
         if gcps is not None:
             points[self.num_tracks :] = ecef_from_ground(gcps.lonlatalt)

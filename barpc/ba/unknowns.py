@@ -209,6 +209,5 @@ def make_unknowns(
 
 
 def _middle_of_scene(view: View) -> Array:
-    alt = sum(view.alt_range) / 2.0
     middle = (np.array(view.size) - 1.0) / 2.0
-    return ecef_from_ground(view.sensor.localize(middle, np.array(alt)))
+    return ecef_from_ground(view.sensor.localize(middle, np.array(view.altitude)))

@@ -104,8 +104,8 @@ def _run(
     if flags["as_json"]:
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
-        print_summary(result.summary)
-    return 0 if result.passed else tell_gate(result.summary["headline"], result.summary["reasons"])
+        print_summary(result.record)
+    return 0 if result.passed else tell_gate(result.record.headline, list(result.record.reasons))
 
 
 def _compare(images: list[str], against: Path, as_json: bool) -> int:

@@ -108,8 +108,8 @@ def _pairs(
     point = first.model.localize((np.array(first.extent) - 1) / 2, height) if at is None else np.array(at)
     rows = []
     for image, camera in list(zip(images, cameras, strict=True))[i + 1 :]:
-        angle = float(geometry.convergence_angle(first.model, camera.model, point))
-        ratio = 2 * float(np.tan(np.radians(angle) / 2))
+        both = (first.model, camera.model, point)
+        angle, ratio = float(geometry.convergence_angle(*both)), float(geometry.base_to_height(*both))
         rows.append({"with": split_spec(image)[0].stem, "convergence_deg": angle, "b_over_h": ratio})
     return rows
 
@@ -151,15 +151,14 @@ def _geometry(
     if not np.isfinite(center).all():
         return report | {"problem": "no ground point at the image's centre"}
     incidence, azimuth = geometry.view_angles(model, center if at is None else np.array(at))
-    metres = geometry.ground_sample_distance(model, middle, alt)
+    metres, _ = geometry.ground_sample_distance(model, center)
     stand = geometry.camera_center(model, size, camera.alt_range)
-    ring = geometry.footprint(model, size, alt)
     return report | {
         "incidence_deg": float(incidence),
         "azimuth_deg": float(azimuth),
         "gsd_m": {"col": float(metres[0]), "row": float(metres[1])},
         "camera_altitude_m": {"value": stand.altitude, "method": stand.method},
-        "footprint": polygon(ring) if np.isfinite(ring).all() else None,
+        "footprint": polygon(geometry.footprint(model, size, alt)),
     }
 
 

@@ -10,11 +10,12 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from barpc.cli.terminal import echo
 
-Summary = Mapping[str, Any]
+if TYPE_CHECKING:
+    from barpc.report import Summary
 
 GAP = "  "
 NARROWEST = 12
@@ -25,17 +26,22 @@ _COLORS = {"good": "green", "look": "yellow", "bad": "red"}
 
 def print_summary(summary: Summary) -> None:
     """The verdict, a table of views and a table of pairs, on stdout."""
+    from barpc.report.records import table
+    from barpc.report.summary import PairEntry, ViewEntry
+
     width = output_width()
-    for title, table in (
-        ("Reprojection error of the tie points", _views(summary)),
-        ("Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line", _pairs(summary)),
+    errors = "Reprojection error of the tie points"
+    offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
+    for shown in (
+        table("views", errors, summary.views, ViewEntry, ViewEntry.TERMINAL, summary.adjusted),
+        table("pairs", offsets, summary.pairs, PairEntry, PairEntry.TERMINAL, summary.adjusted),
     ):
-        if len(table) > 1:
-            _echo_table(title, table, width)
-    echo(summary["headline"], bold=True, fg=_COLORS[summary["status"]])
-    _echo_lines(summary["verdict"], width)
-    if summary.get("out_dir"):
-        echo(f"Written to {summary['out_dir']}")
+        if shown.rows:
+            _echo_table(shown.caption, shown.texts, width)
+    echo(summary.headline, bold=True, fg=_COLORS[summary.status])
+    _echo_lines(summary.verdict, width)
+    if summary.out_dir:
+        echo(f"Written to {summary.out_dir}")
 
 
 def print_comparison(comparison: Mapping[str, Any]) -> None:
@@ -122,33 +128,3 @@ def _echo_lines(lines: Sequence[str], width: int | None) -> None:
 
 def _number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _views(summary: Summary) -> list[list[str]]:
-    adjusted = summary["kind"] == "adjust"
-    after = ("after [px]", "shift col, row [px]", "RPC fit [px]")
-    table = [["image", "verdict", "tie points", "before [px]", *(after if adjusted else ())]]
-    for view in summary["views"]:
-        row = [view["name"], view["status"], str(view["num_observations"]), _number(view["rmse_before"])]
-        if adjusted:
-            shift, fit = (view["correction"] or {}).get("center_shift_px"), view["fit"]
-            row += [
-                _number(view["rmse_after"]),
-                "-" if shift is None else f"{shift[0]:+.2f}, {shift[1]:+.2f}",
-                "-" if fit is None else f"{max(fit['max_px']):.0e}",
-            ]
-        table.append(row)
-    return table
-
-
-def _pairs(summary: Summary) -> list[list[str]]:
-    adjusted = summary["kind"] == "adjust"
-    table = [["pair", "matches", "angle [deg]", "B/H", "before [px]", *(("after [px]",) if adjusted else ())]]
-    for pair in summary["pairs"]:
-        row = [f"{pair['a']} - {pair['b']}", str(pair["num_matches"]), _number(pair["convergence_deg"], 1)]
-        row.append(_number(pair["base_to_height"], 2))
-        for when in ("before", "after")[: 1 + adjusted]:
-            offset = pair[f"epipolar_{when}"]
-            row.append("-" if offset is None else f"{offset['median']:+.3f} ± {offset['spread']:.3f}")
-        table.append(row)
-    return table

@@ -59,7 +59,7 @@ class Given:
 
 def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
     """Raise unless the terrain is known somewhere along the outlines of the views."""
-    rings = [footprint(view.sensor, view.size, sum(view.alt_range) / 2) for view in views]
+    rings = [footprint(view.sensor, view.size, view.altitude) for view in views]
     lon, lat = np.concatenate(rings).T
     if np.isnan(dem(lon, lat)).all():
         raise InputError(

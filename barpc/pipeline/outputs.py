@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Sequence, Set
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +14,9 @@ from barpc.handoff import verify
 from barpc.options import RunOptions
 from barpc.owned import own_files
 from barpc.pipeline.inputs import PRIOR
-from barpc.report import Run
+from barpc.report import Run, Summary
 from barpc.report.page import can_render, report_html
+from barpc.report.records import plain
 from barpc.report.tables import TABLES
 from barpc.rpcio import CARRIERS, WRITABLE, sidecars, write_camera
 from barpc.scene import View
@@ -100,11 +100,11 @@ def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
                 )
 
 
-def write_tables(workspace: Workspace, run: Run, summary: Mapping[str, Any]) -> None:
+def write_tables(workspace: Workspace, run: Run, summary: Summary) -> None:
     """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete."""
     for name, content in TABLES.items():
         with workspace.output(name) as partial:
             partial.write_bytes(content(run, summary))
     if can_render():
         workspace.write_text("report.html", report_html(summary, workspace.folder))
-    workspace.write_text("summary.json", json.dumps(summary, indent=1) + "\n")
+    workspace.write_text("summary.json", json.dumps(plain(summary), indent=1) + "\n")

@@ -6,8 +6,9 @@ import logging
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,9 +24,10 @@ from barpc.pipeline.views import Image, image_path, load_views
 from barpc.plain import plain_path
 from barpc.pointio.matches import asp_text, read_matches, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
-from barpc.report import Run, summarize
-from barpc.report.measures import pair_ties
+from barpc.report import Run, Summary, summarize
 from barpc.report.page import remake_report
+from barpc.report.records import plain
+from barpc.report.run import pair_ties
 from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
@@ -49,24 +51,30 @@ class AdjustResult:
     run : Run
         Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`,
         files) images stand in the order of their names, `run.views`, so that the order given does not matter.
-    summary : dict
-        What summary.json holds.
+    record : Summary
+        What summary.json holds, as a typed record.
     """
 
     views: tuple[View, ...]
     run: Run
-    summary: dict[str, Any]
+    record: Summary
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """What summary.json holds."""
+        found: dict[str, Any] = plain(self.record)
+        return found
 
     def __repr__(self) -> str:
         tracks, place = self.run.tracks, self.run.out_dir
         counts = f"{len(self.views)} views, {tracks.num_points} tie points, {len(tracks)} observations"
         written = f", in {place if len(place) <= 50 else '...' + place[-47:]}" if place else ""
-        return f"AdjustResult({self.run.kind}: {counts}, {self.summary['status']}{written})"
+        return f"AdjustResult({self.run.kind}: {counts}, {self.record.status}{written})"
 
     @property
     def passed(self) -> bool:
         """Whether every image was used and every quality gate met."""
-        return bool(self.summary["passed"])
+        return self.record.passed
 
     @property
     def adjustment(self) -> Adjustment:
@@ -162,7 +170,7 @@ def _as_given(views: Iterable[View], images: Sequence[Image]) -> tuple[View, ...
     return tuple(sorted(views, key=lambda view: place[view.path]))
 
 
-def _loaded(kind: str, images: Sequence[Image], options: RunOptions) -> Run:
+def _loaded(kind: Literal["adjust", "check"], images: Sequence[Image], options: RunOptions) -> Run:
     """The run before anything is found."""
     for path in input_files(options):
         plain_path(path)

@@ -120,7 +120,7 @@ def _load(name: str, file: Path, image: Image, band: int) -> tuple[View, Camera]
     else:
         camera = open_camera(image, size=size)
     view = View(name, str(file), size, camera.model, _altitudes(camera))
-    ring = footprint(view.sensor, size, sum(view.alt_range) / 2)
+    ring = footprint(view.sensor, size, view.altitude)
     if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
         raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
     return view, camera

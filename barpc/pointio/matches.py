@@ -12,14 +12,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.pointio.names import ViewNames, cell, from_cell
 from barpc.record import load_npz
-from barpc.scene import IntArray, Tracks
+from barpc.scene import IntArray, Tracks, connected_labels
 from barpc.sidefile import TABLE, opened_text, read_text
 
 SIGMA = 0.5
@@ -207,10 +205,8 @@ def _read_asp(paths: Sequence[Path], views: ViewNames, sigma: float) -> Columns:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0)
     keypoints = np.column_stack([np.concatenate(view), np.concatenate(xy)])
     unique, index = np.unique(keypoints, axis=0, return_inverse=True)
-    i, j = index.ravel()[np.concatenate(pairs)].T
-    graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(unique), len(unique)))
-    _, point = connected_components(graph, directed=False)
-    return unique[:, 0].astype(np.int64), point.astype(np.int64), unique[:, 1:], np.full(len(unique), sigma)
+    point = connected_labels(len(unique), index.ravel()[np.concatenate(pairs)])
+    return unique[:, 0].astype(np.int64), point, unique[:, 1:], np.full(len(unique), sigma)
 
 
 def _asp_images(path: Path, views: ViewNames) -> tuple[str, str]:

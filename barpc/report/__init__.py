@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from barpc.report.run import Run
-from barpc.report.summary import summarize
+from barpc.report.summary import Summary
+from barpc.report.verdict import summarize
 
-__all__ = ["Run", "summarize"]
+__all__ = ["Run", "Summary", "summarize"]

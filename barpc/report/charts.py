@@ -1,35 +1,177 @@
-"""Charts of the report: errors before and after, pairs, geometry, corrections. Each is one SVG text."""
+"""Charts of the report, each one SVG text: errors before and after, pairs, geometry, corrections.
+
+Colours are CSS variables of the page. A chart is drawn on a sheet `WIDTH` units wide, so that its text stays readable
+on a phone, where a unit is about 0.85 pixels, and is not blown up on a desk, where the page caps the width.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
 
 from barpc.geodesy import Array
-from barpc.report.svg import (
-    MAX_ROWS,
-    ROW,
-    WIDTH,
-    Scale,
-    label,
-    line,
-    log_scale,
-    path,
-    sheet,
-    tag,
-    titled,
-    x_axis,
-)
+from barpc.report.load import RunFiles
+from barpc.report.summary import PairEntry, ViewEntry
 
-Record = Mapping[str, Any]
-
+WIDTH = 420.0
+"""Units of a chart from left to right."""
+ROW = 17.0
+"""Units from one row of a list chart to the next."""
+MAX_ROWS = 24
+"""A list chart shows so many rows, the most telling ones."""
 _NAMES = 128.0  # units kept free for names on the left
 _RIGHT = WIDTH - 12.0
 _BINS = 48
+
+
+def tag(name: str, *children: str, **attributes: object) -> str:
+    """An element; `class_` is class, underscores are hyphens, numbers have two decimals at most.
+
+    Examples
+    --------
+    >>> tag("text", "a &lt; b", x=1.0, text_anchor="end", class_="tick")
+    '<text x="1" text-anchor="end" class="tick">a &lt; b</text>'
+    >>> tag("path", d="M0 0")
+    '<path d="M0 0"/>'
+    """
+    words = "".join(
+        f' {key.rstrip("_").replace("_", "-")}="{_value(value)}"' for key, value in attributes.items()
+    )
+    return f"<{name}{words}>{''.join(children)}</{name}>" if children else f"<{name}{words}/>"
+
+
+def _value(value: object) -> str:
+    return number(value) if isinstance(value, (int, float)) else escape(str(value))
+
+
+def number(value: float) -> str:
+    """A coordinate in as few characters as two decimals take."""
+    text = f"{value:.2f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text
+
+
+def label(x: float, y: float, text: str, anchor: str = "start", class_: str = "tick") -> str:
+    """Text at a place."""
+    return tag("text", escape(text), x=x, y=y, text_anchor=anchor, class_=class_)
+
+
+def line(x1: float, y1: float, x2: float, y2: float, class_: str) -> str:
+    """A straight line."""
+    return tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_=class_)
+
+
+def path(points: Iterable[Sequence[float]], class_: str, closed: bool = False) -> str:
+    """A line through points."""
+    text = "L".join(f"{number(x)} {number(y)}" for x, y in points)
+    return tag("path", d=f"M{text}{'Z' if closed else ''}", class_=class_)
+
+
+def titled(shape: str, title: str) -> str:
+    """A shape that says `title` under the pointer and to screen readers."""
+    return tag("g", tag("title", escape(title)), shape)
+
+
+def sheet(key: str, title: str, description: str, height: float, body: Sequence[str], **more: object) -> str:
+    """A whole chart: a key unique on the page, what it is, what it shows for those who do not see it, its elements.
+
+    `more`: `width` where it is not `WIDTH`; other attributes.
+    """
+    width = more.pop("width", WIDTH)
+    return tag(
+        "svg",
+        tag("title", escape(title), id=f"{key}-t"),
+        tag("desc", escape(description), id=f"{key}-d"),
+        *body,
+        viewBox=f"0 0 {_value(width)} {number(height)}",
+        role="img",
+        aria_labelledby=f"{key}-t {key}-d",
+        **more,
+    )
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A map from values between `low` and `high` to units between `start` and `stop`.
+
+    `log`: equal steps are equal ratios; values below `low` go to `start`.
+    """
+
+    low: float
+    high: float
+    start: float
+    stop: float
+    log: bool = False
+
+    def __call__(self, value: float) -> float:
+        """The place of a value."""
+        low, high = self.low, self.high
+        if self.log:
+            low, high, value = math.log10(low), math.log10(high), math.log10(max(value, low))
+        share = (value - low) / (high - low)
+        return self.start + (self.stop - self.start) * share
+
+    @property
+    def ticks(self) -> list[float]:
+        """Round values between the ends: powers of ten of a logarithmic scale, with 2 and 5 where few."""
+        if not self.log:
+            return round_ticks(self.low, self.high)
+        first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
+        steps = (1, 2, 5) if last - first <= 2 else (1, 3) if last - first <= 3 else (1,)
+        values = [step * 10.0**power for power in range(first, last + 1) for step in steps]
+        return [value for value in values if self.low * 0.999 <= value <= self.high * 1.001]
+
+
+def round_ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """At most `most` values of a step of 1, 2 or 5 times a power of ten in an interval.
+
+    Examples
+    --------
+    >>> round_ticks(-0.3, 1.1)
+    [0.0, 0.5, 1.0]
+    """
+    raw = (high - low) / most
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(power * s for s in (1, 2, 5, 10) if power * s >= raw * 0.999)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [round(k * step, 12) + 0.0 for k in range(first, last + 1)]
+
+
+def log_scale(values: Sequence[float], start: float, stop: float, floor: float = 1e-12) -> Scale:
+    """A logarithmic scale that holds all positive values with a margin."""
+    positive = [value for value in values if value > floor] or [1.0]
+    low, high = min(positive), max(positive)
+    return Scale(low / 1.25, max(high * 1.25, low * 4), start, stop, log=True)
+
+
+def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
+    """Ticks with grid lines, numbers below, and the title with its unit below these."""
+    parts = []
+    for value in scale.ticks:
+        x = scale(value)
+        parts += [line(x, top, x, bottom, "grid"), label(x, bottom + 13, f"{value:g}", "middle")]
+    return [*parts, label(scale.stop, bottom + 29, title, "end", "axis")]
+
+
+def numbered(names: Sequence[str], most: int = 15) -> list[str]:
+    """Names behind their number in the table of images, cut in their middle, where they tell least apart.
+
+    Examples
+    --------
+    >>> numbered(["IMG_PHR1A_P_201304171032_SEN_001", "a"])
+    ['1 IMG_PH…EN_001', '2 a']
+    """
+    out = []
+    for k, name in enumerate(names):
+        room = most - len(str(k + 1)) - 1
+        tail = (room - 1) // 2
+        short = name if len(name) <= room else f"{name[: room - 1 - tail]}…{name[-tail:]}"
+        out.append(f"{k + 1} {short}")
+    return out
 
 
 def histogram(before: Array, after: Array) -> str:
@@ -84,15 +226,7 @@ class Row:
 
 
 def dumbbells(key: str, title: str, axis: str, rows: Sequence[Row]) -> str:
-    """A row a name with a value before and one after, on a logarithmic axis.
-
-    Parameters
-    ----------
-    key, title, axis : str
-        Identity; what it is; the axis' title with its unit.
-    rows : sequence of Row
-        Of more than `MAX_ROWS` the largest are shown.
-    """
+    """A row a name with a value before and one after, on a logarithmic axis; of more than `MAX_ROWS` the largest."""
     shown = most_telling(rows, lambda row: -row.last)
     scale = log_scale([value for row in shown for value in (row.before, row.after) if value], _NAMES, _RIGHT)
     bottom = 24 + ROW * len(shown)
@@ -116,38 +250,38 @@ def most_telling(rows: Sequence[Any], order: Any) -> list[Any]:
     return list(rows) if len(rows) <= MAX_ROWS else sorted(rows, key=order)[:MAX_ROWS]
 
 
-def connections(views: Sequence[Record], pairs: Sequence[Record]) -> str:
+def connections(files: RunFiles) -> str:
     """The images on a circle, numbered as in the table; a line for each pair, thicker with more matches."""
+    views, pairs, index = files.summary.views, files.summary.pairs, files.number
     num, middle, radius = len(views), WIDTH / 2, 150.0
     angle = [2 * math.pi * k / num - math.pi / 2 for k in range(num)]
     place = [(middle + radius * math.cos(a), 175 + radius * math.sin(a)) for a in angle]
-    index = {view["name"]: k for k, view in enumerate(views)}
-    most = max([pair["num_matches"] for pair in pairs], default=1)
+    most = max([pair.num_matches for pair in pairs], default=1)
     parts = []
-    for pair in sorted(pairs, key=lambda p: p["num_matches"])[-1500:]:
-        (x1, y1), (x2, y2) = place[index[pair["a"]]], place[index[pair["b"]]]
-        share = math.sqrt(pair["num_matches"] / most)
+    for pair in sorted(pairs, key=lambda p: p.num_matches)[-1500:]:
+        (x1, y1), (x2, y2) = place[index[pair.a]], place[index[pair.b]]
+        share = math.sqrt(pair.num_matches / most)
         link = tag(
             "line", x1=x1, y1=y1, x2=x2, y2=y2, class_="tie", stroke_width=0.5 + 5.5 * share / max(num / 8, 1),
             stroke_opacity=0.15 + 0.65 * share,
         )  # fmt: skip
-        parts.append(titled(link, f"{pair['a']} - {pair['b']}: {pair['num_matches']} matches"))
+        parts.append(titled(link, f"{pair.a} - {pair.b}: {pair.num_matches} matches"))
     size = 12.0 if num <= 24 else max(3.0, 290.0 / num)
     for k, view in enumerate(views):
         x, y = place[k]
-        node = tag("circle", cx=x, cy=y, r=size, class_=f"node {view['status']}")
+        node = tag("circle", cx=x, cy=y, r=size, class_=f"node {view.status}")
         text = label(x, y + 4, str(k + 1), "middle", "nodename") if num <= 40 else ""
-        parts.append(titled(node + text, f"{k + 1} {view['name']}: {view['num_observations']} tie points"))
+        parts.append(titled(node + text, f"{k + 1} {view.name}: {view.num_observations} tie points"))
     described = f"{num} images, {len(pairs)} pairs with tie points in common; up to {most} matches a pair."
     return sheet("graph-chart", "Graph of the images and their pairs", described, 350, parts)
 
 
-def convergence(pairs: Sequence[Record]) -> str:
+def convergence(pairs: Sequence[PairEntry]) -> str:
     """Matches of each pair over its convergence angle; heights are weak on the left, matching on the right."""
-    shown = [pair for pair in pairs if pair["convergence_deg"] is not None]
-    high = max([pair["convergence_deg"] for pair in shown], default=1.0)
+    angles = [pair.convergence_deg or 0.0 for pair in pairs]
+    high = max(angles, default=1.0)
     x = Scale(0.0, max(high * 1.08, 8.0), 44.0, _RIGHT)
-    y = log_scale([pair["num_matches"] for pair in shown], 190.0, 44.0)
+    y = log_scale([pair.num_matches for pair in pairs], 190.0, 44.0)
     parts = []
     for low, up, words in ((0.0, 5.0, "weak heights"), (5.0, 35.0, "good"), (35.0, 180.0, "hard to match")):
         if low < x.high:
@@ -161,22 +295,24 @@ def convergence(pairs: Sequence[Record]) -> str:
     for value in y.ticks:
         parts += [line(44, y(value), _RIGHT, y(value), "grid"), label(40, y(value) + 4, f"{value:g}", "end")]
     parts.append(label(4, 12, "matches", class_="axis"))
-    for pair in shown:
-        dot = tag(
-            "circle", cx=x(pair["convergence_deg"]), cy=y(pair["num_matches"]), r=4.5, class_="dot after see"
-        )
-        words = f"{pair['a']} - {pair['b']}: {pair['convergence_deg']:.1f} deg, {pair['num_matches']} matches"
-        parts.append(titled(dot, words))
-    described = f"{len(shown)} pairs, up to {high:.1f} degrees."
+    for pair, angle in zip(pairs, angles, strict=True):
+        dot = tag("circle", cx=x(angle), cy=y(pair.num_matches), r=4.5, class_="dot after see")
+        parts.append(titled(dot, f"{pair.a} - {pair.b}: {angle:.1f} deg, {pair.num_matches} matches"))
+    described = f"{len(pairs)} pairs, up to {high:.1f} degrees."
     return sheet("angles-chart", "Matches of each pair over its convergence angle", described, 222, parts)
 
 
-def corrections(views: Sequence[Record], labels: Sequence[str]) -> str:
+def moves_of(views: Sequence[ViewEntry]) -> list[tuple[Any, Any]]:
+    """Shift and sigma (col, row) [px] of the views whose correction states both."""
+    moves = [view.correction for view in views if view.correction]
+    both = [(move.center_shift_px, move.center_sigma_px) for move in moves]
+    return [(shift, sigma) for shift, sigma in both if shift and sigma and None not in (*shift, *sigma)]
+
+
+def corrections(views: Sequence[ViewEntry]) -> str:
     """How far each camera was moved in its image, col and row; with one sigma where that fits on the chart."""
-    rows = [
-        (text, v["name"], v["correction"]["center_shift_px"], v["correction"]["center_sigma_px"])
-        for text, v in zip(labels, views, strict=True)
-    ]
+    names = [view.name for view in views]
+    rows = [(*both, *move) for *both, move in zip(numbered(names), names, moves_of(views), strict=True)]
     shown = most_telling(rows, lambda row: -max(map(abs, row[2])))
     largest = max(abs(value) for row in shown for value in row[2]) or 1e-3
     spread = max(sigma for row in shown for sigma in row[3])

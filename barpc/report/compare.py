@@ -10,11 +10,11 @@ import numpy as np
 
 from barpc.errors import BarpcError, InputError
 from barpc.report.load import read_summary
-from barpc.report.summary import plain
+from barpc.report.records import plain
+from barpc.report.summary import Summary, ViewEntry
 from barpc.rpcio import read_rpc
+from barpc.sensor.geometry import image_grid
 from barpc.sensor.rpc import RPC
-
-Record = Mapping[str, Any]
 
 _NODES = 7
 _NO_EFFECT = ("overwrite", "keep_going")
@@ -43,57 +43,44 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
         A folder holds no finished run, or they have no image in common.
     """
     folders = (Path(folder_a), Path(folder_b))
-    runs = tuple(read_summary(folder) for folder in folders)
-    by_name = tuple({view["name"]: view for view in run["views"]} for run in runs)
-    common = [name for name in by_name[0] if name in by_name[1]]
-    if not common:
+    runs = (read_summary(folders[0]), read_summary(folders[1]))
+    a, b = ({view.name: view for view in run.views} for run in runs)
+    if not a.keys() & b.keys():
         raise InputError(f"{folder_a} and {folder_b}: the runs have no image in common")
-    views = [_view(name, folders, (by_name[0][name], by_name[1][name])) for name in common]
     comparison = {
         "a": str(folder_a),
         "b": str(folder_b),
-        "views": views,
+        "views": [_view(folders, (a[name], b[name])) for name in a if name in b],
         "pairs": _pairs(*runs),
-        "only_a": [name for name in by_name[0] if name not in by_name[1]],
-        "only_b": [name for name in by_name[1] if name not in by_name[0]],
+        "only_a": [name for name in a if name not in b],
+        "only_b": [name for name in b if name not in a],
         "options": _options(*runs),
-        "versions": [run["barpc"] for run in runs],
+        "versions": [run.barpc for run in runs],
     }
     found: dict[str, Any] = plain({**comparison, "lines": _lines(comparison)})
     return found
 
 
-def _view(name: str, folders: tuple[Path, Path], views: tuple[Record, Record]) -> dict[str, Any]:
+def _view(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]) -> dict[str, Any]:
     whole, relative = _rpc_difference(folders, views)
     return {
-        "name": name,
-        "status": [view["status"] for view in views],
-        "num_observations": [view["num_observations"] for view in views],
-        "rmse": [_rmse(view) for view in views],
+        "name": views[0].name,
+        "status": [view.status for view in views],
+        "num_observations": [view.num_observations for view in views],
+        "rmse": [view.rmse_before if view.rmse_after is None else view.rmse_after for view in views],
         "rpc_difference_px": whole,
         "rpc_difference_without_shift_px": relative,
     }
 
 
-def _rmse(view: Record) -> float | None:
-    """RMS reprojection error at the end of a run [px]."""
-    last: float | None = view["rmse_before"] if view["rmse_after"] is None else view["rmse_after"]
-    return last
-
-
 def _rpc_difference(
-    folders: tuple[Path, Path], views: tuple[Record, Record]
+    folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]
 ) -> tuple[float | None, float | None]:
-    rpcs = [_written_rpc(folder, view) for folder, view in zip(folders, views, strict=True)]
-    first, second = rpcs
+    first, second = (_written_rpc(folder, view) for folder, view in zip(folders, views, strict=True))
     if first is None or second is None:
         return None, None
-    t = np.linspace(0.0, 1.0, _NODES)
-    low, high = views[0]["alt_range_m"]
-    share = np.stack(np.meshgrid(t, t, t, indexing="ij"), axis=-1).reshape(-1, 3)
-    size = np.array(views[0]["size"], dtype=np.float64)
     with np.errstate(all="ignore"):  # where the second has no value there is no difference
-        ground = first.localize(share[:, :2] * (size - 1), low + share[:, 2] * (high - low))
+        ground = first.localize(*image_grid(views[0].size, views[0].alt_range_m, (_NODES, _NODES)))
         difference = second.project(ground) - first.project(ground)
     difference = difference[np.isfinite(difference).all(axis=1)]
     if not len(difference):
@@ -102,12 +89,12 @@ def _rpc_difference(
     return float(np.hypot(*difference.T).max()), float(np.hypot(*relative.T).max())
 
 
-def _written_rpc(folder: Path, view: Record) -> RPC | None:
+def _written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
     """The RPC that a run wrote for a view, from the first of its files that can be read.
 
     Only what lies in the folder itself is opened, whatever the summary names.
     """
-    for name in view["outputs"]:
+    for name in view.outputs:
         try:
             path = (folder / name).resolve()
             if path.parent == folder.resolve() and path.is_file():
@@ -117,33 +104,27 @@ def _written_rpc(folder: Path, view: Record) -> RPC | None:
     return None
 
 
-def _pairs(run_a: Record, run_b: Record) -> list[dict[str, Any]]:
-    of_b = {(pair["a"], pair["b"]): pair for pair in run_b["pairs"]}
+def _pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:
+    of_b = {(pair.a, pair.b): pair for pair in run_b.pairs}
+    both = [(pair, of_b[pair.a, pair.b]) for pair in run_a.pairs if (pair.a, pair.b) in of_b]
     return [
         {
-            "a": pair["a"],
-            "b": pair["b"],
-            "num_matches": [pair["num_matches"], of_b[pair["a"], pair["b"]]["num_matches"]],
-            "epipolar_rms": [_rms(pair), _rms(of_b[pair["a"], pair["b"]])],
+            "a": pairs[0].a,
+            "b": pairs[0].b,
+            "num_matches": [pair.num_matches for pair in pairs],
+            "epipolar_rms": [pair.offset_rms[pair.epipolar_after is not None] for pair in pairs],
         }
-        for pair in run_a["pairs"]
-        if (pair["a"], pair["b"]) in of_b
+        for pairs in both
     ]
 
 
-def _rms(pair: Record) -> float | None:
-    offset = pair["epipolar_after"] or pair["epipolar_before"]
-    return None if offset is None else offset["rms"]
-
-
-def _options(run_a: Record, run_b: Record) -> list[dict[str, Any]]:
-    a, b = (flat_options(run["options"] or {}) for run in (run_a, run_b))
-    keys = [*a, *(key for key in b if key not in a)]
-    changed = [key for key in keys if a.get(key) != b.get(key) and key not in _NO_EFFECT]
+def _options(*runs: Summary) -> list[dict[str, Any]]:
+    a, b = (flat_options(run.options or {}) for run in runs)
+    changed = [key for key in {**a, **b} if a.get(key) != b.get(key) and key not in _NO_EFFECT]
     return [{"option": key, "values": [a.get(key), b.get(key)]} for key in changed]
 
 
-def flat_options(options: Record, before: str = "") -> dict[str, Any]:
+def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     """Nested options as one level, names joined by dots.
 
     Examples
@@ -160,12 +141,14 @@ def flat_options(options: Record, before: str = "") -> dict[str, Any]:
     return flat
 
 
-def _lines(comparison: Record) -> list[str]:
+def _lines(comparison: Mapping[str, Any]) -> list[str]:
     views = comparison["views"]
-    medians = [_median([view["rmse"][k] for view in views]) for k in (0, 1)]
-    lines = [
-        f"{len(views)} images in both: their tie points agree to {medians[0]:.3f} px in A, {medians[1]:.3f} px in B."
-    ]
+    rmse = np.array([view["rmse"] for view in views], dtype=np.float64)
+    a, b = (
+        float(np.median(column[np.isfinite(column)])) if np.isfinite(column).any() else np.nan
+        for column in rmse.T
+    )
+    lines = [f"{len(views)} images in both: their tie points agree to {a:.3f} px in A, {b:.3f} px in B."]
     moved = [view for view in views if view["rpc_difference_px"] is not None]
     if moved:
         most = max(moved, key=lambda view: view["rpc_difference_px"])
@@ -179,8 +162,3 @@ def _lines(comparison: Record) -> list[str]:
             lines.append(f"In {run} alone: {', '.join(comparison[key])}.")
     options = comparison["options"]
     return lines + [f"Option {o['option']}: {o['values'][0]} in A, {o['values'][1]} in B." for o in options]
-
-
-def _median(values: list[float | None]) -> float:
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else float("nan")

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ import numpy as np
 from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.pointio.names import from_cell
-from barpc.report.summary import SCHEMA
+from barpc.report.summary import SCHEMA, Summary, published_schema
 from barpc.report.tables import OBSERVATIONS, RESIDUALS
 from barpc.scene import BoolArray, IntArray
 from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
@@ -27,18 +25,9 @@ _FAR = 1e12  # px, deg and m: no number of a table comes near
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """observations.csv.
+    """observations.csv: index of the view (K,), col, row (K, 2) [px], whether it was kept (K,).
 
-    Parameters
-    ----------
-    view : (K,)
-        Index of the view in the summary.
-    xy : (K, 2)
-        col, row [px].
-    before, after : (K, 2)
-        Projected - observed [px]; NaN where there is none.
-    used : (K,)
-        Whether the adjustment kept it.
+    `before`, `after` (K, 2): projected - observed [px]; NaN where there is none.
     """
 
     view: IntArray
@@ -52,25 +41,22 @@ class Observations:
 class RunFiles:
     """What lies in the folder of a run.
 
-    Parameters
-    ----------
-    summary : mapping
-        summary.json.
-    observations : Observations
-        observations.csv.
-    points : (n, 4)
-        lon, lat [deg], altitude [m], mean residual [px] of the tie points.
-    outlines : sequence of sequence of (m, 2)
-        The rings of every view's footprint; lon, lat [deg], closed, cut at the antimeridian.
+    `points` (n, 4): lon, lat [deg], altitude [m], mean residual [px] of the tie points; `outlines`: the rings (m, 2) of
+    every view's footprint, lon, lat [deg], closed, cut at the antimeridian.
     """
 
-    summary: Mapping[str, Any]
+    summary: Summary
     observations: Observations
     points: Array
     outlines: Sequence[Sequence[Array]]
 
+    @property
+    def number(self) -> dict[str, int]:
+        """Name of an image -> its index."""
+        return {view.name: k for k, view in enumerate(self.summary.views)}
 
-def read_summary(folder: Path) -> dict[str, Any]:
+
+def read_summary(folder: Path) -> Summary:
     """summary.json of a run folder.
 
     Raises
@@ -81,42 +67,37 @@ def read_summary(folder: Path) -> dict[str, Any]:
     path = folder / "summary.json"
     if not path.exists():
         raise InputError(f"{folder}: no summary.json, so no finished run")
-    summary = read_json(path, SUMMARY)
-    found = summary.get("schema") if isinstance(summary, dict) else None
-    if found != SCHEMA:
-        raise InputError(f"{path}: schema {found!r}, this release reads {SCHEMA}: run the adjustment again")
-    wrong = _wrong(summary)
-    if wrong:
-        raise InputError(f"{path}: damaged, {wrong}: run the adjustment again")
-    checked: dict[str, Any] = summary
-    return checked
+    found = read_json(path, SUMMARY)
+    version = found.get("schema") if isinstance(found, dict) else None
+    if version != SCHEMA:
+        raise InputError(f"{path}: schema {version!r}, this release reads {SCHEMA}: run the adjustment again")
+    try:
+        _validate()(found)
+    except ValueError as error:  # fastjsonschema's own are some
+        raise _damaged(path, str(error).replace("data", "summary", 1)) from None
+    summary = Summary.read(found)
+    names = {view.name for view in summary.views}
+    if len(names) < len(summary.views):
+        raise _damaged(path, "two images have one name")
+    for pair in summary.pairs:
+        if pair.a == pair.b or not {pair.a, pair.b} <= names:
+            raise _damaged(path, f"no pair of its images is {pair.a} - {pair.b}")
+    return summary
+
+
+def _damaged(path: Path, why: str) -> InputError:
+    return InputError(f"{path}: damaged, {why}: run the adjustment again")
 
 
 @cache
 def _validate() -> Callable[[Any], Any]:
     import fastjsonschema
 
-    text = files("barpc.report").joinpath("summary.schema.json").read_bytes()
-    found: Callable[[Any], Any] = fastjsonschema.compile(json.loads(text))
+    found: Callable[[Any], Any] = fastjsonschema.compile(published_schema())
     return found
 
 
-def _wrong(summary: Any) -> str | None:
-    """What a summary has that its schema, or a name in it that another part does not know, forbids."""
-    try:
-        _validate()(summary)
-    except ValueError as error:  # fastjsonschema's own are some
-        return str(error).replace("data", "summary", 1)
-    names = {view["name"] for view in summary["views"]}
-    if len(names) < len(summary["views"]):
-        return "two images have one name"
-    for pair in summary["pairs"]:
-        if pair["a"] == pair["b"] or not {pair["a"], pair["b"]} <= names:
-            return f"no pair of its images is {pair['a']} - {pair['b']}"
-    return None
-
-
-def read_tables(summary: Mapping[str, Any], folder: Path) -> RunFiles:
+def read_tables(summary: Summary, folder: Path) -> RunFiles:
     """The tables of a run folder, beside a summary that is at hand.
 
     Raises
@@ -124,7 +105,7 @@ def read_tables(summary: Mapping[str, Any], folder: Path) -> RunFiles:
     InputError
         A table is missing or damaged; the message names it.
     """
-    names = [view["name"] for view in summary["views"]]
+    names = [view.name for view in summary.views]
     outlines = _read(folder / "footprints.geojson", GEOJSON, _outlines)
     if len(outlines) != len(names):
         raise InputError(f"{folder / 'footprints.geojson'}: {len(outlines)} outlines of {len(names)} images")
@@ -168,14 +149,13 @@ def _observations(text: str, names: Sequence[str]) -> Observations:
 
 
 def _points(text: str) -> Array:
-    points = _floats(_columns(text, RESIDUALS)[:4], 3)
-    _require_degrees(points)
-    return points
+    return _in_degrees(_floats(_columns(text, RESIDUALS)[:4], 3))
 
 
-def _require_degrees(lonlat: Array) -> None:
-    if not (np.abs(lonlat[:, :2]) <= (540.0, 90.0)).all():
+def _in_degrees(places: Array) -> Array:
+    if not (np.abs(places[:, :2]) <= (540.0, 90.0)).all():
         raise ValueError("a place is no longitude and latitude")
+    return places
 
 
 def _outlines(text: str) -> list[list[Array]]:
@@ -193,5 +173,4 @@ def _ring(positions: Any) -> Array:
     ring = np.array(positions, dtype=np.float64)
     if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 4:
         raise ValueError(f"an outline of shape {ring.shape}")
-    _require_degrees(ring)
-    return ring
+    return _in_degrees(ring)

@@ -1,17 +1,39 @@
-"""report.html: one self-contained page, made from summary.json and the tables of a run alone."""
+"""report.html: one self-contained page, made from summary.json and the tables of a run alone.
+
+A section is a question that a user has, the answer in words, and the charts and tables that show it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from barpc.errors import BarpcError
 from barpc.plain import visible
-from barpc.report.load import read_summary, read_tables
-from barpc.report.sections import sections
-from barpc.report.verdict import STATUS_WORDS
+from barpc.report import charts
+from barpc.report.charts import MAX_ROWS, numbered
+from barpc.report.compare import flat_options
+from barpc.report.load import RunFiles, read_summary, read_tables
+from barpc.report.maps import ground_map, residual_panels
+from barpc.report.records import Cell, Table, cell_of, table
+from barpc.report.summary import (
+    STATUS_WORDS,
+    CheckPointEntry,
+    GcpEntry,
+    PairEntry,
+    StageEntry,
+    Summary,
+    ViewEntry,
+    largest,
+    metres,
+)
+from barpc.report.verdict import GOOD
+from barpc.scene import connected_groups
 from barpc.workspace import Workspace
 
 NAME = "report.html"
@@ -22,20 +44,8 @@ def can_render() -> bool:
     return find_spec("jinja2") is not None
 
 
-def report_html(summary: Mapping[str, Any], folder: Path | str) -> str:
-    """The page of a run.
-
-    Parameters
-    ----------
-    summary : mapping
-        What summary.json holds.
-    folder : path
-        Where the run's tables lie.
-
-    Returns
-    -------
-    html : str
-        The same files give the same text.
+def report_html(summary: Summary, folder: Path | str) -> str:
+    """The page of a run whose tables lie in a folder; the same files give the same text.
 
     Raises
     ------
@@ -52,8 +62,9 @@ def report_html(summary: Mapping[str, Any], folder: Path | str) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    shown = [section for make in SECTIONS if (section := make(files)) is not None]
     template = environment.get_template("template.html.j2")
-    return visible(template.render(summary=summary, sections=sections(files), words=STATUS_WORDS))
+    return visible(template.render(summary=summary, sections=shown, words=STATUS_WORDS))
 
 
 def remake_report(folder: Path | str) -> Path:
@@ -76,3 +87,289 @@ def remake_report(folder: Path | str) -> Path:
     with Workspace(folder, overwrite=True, names=[NAME], adds=True) as workspace:
         workspace.write_text(NAME, html)
     return folder / NAME
+
+
+Pictures = Sequence[tuple[str, str]]
+"""SVG texts with their captions."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A question and its answer, with what shows it.
+
+    `panels` are small maps; `folds` are words and more of them that open on demand; `bars` are words, a value as text
+    and a length in percent; `half`: half the width of a desk's screen is enough.
+    """
+
+    key: str
+    question: str
+    answer: str
+    charts: Pictures = ()
+    panels: Pictures = ()
+    folds: Sequence[tuple[str, Pictures]] = ()
+    bars: Sequence[tuple[str, str, float]] = ()
+    tables: Sequence[Table] = ()
+    half: bool = False
+
+
+def _images(files: RunFiles) -> Section:
+    views = files.summary.views
+    good = sum(view.status in GOOD.values() for view in views)
+    answer = f"{good} of {len(views)} without reservation."
+    if any(view.advice for view in views):
+        answer += " What to do about the others stands in the verdict above."
+    caption = "Images: reprojection error (RMS) of the tie points that count"
+    shown = table("images", caption, views, ViewEntry, ViewEntry.PAGE, files.summary.adjusted)
+    numbers = [cell_of(k + 1) for k in range(len(views))]
+    return Section("images", "Which images can I use?", answer, tables=[shown.numbered(numbers)])
+
+
+def _map(files: RunFiles) -> Section | None:
+    views, pairs = files.summary.views, files.summary.pairs
+    shown = []
+    if any(files.outlines):
+        caption = (
+            "Outlines at the altitude of the scene with their numbers in the table of images; dots are tie points;"
+            " a stronger line stands for more matches."
+        )
+        if files.summary.gcps or files.summary.check_points:
+            caption += " Triangles are GCPs, those on their tip check points."
+        shown.append((ground_map(files), caption))
+    if pairs and len(views) > 2:
+        caption = "Numbers as in the table of images; a thicker line is a pair with more matches."
+        shown.append((charts.connections(files), caption))
+    return Section("map", "Where are the images, and which hold together?", _bonds(files), shown)
+
+
+def _bonds(files: RunFiles) -> str:
+    views, number = files.summary.views, files.number
+    links = [(number[pair.a], number[pair.b]) for pair in files.summary.pairs]
+    groups = connected_groups(len(views), links)
+    partners = np.bincount(np.array(links, dtype=np.int64).ravel(), minlength=len(views))
+    lonely = [view.name for view, n in zip(views, partners, strict=True) if n == 1]
+    answer = "All images hang together."
+    if len(groups) > 1:
+        answer = f"By tie points they fall into {len(groups)} groups."
+    if lonely and len(views) > 2:
+        answer += f" Tied to one other image only: {_some(lonely)}."
+    return answer
+
+
+def _some(names: Sequence[str], most: int = 6) -> str:
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _errors(files: RunFiles) -> Section | None:
+    found, views = files.observations, files.summary.views
+    norms = [np.hypot(*r[found.used & np.isfinite(r).all(axis=1)].T) for r in (found.before, found.after)]
+    if not any((norm > 0).any() for norm in norms):
+        return None
+    labels = numbered([view.name for view in views])
+    rows = [
+        charts.Row(text, view.name, view.rmse_before, view.rmse_after)
+        for text, view in zip(labels, views, strict=True)
+    ]
+    axis = "root mean square reprojection error [px], logarithmic"
+    shown = [
+        (charts.histogram(*norms), "All observations that count; each curve is drawn to its own peak."),
+        (charts.dumbbells("rmse", "Error of each image", axis, rows), _which(rows, "images", "error")),
+    ]
+    if not files.summary.adjusted:
+        answer = f"Half of the observations lie within {np.median(norms[0]):.3f} px of where their cameras put them."
+        return Section("errors", "How large are the errors?", answer, shown)
+    medians = [float(np.median(norm)) for norm in norms]
+    answer = (
+        f"The median reprojection error went from {medians[0]:.3f} px to {medians[1]:.3f} px."
+        " These are the points the adjustment was made of: it shows agreement, not accuracy on the ground."
+    )
+    return Section("errors", "Did the adjustment help?", answer, shown)
+
+
+def _which(rows: Sequence[Any], what: str, by: str) -> str:
+    if len(rows) <= MAX_ROWS:
+        return f"All {what}."
+    return f"The {MAX_ROWS} of {len(rows)} {what} with the largest {by}."
+
+
+def _randomness(files: RunFiles) -> Section | None:
+    if not len(files.observations.view):
+        return None
+    views, adjusted = files.summary.views, files.summary.adjusted
+    panels, shares, key = residual_panels(views, files.observations, "after" if adjusted else "before")
+    marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
+    answer = "Mostly: in no image do residuals point the same way in more than half of the cells."
+    if marked:
+        answer = f"Not in {_some(marked)}: in most of their cells the residuals point the same way."
+        if adjusted:
+            answer += (
+                " Small ones are usual (attitude jitter, relief); where they matter, the verdict says so."
+            )
+    answer += (
+        " A cell is darker where its error is larger; thin lines are single residuals; a bold arrow is the mean of a"
+        f" cell that is larger than chance allows. {key}"
+    )
+    folds = []
+    if adjusted:
+        before, _, key = residual_panels(views, files.observations, "before")
+        folds.append((f"Before the adjustment. {key}", before))
+    return Section("random", "Are the residuals random?", answer, panels=panels, folds=folds)
+
+
+def _pairs(files: RunFiles) -> Section | None:
+    pairs, number = files.summary.pairs, files.number
+    if not pairs:
+        return None
+    ends = [(number[pair.a] + 1, number[pair.b] + 1) for pair in pairs]
+    rows = [
+        charts.Row(f"{a} - {b}", f"{pair.a} - {pair.b}", *pair.offset_rms)
+        for (a, b), pair in zip(ends, pairs, strict=True)
+    ]
+    answer = (
+        f"The epipolar offset, which no height explains, is {max(row.last for row in rows):.3f} px (RMS) in the worst"
+        " pair; stereo matching along epipolar lines wants it well below 0.5 px."
+    )
+    axis = "RMS distance from the epipolar line [px], logarithmic"
+    chart = charts.dumbbells("epipolar", "Epipolar offset of each pair", axis, rows)
+    shown = [(chart, f"{_which(rows, 'pairs', 'offset')} Numbers are those of the images.")]
+    seen = [pair for pair in pairs if None not in (pair.convergence_deg, pair.base_to_height)]
+    if seen:
+        caption = "One dot a pair. Small angles give weak heights; beyond about 35 degrees images look too different."
+        shown.append((charts.convergence(seen), caption))
+        answer += _heights(seen)
+    caption = "Pairs: distance of matches from the epipolar line, median ± spread (1.4826 MAD)"
+    found = table("pairs", caption, pairs, PairEntry, PairEntry.PAGE, files.summary.adjusted)
+    found = found.numbered([Cell(f"{a}-{b}", a + b / 1e6) for a, b in ends])
+    question = "Do the pairs fit for stereo, and can heights be measured?"
+    return Section("pairs", question, answer, shown, tables=[found])
+
+
+def _heights(pairs: Sequence[PairEntry]) -> str:
+    best = min(pairs, key=lambda pair: pair.height_m_per_px or np.inf)
+    if not best.height_m_per_px:
+        return " No pair says anything about heights: all rays are parallel."
+    words = (
+        f" Heights come best from {best.a} - {best.b}: the rays meet under {best.convergence_deg:.1f} degrees"
+        f" (B/H {best.base_to_height:.2f}), so one pixel of parallax is {metres(best.height_m_per_px)} of height."
+    )
+    weak = sum((pair.convergence_deg or 0.0) < 1.0 for pair in pairs)
+    if weak:
+        words += f" {weak} of {len(pairs)} pairs meet under less than one degree and say next to nothing about heights."
+    return words
+
+
+def _corrections(files: RunFiles) -> Section | None:
+    views = files.summary.views
+    moves = charts.moves_of(views)
+    if len(moves) < len(views):
+        return None
+    farthest, sigma = (max(float(np.hypot(*pair)) for pair in pairs) for pairs in zip(*moves, strict=True))
+    answer = (
+        f"Up to {farthest:.2f} px in the middle of an image. The adjustment itself predicts this to be known to"
+        f" {sigma:.2g} px (one sigma, the worst image)."
+    )
+    if not files.summary.gcps:
+        answer += " Most of that is common to all images: the scene's own place, which no tie point can tell."
+    chart = (charts.corrections(views), _which(views, "images", "shift"))
+    caption = "Corrections: shift in the middle of the image ± one sigma, size of rotation and translation"
+    found = table("corrections", caption, views, ViewEntry, ViewEntry.CORRECTIONS, folded=True)
+    return Section("moves", "What was changed in each camera?", answer, [chart], tables=[found], half=True)
+
+
+def _gauge(files: RunFiles) -> Section | None:
+    scene, gcps = files.summary.scene, files.summary.gcps
+    if scene is None:
+        return None
+    modes = [(mode.words, mode.sigma_m) for mode in scene.weakest_modes if mode.sigma_m]
+    most = max([sigma for _, sigma in modes], default=1.0)
+    bars = [(f"{words[0].upper()}{words[1:]}", metres(sigma), 100 * sigma / most) for words, sigma in modes]
+    answer = "Images fix each other, not their place on the Earth. What is left open, one sigma, the weakest first."
+    if scene.num_held_in_height:
+        answer += f" {scene.num_held_in_height} tie points seen under too small an angle were held in height."
+    tables = []
+    if gcps:
+        tables.append(
+            table("gcps", "Ground control: adjusted minus given place", gcps, GcpEntry, GcpEntry.PAGE)
+        )
+    else:
+        answer += " Ground control points (--gcp) are what helps where it matters."
+    return Section("gauge", "What can the images not tell?", answer, bars=bars, tables=tables, half=True)
+
+
+def _check_points(files: RunFiles) -> Section | None:
+    points = files.summary.check_points
+    if not points:
+        return None
+    image = np.array([r for point in points for r in point.seen]).reshape(-1, 2)
+    missed = [point.residual_enu_m for point in points if None not in point.residual_enu_m]
+    ground = np.array(missed, dtype=np.float64).reshape(-1, 3)
+    parts = []
+    if len(image):
+        parts.append(f"{np.sqrt((image**2).sum(axis=1).mean()):.2f} px in the images")
+    if len(ground):
+        rms = ", ".join(metres(value) for value in np.sqrt((ground**2).mean(axis=0)))
+        parts.append(f"{rms} east, north, up on the ground")
+    found = " and ".join(parts) or "nothing: no camera sees them"
+    answer = f"{len(points)} check points, which the adjustment did not see, are met to {found} (RMS)."
+    caption = "Check points: found minus given place"
+    tables = [table("check-points", caption, points, CheckPointEntry, CheckPointEntry.PAGE)]
+    return Section("accuracy", "How accurate is it on the ground?", answer, tables=tables)
+
+
+def _files(files: RunFiles) -> Section | None:
+    views, tables = files.summary.views, []
+    if all(view.fit for view in views):
+        caption = "Refitted RPCs against P_BA, on points that the fit has not seen"
+        tables.append(table("fits", caption, views, ViewEntry, ViewEntry.FITS))
+    outputs = {file: found for view in views for file, found in view.outputs.items()}
+    if outputs:
+        consumers = list(dict.fromkeys(consumer for found in outputs.values() for consumer in found))
+        heads = ["file", *(f"{consumer} [px]" for consumer in consumers)]
+        rows = [
+            [cell_of(file), *(_reading(found.get(c)) for c in consumers)] for file, found in outputs.items()
+        ]
+        caption = "Files reopened as their readers do: largest difference to P_BA [px]"
+        tables.append(Table("files", caption, heads, rows))
+    if not tables:
+        return None
+    worst = largest([value for view in views for value in (view.fit.max_px if view.fit else (None,))])
+    answer = "Not known for every image."
+    if worst is not None:
+        answer = f"Yes, to {worst:.1e} px at worst, on check points over each image and its altitudes."
+    answer += (
+        " Every file was reopened and compared before it counted as written. Give other tools these files, never the"
+        " old image alone."
+    )
+    return Section("files", "Do the new RPC files hold the corrected cameras?", answer, tables=tables)
+
+
+def _reading(found: float | str | None) -> Cell:
+    """What a consumer read, or why it did not."""
+    return Cell(found, 1e301) if isinstance(found, str) else cell_of(found, ".1e")
+
+
+def _run(files: RunFiles) -> Section:
+    summary = files.summary
+    tracks, stages = summary.tracks, summary.stages
+    answer = (
+        f"{len(summary.views)} images, {tracks.num_tracks} tie points, {tracks.num_observations} observations"
+    )
+    answer += f", {sum(stage.seconds for stage in stages):.1f} s." if stages else "."
+    if not summary.tables.complete:
+        answer += f" Tables and charts hold {summary.tables.num_written_tracks} tie points, evenly taken."
+    longest = max([stage.seconds for stage in stages], default=1.0) or 1.0
+    bars = [(s.stage, f"{s.seconds:.2f} s", 100 * s.seconds / longest) for s in stages]
+    options = [
+        [cell_of(key), cell_of(str(value))] for key, value in flat_options(summary.options or {}).items()
+    ]
+    tables = [
+        table("stages", "Stages of the run", stages, StageEntry, StageEntry.PAGE, folded=True),
+        Table("options", "Options of the run", ["option", "value"], options, folded=True),
+    ]
+    return Section("run", "How was this made, and how long did it take?", answer, bars=bars, tables=tables)
+
+
+SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
+    _images, _map, _errors, _randomness, _pairs, _corrections, _gauge, _check_points, _files, _run,
+)  # fmt: skip
+"""In the order of the page; a section that has nothing to show is None."""

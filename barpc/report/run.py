@@ -1,11 +1,11 @@
-"""What a run knows at its end."""
+"""What a run knows at its end, and what its tie points say of the cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,11 +13,24 @@ from barpc.ba import Adjustment
 from barpc.cameras import Camera
 from barpc.fit import RpcFit
 from barpc.geodesy import Array, ground_from_ecef
-from barpc.report.measures import PairTies, pair_ties, triangulate_tracks, whole_shift
-from barpc.scene import BoolArray, GroundPoints, Tracks, View
+from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import CameraCenter, Triangulation
+from barpc.sensor.geometry import CameraCenter, Triangulation, triangulate
 from barpc.tie import PairReport
+
+MAX_TRACKS = 200_000
+"""Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
+WHOLE, MOST, LEAST = 0.05, 0.9, 20
+"""A whole shift [px], the share of a pair's matches that must have it, and how many there must be."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairTies:
+    """The observations that two views, ascending, have in common: rows a, b (M,) of the tracks."""
+
+    views: tuple[int, int]
+    a: IntArray
+    b: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,38 +41,24 @@ class Run:
     ----------
     kind : {"adjust", "check", "match"}
         Whether cameras were adjusted, looked at, or only tied.
-    views : tuple of View
-        The images.
     sources : tuple of Camera
-        Where their RPCs came from; empty for views that were not read from files.
-    tracks : Tracks
-        Tie points.
+        Where the views' RPCs came from; empty for views that were not read from files.
     matched : tuple of PairReport
         Pairs that were matched; empty for tie points from a file.
-    adjustment : Adjustment or None
-        None for a check.
-    centers : tuple of CameraCenter
-        Camera centres, for an adjustment.
-    fits : tuple of RpcFit
-        Refitted RPCs, for an adjustment that went so far.
+    adjustment, centers, fits
+        Of an adjustment that went so far.
     written : tuple of mapping
         Per view: output name to what each consumer that reopened it found: the largest difference to P_BA
         [px], or why it does not read the file.
     left_out : tuple of (str, str)
         Files that were left out, and why.
-    options : object
-        The options of the run, a dataclass.
     stages : sequence of mapping
         Seconds and peak memory of the stages so far.
-    out_dir : str
-        Where results are.
-    gcps : GroundPoints or None
-        Ground control of the adjustment.
     check_points : GroundPoints or None
-        Ground points that stayed out of it.
+        Ground points that stayed out of the adjustment.
     """
 
-    kind: str
+    kind: Literal["adjust", "check", "match"]
     views: tuple[View, ...]
     sources: tuple[Camera, ...]
     tracks: Tracks
@@ -92,6 +91,11 @@ class Run:
         """The observations (K,) that count: all of them, or those that the adjustment kept."""
         return np.ones(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.inlier
 
+    @property
+    def held_out(self) -> BoolArray:
+        """The observations (K,) that took no part in the adjustment, to be measured on."""
+        return np.zeros(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.held_out
+
     @cached_property
     def pairs(self) -> list[PairTies]:
         """The observations that pairs of views have in common."""
@@ -102,7 +106,7 @@ class Run:
         """Views that show the very pixels of another one, and in words whose, and how far moved."""
         found: dict[str, str] = {}
         for ties in self.pairs:
-            shift = whole_shift(ties, self.tracks)
+            shift = _whole_shift(ties, self.tracks)
             if shift is not None:
                 names = [self.views[i].name for i in ties.views]
                 for name, other, (col, row) in zip(names, names[::-1], (shift, 0.0 - shift), strict=True):
@@ -111,8 +115,8 @@ class Run:
 
     @property
     def start_altitude(self) -> float:
-        """Where triangulation starts [m]: the middle of the views' altitude ranges."""
-        return float(np.mean([view.alt_range for view in self.views]))
+        """Where triangulation starts [m]."""
+        return middle_altitude(self.views)
 
     @cached_property
     def ties_before(self) -> Triangulation:
@@ -136,8 +140,71 @@ class Run:
         """The tie points (P, 3), lon, lat [deg], alt [m], through the best cameras there are."""
         return ground_from_ecef((self.ties_after or self.ties_before).points)
 
+    @property
+    def written_tracks(self) -> IntArray:
+        """The tracks that the tables hold: those with a ground point, evenly taken above `MAX_TRACKS`."""
+        usable = np.flatnonzero(np.isfinite(self.ground).all(axis=1))
+        return usable[:: -(-len(usable) // MAX_TRACKS)] if len(usable) else usable
+
     @cached_property
     def altitude(self) -> float:
         """Altitude of the scene [m]: the median of its tie points; without any, where they would start."""
         alt = self.ground[np.isfinite(self.ground).all(axis=1), 2]
         return float(np.median(alt)) if len(alt) else self.start_altitude
+
+
+def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
+    """All pairs of views with tracks in common, in ascending order; `keep` (K,): the observations to count."""
+    rows = np.arange(len(tracks)) if keep is None else np.flatnonzero(keep)
+    rows = rows[np.lexsort((tracks.view[rows], tracks.point[rows]))]
+    point = tracks.point[rows]
+    found_a, found_b = [], []
+    for step in range(1, int(np.bincount(point).max(initial=1))):
+        together = point[step:] == point[:-step]
+        found_a.append(rows[:-step][together])
+        found_b.append(rows[step:][together])
+    if not found_a:
+        return []
+    a, b = np.concatenate(found_a), np.concatenate(found_b)
+    num = int(tracks.view.max()) + 1
+    code = tracks.view[a] * num + tracks.view[b]
+    order = np.lexsort((a, code))
+    a, b, code = a[order], b[order], code[order]
+    starts = np.flatnonzero(np.diff(code, prepend=-1))
+    ends = np.append(starts[1:], len(code))
+    return [
+        PairTies((int(code[s] // num), int(code[s] % num)), a[s:e], b[s:e])
+        for s, e in zip(starts, ends, strict=True)
+    ]
+
+
+def _whole_shift(ties: PairTies, tracks: Tracks) -> Array | None:
+    """The shift (2,) [px] by whole pixels that the matches of a pair share; None where there is none.
+
+    Two images of one scene never match so: only one that is a part, or a copy, of the other.
+    """
+    shift = tracks.xy[ties.b] - tracks.xy[ties.a]
+    whole: Array = np.rint(np.median(shift, axis=0))
+    same = np.mean((np.abs(shift - whole) <= WHOLE).all(axis=1))
+    return whole if len(shift) >= LEAST and same >= MOST else None
+
+
+def triangulate_tracks(
+    tracks: Tracks, sensors: Sequence[SensorModel], alt: float, keep: BoolArray
+) -> Triangulation:
+    """All tracks intersected through given cameras from the observations (K,) that count, from altitude `alt` [m] on.
+
+    The residuals of the others are measured against the same points; a track with fewer than two observations that
+    count is NaN.
+    """
+    point, view = tracks.point[keep], tracks.view[keep]
+    found = triangulate(sensors, view, point, tracks.xy[keep], tracks.sigma[keep], alt=alt)
+    points = np.full((tracks.num_points, 3), np.nan)
+    points[: len(found.points)] = found.points
+    residuals = np.full((len(tracks), 2), np.nan)
+    residuals[keep] = found.residuals
+    ground = ground_from_ecef(points)
+    for i in np.unique(tracks.view[~keep]):
+        rows = np.flatnonzero(~keep & (tracks.view == i))
+        residuals[rows] = sensors[i].project(ground[tracks.point[rows]]) - tracks.xy[rows]
+    return Triangulation(points, residuals, np.isfinite(points).all(axis=1))

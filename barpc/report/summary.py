@@ -1,305 +1,711 @@
-"""The summary of a run: what summary.json holds, and what everything else on show is drawn from."""
+"""The summary of a run: what summary.json holds. Here alone stands what a value is, its column, how it is measured.
+
+A new value is a field with what is `said` of it and a line in the function that measures its record; named among the
+columns of a table there, it stands in that, too.
+"""
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version as package_version
-from typing import Any
+from operator import attrgetter
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from barpc import __version__
 from barpc.ba import Adjustment, check_residuals
-from barpc.fit import RpcFit
-from barpc.report.measures import (
-    PairOffset,
-    PairTies,
-    coverage,
-    ground_sampling,
-    pair_geometry,
-    pair_offset,
-    rmse_by_view,
-    shift_in_image,
-)
-from barpc.report.run import Run
-from barpc.report.tables import written_tracks
-from barpc.report.verdict import block_verdict, mode_in_words, view_status
-from barpc.scene import Tracks
+from barpc.ba.gauge import Mode
+from barpc.geodesy import Array, ecef_from_ground
+from barpc.report.records import Cell, Column, Number, Record, plain, said, value_of
+from barpc.report.run import PairTies, Run
+from barpc.scene import IntArray
+from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import CameraCenter, view_angles
+from barpc.sensor.geometry import (
+    base_to_height,
+    convergence_angle,
+    epipolar_offset,
+    ground_sample_distance,
+    view_angles,
+)
 from barpc.tie import PairReport
+from barpc.tie.epipolar import robust_spread
 
 SCHEMA = 2
-"""Version of summary.json; `summary.schema.json` beside this module describes it."""
+"""Version of summary.json."""
+MAX_PER_PAIR = 1000
+"""Matches of a pair that its epipolar offset is measured on, evenly taken."""
+CELLS = 8
+"""Cells of an image from left to right and from top to bottom."""
+
+STATUS_WORDS = {
+    "adjusted": "adjusted",
+    "consistent": "consistent",
+    "tied": "tied",
+    "weak": "weakly tied",
+    "doubtful": "doubtful",
+    "failed": "not adjusted",
+}
+"""Status of a view -> what people read, from good to bad."""
+
+_MODE_WORDS = {
+    "east": "the whole scene may lie {0} farther east or west",
+    "north": "the whole scene may lie {0} farther north or south",
+    "up": "all heights may be {0} too high or too low",
+    "tilt east": "the scene may be tilted: {0} up or down at its eastern and western edges",
+    "tilt north": "the scene may be tilted: {0} up or down at its northern and southern edges",
+    "turn": "the scene may be turned about the vertical: {0} at its edge",
+    "scale": "the scene may be too large or too small: {0} at its edge",
+}
+
+Count = Annotated[int, {"minimum": 0}]
+Side = Annotated[int, {"minimum": 1}]
+Share = Annotated[float, {"minimum": 0, "maximum": 1}]
+Pixel = tuple[Number, Number]
+Vector = tuple[Number, Number, Number]
+_ABOVE = "m above the ellipsoid"
+_Plain = float | str | bool | None
+_Value = _Plain | tuple[_Plain, ...] | tuple[tuple[_Plain, ...], ...]
 
 
-def summarize(run: Run) -> dict[str, Any]:
-    """The summary: what summary.json holds. Only plain numbers, texts, lists and mappings; NaN is null."""
-    views = _views(run)
-    reports = {report.names: report for report in run.matched}
-    block = block_verdict(run, views)
-    summary = {
-        "schema": SCHEMA,
-        "barpc": __version__,
-        "kind": run.kind,
-        "status": block["status"],
-        "headline": block["headline"],
-        "verdict": block["lines"],
-        "reasons": block["reasons"],
-        "passed": block["status"] == "good",
-        "out_dir": run.out_dir,
-        "altitude_m": run.altitude,
-        "views": views,
-        "pairs": [_pair(run, ties, reports) for ties in run.pairs],
-        "left_out": [{"path": path, "reason": reason} for path, reason in run.left_out],
-        "tracks": _tracks(run.tracks),
-        "tables": _tables(run),
-        "scene": None if run.adjustment is None else _scene(run.adjustment),
-        "gcps": _gcps(run),
-        "check_points": _check_points(run),
-        "stages": list(run.stages),
-        "options": plain(run.options),
-        "versions": _versions(),
+# --- what it holds ----------------------------------------------------------------------------------------
+
+
+class SourceEntry(Record):
+    """Where a camera came from."""
+
+    format: str = said("Syntax it was read from", head="RPC read from")
+    path: str = said("File that holds it")
+    notes: tuple[str, ...] = said("What the user should know")
+
+
+class CorrectionEntry(Record):
+    """How a camera was corrected: in space, or by a shift and slope in the image (no `center_shift_px` then)."""
+
+    model: str = said("Unknowns of the adjustment")
+    unknowns: tuple[float, ...] = said("In metres (rotation: angle x distance), or px in the image")
+    sigma: tuple[float, ...] = said("Their posterior standard deviations, in the same units")
+    center_shift_px: Pixel | None = said(
+        "Move of the ground point in the middle, col, row", "px", "shift col, row", "+.2f", adjusted=True
+    )
+    center_sigma_px: Pixel | None = said(
+        "Its posterior standard deviation, with the scene's own uncertain place", "px"
+    )
+    shift_px: Pixel | None = said("Models in the image: shift col, row", "px", default=None)
+    slope: tuple[Pixel, ...] | None = said("Models in the image: by (col, row)", "px/px", default=None)
+    rotation_urad: Vector | None = said("Rotation vector R, ECEF axes", "urad", default=None)
+    angle_urad: Number = said("Its length", "urad", "rotation", ".2f", default=None)
+    translation_m: Vector | None = said("Translation T, ECEF", "m", default=None)
+    translation_norm_m: Number = said("Its length", "m", "translation", ".2f", default=None)
+    drift_urad: tuple[Vector, ...] | None = said("Drift, for each power of the row", "urad", default=None)
+
+
+class CenterEntry(Record):
+    """Where a camera stands."""
+
+    ecef_m: Vector = said("Place, ECEF", "m")
+    altitude_m: Number = said("Above the ellipsoid", "m")
+    method: str = said("line, projective, or nominal where neither was plausible", head="found by")
+
+
+class FitEntry(Record):
+    """The certificate of a refitted RPC: against P_BA, on points that the fit has not seen."""
+
+    rmse_px: Pixel = said("Error col, row on check points", "px", "RMSE col, row", ".1e")
+    max_px: Pixel = said("Largest error col, row on check points", "px")
+    min_denominator: Number = said(
+        "Over the box and 25 % around it, relative to its centre", "", "smallest denominator", ".3f"
+    )
+    roundtrip_px: Number = said(
+        "Largest move by projection and back; null where it fails", "px", "round trip", ".1e"
+    )
+    coverage: Number = said("Share of the image that the fit's points cover")
+    method: str = said("Solver", head="solver")
+    num_check_points: Count = said("Check points", head="check points")
+
+
+def largest(values: Sequence[float | None] | None) -> float | None:
+    """The largest number; None where one is missing, which may be larger."""
+    return None if not values or None in values else max(value for value in values if value is not None)
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
+
+
+def _verdict(view: ViewEntry) -> Cell:
+    return Cell(STATUS_WORDS[view.status], list(STATUS_WORDS).index(view.status), f"status {view.status}")
+
+
+def _rejected(view: ViewEntry) -> float | None:
+    every = view.num_observations + view.num_rejected
+    return 100 * view.num_rejected / every if every else None
+
+
+def _kilometres(view: ViewEntry) -> float | None:
+    altitude = value_of(view, "camera_center.altitude_m")
+    return None if altitude is None else float(altitude) / 1e3
+
+
+def _moves(view: ViewEntry) -> list[Cell]:
+    shift, sigma = (value_of(view, f"correction.center_{what}_px") for what in ("shift", "sigma"))
+    return [Cell(f"{value:+.3f} ± {error:.2f}", value) for value, error in zip(shift, sigma, strict=True)]
+
+
+class ViewEntry(Record):
+    """One image."""
+
+    OWN: ClassVar = {
+        "verdict": Column("verdict", _verdict),
+        "rejected": Column("rejected [%]", _rejected, ".1f"),
+        "covered": Column("covered [%]", lambda view: _percent(view.tie_coverage), ".0f"),
+        "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
+        "kilometres": Column("camera centre [km]", _kilometres, ".0f"),
+        "largest": Column("largest [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e"),
+        "about": Column(
+            "RPC fit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".0e", adjusted=True
+        ),
+        "fitted": Column("covered [%]", lambda view: _percent(value_of(view, "fit.coverage")), ".0f"),
     }
-    plain_summary: dict[str, Any] = plain(summary)
-    return plain_summary
+    PAGE: ClassVar = (
+        "name verdict num_observations rejected covered rmse_before rmse_after held_out_px correction.center_shift_px gsd_m "
+        "incidence_deg rpc_source.format"
+    )
+    TERMINAL: ClassVar = (
+        "name verdict num_observations rmse_before rmse_after correction.center_shift_px about"
+    )
+    CORRECTIONS: ClassVar = (
+        "name moves correction.angle_urad correction.translation_norm_m kilometres camera_center.method"
+    )
+    FITS: ClassVar = (
+        "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fitted fit.num_check_points fit.method"
+    )
+    FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
+
+    name: str = said("Unique in the run", head="image", minLength=1)
+    path: str = said("The image; empty for a view without pixels")
+    size: tuple[Side, Side] = said("Width, height", "px")
+    alt_range_m: tuple[float, float] = said("Altitudes that the camera is used for", _ABOVE)
+    rpc_source: SourceEntry | None = said("Where the camera came from; null: not from a file")
+    gsd_m: Number = said("Ground sampling distance in the middle of the image", "m", "GSD", ".2f")
+    incidence_deg: Number = said(
+        "Angle between the vertical and the direction to the sensor", "deg", "incidence", ".1f"
+    )
+    azimuth_deg: Number = said("Direction to the sensor, clockwise from north", "deg")
+    num_observations: Count = said("Tie-point observations that count", head="tie points")
+    num_rejected: Count = said("Observations that the adjustment cut as wrong")
+    num_gcps: Count = said("Observations of ground control points")
+    tie_coverage: Share = said("Share of the cells of an 8 x 8 grid that hold a tie point")
+    rmse_before: Number = said("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
+    rmse_after: Number = said(
+        "The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True
+    )
+    held_out_px: Number = said(
+        "RMS reprojection error of tie points that took no part in the adjustment, by their median",
+        "px",
+        "not used",
+        ".3f",
+        default=None,
+    )
+    smooth_px: Number = said("RMS of what is smooth in the residuals left, less noise", "px")
+    prior_scale: Number = said("By how much the camera's stated standard deviations were widened")
+    correction: CorrectionEntry | None = said("The correction; null for a check")
+    camera_center: CenterEntry | None = said("Centre about which the camera was turned")
+    fit: FitEntry | None = said("Certificate of the refitted RPC; null where none was fitted")
+    outputs: Mapping[str, Mapping[str, float | str | None]] = said(
+        "File -> consumer that reopened it -> difference to P_BA in px, or why it does not read it",
+        propertyNames={"pattern": "^[^/]+$"},
+    )
+    status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = said(
+        "Verdict on the image"
+    )
+    advice: str = said("What to do; empty when all is well")
 
 
-def _views(run: Run) -> list[dict[str, Any]]:
-    num, tracks, keep = len(run.views), run.tracks, run.keep
-    count = np.bincount(tracks.view[keep], minlength=num)
+class OffsetEntry(Record):
+    """Distance of a pair's matches from their epipolar lines."""
+
+    median: float = said("Median signed distance from the epipolar line", "px")
+    spread: float = said("1.4826 times the median absolute deviation", "px")
+    rms: float = said("Root mean square", "px")
+    count: Count = said("Matches measured: at most 1000, evenly taken")
+
+
+def _offset_cell(offset: OffsetEntry | None) -> Cell | None:
+    if offset is None:
+        return None
+    return Cell(f"{offset.median:+.3f} ± {offset.spread:.3f}", float(f"{abs(offset.median):.6g}"))
+
+
+class PairEntry(Record):
+    """Two images with tie points in common."""
+
+    OWN: ClassVar = {
+        "pair": Column("pair", lambda pair: f"{pair.a} - {pair.b}"),
+        "before": Column("before [px]", lambda pair: _offset_cell(pair.epipolar_before), ".3f"),
+        "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
+    }
+    PAGE: ClassVar = "pair num_matches convergence_deg base_to_height height_m_per_px before after"
+    TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
+    CSV: ClassVar = (
+        "a b num_matches convergence_deg base_to_height height_m_per_px epipolar_before.median epipolar_before.spread "
+        "epipolar_before.rms epipolar_after.median epipolar_after.spread epipolar_after.rms"
+    )
+
+    a: str = said("First view")
+    b: str = said("Second view")
+    num_matches: Count = said("Tie points that both see", head="matches")
+    convergence_deg: Number = said("Angle between the lines of sight", "deg", "angle", ".1f")
+    base_to_height: Number = said("B/H along the lines of sight", head="B/H", form=".2f")
+    height_m_per_px: Number = said(
+        "Height whose parallax is a pixel; null for parallel rays", "m", "height per px", ".3g"
+    )
+    epipolar_before: OffsetEntry | None = said("Through the delivered cameras")
+    epipolar_after: OffsetEntry | None = said("Through the new cameras")
+    matching: Mapping[str, Any] | None = said(
+        "What became of it in matching; null for tie points from a file"
+    )
+
+    @property
+    def offset_rms(self) -> tuple[float | None, float | None]:
+        """RMS of the offsets before and after."""
+        before, after = self.epipolar_before, self.epipolar_after
+        return None if before is None else before.rms, None if after is None else after.rms
+
+
+class LeftOutEntry(Record):
+    """A file that was left out."""
+
+    path: str = said("File")
+    reason: str = said("Why")
+
+
+class TracksEntry(Record):
+    """The tie points."""
+
+    num_tracks: Count = said("Tie points")
+    num_observations: Count = said("Their observations")
+    by_length: Mapping[str, int] = said("Number of views -> tie points seen in so many")
+
+
+class TablesEntry(Record):
+    """How much of the tie points the tables hold."""
+
+    num_usable_tracks: Count = said("Tie points with a ground position")
+    num_written_tracks: Count = said("Of these, in the tables (at most 200,000, evenly taken)")
+    complete: bool = said("Whether that is all")
+
+
+class ModeEntry(Record):
+    """A motion of the scene that the images cannot tell."""
+
+    sigma_m: Number = said("Posterior standard deviation", "m")
+    meaning: str = said("Its largest motion", enum=list(_MODE_WORDS))
+    motion_m: tuple[Number, ...] = said(
+        "East, north, up; tilts, turn, scale at the edge", "m", minItems=7, maxItems=7
+    )
+    words: str = said("The same in words", minLength=1)
+
+
+class SceneEntry(Record):
+    """The block as a whole."""
+
+    shift_enu_m: Vector = said("Mean move of the tie points, east, north, up", "m")
+    sigma_enu_m: Vector = said("Posterior standard deviation of the scene's place", "m")
+    radius_m: Number = said(
+        "RMS distance of the tie points from their middle: the edge of tilts, turn and scale", "m"
+    )
+    weakest_modes: tuple[ModeEntry, ...] = said("What the images cannot tell, the weakest first")
+    noise: Number = said("Observed over stated standard deviation of the observations")
+    num_held_out: Count = said("Observations that took no part, to be measured on", default=0)
+    model: str = said("Unknowns of each view that were solved for", default="")
+    in_space_px: Number = said(
+        "Where an affine in the image was chosen: what a rotation and translation leave of the same tie points",
+        "px",
+        default=None,
+    )
+    drift_degree: Count = said("Degree of the rotation in the row")
+    drift_sigma_m: tuple[float, ...] = said(
+        "Standard deviation of the drift at the first and last row, by degree", "m"
+    )
+    prior_ratio: Number = said("Squared corrections over stated variances and degrees of freedom")
+    cost_history: tuple[Number, ...] = said("Sum of squared whitened residuals, by linearisation")
+    num_held_in_height: Count = said("Tie points seen under too small an angle, held in height")
+    gcp_residuals_enu_m: tuple[Vector, ...] = said("Adjusted GCPs minus their given place", "m")
+    solver: str = said("What the solver did")
+
+
+class KnownPoint(Record):
+    """A point whose place is given."""
+
+    name: str = said("Name")
+    lon: float = said("Longitude", "deg", minimum=-540, maximum=540)
+    lat: float = said("Latitude", "deg", minimum=-90, maximum=90)
+    alt_m: float = said("Altitude", _ABOVE)
+
+
+_MISS = "Found minus given place, east, north, up; null where fewer than two views see it"
+
+
+class GcpEntry(KnownPoint):
+    """A ground control point."""
+
+    OWN: ClassVar = {"GCP": Column("GCP", lambda point: point.name)}
+    PAGE: ClassVar = "GCP residual_enu_m sigma_m"
+
+    sigma_m: tuple[float, float, float] = said("Stated", "m", "sigma east, north, up", ".2g")
+    residual_enu_m: Vector = said(_MISS, "m", ("east", "north", "up"), "+.3f")
+
+
+class SeenEntry(Record):
+    """Where a check point is seen."""
+
+    view: str = said("Name")
+    residual_px: Pixel = said("Projected minus observed col, row", "px")
+
+
+def _rms(point: CheckPointEntry) -> float | None:
+    return float(np.sqrt(np.mean(np.square(point.seen).sum(axis=1)))) if point.seen else None
+
+
+class CheckPointEntry(KnownPoint):
+    """A known point that stayed out of the adjustment."""
+
+    OWN: ClassVar = {
+        "point": Column("check point", lambda point: point.name),
+        "images": Column("images", lambda point: len(point.seen)),
+        "rms": Column("in the images [px]", _rms, ".3f"),
+    }
+    PAGE: ClassVar = "point images rms residual_enu_m"
+
+    residual_enu_m: Vector = said(_MISS, "m", ("east", "north", "up"), "+.3f")
+    observations: tuple[SeenEntry, ...] = said("Where it is seen")
+
+    @property
+    def seen(self) -> list[Any]:
+        """Residuals in the images that see it."""
+        return [seen.residual_px for seen in self.observations if None not in seen.residual_px]
+
+
+class StageEntry(Record):
+    """A stage of the run."""
+
+    MORE: ClassVar = _Plain
+    PAGE: ClassVar = "stage seconds cpu_seconds peak_memory_mb"
+
+    stage: str = said("Name", head="stage")
+    seconds: float = said("Wall time in seconds", head="seconds", form=".2f")
+    cpu_seconds: float = said("CPU time in seconds", head="CPU seconds", form=".2f")
+    peak_memory_mb: float = said("Peak memory so far", "MB", "peak memory", ".0f")
+
+
+class Summary(Record):
+    """summary.json of a run."""
+
+    schema: int = said("Version of this description", const=SCHEMA)
+    barpc: str = said("Release")
+    kind: Literal["adjust", "check", "match"] = said("Whether cameras were adjusted, looked at, or only tied")
+    status: Literal["good", "look", "bad"] = said("The verdict on the whole")
+    headline: str = said("The verdict in a sentence")
+    verdict: tuple[str, ...] = said("What was reached, what is unknown, what needs a look")
+    reasons: tuple[str, ...] = said("Those of its sentences that say why it is not good")
+    passed: bool = said("Whether it is good: no image, point or file has a reservation (exit code 0, else 3)")
+    out_dir: str = said("Where the results are")
+    altitude_m: Number = said("Median altitude of the tie points", _ABOVE)
+    views: tuple[ViewEntry, ...] = said("The images", minItems=1)
+    pairs: tuple[PairEntry, ...] = said("Pairs with tie points in common")
+    left_out: tuple[LeftOutEntry, ...] = said("Files that were left out")
+    tracks: TracksEntry = said("Tie points")
+    tables: TablesEntry = said("What the tables hold")
+    scene: SceneEntry | None = said("The block as a whole; null for a check")
+    gcps: tuple[GcpEntry, ...] = said("Ground control")
+    check_points: tuple[CheckPointEntry, ...] = said("Points that stayed out of the adjustment")
+    stages: tuple[StageEntry, ...] = said("Stages of the run")
+    options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = said(
+        "Options of the run"
+    )
+    versions: Mapping[str, str] = said("Versions of Python and packages")
+
+    @property
+    def adjusted(self) -> bool:
+        """Whether cameras were adjusted."""
+        return self.kind == "adjust"
+
+
+def published_schema() -> dict[str, Any]:
+    """The JSON schema of summary.json."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "summary.json of a barpc run",
+        "description": "Pixel (0, 0) is the centre of the first one. A number that is not finite is null.",
+        **Summary.json_schema(),
+    }
+
+
+# --- how it is measured -----------------------------------------------------------------------------------
+
+_SOURCE = attrgetter("format", "path", "notes")
+_CENTER = attrgetter("ecef", "altitude", "method")
+_FIT = attrgetter("rmse_ckp", "max_ckp", "min_denominator", "roundtrip", "coverage", "method", "num_ckp")
+
+
+def measure(run: Run) -> Summary:
+    """The summary of a run, without the verdict on it. Numbers may be NaN here."""
+    reports = {report.names: report for report in run.matched}
+    usable, written = int(np.isfinite(run.ground).all(axis=1).sum()), len(run.written_tracks)
+    lengths = np.bincount(np.bincount(run.tracks.point))
+    names = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely")
+    return Summary(
+        schema=SCHEMA,
+        barpc=__version__,
+        kind=run.kind,
+        status="good",
+        headline="",
+        verdict=(),
+        reasons=(),
+        passed=True,
+        out_dir=run.out_dir,
+        altitude_m=run.altitude,
+        views=_views(run),
+        pairs=tuple(_pair(run, ties, reports) for ties in run.pairs),
+        left_out=tuple(LeftOutEntry(path, reason) for path, reason in run.left_out),
+        tracks=TracksEntry(
+            num_tracks=run.tracks.num_points,
+            num_observations=len(run.tracks),
+            by_length={str(n): int(count) for n, count in enumerate(lengths) if n and count},
+        ),
+        tables=TablesEntry(usable, written, complete=written == usable),
+        scene=None if run.adjustment is None else _scene(run.adjustment),
+        gcps=_gcps(run),
+        check_points=_check_points(run),
+        stages=tuple(StageEntry.read(stage) for stage in run.stages),
+        options=plain(run.options),
+        versions={"python": platform.python_version(), **{name: package_version(name) for name in names}},
+    )
+
+
+def _views(run: Run) -> tuple[ViewEntry, ...]:
+    num, tracks, keep, adjustment = len(run.views), run.tracks, run.keep, run.adjustment
+    count, after = np.bincount(tracks.view[keep], minlength=num), run.ties_after
     first = rmse_by_view(run.ties_before.residuals[keep], tracks.view[keep], num)
-    after = run.ties_after
     last = None if after is None else rmse_by_view(after.residuals[keep], tracks.view[keep], num)
-    out = []
+    entries = []
     for i, view in enumerate(run.views):
         of_view = tracks.view == i
-        entry: dict[str, Any] = {
-            "name": view.name,
-            "path": view.path,
-            "size": list(view.size),
-            "alt_range_m": list(view.alt_range),
-            "rpc_source": _source(run, i),
-            **_geometry(run, i),
-            "num_observations": int(count[i]),
-            "num_rejected": int((~keep & of_view).sum()),
-            "num_gcps": 0 if run.gcps is None else int((run.gcps.view == i).sum()),
-            "tie_coverage": coverage(tracks.xy[keep & of_view], view.size),
-            "rmse_before": first[i],
-            "rmse_after": None if last is None else last[i],
-            "smooth_px": None if run.adjustment is None else run.adjustment.smooth.rms[i],
-            "prior_scale": None if run.adjustment is None else run.adjustment.prior.scale[i],
-            "correction": None if run.adjustment is None else _correction(run, run.adjustment, i),
-            "camera_center": None if not run.centers else _center(run.centers[i]),
-            "fit": None if not run.fits else _fit(run.fits[i]),
-            "outputs": dict(run.written[i]) if run.written else {},
-        }
-        out.append({**entry, **view_status(entry, run)})
-    return out
+        middle = view.sensor.localize((np.array(view.size) - 1) / 2, np.array(run.altitude))
+        incidence, azimuth = view_angles(view.sensor, middle)
+        entry = ViewEntry(
+            name=view.name,
+            path=view.path,
+            size=view.size,
+            alt_range_m=view.alt_range,
+            rpc_source=SourceEntry(*_SOURCE(run.sources[i])) if run.sources else None,
+            gsd_m=float(ground_sample_distance(view.sensor, middle)[1]),
+            incidence_deg=float(incidence),
+            azimuth_deg=float(azimuth),
+            num_observations=int(count[i]),
+            num_rejected=int((~(keep | run.held_out) & of_view).sum()),
+            num_gcps=0 if run.gcps is None else int((run.gcps.view == i).sum()),
+            tie_coverage=len(np.unique(cell_numbers(tracks.xy[keep & of_view], view.size))) / CELLS**2,
+            rmse_before=first[i],
+            rmse_after=None if last is None else last[i],
+            held_out_px=None if adjustment is None else adjustment.held_out_rms[i],
+            smooth_px=None if adjustment is None else adjustment.smooth.rms[i],
+            prior_scale=None if adjustment is None else adjustment.prior.scale[i],
+            correction=None if adjustment is None else _correction(adjustment, i, middle),
+            camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
+            fit=FitEntry(*_FIT(run.fits[i])) if run.fits else None,
+            outputs=dict(run.written[i]) if run.written else {},
+            status="adjusted",
+            advice="",
+        )
+        entries.append(entry)
+    return tuple(entries)
 
 
-def _source(run: Run, i: int) -> dict[str, Any] | None:
-    if not run.sources:
-        return None
-    source = run.sources[i]
-    return {"format": source.format, "path": str(source.path), "notes": list(source.notes)}
+def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
+    """RMS of each view (N,) [px]: sqrt(mean(dcol^2 + drow^2)) over those residuals (K, 2) that are not NaN."""
+    use = np.isfinite(residuals).all(axis=1)
+    squares = np.bincount(view[use], (residuals[use] ** 2).sum(axis=1), minlength=num_views)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(squares / np.bincount(view[use], minlength=num_views)))
 
 
-def _geometry(run: Run, i: int) -> dict[str, float]:
-    """Ground sampling and view angles in the middle of the image, at the scene's altitude."""
-    view = run.views[i]
-    middle = view.sensor.localize((np.array(view.size) - 1) / 2, np.array(run.altitude))
-    incidence, azimuth = view_angles(view.sensor, middle)
-    return {
-        "gsd_m": float(ground_sampling(view.sensor, middle)),
-        "incidence_deg": float(incidence),
-        "azimuth_deg": float(azimuth),
-    }
+def cell_numbers(xy: Array, size: Sequence[int]) -> IntArray:
+    """Which of the `CELLS` x `CELLS` cells of an image points (n, 2) [px] lie in, row by row."""
+    col, row = ((xy + 0.5) / np.array(size) * CELLS).astype(np.int64).clip(0, CELLS - 1).T
+    number: IntArray = row * CELLS + col
+    return number
 
 
-def _pair(run: Run, ties: PairTies, reports: Mapping[tuple[str, str], PairReport]) -> dict[str, Any]:
+def _pair(run: Run, ties: PairTies, reports: Mapping[tuple[str, str], PairReport]) -> PairEntry:
     i, j = ties.views
     names = (run.views[i].name, run.views[j].name)
     report = reports.get(names)
-    some = ties.a[:: max(1, len(ties.a) // 100)]
-    convergence, base_to_height, height = pair_geometry(ties, run.before, run.ground[run.tracks.point[some]])
-    offsets = {}
-    for when, sensors, alt in (
-        ("before", run.before, run.altitudes_before),
-        ("after", run.after, run.ground[:, 2]),
-    ):
-        found = None if sensors is None else pair_offset(ties, run.tracks, sensors, alt)
-        offsets[f"epipolar_{when}"] = None if found is None else _offset(found)
-    return {
-        "a": names[0],
-        "b": names[1],
-        "num_matches": len(ties.a),
-        "convergence_deg": convergence,
-        "base_to_height": base_to_height,
-        "height_m_per_px": height,
-        **offsets,
-        "matching": None if report is None else plain(report),
-    }
-
-
-def _offset(offset: PairOffset) -> dict[str, float | int] | None:
-    if not offset.count:
-        return None
-    return {"median": offset.median, "spread": offset.spread, "rms": offset.rms, "count": offset.count}
-
-
-def _correction(run: Run, adjustment: Adjustment, i: int) -> dict[str, Any]:
-    sensor = adjustment.sensors[i]
-    correction, covariance = adjustment.corrections[i], adjustment.covariance.view(i)
-    out: dict[str, Any] = {
-        "model": adjustment.cameras.unknowns.model,
-        "unknowns": adjustment.params[i],
-        "sigma": np.sqrt(np.maximum(np.diag(covariance), 0.0)),
-        "center_shift_px": None,
-        "center_sigma_px": None,
-    }
-    if not isinstance(correction, Correction):
-        return {**out, "shift_px": correction.shift, "slope": correction.slope}
-    assert isinstance(sensor, Corrected)
-    middle = sensor.sensor.localize((np.array(run.views[i].size) - 1) / 2, np.array(run.altitude))
-    shift, sigma = shift_in_image(sensor, covariance, adjustment.cameras.unknowns.model, middle)
-    return {
-        **out,
-        "center_shift_px": shift,
-        "center_sigma_px": sigma,
-        "rotation_urad": correction.rotation * 1e6,
-        "angle_urad": float(np.linalg.norm(correction.rotation)) * 1e6,
-        "translation_m": correction.translation,
-        "translation_norm_m": float(np.linalg.norm(correction.translation)),
-        "drift_urad": correction.drift * 1e6,
-    }
-
-
-def _center(center: CameraCenter) -> dict[str, Any]:
-    return {"ecef_m": center.ecef, "altitude_m": center.altitude, "method": center.method}
-
-
-def _fit(fit: RpcFit) -> dict[str, Any]:
-    return {
-        "rmse_px": fit.rmse_ckp,
-        "max_px": fit.max_ckp,
-        "min_denominator": fit.min_denominator,
-        "roundtrip_px": fit.roundtrip,
-        "coverage": fit.coverage,
-        "method": fit.method,
-        "num_check_points": fit.num_ckp,
-    }
-
-
-def _tracks(tracks: Tracks) -> dict[str, Any]:
-    length = np.bincount(np.bincount(tracks.point)) if len(tracks) else np.zeros(0, dtype=np.int64)
-    return {
-        "num_tracks": tracks.num_points,
-        "num_observations": len(tracks),
-        "by_length": {str(n): int(count) for n, count in enumerate(length) if n > 0 and count},
-    }
-
-
-def _tables(run: Run) -> dict[str, Any]:
-    """How much of the tie points the tables hold."""
-    usable = int(np.isfinite(run.ground).all(axis=1).sum())
-    written = len(written_tracks(run))
-    return {"num_usable_tracks": usable, "num_written_tracks": written, "complete": written == usable}
-
-
-def _scene(adjustment: Adjustment) -> dict[str, Any]:
-    gauge = adjustment.gauge
-    modes = [
-        {
-            "sigma_m": mode.sigma,
-            "meaning": mode.meaning,
-            "motion_m": mode.motion,
-            "words": mode_in_words(mode),
-        }
-        for mode in gauge.modes
-    ]
-    return {
-        "shift_enu_m": gauge.shift,
-        "sigma_enu_m": gauge.sigma,
-        "radius_m": gauge.radius,
-        "weakest_modes": modes,
-        "noise": adjustment.noise,
-        "drift_degree": adjustment.cameras.unknowns.drift,
-        "drift_sigma_m": list(adjustment.prior.drift_sigma),
-        "prior_ratio": adjustment.prior.ratio,
-        "cost_history": list(adjustment.cost_history),
-        "num_held_in_height": int(np.count_nonzero(adjustment.held)),
-        "gcp_residuals_enu_m": adjustment.gcp_residuals,
-        "solver": adjustment.status,
-    }
-
-
-def _gcps(run: Run) -> list[dict[str, Any]]:
-    if run.gcps is None:
-        return []
-    left = (
-        run.adjustment.gcp_residuals
-        if run.adjustment is not None
-        else np.full((len(run.gcps.names), 3), np.nan)
+    at = run.ground[run.tracks.point[ties.a[:: max(1, len(ties.a) // 100)]]]
+    convergence, base, height = _pair_geometry(run.before[i], run.before[j], at[np.isfinite(at).all(axis=1)])
+    return PairEntry(
+        a=names[0],
+        b=names[1],
+        num_matches=len(ties.a),
+        convergence_deg=convergence,
+        base_to_height=base,
+        height_m_per_px=height,
+        epipolar_before=_pair_offset(run, ties, run.before, run.altitudes_before),
+        epipolar_after=None if run.after is None else _pair_offset(run, ties, run.after, run.ground[:, 2]),
+        matching=None if report is None else plain(report),
     )
-    return [
-        {
-            "name": name,
-            "lon": place[0],
-            "lat": place[1],
-            "alt_m": place[2],
-            "sigma_m": sigma,
-            "residual_enu_m": r,
-        }
-        for name, place, sigma, r in zip(
-            run.gcps.names, run.gcps.lonlatalt, run.gcps.sigma, left, strict=True
-        )
-    ]
 
 
-def _check_points(run: Run) -> list[dict[str, Any]]:
+def _pair_geometry(a: SensorModel, b: SensorModel, at: Array) -> tuple[float, float, float]:
+    """Medians over ground points (n, 3): convergence angle [deg], B/H, height of a pixel of the finer image [m]."""
+    if not len(at):
+        return float("nan"), float("nan"), float("nan")
+    base = base_to_height(a, b, at)
+    finer = np.minimum(ground_sample_distance(a, at)[1], ground_sample_distance(b, at)[1])
+    with np.errstate(divide="ignore"):
+        height = float(np.median(finer / base))
+    return float(np.median(convergence_angle(a, b, at))), float(np.median(base)), height
+
+
+def _pair_offset(run: Run, ties: PairTies, sensors: Sequence[SensorModel], alt: Array) -> OffsetEntry | None:
+    """The epipolar offset of a pair's matches.
+
+    The tracks' altitudes (P,) [m] through these cameras are so near to where the pair's own rays pass each other
+    that two steps from there arrive.
+    """
+    pick = np.linspace(0, len(ties.a) - 1, min(len(ties.a), MAX_PER_PAIR)).astype(np.int64)
+    start = alt[run.tracks.point[ties.a[pick]]]
+    pick, start = pick[np.isfinite(start)], start[np.isfinite(start)]
+    i, j = ties.views
+    image_a, image_b = run.tracks.xy[ties.a[pick]], run.tracks.xy[ties.b[pick]]
+    offset, _ = epipolar_offset(sensors[i], sensors[j], image_a, image_b, start, steps=2)
+    offset = offset[np.isfinite(offset)]
+    if not len(offset):
+        return None
+    median, rms = float(np.median(offset)), float(np.sqrt((offset**2).mean()))
+    return OffsetEntry(median, robust_spread(offset, median), rms, len(offset))
+
+
+def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
+    """The correction of a view, at the ground point (3,) in the middle of its image."""
+    sensor, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
+    correction, covariance = adjustment.corrections[i], adjustment.covariance.view(i)
+    unknowns = adjustment.params[i].tolist()
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    if not isinstance(correction, Correction):
+        shift, slope = correction.shift.tolist(), correction.slope.tolist()
+        return CorrectionEntry(model, unknowns, sigma, None, None, shift_px=shift, slope=slope)
+    assert isinstance(sensor, Corrected)
+    moved, uncertain = shift_in_image(sensor, covariance, model, middle)
+    return CorrectionEntry(
+        model,
+        unknowns,
+        sigma,
+        moved.tolist(),
+        uncertain.tolist(),
+        rotation_urad=(correction.rotation * 1e6).tolist(),
+        angle_urad=float(np.linalg.norm(correction.rotation)) * 1e6,
+        translation_m=correction.translation.tolist(),
+        translation_norm_m=float(np.linalg.norm(correction.translation)),
+        drift_urad=(correction.drift * 1e6).tolist(),
+    )
+
+
+def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array]:
+    """How far P_BA moves a ground point (3,) near the middle of the image, and the standard deviation of that.
+
+    Parameters
+    ----------
+    model : Corrected
+        P_BA.
+    covariance : (q, q)
+        Of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the middle row.
+    unknowns : str
+        Which there are: "rotation", "translation", "rotation+translation".
+
+    Returns
+    -------
+    shift, sigma : (2,)
+        col, row [px].
+    """
+    ecef = ecef_from_ground(ground)
+    image, _, by_rotation, by_translation = model.project_ecef(ecef)
+    distance = np.linalg.norm(ecef - model.correction.center)
+    parts = {"rotation": by_rotation / distance, "translation": by_translation}
+    jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
+    q = jacobian.shape[1]
+    variance = np.einsum("ij,jk,ik->i", jacobian, covariance[:q, :q], jacobian)
+    return image - model.sensor.project(ground), np.sqrt(np.maximum(variance, 0.0))
+
+
+def _scene(adjustment: Adjustment) -> SceneEntry:
+    gauge, prior = adjustment.gauge, adjustment.prior
+    modes = [ModeEntry(m.sigma, m.meaning, m.motion.tolist(), mode_in_words(m)) for m in gauge.modes]
+    return SceneEntry(
+        shift_enu_m=gauge.shift.tolist(),
+        sigma_enu_m=gauge.sigma.tolist(),
+        radius_m=gauge.radius,
+        weakest_modes=tuple(modes),
+        noise=adjustment.noise,
+        num_held_out=int(np.count_nonzero(adjustment.held_out)),
+        model=adjustment.cameras.unknowns.model,
+        in_space_px=adjustment.in_space_rms,
+        drift_degree=adjustment.cameras.unknowns.drift,
+        drift_sigma_m=tuple(prior.drift_sigma),
+        prior_ratio=prior.ratio,
+        cost_history=tuple(adjustment.cost_history),
+        num_held_in_height=int(np.count_nonzero(adjustment.held)),
+        gcp_residuals_enu_m=adjustment.gcp_residuals.tolist(),
+        solver=adjustment.status,
+    )
+
+
+def metres(value: float) -> str:
+    """A length with a unit that keeps it readable.
+
+    Examples
+    --------
+    >>> metres(3.14159), metres(0.0421), metres(0.00012)
+    ('3.1 m', '4.2 cm', '0.1 mm')
+    """
+    for factor, unit in ((1.0, "m"), (1e2, "cm"), (1e3, "mm")):
+        if abs(value) * factor >= 1.0:
+            return f"{value * factor:.1f} {unit}"
+    return f"{value * 1e3:.1f} mm"
+
+
+def mode_in_words(mode: Mode) -> str:
+    """One weak mode of the scene as a sentence without its full stop."""
+    return _MODE_WORDS[mode.meaning].format(metres(mode.sigma))
+
+
+def _gcps(run: Run) -> tuple[GcpEntry, ...]:
+    points = run.gcps
+    if points is None:
+        return ()
+    left = np.full_like(points.sigma, np.nan) if run.adjustment is None else run.adjustment.gcp_residuals
+    rows = zip(
+        points.names, *(table.tolist() for table in (points.lonlatalt, points.sigma, left)), strict=True
+    )
+    return tuple(
+        GcpEntry(name, lon, lat, alt, sigma, residual) for name, (lon, lat, alt), sigma, residual in rows
+    )
+
+
+def _check_points(run: Run) -> tuple[CheckPointEntry, ...]:
     """Points that stayed out of the adjustment: image residuals of each observation, and the ground error."""
-    if run.check_points is None:
-        return []
     points = run.check_points
+    if points is None:
+        return ()
     left = check_residuals(run.before if run.after is None else run.after, points)
-    return [
-        {
-            "name": name,
-            "lon": place[0],
-            "lat": place[1],
-            "alt_m": place[2],
-            "residual_enu_m": left.ground[i],
-            "observations": [
-                {"view": run.views[points.view[row]].name, "residual_px": left.image[row]}
-                for row in np.flatnonzero(points.point == i)
-            ],
-        }
-        for i, (name, place) in enumerate(zip(points.names, points.lonlatalt, strict=True))
-    ]
-
-
-def _versions() -> dict[str, str]:
-    names = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely")
-    return {"python": platform.python_version(), **{name: package_version(name) for name in names}}
-
-
-def plain(value: Any) -> Any:
-    """A value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value) if f.name[0] != "_"}
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    if value is None or isinstance(value, (bool, int, str)):
-        return value
-    return str(value)
+    seen = [SeenEntry(run.views[i].name, r) for i, r in zip(points.view, left.image.tolist(), strict=True)]
+    rows = zip(points.names, points.lonlatalt.tolist(), left.ground.tolist(), strict=True)
+    return tuple(
+        CheckPointEntry(
+            name, lon, lat, alt, miss, tuple(seen[row] for row in np.flatnonzero(points.point == i))
+        )
+        for i, (name, (lon, lat, alt), miss) in enumerate(rows)
+    )

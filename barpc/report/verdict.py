@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
-from barpc.ba.gauge import Mode
 from barpc.geodesy import Array
+from barpc.report.records import plain
 from barpc.report.run import Run
+from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, measure, metres
 
 GOOD_RMSE = 0.5
 """A view whose tie points are left with more than this [px] is called doubtful."""
@@ -30,16 +32,6 @@ NOISE_LIMIT = 2.5
 MOVED = 3.0
 """A scene that moved by more than so many of its own standard deviations needs a look."""
 
-STATUS_WORDS = {
-    "adjusted": "adjusted",
-    "consistent": "consistent",
-    "tied": "tied",
-    "weak": "weakly tied",
-    "doubtful": "doubtful",
-    "failed": "not adjusted",
-}
-"""Status of a view -> what people read, from good to bad."""
-
 GOOD = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
 """Kind of a run -> the status of a view without reservation."""
 _ALL_WELL = {
@@ -49,39 +41,8 @@ _ALL_WELL = {
 }
 _LISTED = 10  # names in a sentence
 
-_MODE_WORDS = {
-    "east": "the whole scene may lie {0} farther east or west",
-    "north": "the whole scene may lie {0} farther north or south",
-    "up": "all heights may be {0} too high or too low",
-    "tilt east": "the scene may be tilted: {0} up or down at its eastern and western edges",
-    "tilt north": "the scene may be tilted: {0} up or down at its northern and southern edges",
-    "turn": "the scene may be turned about the vertical: {0} at its edge",
-    "scale": "the scene may be too large or too small: {0} at its edge",
-}
 
-View = Mapping[str, Any]
-
-
-def metres(value: float) -> str:
-    """A length with a unit that keeps it readable.
-
-    Examples
-    --------
-    >>> metres(3.14159), metres(0.0421), metres(0.00012)
-    ('3.1 m', '4.2 cm', '0.1 mm')
-    """
-    for factor, unit in ((1.0, "m"), (1e2, "cm"), (1e3, "mm")):
-        if abs(value) * factor >= 1.0:
-            return f"{value * factor:.1f} {unit}"
-    return f"{value * 1e3:.1f} mm"
-
-
-def mode_in_words(mode: Mode) -> str:
-    """One weak mode of the scene as a sentence without its full stop."""
-    return _MODE_WORDS[mode.meaning].format(metres(mode.sigma))
-
-
-def view_status(view: View, run: Run) -> dict[str, str]:
+def view_status(view: ViewEntry, run: Run) -> dict[str, str]:
     """The verdict on a view: a word of `STATUS_WORDS`, and what to do (empty when all is well)."""
     for status, advice in (_failure(view, run), _weakness(view), _doubt(view, run)):
         if advice:
@@ -89,11 +50,11 @@ def view_status(view: View, run: Run) -> dict[str, str]:
     return {"status": GOOD[run.kind], "advice": ""}
 
 
-def _failure(view: View, run: Run) -> tuple[str, str]:
+def _failure(view: ViewEntry, run: Run) -> tuple[str, str]:
     tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
-    if run.adjustment is not None and view["name"] in run.adjustment.left_out:
+    if run.adjustment is not None and view.name in run.adjustment.left_out:
         return "failed", "not tied to the other images: its camera was left as it was"
-    if view["fit"] is not None and not max(view["fit"]["max_px"]) <= tolerance:
+    if view.fit is not None and not max(map(_known, view.fit.max_px)) <= tolerance:
         return (
             "failed",
             f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range",
@@ -101,29 +62,31 @@ def _failure(view: View, run: Run) -> tuple[str, str]:
     return "failed", ""
 
 
-def _weakness(view: View) -> tuple[str, str]:
-    few = view["num_observations"]
-    if few >= FEW_OBSERVATIONS or view["num_gcps"] >= ENOUGH_GCPS:
+def _weakness(view: ViewEntry) -> tuple[str, str]:
+    few = view.num_observations
+    if few >= FEW_OBSERVATIONS or view.num_gcps >= ENOUGH_GCPS:
         return "weak", ""
     return "weak", f"{f'only {few}' if few else 'no'} tie points: check overlap, clouds and dates"
 
 
-def _doubt(view: View, run: Run) -> tuple[str, str]:
+def _doubt(view: ViewEntry, run: Run) -> tuple[str, str]:
     if run.kind == "match":  # how well cameras agree is not what was asked
         return "doubtful", ""
-    if view["name"] in run.copies:
-        return "doubtful", f"shows the same pixels as {run.copies[view['name']]}: give each image once"
-    if run.adjustment is not None and (odd := _oddity(view["name"], run.adjustment)):
+    if view.name in run.copies:
+        return "doubtful", f"shows the same pixels as {run.copies[view.name]}: give each image once"
+    if run.adjustment is not None and (odd := _oddity(view.name, run.adjustment)):
         return "doubtful", odd
-    error = view["rmse_after"] if run.kind == "adjust" else view["rmse_before"]
-    if not error <= GOOD_RMSE and view["num_observations"]:
+    if run.adjustment is not None and (left := _left(view.name, run.adjustment)):
+        return "doubtful", left
+    error = _known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
+    if not error <= GOOD_RMSE and view.num_observations:
         if run.kind == "check":
             return "doubtful", f"tie points disagree by {error:.2f} px: adjust the cameras"
         return (
             "doubtful",
             f"tie points are left with {error:.2f} px: look for wrong matches and moving things",
         )
-    lost = view["num_rejected"] / max(view["num_rejected"] + view["num_observations"], 1)
+    lost = view.num_rejected / max(view.num_rejected + view.num_observations, 1)
     if lost > MANY_REJECTED:
         return (
             "doubtful",
@@ -147,13 +110,25 @@ def _oddity(name: str, adjustment: Adjustment) -> str:
         )
     if smooth.found(SMOOTH_LEFT)[i] or smooth.shared[i] > SMOOTH_LEFT:
         along = "along the rows" if smooth.by_row[i] > 0.5 else "over the image"
-        why = "attitude jitter, optics, or an image that was resampled (--model affine)"
+        why = "attitude jitter, optics, or steps between detectors, which one RPC does not follow"
         if adjustment.options.drift == 0:
             why = "a drift was not allowed (--drift 0)"
         return (
             f"an error of {max(smooth.rms[i], smooth.shared[i]):.2f} px that changes {along} is left: {why}"
         )
     return ""
+
+
+def _left(name: str, adjustment: Adjustment) -> str:
+    """What tie points say that took no part: the others were chosen to agree."""
+    i = adjustment.names.index(name)
+    noise, error = adjustment.held_out_noise[i], adjustment.held_out_rms[i]
+    if not noise > NOISE_LIMIT:
+        return ""
+    return (
+        f"tie points that took no part are left with {error:.2f} px, {noise:.1f} times what the matcher states: look for "
+        "wrong matches, moving things, or errors that these unknowns cannot follow"
+    )
 
 
 def _block_reasons(run: Run) -> list[str]:
@@ -168,6 +143,23 @@ def _block_reasons(run: Run) -> list[str]:
             f"The cameras are {common:.1f} times farther off than stated: their standard deviations were widened, and "
             "what is known of the scene's place with them."
         )
+    if (in_space := run.adjustment.in_space_rms) is not None:
+        tilts = ", ".join(metres(s) for s in run.adjustment.gauge.motion_sigma[3:5])
+        out.append(
+            f"Rotations and translations leave {in_space:.2f} px of tie points that took no part; an affine in each image "
+            f"leaves {_median(run.adjustment.held_out_rms):.2f} px and was taken: images that were turned, resampled or "
+            "cropped otherwise than their RPCs say, or RPCs of other images. The scene's tilts are known to "
+            f"{tilts} (east, north) only."
+        )
+    names = run.adjustment.names
+    for group in run.adjustment.two_groups:
+        i, j = group.views
+        if not (_oddity(names[i], run.adjustment) or _oddity(names[j], run.adjustment)):
+            out.append(
+                f"Tie points of {names[i]} and {names[j]} fall into two groups, {100 * group.share:.0f} % lying "
+                f"{group.apart:.2f} px from the others: there are two solutions, and this is the one between them. Look "
+                "for a moving cloud or a repeated pattern, or add an image."
+            )
     if noise > NOISE_LIMIT:
         out.append(
             f"Tie points scatter {noise:.1f} times as much as stated: wrong matches, or errors that these unknowns "
@@ -190,15 +182,15 @@ def _place_is_free(run: Run) -> bool:
     return run.gcps is None and not run.adjustment.options.fixed and not any(given)
 
 
-def block_verdict(run: Run, views: Sequence[View]) -> dict[str, Any]:
+def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
     """The verdict on the whole: `status`, a `headline`, `lines`, and those of them that are `reasons`.
 
     The one rule of what passes: `status` is "good" when no image, no control point and no file has a reservation;
     "bad" when an image was not adjusted or a file left out; else "look". What is not good ends with exit code 3.
     """
-    bad = [view for view in views if view["status"] == "failed"]
-    look = [view for view in views if view["advice"] and view not in bad]
-    reasons = [f"{view['name']}: {STATUS_WORDS[view['status']]}: {view['advice']}." for view in bad + look]
+    bad = [view for view in views if view.status == "failed"]
+    look = [view for view in views if view.advice and view not in bad]
+    reasons = [f"{view.name}: {STATUS_WORDS[view.status]}: {view.advice}." for view in bad + look]
     reasons += [f"{path} was left out: {reason}" for path, reason in run.left_out]
     whole, points = _block_reasons(run), _control_reasons(run)
     control = whole + points
@@ -253,9 +245,12 @@ def _listed(names: Sequence[str]) -> str:
     return f"{', '.join(names[:_LISTED])}{more}"
 
 
-def _adjusted_lines(run: Run, views: Sequence[View]) -> list[str]:
+def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     assert run.adjustment is not None
-    before, after = (_median([view[f"rmse_{when}"] for view in views]) for when in ("before", "after"))
+    before, after = (
+        _median([view.rmse_before for view in views]),
+        _median([view.rmse_after for view in views]),
+    )
     gauge = run.adjustment.gauge
     lines = [f"Tie points of {len(views)} images agree to {after:.3f} px (before: {before:.3f} px)."]
     if not len(run.tracks):
@@ -289,15 +284,30 @@ def _enu(shift: Array) -> str:
     return ", ".join(f"{s:+.2f} m {word}" for s, word in zip(shift, ("east", "north", "up"), strict=True))
 
 
-def _checked_lines(run: Run, views: Sequence[View]) -> list[str]:
-    rmse = _median([view["rmse_before"] for view in views])
+def _checked_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
+    rmse = _median([view.rmse_before for view in views])
     return [f"Tie points of {len(views)} images agree to {rmse:.3f} px as the cameras are."]
 
 
-def _matched_lines(run: Run, views: Sequence[View]) -> list[str]:
+def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     return [f"{run.tracks.num_points} tie points of {len(views)} images, {len(run.tracks)} observations."]
 
 
-def _median(values: Sequence[float]) -> float:
-    finite = [value for value in values if np.isfinite(value)]
+def _median(values: Iterable[float | None]) -> float:
+    finite = [value for value in values if value is not None and np.isfinite(value)]
     return float(np.median(finite)) if finite else float("nan")
+
+
+def _known(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def summarize(run: Run) -> Summary:
+    """The summary of a run with the verdict on it; a number that is not finite is None, as a file has it."""
+    found = measure(run)
+    views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
+    block = block_verdict(run, views)
+    verdict = {"status": block["status"], "headline": block["headline"], "reasons": block["reasons"]}
+    passed = block["status"] == "good"
+    whole = replace(found, views=views, verdict=block["lines"], passed=passed, **verdict)
+    return Summary.read(plain(whole))

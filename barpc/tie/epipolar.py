@@ -148,19 +148,25 @@ def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
     coefficients = np.array([np.median(values), 0.0, 0.0])
     for _ in range(steps):
         residual = values - design @ coefficients
-        spread = max(mad(residual), 1e-3)
+        spread = max(robust_spread(residual), 1e-3)
         weight = np.maximum(0.0, 1.0 - (residual / (_TUKEY * spread)) ** 2)  # the biweight's root
         solution = np.linalg.lstsq(design[:, :columns] * weight[:, None], values * weight, rcond=1e-9)[0]
         change = np.abs(solution - coefficients[:columns]).max()
         coefficients[:columns] = solution
         if change < 1e-4 * spread:
             break
-    return Affine(coefficients, middle, scale, mad(values - design @ coefficients))
+    return Affine(coefficients, middle, scale, robust_spread(values - design @ coefficients))
 
 
-def mad(values: Array) -> float:
-    """Robust standard deviation: 1.4826 times the median of the absolute values (about zero)."""
-    return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
+def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
+    """Robust standard deviation: 1.4826 times the median over the last axis of the distances from a centre.
+
+    Residuals are measured from zero; a sample that is stated with its median from that median.
+    """
+    if not len(values):
+        return 0.0
+    spread = 1.4826 * np.median(np.abs(values - center), axis=-1)
+    return spread if spread.ndim else float(spread)
 
 
 def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
@@ -176,7 +182,7 @@ def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, A
     for rows in grouped(*np.floor(xy[:, ::-1] / _WINDOW).T):
         if len(rows) >= _WINDOW_POINTS:
             residual[rows] = values[rows] - robust_affine(xy[rows], values[rows])(xy[rows])
-        keep[rows] = np.abs(residual[rows]) <= max(3.0 * mad(residual[rows]), floor)
+        keep[rows] = np.abs(residual[rows]) <= max(3.0 * robust_spread(residual[rows]), floor)
     return keep, residual
 
 

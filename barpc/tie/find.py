@@ -11,7 +11,7 @@ import numpy as np
 from barpc.errors import TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.options import TieOptions
-from barpc.scene import Tracks, View
+from barpc.scene import Tracks, View, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.area import Area
 from barpc.tie.features import Keypoints, bounded, detect_tile, join
@@ -167,8 +167,7 @@ def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
     if area is None or not len(tracks):
         return tracks
     cameras = [view.sensor for view in views]
-    alt = float(np.mean([view.alt_range for view in views]))
-    points = triangulate(cameras, tracks.view, tracks.point, tracks.xy, alt=alt).points
+    points = triangulate(cameras, tracks.view, tracks.point, tracks.xy, alt=middle_altitude(views)).points
     ground = ground_from_ecef(points)
     kept = area.contains(ground[:, :2])
     if not kept.any():

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import View
-from barpc.tie.epipolar import Frame, agreeing, frame, mad, robust_affine
+from barpc.tie.epipolar import Frame, agreeing, frame, robust_affine, robust_spread
 from barpc.tie.features import Keypoints
 from barpc.tie.guided import Guided
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
@@ -126,7 +126,7 @@ def match_pair(
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
     if report.verified < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches on common epipolar lines")
-    spread = mad(residual[keep])
+    spread = robust_spread(residual[keep])
     report = replace(
         report,
         inlier_share=report.verified / len(found),
@@ -260,7 +260,7 @@ class _Search:
         def nearby(xy: Array) -> Frame:
             along = errors[tree.query(xy, k=min(_NEIGHBOURS, len(tight)))[1], 0]
             middle = np.median(along, axis=1)
-            half = 4.0 + 3.0 * 1.4826 * np.median(np.abs(along - middle[:, None]), axis=1)
+            half = 4.0 + 3.0 * robust_spread(along, middle[:, None])
             return replace(self._frame(xy).moved(across(xy)), before=middle - half, after=middle + half)
 
         return self._predicted(nearby, float(np.clip(4.0 * across.spread, 0.6, TOLERANCE)))

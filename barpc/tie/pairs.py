@@ -9,6 +9,8 @@ from itertools import compress
 
 import numpy as np
 import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import minimum_spanning_tree
 
 from barpc.errors import DisconnectedError, TiePointError
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
@@ -200,22 +202,17 @@ def _candidates(
 def _best(pairs: Sequence[Pair], num_views: int, neighbours: int) -> list[Pair]:
     """The best partners of every view, and what connects all views, ascending."""
     taken = [0] * num_views
-    parent = list(range(num_views))
-
-    def root(i: int) -> int:
-        while parent[i] != i:
-            i = parent[i]
-        return i
-
+    ranked = sorted(pairs, key=lambda pair: (-pair.score, pair.views))
+    first, second = np.array([pair.views for pair in ranked], dtype=np.int64).reshape(-1, 2).T
+    rank = np.arange(1.0, len(ranked) + 1)  # the graph's weights; no two alike, so the tree is one
+    tree = minimum_spanning_tree(coo_array((rank, (first, second)), shape=(num_views, num_views)))
     chosen = []
-    for pair in sorted(pairs, key=lambda pair: (-pair.score, pair.views)):
+    for pair, joins in zip(ranked, np.isin(rank, tree.data).tolist(), strict=True):
         i, j = pair.views
-        joins = root(i) != root(j)
         if joins or min(taken[i], taken[j]) < neighbours:
             chosen.append(pair)
             taken[i] += 1
             taken[j] += 1
-            parent[max(root(i), root(j))] = min(root(i), root(j))
     return sorted(chosen, key=lambda pair: pair.views)
 
 

@@ -10,13 +10,11 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from barpc.geodesy import Array
 from barpc.options import TieOptions
-from barpc.scene import BoolArray, IntArray, Tracks, View
-from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, mad
+from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels
+from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, robust_spread
 from barpc.tie.matcher import Matches
 from barpc.tie.register import Registration, register_places
 from barpc.tie.tasks import Progress, ordered
@@ -58,10 +56,7 @@ def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks
     new = (np.diff(view[order]) != 0) | (np.diff(number[order]) != 0)
     node: IntArray = np.empty(len(order), dtype=np.int64)
     node[order] = np.concatenate([[0], np.cumsum(new)])
-    total = int(node.max()) + 1
-    first, second = node.reshape(-1, 2).T
-    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(total, total))
-    label: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)
+    label = connected_labels(int(node.max()) + 1, node.reshape(-1, 2))
     order = np.lexsort((sigma, node))
     once = order[np.r_[True, np.diff(node[order]) > 0]]
     return _clean(view[once], label[node[once]], xy[once], sigma[once])
@@ -281,7 +276,7 @@ class _Links:
             if len(group) >= _FEW:
                 across = self.errors(found, group)[0][:, 1]
                 residual = agreeing(self.origin[group], across, _FLOOR)[1]
-                sigma[group] *= max(1.0, mad(residual / sigma[group]))
+                sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
         return sigma
 
 

@@ -16,7 +16,7 @@ from barpc.cli.main import MOVED
 from barpc.cli.progress import progress_bars
 from barpc.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.geometry import base_to_height, triangulate
 from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
 
 POINT = ["5.4005", "43.1995", "200"]
@@ -146,7 +146,8 @@ def test_info_tells_the_angle_between_several_images(image, other, capsys):
     (pair,) = first["pairs"]
     assert pair["with"] == "other"
     assert second["pairs"] == []
-    assert pair["b_over_h"] == pytest.approx(2 * np.tan(np.radians(pair["convergence_deg"]) / 2))
+    place = np.array([*first["center_deg"], np.mean(first["altitude_range_m"])])
+    assert pair["b_over_h"] == pytest.approx(float(base_to_height(read_rpc(image), read_rpc(other), place)))
     assert 1 < pair["convergence_deg"] < 60
     assert run("info", image, other) == 0
     assert "pairs: with other, convergence_deg " in capsys.readouterr().out

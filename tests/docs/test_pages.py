@@ -50,6 +50,14 @@ def test_the_page_of_options_is_what_the_code_says():
     assert (DOCS / "options.md").read_text(encoding="utf-8") == generator.page()
 
 
+def test_the_page_of_the_summary_is_what_its_records_say():
+    page = script("generate_summary").page()
+    assert (DOCS / "summary.md").read_text(encoding="utf-8") == page
+    assert (
+        "| `rmse_after` | number or null | The same through the new cameras; null for a check [px]. |" in page
+    )
+
+
 def test_every_page_of_the_navigation_exists_and_every_page_is_in_it():
     configuration = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     listed = re.findall(r": ([\w/]+\.md)$", configuration, re.MULTILINE)

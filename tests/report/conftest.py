@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
+from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.fit import fit_rpc
 from barpc.options import RunOptions
 from barpc.pipeline.outputs import write_tables
-from barpc.report import Run, summarize
+from barpc.report import Run, Summary
+from barpc.report.records import plain
 from barpc.rpcio import write_rpc
 from barpc.scene import View
 from barpc.sensor.geometry import camera_center
@@ -55,14 +57,19 @@ def run_of_block(
     )
 
 
+def summarize(run: Run) -> dict[str, Any]:
+    """What summary.json holds of a run."""
+    return plain(report.summarize(run))
+
+
 def written(run: Run, folder: Path) -> dict[str, Any]:
-    """Tables, RPC files, report and summary of a run in a folder; the summary."""
-    summary = summarize(run)
+    """Tables, RPC files, report and summary of a run in a folder; the summary as the file holds it."""
+    summary = report.summarize(run)
     with Workspace(folder, overwrite=True) as workspace:
         write_tables(workspace, run, summary)
         for view, fit in zip(run.views, run.fits, strict=bool(run.fits)):
             write_rpc(fit.rpc, folder / f"{view.name}_RPC.TXT", overwrite=True)
-    return summary
+    return plain(summary)
 
 
 @dataclass(frozen=True)
@@ -72,6 +79,11 @@ class Finished:
     run: Run
     summary: dict[str, Any]
     folder: Path
+
+    @property
+    def record(self) -> Summary:
+        """The summary as a typed record."""
+        return Summary.read(self.summary)
 
     @property
     def views(self) -> tuple[View, ...]:

@@ -7,16 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.report import summarize
-from barpc.report.verdict import GOOD, STATUS_WORDS, block_verdict
+from barpc.report.summary import STATUS_WORDS, measure
+from barpc.report.verdict import GOOD, block_verdict
+from tests.report.conftest import summarize
 
 ADVICE = {"weak": "only 3 tie points", "doubtful": "tie points are left with 2 px", "failed": "not tied"}
 OVERALL = {"weak": "look", "doubtful": "look", "failed": "bad"}
 
 
 def verdict(run, status, kind="adjust", **changes):
-    views = [{**view, "status": GOOD[kind], "advice": ""} for view in summarize(run)["views"]]
-    views[1] |= {"status": status, "advice": ADVICE.get(status, "")}
+    views = [replace(view, status=GOOD[kind], advice="") for view in measure(run).views]
+    views[1] = replace(views[1], status=status, advice=ADVICE.get(status, ""))
     return block_verdict(replace(run, kind=kind, **changes), views)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from shapely.geometry import LinearRing, shape
 
-from barpc.report.footprints import polygon_geometry
+from barpc.geojson import polygon
 
 
 def outlines(finished):
@@ -39,8 +39,8 @@ def test_an_image_across_the_antimeridian_is_two_polygons_of_the_same_area(antim
         sides = sorted(float(np.mean(np.array(ring)[:, 0])) for ring in rings(geometry))
         assert sides[0] < -179 < 179 < sides[-1]
     ring = np.array([[179.5, 0.0], [180.5, 0.1], [180.4, 1.0], [179.4, 0.9]])
-    whole = polygon_geometry(ring - [10.0, 0.0])
-    assert shape(polygon_geometry(ring)).area == pytest.approx(shape(whole).area, rel=1e-6)
+    whole = polygon(ring - [10.0, 0.0])
+    assert shape(polygon(ring)).area == pytest.approx(shape(whole).area, rel=1e-6)
 
 
 def test_tie_points_lie_in_the_footprints(block_run):
@@ -56,4 +56,4 @@ def test_tie_points_lie_in_the_footprints(block_run):
 
 
 def test_an_outline_that_misses_the_ground_has_no_geometry():
-    assert polygon_geometry(np.array([[0.0, 0.0], [np.nan, 1.0], [1.0, 1.0]])) is None
+    assert polygon(np.array([[0.0, 0.0], [np.nan, 1.0], [1.0, 1.0]])) is None

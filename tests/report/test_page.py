@@ -16,9 +16,9 @@ from click.testing import CliRunner
 from barpc.cli.main import cli
 from barpc.errors import BarpcError, InputError
 from barpc.pipeline import outputs
-from barpc.report import Run, charts, datatables, page, panels, sections, summarize
+from barpc.report import Run, charts, maps, page, records, summarize
+from barpc.report.summary import metres
 from barpc.report.tables import TABLES
-from barpc.report.verdict import metres
 from barpc.scene import Tracks
 from tests.report.conftest import run_of_block, written
 
@@ -111,11 +111,11 @@ def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_pat
 
 
 def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatch):
-    monkeypatch.setattr(panels, "_MOST", 4)
-    monkeypatch.setattr(datatables, "MAX_TABLE_ROWS", 5)
+    monkeypatch.setattr(maps, "_MOST", 4)
+    monkeypatch.setattr(records, "MAX_TABLE_ROWS", 5)
     monkeypatch.setattr(charts, "MAX_ROWS", 3)
-    monkeypatch.setattr(sections, "MAX_ROWS", 3)
-    html = page.report_html(block_run.summary, block_run.folder)
+    monkeypatch.setattr(page, "MAX_ROWS", 3)
+    html = page.report_html(block_run.record, block_run.folder)
     assert "The 4 of 9 images with the largest systematic part are shown." in html
     assert "the first 5 of 9, all in the files beside this page" in html
     assert "The 3 of 9 images with the largest error." in html

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.report import Run, summarize
-from barpc.report.measures import pair_ties, shift_in_image, triangulate_tracks
+from barpc.report import Run
+from barpc.report.load import read_summary
+from barpc.report.records import Number, plain, said, table
+from barpc.report.run import pair_ties, triangulate_tracks
+from barpc.report.summary import ViewEntry, published_schema, shift_in_image
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import epipolar_offset, view_angles
+from tests.report.conftest import summarize
 
-SCHEMA = json.loads((Path(__file__).parents[2] / "barpc/report/summary.schema.json").read_text())
+SCHEMA = published_schema()
 TYPES = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None)}
 
 
@@ -81,6 +85,39 @@ def test_every_field_of_the_schema_says_what_it_is():
             yield from undescribed(part.get("items", {}), f"{where}.{key}[]")
 
     assert list(undescribed(SCHEMA, "$")) == []
+
+
+class Sharper(ViewEntry):
+    """A view with one value more: all that a new column takes."""
+
+    PAGE: ClassVar = f"{ViewEntry.PAGE} sharpness_px"
+    TERMINAL: ClassVar = f"{ViewEntry.TERMINAL} sharpness_px"
+
+    sharpness_px: Number = said("How sharp it is", "px", "sharpness", ".2f", default=None)
+
+
+def test_a_new_value_is_declared_once_and_stands_in_schema_file_and_tables(block_run):
+    view = Sharper(**vars(block_run.record.views[0]), sharpness_px=0.125)
+    assert plain(view) == {**block_run.summary["views"][0], "sharpness_px": 0.125}
+    assert faults(plain(view), Sharper.json_schema()) == []
+    told = Sharper.json_schema()["properties"]["sharpness_px"]
+    assert told == {"type": ["number", "null"], "description": "How sharp it is [px]."}
+    for columns in (Sharper.PAGE, Sharper.TERMINAL):
+        heads, row = table("views", "", [view], Sharper, columns).texts
+        assert (heads[-1], row[-1]) == ("sharpness [px]", "0.12")
+
+
+def test_an_older_summary_without_a_newer_value_is_read(block_run):
+    older = block_run.summary["views"][0]
+    assert faults(older, Sharper.json_schema()) == []
+    assert Sharper.read(older).sharpness_px is None
+    assert plain(Sharper.read(older)) == older
+
+
+def test_a_summary_read_from_its_file_is_the_one_that_was_written(block_run):
+    read = read_summary(block_run.folder)
+    assert read == block_run.record
+    assert plain(read) == json.loads((block_run.folder / "summary.json").read_text()) == block_run.summary
 
 
 def test_outliers_do_not_bend_the_points_that_errors_are_measured_at(block_run):

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from barpc.geodesy import ecef_from_ground, enu_basis
-from barpc.report import summarize, tables
+from barpc.report import run as runs
+from barpc.report import summarize
 from barpc.report.load import read_tables
+from barpc.report.records import plain
 from barpc.report.tables import OBSERVATIONS, RESIDUALS, TABLES
 
 
@@ -55,7 +57,7 @@ def test_observations_give_the_errors_of_the_summary_back(block_run):
 
 def test_outliers_are_in_the_table_with_the_residual_that_had_them_cut(block_run):
     run = block_run.run
-    files = read_tables(block_run.summary, block_run.folder)
+    files = read_tables(block_run.record, block_run.folder)
     cut = ~files.observations.used & np.isfinite(files.observations.after).all(axis=1)
     assert cut.sum() > 50
     assert np.median(np.hypot(*files.observations.after[cut].T)) > 3.0
@@ -101,30 +103,31 @@ def test_the_point_cloud_is_the_tie_points_about_the_origin_it_states(block_run)
 
 
 def test_the_same_run_gives_the_same_bytes(block_run):
-    run, summary = block_run.run, block_run.summary
+    run, summary = block_run.run, block_run.record
     again = summarize(run)
-    assert json.dumps(again) == json.dumps(summary)
+    assert again == summary
+    assert json.dumps(plain(again)) == json.dumps(block_run.summary)
     for name, content in TABLES.items():
         assert content(run, again) == (block_run.folder / name).read_bytes(), name
 
 
 def test_a_huge_run_is_thinned_evenly_and_says_so(block_run, monkeypatch):
-    monkeypatch.setattr(tables, "MAX_TRACKS", 100)
+    monkeypatch.setattr(runs, "MAX_TRACKS", 100)
     summary = summarize(block_run.run)
-    found = summary["tables"]
-    assert not found["complete"]
-    assert 50 < found["num_written_tracks"] <= 100
+    found = summary.tables
+    assert not found.complete
+    assert 50 < found.num_written_tracks <= 100
     lines = TABLES["residuals.csv"](block_run.run, summary).decode().splitlines()
-    assert len(lines) == found["num_written_tracks"] + 1
+    assert len(lines) == found.num_written_tracks + 1
     observed = {
         line.split(",")[1] for line in TABLES["observations.csv"](block_run.run, summary).decode().split()[1:]
     }
-    assert len(observed) == found["num_written_tracks"]
+    assert len(observed) == found.num_written_tracks
     assert block_run.summary["tables"]["complete"]
 
 
 def test_names_with_commas_and_quotes_come_back(antimeridian_run):
-    files = read_tables(antimeridian_run.summary, antimeridian_run.folder)
+    files = read_tables(antimeridian_run.record, antimeridian_run.folder)
     tracks = antimeridian_run.run.tracks
     usable = np.isfinite(antimeridian_run.run.ground).all(axis=1)[tracks.point]
     assert (files.observations.view == tracks.view[usable]).all()

@@ -57,7 +57,7 @@ def shown(finished, width, monkeypatch):
 
     @click.command()
     def command():
-        print_summary(finished.summary)
+        print_summary(finished.record)
 
     monkeypatch.setattr(tables, "output_width", lambda: width)
     return CliRunner().invoke(command).output

@@ -12,8 +12,9 @@ from barpc.ba.gauge import MOTIONS, Mode
 from barpc.errors import BarpcWarning
 from barpc.fit import FitOptions
 from barpc.options import RunOptions
-from barpc.report import Run, summarize
-from barpc.report.verdict import metres, mode_in_words
+from barpc.report import Run
+from barpc.report.summary import metres, mode_in_words
+from tests.report.conftest import summarize
 
 
 def test_a_block_that_came_out_well_needs_no_advice(block_run):

@@ -7,10 +7,12 @@ import pytest
 
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.sensor.geometry import (
+    base_to_height,
     camera_center,
     convergence_angle,
     epipolar_offset,
     footprint,
+    ground_sample_distance,
     image_border,
     lines_of_sight,
     triangulate,
@@ -71,6 +73,30 @@ def test_the_convergence_angle_is_the_angle_between_the_rays():
     expected = np.degrees(np.arccos(rays[0] @ rays[1]))
     assert convergence_angle(a, b, ground) == pytest.approx(expected, abs=0.01)
     assert convergence_angle(a, a, ground) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_base_to_height_is_the_parallax_on_the_ground_of_a_metre_of_height():
+    """Of two cameras on one side of the vertical, too, where 2 tan(angle / 2) is far smaller."""
+    a, b = tilted_rpc((3.0, 0.0)), tilted_rpc((1.5, 0.5))
+    place = np.array([5.0, 43.0, 500.0])
+    place = a.localize(a.project(place), np.array(500.0))
+    top = place + [0.0, 0.0, 1.0]
+    seen = [ecef_from_ground(rpc.localize(rpc.project(top), np.array(500.0))) for rpc in (a, b)]
+    parallax = np.linalg.norm(seen[0] - seen[1])
+    assert base_to_height(a, b, place) == pytest.approx(parallax, rel=1e-3)
+    halved = 2 * np.tan(np.radians(convergence_angle(a, b, place)) / 2)
+    assert halved < 0.8 * parallax
+
+
+def test_the_ground_sample_distance_is_how_far_neighbouring_pixels_lie_apart():
+    rpc = tilted_rpc((0.3, 0.2))
+    image, alt = np.array([3000.0, 4000.0]), np.array(500.0)
+    here, right, below = (
+        ecef_from_ground(rpc.localize(image + step, alt)) for step in ((0, 0), (1, 0), (0, 1))
+    )
+    sides, mean = ground_sample_distance(rpc, rpc.localize(image, alt))
+    assert sides == pytest.approx([np.linalg.norm(right - here), np.linalg.norm(below - here)], rel=1e-5)
+    assert mean == pytest.approx(np.sqrt(np.linalg.norm(np.cross(right - here, below - here))), rel=1e-5)
 
 
 def test_triangulation_meets_the_points_that_were_projected():

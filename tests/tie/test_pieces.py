@@ -23,8 +23,8 @@ from barpc.tie.epipolar import (
     frame,
     grouped,
     linear_map,
-    mad,
     robust_affine,
+    robust_spread,
 )
 from barpc.tie.features import detect_tile, join
 from barpc.tie.matcher import Matches, Prediction
@@ -314,9 +314,17 @@ def test_an_affine_function_is_found_among_outliers_with_its_spread() -> None:
 
 
 def test_the_mad_is_a_standard_deviation_about_zero() -> None:
-    assert mad(np.array([-2.0, 1.0, 3.0])) == pytest.approx(1.4826 * 2.0)
-    assert mad(np.empty(0)) == 0.0
-    assert mad(np.random.default_rng(0).normal(0, 5, 20000)) == pytest.approx(5.0, rel=0.03)
+    assert robust_spread(np.array([-2.0, 1.0, 3.0])) == pytest.approx(1.4826 * 2.0)
+    assert robust_spread(np.empty(0)) == 0.0
+    shifted = np.array(
+        [8.0, 10.0, 13.0]
+    )  # of residuals the shift counts, of a sample about its median it does not
+    assert robust_spread(shifted) == pytest.approx(1.4826 * 10.0)
+    assert robust_spread(shifted, np.median(shifted)) == pytest.approx(1.4826 * 2.0)
+    assert robust_spread(np.stack([shifted, -shifted]), np.array([[10.0], [0.0]])) == pytest.approx(
+        [1.4826 * 2, 1.4826 * 10]
+    )
+    assert robust_spread(np.random.default_rng(0).normal(0, 5, 20000)) == pytest.approx(5.0, rel=0.03)
 
 
 def test_what_agrees_lies_within_three_deviations_or_the_floor_window_by_window() -> None:

@@ -1,0 +1,309 @@
+"""Typed records: what is declared beside a field is its JSON schema, its column in tables and its line in the docs.
+
+A field with a default is optional: it is left out of the file while it is None, and older files need not have it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
+from functools import cache, partial
+from operator import attrgetter
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Self,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import numpy as np
+
+Number = float | None
+"""A number; None (null) stands for what is not finite."""
+_WORDS = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
+
+
+def said(
+    text: str,
+    unit: str = "",
+    head: str | tuple[str, ...] = "",
+    form: str = "",
+    *,
+    adjusted: bool = False,
+    default: Any = MISSING,
+    **schema: Any,
+) -> Any:
+    """A field of a record, with all that is said of it.
+
+    Parameters
+    ----------
+    text, unit : str
+        Its meaning in a line without full stop; its unit.
+    head : str or tuple of str
+        Over its column in tables; several: its numbers stand in columns of their own.
+    form : str
+        How its numbers are written there; empty for whole numbers and names.
+    adjusted : bool
+        Whether only an adjustment has it: other runs leave its column out.
+    default
+        None for an optional value.
+    **schema
+        More words of its JSON schema.
+    """
+    end = f" [{unit}]" if unit else ""
+    heads = tuple(f"{words}{end}" for words in ((head,) if isinstance(head, str) else head))
+    more = {**schema, "description": f"{text}{end}."}
+    return field(default=default, metadata={"schema": more, "column": (heads, form, adjusted)})
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(said,))
+class Record:
+    """A part of the summary: its children are frozen dataclasses whose fields are declared by `said`."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    OWN: ClassVar[Mapping[str, Column]] = {}
+    """Columns of tables that are no fields."""
+    MORE: ClassVar[Any] = None
+    """Type of values beyond the fields that a file may hold; None: there must be none."""
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True)(cls)
+
+    @classmethod
+    def read(cls, found: Mapping[str, Any]) -> Self:
+        """The record of what a file holds, checked before; what it does not know is passed over."""
+        readers = _readers(cls)  # type: ignore[arg-type]  # a class can be hashed
+        known = ((key, value, readers[key]) for key, value in found.items() if key in readers)
+        return cls(
+            **{key: read(value) if read and value is not None else value for key, value, read in known}
+        )
+
+    @classmethod
+    def json_schema(cls) -> dict[str, Any]:
+        """Its JSON schema."""
+        hints = get_type_hints(cls, include_extras=True)
+        words = {
+            field.name: {**schema_of(hints[field.name]), **field.metadata["schema"]} for field in fields(cls)
+        }
+        return {
+            "type": "object",
+            "properties": words,
+            "required": [field.name for field in fields(cls) if field.default is MISSING],
+            "additionalProperties": False if cls.MORE is None else schema_of(cls.MORE),
+        }
+
+
+@cache
+def _readers(record: Any) -> dict[str, Callable[[Any], Any] | None]:
+    hints = get_type_hints(record)
+    return {field.name: _reader(hints[field.name]) for field in fields(record)}
+
+
+def _reader(kind: Any) -> Callable[[Any], Any] | None:
+    """What makes a value of a type from JSON; None where it stays as it is."""
+    if get_origin(kind) in (Union, UnionType):
+        kind = next(part for part in get_args(kind) if part is not NoneType)
+    if isinstance(kind, type) and issubclass(kind, Record):
+        return kind.read
+    if get_origin(kind) is not tuple:
+        return None
+    item = _reader(get_args(kind)[0])
+    return tuple if item is None else lambda values: tuple(map(item, values))
+
+
+def schema_of(kind: Any) -> dict[str, Any]:
+    """The JSON schema of a type."""
+    if get_origin(kind) is Annotated:
+        first, words = get_args(kind)
+        return {**schema_of(first), **words}
+    if isinstance(kind, type) and issubclass(kind, Record):
+        return kind.json_schema()
+    return _COMPOSED[get_origin(kind)](get_args(kind)) if get_origin(kind) else _single(kind)
+
+
+def _single(kind: Any) -> dict[str, Any]:
+    return {} if kind is Any else {"type": _WORDS[kind]}
+
+
+def _either(parts: Sequence[Any]) -> dict[str, Any]:
+    schemas = [schema_of(part) for part in parts]
+    simple: list[Any] = [schema["type"] for schema in schemas if schema.keys() == {"type"}]
+    rest = [schema for schema in schemas if schema.keys() != {"type"}]
+    if len(rest) > 1:
+        return {"anyOf": [{"type": simple}, *rest]}  # the usual first
+    return {**rest[0], "type": [rest[0]["type"], *simple]} if rest else {"type": simple}
+
+
+def _array(items: Sequence[Any]) -> dict[str, Any]:
+    fixed = {} if items[-1] is Ellipsis else {"minItems": len(items), "maxItems": len(items)}
+    return {"type": "array", **fixed, "items": schema_of(items[0])}
+
+
+_COMPOSED: dict[Any, Any] = {
+    Union: _either,
+    UnionType: _either,
+    tuple: _array,
+    Mapping: lambda parts: {"type": "object", "additionalProperties": schema_of(parts[1])},
+    Literal: lambda values: {"enum": list(values)},
+}
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
+    if is_dataclass(value) and not isinstance(value, type):
+        held = {f.name: getattr(value, f.name) for f in fields(value) if f.name[0] != "_"}
+        if isinstance(value, Record):
+            unset = {f.name for f in fields(value) if f.default is None}
+            held = {key: item for key, item in held.items() if item is not None or key not in unset}
+        return plain(held)
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    return str(value)
+
+
+# --- tables -----------------------------------------------------------------------------------------------
+
+MAX_TABLE_ROWS = 1000
+"""A table of the page shows so many rows; the files beside it have all."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell: its text, what it is sorted by, and its CSS class: a status, "number" or "name"."""
+
+    text: str
+    key: float | str
+    kind: str = "number"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with its caption and the heads of its columns, units in them; `folded` ones open on demand."""
+
+    key: str
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    folded: bool = False
+
+    def numbered(self, numbers: Sequence[Cell]) -> Table:
+        """The same behind a column of numbers."""
+        rows = [[number, *row] for number, row in zip(numbers, self.rows, strict=True)]
+        return replace(self, columns=["#", *self.columns], rows=rows)
+
+    @property
+    def shown(self) -> Sequence[Sequence[Cell]]:
+        """The rows on the page."""
+        return self.rows[:MAX_TABLE_ROWS]
+
+    @property
+    def heading(self) -> str:
+        """The caption, which says where rows are missing."""
+        if len(self.rows) <= MAX_TABLE_ROWS:
+            return self.caption
+        return f"{self.caption}; the first {MAX_TABLE_ROWS} of {len(self.rows)}, all in the files beside this page"
+
+    @property
+    def kinds(self) -> list[str]:
+        """How each column is set: "text" on the left, "number" on the right."""
+        first = self.rows[0] if self.rows else []
+        kinds = ["number" if cell.kind == "number" else "text" for cell in first]
+        return kinds or ["text"] * len(self.columns)
+
+    @property
+    def texts(self) -> list[list[str]]:
+        """Heads and cells as text, for a terminal."""
+        return [list(self.columns), *([cell.text for cell in row] for row in self.rows)]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: its head (several: a column for each of its values), its value in a row, and as in `said`."""
+
+    head: str | tuple[str, ...]
+    value: Callable[[Any], Any]
+    form: str = ""
+    adjusted: bool = False
+
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """Its heads."""
+        return (self.head,) if isinstance(self.head, str) else self.head
+
+    def cells(self, row: Record) -> list[Cell]:
+        """Its cells in a row."""
+        value, num = self.value(row), len(self.heads)
+        values = [value] if num == 1 else [None] * num if value is None else value
+        return [cell_of(item, self.form) for item in values]
+
+
+def table(
+    key: str,
+    caption: str,
+    rows: Sequence[Record],
+    kind: type[Record],
+    columns: str,
+    adjusted: bool = True,
+    folded: bool = False,
+) -> Table:
+    """The table of records: a row each; the words of `columns` are fields (``part.field``) and columns of its `OWN`."""
+    found = [column_of(kind, name) for name in columns.split()]  # type: ignore[arg-type]
+    found = [column for column in found if adjusted or not column.adjusted]
+    cells = [[cell for column in found for cell in column.cells(row)] for row in rows]
+    return Table(key, caption, [head for column in found for head in column.heads], cells, folded)
+
+
+@cache
+def column_of(kind: Any, path: str) -> Column:
+    """One of its own columns, or that of a field, of a part of the record where the path has dots."""
+    if path in kind.OWN:
+        return kind.OWN[path]  # type: ignore[no-any-return]
+    for name in path.split("."):
+        hint, declared = get_type_hints(kind)[name], kind.__dataclass_fields__[name]
+        parts = (hint, *get_args(hint))
+        kind = next((part for part in parts if isinstance(part, type) and issubclass(part, Record)), kind)
+    heads, form, adjusted = declared.metadata["column"]
+    value = partial(value_of, path=path) if "." in path else attrgetter(path)
+    return Column(heads, value, form, adjusted)
+
+
+def value_of(record: Any, path: str) -> Any:
+    """A field of a record, or of a part of it that may be None."""
+    for name in path.split("."):
+        record = None if record is None else getattr(record, name)
+    return record
+
+
+def cell_of(value: Any, form: str = "") -> Cell:
+    """A value as a cell; nothing is a dash that sorts last."""
+    if isinstance(value, Cell):
+        return value
+    if value is None or (isinstance(value, tuple) and None in value):
+        return Cell("-", 1e300) if form else Cell("-", "-", "name")
+    if isinstance(value, str):
+        return Cell(value, value, "name")
+    if isinstance(value, tuple):
+        return Cell(", ".join(format(item, form) for item in value), _key(max(map(abs, value))))
+    return Cell(format(value, form) if value else "0", _key(value))
+
+
+def _key(value: float) -> float:
+    return float(f"{value:.6g}")
