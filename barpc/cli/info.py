@@ -13,7 +13,7 @@ from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.points import as_json
 from barpc.cli.terminal import echo
 from barpc.errors import RpcError
-from barpc.fit.certificate import smallest_denominator
+from barpc.fit.rpc import smallest_denominator
 from barpc.geodesy import Array
 from barpc.geojson import collection, feature, polygon
 from barpc.sensor.geometry import (

@@ -12,7 +12,6 @@ import pytest
 from barpc.errors import FitError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import rpc as fit_module
-from barpc.fit.certificate import Errors, coverage, roundtrip, smallest_denominator
 from barpc.fit.points import (
     _check_order,
     check_points,
@@ -22,9 +21,15 @@ from barpc.fit.points import (
     terrain_range,
     widened,
 )
-from barpc.fit.rpc import relative_weight, underlying_rpc
-from barpc.fit.solve import _curvature, expected_size, noise_scaled, solution, solve_lcurve
-from barpc.fit.system import ALL, Problem
+from barpc.fit.rpc import (
+    Errors,
+    coverage,
+    relative_weight,
+    roundtrip,
+    smallest_denominator,
+    underlying_rpc,
+)
+from barpc.fit.solve import ALL, Problem, _curvature, expected_size, noise_scaled, solution, solve_lcurve
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
 

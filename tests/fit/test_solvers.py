@@ -7,8 +7,7 @@ import pytest
 
 from barpc.fit import Normalization
 from barpc.fit.options import PRECISIONS
-from barpc.fit.solve import corner, expected_size, noise_scaled, penalized, solution
-from barpc.fit.system import ALL, Problem
+from barpc.fit.solve import ALL, Problem, corner, expected_size, noise_scaled, solution
 from barpc.geodesy import Array
 from tests.fit.cameras import Camera, random_points
 
@@ -53,7 +52,7 @@ def test_the_penalised_solution_is_that_of_the_normal_equations(problem: Problem
     penalty = np.r_[np.zeros(4), np.linspace(0.1, 3, 35)]
     matrix = whole[:, :-1]
     expected = np.linalg.solve(matrix.T @ matrix + np.diag(penalty**2), matrix.T @ whole[:, -1])
-    assert solution(penalized(problem.compressed(0), penalty)) == pytest.approx(expected, abs=1e-9)
+    assert solution(problem.compressed(0).penalized(penalty)) == pytest.approx(expected, abs=1e-9)
 
 
 def test_the_penalty_follows_the_noise(camera: Camera, problem: Problem) -> None:
