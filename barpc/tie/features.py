@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
@@ -11,10 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.geodesy import Array
-from barpc.scene import BoolArray, IntArray
-from barpc.tie.options import TieOptions
-from barpc.tie.raster import Box, ByteImage, Stretch, grow, read_pixels
+from barpc.scene import BoolArray, IntArray, View
+from barpc.tie.options import Progress, TieOptions, ordered
+from barpc.tie.pairs import Area, Pair, shared_tiles
+from barpc.tie.raster import Box, ByteImage, Stretch, grow, read_pixels, sample_stretch, tiles
 
+_DEFAULTS = TieOptions()
 _MARGIN = 48  # px read around a tile, so that keypoints at its border are those of the whole image
 
 
@@ -53,12 +56,10 @@ class Keypoints:
 
 def join(parts: Sequence[Keypoints]) -> Keypoints:
     """Keypoints of several tiles as one set; an empty set of none."""
-    if not parts:
-        none = np.empty(0)
-        return Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))
-    return Keypoints(
-        *(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Keypoints))
-    )
+    none = np.empty(0)
+    parts = parts or [Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))]
+    columns = (np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Keypoints))
+    return Keypoints(*columns)
 
 
 class Detector(Protocol):
@@ -78,8 +79,6 @@ class Sift:
     def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
         """Keypoints for which `keep(xy, scale, response)` is true; only those are described."""
         found = self._sift.detect(picture, None)
-        if not found:
-            return join([])
         kept = np.flatnonzero(keep(*_table(found)))
         described, raw = self._sift.compute(picture, [found[i] for i in kept])
         if raw is None:
@@ -102,9 +101,9 @@ def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
 def detect_tile(
     path: str, size: tuple[int, int], box: Box, stretch: Stretch, options: TieOptions
 ) -> Keypoints:
-    """Keypoints of one tile of an image of `size` (width, height), at most a quota a cell.
+    """Keypoints of one tile of an image of `size` (width, height), at most a quota a cell, sorted by row and column.
 
-    In the coordinates of the whole image, sorted by row and column; `stretch` is that of the whole image.
+    Coordinates and `stretch` are those of the whole image.
     """
     cv2.setNumThreads(1)
     window = grow(box, _MARGIN, size)
@@ -116,16 +115,12 @@ def detect_tile(
 
     def keep(xy: Array, scale: Array, response: Array) -> BoolArray:
         col, row = np.rint(xy).astype(int).T
-        inside = (
-            (xy + origin >= box[:2] - 0.5 * np.ones(2)) & (xy + origin < np.add(box[:2], box[2:]) - 0.5)
-        ).all(1)
+        place = xy + origin
+        inside = ((place >= np.array(box[:2]) - 0.5) & (place < np.add(box[:2], box[2:]) - 0.5)).all(axis=1)
         inside &= distance[row.clip(0, window[3] - 1), col.clip(0, window[2] - 1)] > np.maximum(3.0, scale)
-        chosen = np.zeros(len(xy), dtype=bool)
         index = np.flatnonzero(inside)
-        chosen[
-            index[quota(xy[index] + origin, response[index], options.cell, options.keypoints_per_cell)]
-        ] = True
-        return chosen
+        strongest = quota(place[index], response[index], options.cell, options.keypoints_per_cell)
+        return np.isin(np.arange(len(xy)), index[strongest])
 
     found = DETECTORS[options.detector](options).detect(stretch.apply(pixels, valid), keep)
     found = found.select(np.lexsort((found.angle, found.xy[:, 0], found.xy[:, 1])))
@@ -156,3 +151,41 @@ def bounded(keypoints: Keypoints, options: TieOptions) -> Keypoints:
         strongest = np.argsort(-keypoints.response, kind="stable")[: options.keypoints_per_image]
         keypoints = keypoints.select(np.sort(strongest))
     return keypoints
+
+
+def detect(
+    views: Sequence[View],
+    options: TieOptions = _DEFAULTS,
+    *,
+    pairs: Sequence[Pair] | None = None,
+    area: Area | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> list[Keypoints]:
+    """Keypoints of every view; none in an image in which nothing varies.
+
+    Parameters
+    ----------
+    views : sequence of View
+        The images.
+    options : TieOptions
+        Band, detector, tiles, quotas.
+    pairs, area : optional
+        Of `select_pairs`: tiles that no partner may see, and those outside the area, are not read.
+    executor, progress : optional
+        As for `find_tracks`.
+    """
+    stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
+    boxes = [tiles(view.size, options) for view in views]
+    if pairs is not None:
+        boxes = shared_tiles(views, pairs, options, area)
+    owners, tasks = [], []
+    for owner, (view, stretch) in enumerate(zip(views, stretches, strict=True)):
+        of_view = boxes[owner] if stretch is not None else []
+        owners += [owner] * len(of_view)
+        tasks += [(view.path, view.size, box, stretch, options) for box in of_view]
+    found = ordered(executor, detect_tile, tasks, "detect", progress)
+    parts: list[list[Keypoints]] = [[] for _ in views]
+    for owner, part in zip(owners, found, strict=True):
+        parts[owner].append(part)
+    return [bounded(join(part), options) for part in parts]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from barpc.errors import DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.sensor.geometry import triangulate
-from barpc.tie import TieOptions, find, find_tracks, read_area, select_pairs
+from barpc.tie import TieOptions, features, find_tracks, read_area, select_pairs
 from barpc.tie.pairs import Footprints, shared_tiles
 from barpc.tie.raster import tiles
 
@@ -239,9 +239,9 @@ def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(
     scene = render(views=2)
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.4)))
     read: list[tuple[str, tuple[int, ...]]] = []
-    original = find.detect_tile
+    original = features.detect_tile
     monkeypatch.setattr(
-        find,
+        features,
         "detect_tile",
         lambda path, size, box, *rest: read.append((path, box)) or original(path, size, box, *rest),
     )

@@ -14,7 +14,6 @@ from barpc.errors import InputError
 from barpc.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import TieOptions, TieResult, find_tracks, select_pairs
-from barpc.tie import find as find_module
 from barpc.tie.epipolar import (
     Affine,
     Frame,
@@ -27,12 +26,12 @@ from barpc.tie.epipolar import (
     robust_affine,
 )
 from barpc.tie.features import detect_tile, join
-from barpc.tie.find import require_known
 from barpc.tie.matcher import Matches, Prediction
-from barpc.tie.matching import MATCHERS, _Search
+from barpc.tie.matching import MATCHERS, PairReport, _Search
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import sample_stretch, tiles
-from barpc.tie.tracks import _shared, references, thin
+from barpc.tie.register import _shared, references
+from barpc.tie.tracks import require_known, require_tracks, thin
 from tests.tie.conftest import Rendered, write_image
 from tests.tie.test_pairs import METRE, camera, views
 
@@ -376,11 +375,11 @@ def test_rows_aregrouped_by_equal_keys() -> None:
 def test_tracks_must_tie_every_pair_after_registration() -> None:
     two = views(camera(0.0), camera(100 * METRE))
     pairs = select_pairs(two, TieOptions())
-    reports = [find_module.PairReport(("v0", "v1"), "ok", (50, 50), 30, 20)]
+    reports = [PairReport(("v0", "v1"), "ok", (50, 50), 30, 20)]
     tracks = _tracks(*[(v, p) for p in range(12) for v in (0, 1)])
-    find_module.require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=12))
+    require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=12))
     with pytest.raises(Exception, match="only 12 tracks after registration"):
-        find_module.require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=13))
+        require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=13))
 
 
 # --- matching ----------------------------------------------------------------------------------------------
