@@ -164,11 +164,6 @@ def fit_rpc(
     strict : bool
         Raise where the tolerance is missed; otherwise give the best fit found, to be judged by `RpcFit.verdict`.
 
-    Returns
-    -------
-    RpcFit
-        The RPC and its certificate on check points.
-
     Raises
     ------
     FitError
@@ -203,12 +198,9 @@ def _found(cnp: Array, image: Array, alt_range: tuple[float, float]) -> tuple[Ar
         )
     if ok.all():
         return cnp, image
-    warnings.warn(
-        f"{np.count_nonzero(~ok)} of {ok.size} control points have no ground point and are left out: the "
-        "RPC extrapolates there",
-        BarpcWarning,
-        stacklevel=3,
-    )
+    count = f"{np.count_nonzero(~ok)} of {ok.size} control points"
+    message = f"{count} have no ground point and are left out: the RPC extrapolates there"
+    warnings.warn(message, BarpcWarning, stacklevel=3)
     return cnp[ok], image[ok]
 
 
@@ -243,11 +235,6 @@ def fit_rpc_points(
         Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
     strict : bool
         As for `fit_rpc`.
-
-    Returns
-    -------
-    RpcFit
-        The RPC and its certificate.
 
     Raises
     ------

@@ -366,9 +366,7 @@ def solve(
     """
     keeps = method == "vendor-denominators"
     if keeps and vendor is None:
-        raise FitError(
-            "vendor-denominators: the model is not built on an RPC whose denominators could be kept"
-        )
+        raise FitError(f"{method}: the model is not built on an RPC whose denominators could be kept")
     norm = normalization(ground, image, options, vendor if keeps else None)
     problem = Problem(ground, image, norm, weight=weight).screened()
     unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)

@@ -19,29 +19,15 @@ _WINDOW_POINTS = 60  # that a window needs for a fit of its own
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Points of image A in image B, in axes along and across the epipolar direction.
+    """Points of image A in image B, in axes along and across the epipolar direction; between two altitudes."""
 
-    Parameters
-    ----------
-    axis : (2,)
-        Unit vector in B along which a point moves when its altitude grows.
-    along, across : (N,)
-        Coordinates of the points at the middle altitude [px].
-    slope : (N,)
-        d(across)/d(along).
-    before, after : (N,)
-        Where to look along the axis, from (negative: backwards) and to [px]: from the lowest to the highest altitude.
-    linear : (2, 2)
-        d(image B)/d(image A) at constant altitude, in the middle of the points.
-    """
-
-    axis: Array
-    along: Array
+    axis: Array  # (2,) unit vector in B along which a point moves when its altitude grows
+    along: Array  # (N,) coordinates of the points at the middle altitude [px]
     across: Array
-    slope: Array
-    before: Array
-    after: Array
-    linear: Array
+    slope: Array  # (N,) d(across)/d(along)
+    before: Array  # (N,) where to look along the axis [px]: from the lowest altitude (negative: backwards)
+    after: Array  # to the highest
+    linear: Array  # (2, 2) d(image B)/d(image A) at constant altitude, in the middle of the points
 
     def turn(self, xy: Array) -> Array:
         """Coordinates along and across (..., 2) of points (..., 2) of image B [px]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
+from itertools import islice
 from typing import Any, Protocol
 
 import cv2
@@ -23,27 +24,13 @@ _MARGIN = 48  # px read around a tile, so that keypoints at its border are those
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Points of an image that can be found again in another one.
+    """Points of an image that can be found again in another one."""
 
-    Parameters
-    ----------
-    xy : (N, 2)
-        col, row [full-resolution px].
-    scale : (N,)
-        Diameter of the neighbourhood described [px].
-    angle : (N,)
-        Orientation, from the column axis towards the row axis [rad].
-    response : (N,)
-        Strength, comparable within an image.
-    descriptors : (N, D) uint8
-        Unit vectors times 255 (RootSIFT: square roots of SIFT's).
-    """
-
-    xy: Array
-    scale: Array
-    angle: Array
-    response: Array
-    descriptors: npt.NDArray[np.uint8]
+    xy: Array  # (N, 2) col, row [full-resolution px]
+    scale: Array  # (N,) diameter of the neighbourhood described [px]
+    angle: Array  # (N,) orientation, from the column axis towards the row axis [rad]
+    response: Array  # (N,) strength, comparable within an image
+    descriptors: npt.NDArray[np.uint8]  # (N, D) unit vectors times 255 (RootSIFT: square roots of SIFT's)
 
     def __len__(self) -> int:
         """Number of keypoints N."""
@@ -164,28 +151,16 @@ def detect(
 ) -> list[Keypoints]:
     """Keypoints of every view; none in an image in which nothing varies.
 
-    Parameters
-    ----------
-    views : sequence of View
-        The images.
-    options : TieOptions
-        Band, detector, tiles, quotas.
-    pairs, area : optional
-        Of `select_pairs`: tiles that no partner may see, and those outside the area, are not read.
-    executor, progress : optional
-        As for `find_tracks`.
+    With `pairs`, tiles that no partner may see are not read, nor those outside `area`; the rest as for `find_tracks`.
     """
     stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
     boxes = [tiles(view.size, options) for view in views]
     if pairs is not None:
         boxes = shared_tiles(views, pairs, options, area)
-    owners, tasks = [], []
-    for owner, (view, stretch) in enumerate(zip(views, stretches, strict=True)):
-        of_view = boxes[owner] if stretch is not None else []
-        owners += [owner] * len(of_view)
-        tasks += [(view.path, view.size, box, stretch, options) for box in of_view]
-    found = ordered(executor, detect_tile, tasks, "detect", progress)
-    parts: list[list[Keypoints]] = [[] for _ in views]
-    for owner, part in zip(owners, found, strict=True):
-        parts[owner].append(part)
-    return [bounded(join(part), options) for part in parts]
+    boxes = [of_view if stretch else [] for of_view, stretch in zip(boxes, stretches, strict=True)]
+    each = zip(views, stretches, boxes, strict=True)
+    tasks = [
+        (view.path, view.size, box, stretch, options) for view, stretch, of_view in each for box in of_view
+    ]
+    found = iter(ordered(executor, detect_tile, tasks, "detect", progress))
+    return [bounded(join(list(islice(found, len(of_view)))), options) for of_view in boxes]

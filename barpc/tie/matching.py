@@ -42,54 +42,28 @@ _NEIGHBOURS = 12
 
 @dataclass(frozen=True)
 class PairReport:
-    """What became of a pair of views.
-
-    Parameters
-    ----------
-    names : tuple of str
-        The views.
-    status : str
-        "ok", or what went wrong.
-    keypoints : tuple of int
-        Keypoints of the two views; 0 for a matcher that wants none.
-    matches, verified : int
-        After the tight pass; after the verification.
-    inlier_share : float
-        verified / matches.
-    control_share : float
-        Share of the verified matches that chance alone would give.
-    offset : tuple of float
-        Median distance along and across the epipolar line from the prediction at the middle altitude [px].
-    spread : float
-        Robust standard deviation across the epipolar line after the affine fit [px].
-    angle : float
-        Convergence angle [deg].
-    overlap : float
-        Common area over that of the smaller footprint.
-    """
+    """What became of a pair of views."""
 
     names: tuple[str, str]
-    status: str
-    keypoints: tuple[int, int]
-    matches: int = 0
-    verified: int = 0
-    inlier_share: float = 0.0
-    control_share: float = 0.0
+    status: str  # "ok", or what went wrong
+    keypoints: tuple[int, int]  # of the two views; 0 for a matcher that wants none
+    matches: int = 0  # after the tight pass
+    verified: int = 0  # of them, after the verification
+    inlier_share: float = 0.0  # verified / matches
+    control_share: float = 0.0  # of the verified matches: what chance alone would give
     offset: tuple[float, float] = (float("nan"), float("nan"))
-    spread: float = float("nan")
-    angle: float = float("nan")
-    overlap: float = float("nan")
+    """Median distance along and across the epipolar line from the prediction at the middle altitude [px]."""
+    spread: float = float("nan")  # robust, across the epipolar line after the affine fit [px]
+    angle: float = float("nan")  # of convergence [deg]
+    overlap: float = float("nan")  # common area over that of the smaller footprint
 
 
 def match_pair(
     views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions
 ) -> tuple[Matches, PairReport]:
-    """Match two views; keypoints are empty for a matcher that wants none.
-
-    No matches where the pair failed: the report says why.
-    """
-    counts = (len(keypoints[0]), len(keypoints[1]))
-    report = PairReport((views[0].name, views[1].name), "ok", counts, angle=pair.angle, overlap=pair.overlap)
+    """Match two views; keypoints are empty for a matcher that wants none. No matches: the report says why."""
+    names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
+    report = PairReport(names, "ok", counts, angle=pair.angle, overlap=pair.overlap)
     kind = MATCHERS[options.matcher]
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
@@ -107,13 +81,9 @@ def match_pair(
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
     if report.verified < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches on common epipolar lines")
-    spread = mad(residual[keep])
-    report = replace(
-        report,
-        inlier_share=report.verified / len(found),
-        offset=(float(np.median(errors[keep, 0])), float(np.median(errors[keep, 1]))),
-        spread=spread,
-    )
+    spread, share = mad(residual[keep]), report.verified / len(found)
+    along, across = np.median(errors[keep], axis=0).tolist()
+    report = replace(report, inlier_share=share, offset=(along, across), spread=spread)
     return replace(found.select(keep), sigma=max(spread, 0.05)), report
 
 
@@ -127,10 +97,8 @@ def match(
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
     """Matches of every pair, each with its report: `match_pair` over all pairs."""
-    tasks = []
-    for pair in pairs:
-        i, j = pair.views
-        tasks.append(((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options))
+    ends = [(pair, *pair.views) for pair in pairs]
+    tasks = [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
     return ordered(executor, match_pair, tasks, "match", progress)
 
 

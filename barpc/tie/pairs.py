@@ -116,21 +116,11 @@ def _ring(positions: list[list[float]]) -> Array:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two views to be matched.
+    """Two views to be matched."""
 
-    Parameters
-    ----------
-    views : tuple of int
-        Their indices, ascending.
-    overlap : float
-        Common area over that of the smaller footprint.
-    angle : float
-        Convergence angle in the middle of the common area [deg].
-    """
-
-    views: tuple[int, int]
-    overlap: float
-    angle: float
+    views: tuple[int, int]  # their indices, ascending
+    overlap: float  # common area over that of the smaller footprint
+    angle: float  # of convergence in the middle of the common area [deg]
 
     @property
     def score(self) -> float:

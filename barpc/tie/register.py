@@ -15,15 +15,12 @@ from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray, Tracks, View
 from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, mad
 from barpc.tie.options import Progress, TieOptions, ordered
 from barpc.tie.raster import FloatImage, grow, levelled, read_pixels
-
-FloatArray = npt.NDArray[np.float32]
 
 _CHUNK = 256  # patches worked on at a time: they stay in cache
 _STEPS = 12
@@ -59,10 +56,8 @@ class Registration:
     @staticmethod
     def none(start: Array) -> Registration:
         """Nothing found yet of points (N, 2)."""
-        count = len(start)
-        return Registration(
-            start.copy(), np.zeros(count), np.full(count, np.inf), np.zeros(count, dtype=bool)
-        )
+        zero = np.zeros(len(start))
+        return Registration(start.copy(), zero, zero + np.inf, zero > 0)
 
     def put(self, rows: IntArray, found: Registration) -> None:
         """Take in what was found of some rows."""
@@ -96,11 +91,9 @@ def register_places(
 
 def _usable(valid: BoolArray, patch: int) -> BoolArray:
     """Pixels about which a whole patch is valid and inside."""
-    kernel = np.ones((patch, patch), np.uint8)
-    out: BoolArray = (
-        cv2.erode(valid.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    )
-    return out
+    whole, kernel = valid.astype(np.uint8), np.ones((patch, patch), np.uint8)
+    usable: BoolArray = cv2.erode(whole, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    return usable
 
 
 def register(
@@ -159,7 +152,7 @@ def _upsampled(image: FloatImage) -> FloatImage:
     return out
 
 
-def _kernels() -> list[FloatArray]:
+def _kernels() -> list[FloatImage]:
     """Weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel."""
     kernels = []
     for phase in range(_FINE):
@@ -186,7 +179,7 @@ class _Template:
         self._effective = float(weight.sum() ** 2 / (weight**2).sum())  # pixels that count
         self._weight = (weight / weight.sum()).astype(np.float32)
 
-    def _normalized(self, patches: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _normalized(self, patches: FloatImage) -> tuple[FloatImage, FloatImage]:
         """Patches of weighted mean 0 and variance 1, and their standard deviations (N, 1)."""
         mean = (patches @ self._weight)[:, None]
         centred = patches - mean
@@ -218,7 +211,7 @@ class _Template:
         return Registration(xy[0], correlation, sigma, ok)
 
     def _iterate(
-        self, fine: FloatImage, solver: FloatArray, centre: Array, linear: Array
+        self, fine: FloatImage, solver: FloatImage, centre: Array, linear: Array
     ) -> tuple[tuple[Array, Array], Array]:
         """Centres and distortions after the iterations, and the length of each one's last step [px]."""
         length = np.full(len(centre), np.inf)
@@ -239,14 +232,13 @@ class _Template:
                 break
         return (centre, linear), length
 
-    def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatArray:
+    def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatImage:
         """Patches (N, P) of the other image about centres (N, 2) under distortions (N, 2, 2)."""
         offsets = np.stack([self._col, self._row]).astype(np.float32)
         where = _FINE * (linear.astype(np.float32) @ offsets + centre.astype(np.float32)[:, :, None])
-        return np.asarray(
-            cv2.remap(fine, where[:, 0], where[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101),
-            np.float32,
-        )
+        border = cv2.BORDER_REFLECT_101
+        patches = cv2.remap(fine, where[:, 0], where[:, 1], cv2.INTER_LINEAR, borderMode=border)
+        return np.asarray(patches, np.float32)
 
 
 def refine(
@@ -350,9 +342,8 @@ class _Links:
         apart = (altitude[first] - altitude[second]) * np.minimum(reach[first], reach[second])
         compared, agreed = np.zeros((2, len(self)), dtype=bool)
         views = self.tracks.view
-        for group in grouped(
-            views[self.reference[first]], views[self.other[first]], views[self.other[second]]
-        ):
+        three = views[self.reference[first]], views[self.other[first]], views[self.other[second]]
+        for group in grouped(*three):
             agree = agreeing(self.origin[first[group]], apart[group], 2 * _FLOOR)[0]
             for end in (first[group], second[group]):
                 compared[end] = True
@@ -389,8 +380,8 @@ def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma
 def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_views: int) -> IntArray:
     """Row of the reference observation of every track (P,): the view that is most like the others.
 
-    That is told by the pairs' spread across the epipolar line [px]: it grows with the angle between two views and with
-    all else that makes them look different.
+    That is where the pairs' spread across the epipolar line [px] is least: it grows with the angle between two views
+    and with all else that makes them look different.
     """
     key = np.array([min(pair) * num_views + max(pair) for pair in spreads] or [-1], dtype=np.int64)
     spread = np.array(list(spreads.values()) or [0.0])[np.argsort(key)]

@@ -29,21 +29,11 @@ _QUOTAS = (4, 8, 16)
 
 @dataclass(frozen=True, eq=False)
 class TieResult:
-    """Tie points, and how they came about.
-
-    Parameters
-    ----------
-    tracks : Tracks
-        The tie points.
-    pairs : tuple of PairReport
-        One a pair that was tried.
-    keypoints : tuple of int
-        Keypoints of each view.
-    """
+    """Tie points, and how they came about."""
 
     tracks: Tracks
-    pairs: tuple[PairReport, ...]
-    keypoints: tuple[int, ...]
+    pairs: tuple[PairReport, ...]  # one a pair that was tried
+    keypoints: tuple[int, ...]  # of each view
 
 
 def find_tracks(
@@ -109,10 +99,8 @@ def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
     """The tracks whose ground points lie in an area, all without one; TiePointError where none does."""
     if area is None or not len(tracks):
         return tracks
-    alt = float(np.mean([view.alt_range for view in views]))
-    points = triangulate(
-        [view.sensor for view in views], tracks.view, tracks.point, tracks.xy, alt=alt
-    ).points
+    cameras, alt = [view.sensor for view in views], float(np.mean([view.alt_range for view in views]))
+    points = triangulate(cameras, tracks.view, tracks.point, tracks.xy, alt=alt).points
     kept = area.contains(ground_from_ecef(points)[:, :2])
     if not kept.any():
         raise TiePointError(f"none of {len(kept)} tie points lies in the area of interest: enlarge it")
@@ -122,7 +110,7 @@ def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
 def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport]) -> None:
     """Raise TiePointError where two views do not match, DisconnectedError where more fall into groups."""
     failed = [report for report in reports if report.status != "ok"]
-    told = "; ".join(
+    listed = "; ".join(
         f"{r.names[0]} - {r.names[1]}: {r.status} ({r.keypoints[0]} and {r.keypoints[1]} keypoints, "
         f"{r.verified} of {r.matches} matches verified)"
         for r in failed[:4]
@@ -134,9 +122,9 @@ def require_matches(views: Sequence[View], pairs: Sequence[Pair], reports: Seque
         names = ", ".join(blank[:4])
         advice = f"no detail in {names} (one value? no valid pixels? clouds?): look at the images"
     if len(views) == 2 and failed:
-        raise TiePointError(f"too few tie points: {told}: {advice}")
+        raise TiePointError(f"too few tie points: {listed}: {advice}")
     links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]
-    require_connected(views, links, f"no tie points between them: {told}: {advice}")
+    require_connected(views, links, f"no tie points between them: {listed}: {advice}")
 
 
 def require_tracks(
@@ -163,21 +151,17 @@ def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks
     """
     if not any(len(m) for m in matches):
         return Tracks(*(np.empty(0, np.int64),) * 2, np.empty((0, 2)), np.empty(0))
-    count = [2 * len(m) for m in matches]
     view: IntArray = np.concatenate([np.tile(pair, len(m)) for pair, m in zip(pairs, matches, strict=True)])
-    number = np.concatenate([m.index for m in matches]).ravel()
+    _, number = np.unique(np.concatenate([m.index for m in matches]).ravel(), return_inverse=True)
     xy = np.concatenate([m.xy for m in matches]).reshape(-1, 2)
-    sigma = np.repeat([m.sigma for m in matches], count)
-    order = np.lexsort((number, view))
-    new = (np.diff(view[order]) != 0) | (np.diff(number[order]) != 0)
-    node: IntArray = np.empty(len(order), dtype=np.int64)
-    node[order] = np.concatenate([[0], np.cumsum(new)])
-    total = int(node.max()) + 1
-    first, second = node.reshape(-1, 2).T
-    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(total, total))
+    sigma = np.repeat([m.sigma for m in matches], [2 * len(m) for m in matches])
+    points, node = np.unique(view * len(number) + number, return_inverse=True)
+    graph = coo_array(
+        (np.ones(len(node) // 2, dtype=np.int8), tuple(node.reshape(-1, 2).T)), shape=(len(points),) * 2
+    )
     label: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)
-    order = np.lexsort((sigma, node))
-    once = order[np.r_[True, np.diff(node[order]) > 0]]
+    best = np.lexsort((sigma, node))
+    once = best[np.unique(node[best], return_index=True)[1]]
     return _clean(view[once], label[node[once]], xy[once], sigma[once])
 
 
@@ -206,8 +190,7 @@ def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
     if not len(tracks) or (count <= most).all():
         return tracks
     side = np.sqrt([_QUOTAS[0] * width * height / most for width, height in sizes])
-    columns = np.array([int(width / s) + 2 for (width, _), s in zip(sizes, side, strict=True)])
-    rows = np.array([int(height / s) + 2 for (_, height), s in zip(sizes, side, strict=True)])
+    columns, rows = (np.array(sizes) / side[:, None]).astype(np.int64).T + 2
     first_cell = np.concatenate([[0], np.cumsum(columns * rows)])
     col, row = np.floor((tracks.xy + 0.5) / side[tracks.view][:, None]).astype(np.int64).clip(0).T
     cell = first_cell[tracks.view] + row * columns[tracks.view] + col
