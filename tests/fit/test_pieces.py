@@ -121,6 +121,23 @@ def test_weighted_passes_are_made_where_the_denominator_varies(camera: Camera) -
     assert flat.iterations == 1  # within 5 %
 
 
+@pytest.mark.parametrize("sides", ["lon", "lat", "alt"])
+def test_a_denominator_that_varies_along_any_axis_weights_a_second_pass(camera: Camera, sides: str) -> None:
+    for slope, passes in ((0.4, 2), (0.04, 1)):
+        rpc = _with_denominator(0, slope, sides)
+        ground = camera.model.localize(*_image_points(camera, 600))
+        fit = fit_rpc_points(ground, rpc.project(ground), options=FitOptions(method="ridge", tolerance=1.0))
+        assert fit.iterations == passes
+
+
+def test_the_regularisation_is_the_noise_over_the_size_expected(camera: Camera) -> None:
+    """Both in units of an image coordinate over its scale; a denominator is expected within 0.003 of 1."""
+    ground, image = random_points(camera, 2500, np.random.default_rng(7))
+    noisy = image + np.random.default_rng(8).normal(0, 1, image.shape) * [0.2, 0.6]
+    fit = fit_rpc_points(ground, noisy, options=FitOptions(method="ridge", tolerance=5.0))
+    assert fit.h * fit.rpc.image_scale * 0.003 == pytest.approx([0.2, 0.6], rel=0.1)
+
+
 def _image_points(camera: Camera, count: int) -> tuple[Any, Any]:
     rng = np.random.default_rng(6)
     return rng.uniform(0, 1, (count, 2)) * camera.size, rng.uniform(*camera.alt_range, count)
@@ -347,6 +364,15 @@ def test_coverage_is_the_share_of_the_image_inside_the_hull() -> None:
     assert coverage(corners[:3], low, high) == pytest.approx(0.5, abs=0.06)
     many = np.random.default_rng(0).uniform(low, low + 0.5 * (high - low), (3000, 2))
     assert coverage(many, low, high) == pytest.approx(0.25, abs=0.03)
+
+
+@pytest.mark.parametrize("step", [1, 3, 8])
+def test_a_narrow_strip_covers_its_own_share(step: int) -> None:
+    """A strip of a tenth of the image's side, across it askew: its hull is no wider for being thin."""
+    angle = 2 * np.pi * step / 64
+    along, across = np.array([-np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), np.sin(angle)])
+    ends = [0.5 + a * along + b * across for a in (-0.4, 0.4) for b in (-0.05, 0.05)]
+    assert coverage(np.array(ends), np.zeros(2), np.ones(2)) == pytest.approx(0.08, abs=0.012)
 
 
 # --- grid --------------------------------------------------------------------------------------------------
