@@ -435,6 +435,45 @@ def test_as_many_matches_are_trusted_as_the_bands_aside_allow(search, aside, sha
     assert matcher.asked == [0.0, -12.0, 12.0]  # twice the band's half width and six pixels more
 
 
+class Wrong:
+    """A matcher of two like cameras, the second of which is wrong by given amounts along and across the rows."""
+
+    detects = True
+
+    def __init__(self, along: np.ndarray, across: np.ndarray) -> None:
+        places = np.random.default_rng(1).uniform(0, 999, (len(along), 2))
+        xy = np.stack([places, places + np.column_stack([along, across])], axis=1)
+        self.found = Matches.of_places(xy, np.linspace(0, 1, len(along)))
+
+    def match(self, a: Any, b: Any, prediction: Prediction) -> Matches:
+        return self.found.select(prediction.contains(self.found.xy))
+
+
+def test_after_a_blind_pass_the_search_is_where_its_matches_lie(search) -> None:
+    """Half their spread and ten pixels more either side along the lines; on the line itself across them."""
+    rng = np.random.default_rng(2)
+    for spread in (4.0, 12.0):
+        along = rng.uniform(3 - spread, 3 + spread, 200)
+        found = search(Wrong(along, np.full(200, -5.0))).offset()
+        assert found is not None
+        places = rng.uniform(0, 999, (5, 2))
+        where = found.at(places)
+        low, high = np.percentile(along, [2, 98])
+        np.testing.assert_allclose(where.before, low - 0.5 * (high - low) - 10.0)
+        np.testing.assert_allclose(where.after, high + 0.5 * (high - low) + 10.0)
+        np.testing.assert_allclose(where.place(np.full(5, 3.0)), places + [3.0, -5.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(("noise", "width"), [(0.01, 0.6), (0.3, 1.2), (2.0, 3.0)])
+def test_the_local_band_is_four_standard_deviations_wide_within_its_bounds(search, noise, width) -> None:
+    rng = np.random.default_rng(3)
+    wrong = Wrong(np.full(400, 7.0), rng.normal(0, noise, 400))
+    found = search(wrong).local(wrong.found)
+    assert found.half_width == pytest.approx(width, rel=0.15)
+    where = found.at(np.array([[500.0, 500.0]]))
+    np.testing.assert_allclose([where.before, where.after], [[3.0], [11.0]], atol=1e-6)
+
+
 def test_the_best_come_first_and_each_place_once(search) -> None:
     matcher = Scripted([0.4, 0.3, 0.2, 0.1])
     matcher.places = (

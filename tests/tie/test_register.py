@@ -107,12 +107,14 @@ def test_no_patches_at_all_is_no_error(texture) -> None:
     assert len(run(texture, texture, np.empty((0, 2)), np.empty((0, 2)), np.eye(2)).ok) == 0
 
 
-def test_upsampling_keeps_the_pixels_and_a_wave_between_them() -> None:
-    wave = np.tile(np.cos(2 * np.pi * np.arange(200.0) / 5.0), (50, 1)).astype(np.float32)
+@pytest.mark.parametrize(("period", "error"), [(3, 0.01), (4, 0.003), (5, 0.004), (8, 0.002)])
+def test_upsampling_keeps_the_pixels_and_a_wave_between_them(period: int, error: float) -> None:
+    wave = np.tile(np.cos(2 * np.pi * np.arange(240.0) / period), (50, 1)).astype(np.float32)
     fine = _upsampled(wave)
     np.testing.assert_allclose(fine[::4, ::4], wave, atol=1e-6)
-    expected = np.cos(2 * np.pi * np.arange(800) / 20.0)
-    np.testing.assert_allclose(fine[80, 80:-80], expected[80:-80], atol=0.01)
+    expected = np.cos(2 * np.pi * np.arange(960) / (4 * period))
+    np.testing.assert_allclose(fine[80, 80:-80], expected[80:-80], atol=error)
+    np.testing.assert_allclose(_upsampled(wave.T.copy()), fine.T, atol=1e-6)
 
 
 def test_the_result_does_not_depend_on_opencv_threads(texture, reference) -> None:
@@ -162,3 +164,16 @@ def test_the_derivative_of_a_ramp_is_its_slope() -> None:
     assert template._weight.sum() == pytest.approx(1.0, rel=1e-5)
     middle, edge = template._weight[220], template._weight[210]
     assert edge / middle == pytest.approx(np.exp(-0.5 / 0.7**2), rel=1e-5)
+
+
+@pytest.mark.parametrize(("detail", "flat"), [(0.0005, True), (0.003, False)])
+def test_a_patch_is_flat_below_a_millionth_of_its_level(detail: float, flat: bool) -> None:
+    """Of level 1000 a millionth is 0.001, some steps of float32."""
+    template = _Template(np.zeros((60, 60), np.float32), 21)
+    noise = np.random.default_rng(9).normal(0, detail, (1, 21 * 21))
+    patch, deviation = template._normalized((1000.0 + noise).astype(np.float32))
+    assert (patch == 0).all() == flat
+    assert np.isinf(deviation).all() == flat
+    if not flat:
+        assert deviation[0, 0] == pytest.approx(detail, rel=0.2)
+        assert (patch**2 @ template._weight)[0] == pytest.approx(1.0, rel=1e-3)
