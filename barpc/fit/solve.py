@@ -240,15 +240,13 @@ def _curvature(h: Array, s: Array, beta: Array, rest: float) -> Array:
     xi2, beta2 = (beta / s) ** 2, beta**2
     f = s**2 / (s**2 + h**2)
     g = 1.0 - f
-    f1 = -2.0 * f * g / h
-    f2 = -f1 * (3.0 - 4.0 * f) / h
+    # -h/2 df/dh: curvature takes neither the parameter's scale nor d2f/dh2, which is along the curve
+    slope = f * g
     eta2, rho2 = (f * f * xi2).sum(axis=1), (g * g * beta2).sum(axis=1) + rest
-    phi, psi = (f * f1 * xi2).sum(axis=1), (g * f1 * beta2).sum(axis=1)
-    dphi = ((f1 * f1 + f * f2) * xi2).sum(axis=1)
-    dpsi = ((g * f2 - f1 * f1) * beta2).sum(axis=1)
-    # derivatives of log(eta) and log(rho) with respect to h
-    eta1, rho1 = phi / eta2, -psi / rho2
-    eta22, rho22 = dphi / eta2 - 2.0 * eta1**2, -dpsi / rho2 - 2.0 * rho1**2
+    # derivatives of log(eta) and log(rho)
+    eta1, rho1 = -(f * slope * xi2).sum(axis=1) / eta2, (g * slope * beta2).sum(axis=1) / rho2
+    eta22 = (slope**2 * xi2).sum(axis=1) / eta2 - 2.0 * eta1**2
+    rho22 = (slope**2 * beta2).sum(axis=1) / rho2 - 2.0 * rho1**2
     return np.asarray((rho1 * eta22 - rho22 * eta1) / (rho1**2 + eta1**2) ** 1.5)
 
 

@@ -84,7 +84,7 @@ def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> Fr
 
 
 def linear_map(first: View, second: View, xy: Array) -> Array:
-    """Derivative (..., 2, 2) of the place in B by that in A (..., 2) [px] at the middle altitude; 1 where one fails."""
+    """Derivative (..., 2, 2) of the place in B by that in A (..., 2) [px] at mid altitude; identity if one fails."""
     alt = 0.5 * sum(common_range(first, second))
     ground = first.sensor.localize(xy, np.full(xy.shape[:-1], alt))
     by_a, by_b = (view.sensor.project_jacobian(ground)[1][..., :2] for view in (first, second))
@@ -141,7 +141,7 @@ def mad(values: Array) -> float:
 def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
     """Which values (N,) [px] agree with an affine function of position (N, 2) [px], and their distances from it (N,).
 
-    Each window has its own; three robust standard deviations agree, or `floor` [px].
+    Each window has its own function; what lies within three robust standard deviations of it, or `floor` [px], agrees.
     """
     keep = np.zeros(len(values), dtype=bool)
     if not len(values):

@@ -293,7 +293,7 @@ def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], w
 def shared_tiles(
     views: Sequence[View], pairs: Sequence[Pair], options: TieOptions, area: Area | None = None
 ) -> list[list[Box]]:
-    """The tiles of every view that a partner in `pairs` may see in the area, at some altitude, by cameras that err."""
+    """The tiles of every view that a partner may see in the area, though cameras be wrong by `options.search`."""
     boxes = [tiles(view.size, options) for view in views]
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]

@@ -60,7 +60,7 @@ def _levelled(pixels: Pixels, low: float, high: float, levels: float) -> FloatIm
 def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
     """Pixels of a window in float32, as they are or (from float64) on a scale of the window's own.
 
-    Registration does not see offset and scale; in float32 an offset of 2e9 would swallow the picture, 1e30 overflow.
+    Registration does not see offset and scale; float32 would lose the picture beside 2e9, and overflow squaring 1e30.
     """
     if pixels.dtype == np.float32:
         return pixels.astype(np.float32, copy=False)

@@ -104,11 +104,11 @@ def register(
     linear: Array,
     patch: int,
 ) -> Registration:
-    """Register patches of a side [px], odd, of the second image to those of the first, of valid pixels all.
+    """Register patches of the second image to patches of the first; a patch, `patch` [px] a side (odd), is all valid.
 
-    They are centred at `reference` (N, 2), whole pixels, and at about `start` (N, 2) [px] in the second image, and
-    d(second)/d(first) is about `linear` (N, 2, 2). What fails (at a border, on a steep slope) is tried again with a
-    smaller patch; what succeeds must be confirmed by it.
+    They are centred at `reference` (N, 2), whole pixels, and at about `start` (N, 2) [px] in the second image, with
+    `linear` (N, 2, 2) a first guess of d(second)/d(first). What fails (at a border, on a steep slope) is tried again
+    with a smaller patch; what succeeds must be confirmed by it.
     """
     fine, best = _upsampled(images[1]), Registration.none(start)
     smaller = int(_SMALLER * patch) | 1

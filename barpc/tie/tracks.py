@@ -183,8 +183,7 @@ def _clean(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
 def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
     """Fewer tracks, evenly spread: long and accurate ones first, about `most` observations in an image.
 
-    `sizes` are those (width, height) of the images. A track is taken that a cell of one of its views is not yet full
-    for.
+    `sizes` are those (width, height) of the images. A track is taken where a cell of one of its views is not full yet.
     """
     count = np.bincount(tracks.view, minlength=len(sizes))
     if not len(tracks) or (count <= most).all():

@@ -207,6 +207,23 @@ def test_mirrored_points_are_taken_where_allowed(camera: Camera) -> None:
         screened(ground, mirrored, False)
     screened(ground, mirrored, True)
     screened(ground, image, False)
+    ground, image = random_points(camera, 2000, np.random.default_rng(0))
+    strip = image[:, 1] < 0.15 * camera.size[1]  # its pixels are as square as those of the whole
+    screened(ground[strip], image[strip], False)
+    with pytest.raises(FitError, match="mirrored"):
+        screened(ground[strip], (image * [-1.0, 1.0])[strip], False)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-3, 1e-6])
+def test_a_scene_of_any_size_is_one_in_space(camera: Camera, size: float) -> None:
+    """Shrunk in longitude and latitude, to a hand's width at last: not flat for that; its diagonal plane still is."""
+    ground, image = random_points(camera, 300, np.random.default_rng(0))
+    middle = ground.mean(axis=0)
+    small = middle + (ground - middle) * [size, size, 1.0]
+    screened(small, image, False)
+    small[:, 1] = middle[1] + (small[:, 0] - middle[0])
+    with pytest.raises(FitError, match="in a plane"):
+        screened(small, image, True)
 
 
 @pytest.mark.parametrize(

@@ -91,6 +91,22 @@ def test_the_corner_of_the_l_curve_has_the_largest_curvature(problem: Problem) -
     assert abs(np.log(grid[5 + np.argmax(curvature[5:-5])] / h)) <= 0.02
 
 
+def test_a_corner_that_is_not_sharp_is_one() -> None:
+    """Singular values from 1 to 0.001, of a curve whose curvature is at most 0.47: against the sampled curve."""
+    s = np.geomspace(1.0, 1e-3, 5)
+    triangle = np.zeros((6, 6))
+    triangle[:5], triangle[5, 5] = np.column_stack([np.diag(s), s]), 1.0
+    t = np.linspace(np.log(1e-3), 0.0, 20001)
+    f = s**2 / (s**2 + np.exp(2 * t)[:, None])
+    rho, eta = 0.5 * np.log((((1 - f) * s) ** 2).sum(axis=1) + 1.0), 0.5 * np.log((f**2).sum(axis=1))
+    rho1, eta1 = np.gradient(rho, t), np.gradient(eta, t)
+    rho2, eta2 = np.gradient(rho1, t), np.gradient(eta1, t)
+    curvature = (rho1 * eta2 - rho2 * eta1) / (rho1**2 + eta1**2) ** 1.5
+    best = 10 + int(np.argmax(curvature[10:-10]))
+    assert curvature[best] == pytest.approx(0.47, abs=0.01)
+    assert corner([Compressed(triangle, 10)]) == pytest.approx(np.exp(t[best]), rel=0.01)
+
+
 def test_without_a_corner_the_regularisation_is_the_least() -> None:
     """Of exact points whose L-curve is concave from the smallest singular value to the largest."""
     s, beta = np.array([0.4, 0.1]), np.array([0.05, 0.9])
