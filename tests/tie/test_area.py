@@ -115,6 +115,8 @@ def test_the_whole_world_is_an_area(tmp_path) -> None:
         ({"type": "Polygon", "coordinates": [[[1], [2], [3], [1]]]}, "not an area of interest"),
         ({"type": "Polygon", "coordinates": []}, "not an area of interest"),
         (box(500000, 4800000, 501000, 4801000), "not a longitude and a latitude"),
+        (box(5, 89, 6, 90.5), "not a longitude and a latitude"),
+        (box(539, 43, 540.5, 44), "not a longitude and a latitude"),
         ('{"type": "Polygon", "coordinates": [[[5, NaN], [6, 44], [5, 44], [5, 43]]]}', "NaN is no finite number"),
         (box(5, 43, 5, 44), "of any extent"),
         (wrapped({"type": "MultiPolygon", "coordinates": []}), "of any extent"),

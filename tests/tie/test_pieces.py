@@ -30,7 +30,7 @@ from barpc.tie.matcher import Matches, Prediction
 from barpc.tie.matching import MATCHERS, PairReport, _Search
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import sample_stretch, tiles
-from barpc.tie.register import _shared, references
+from barpc.tie.register import Registration, _Links, _shared, references
 from barpc.tie.tracks import require_known, require_tracks, thin
 from tests.tie.conftest import Rendered, write_image
 from tests.tie.test_pairs import METRE, camera, views
@@ -363,6 +363,23 @@ def test_the_variance_of_a_registration_is_shared_by_both_ends() -> None:
     np.testing.assert_allclose(found.sigma, expected)
     np.testing.assert_allclose(found.xy[[1, 2, 4]], xy)
     np.testing.assert_array_equal(found.xy[[0, 3]], np.rint(tracks.xy[[0, 3]]))
+
+
+@pytest.mark.parametrize(
+    ("count", "noise", "scaled"), [(200, 0.3, 0.3), (200, 0.02, 0.1), (19, 0.3, 0.1), (20, 0.3, 0.3)]
+)
+def test_sigmas_are_those_of_the_epipolar_lines_where_these_say_more(count, noise, scaled) -> None:
+    two = views(camera(0.0, lean=0.0), camera(0.0, lean=0.2))
+    rng = np.random.default_rng(4)
+    places = rng.integers(100, 900, (count, 2)).astype(float)
+    xy = np.stack([places, frame(*two, places).place(np.zeros(count))], axis=1).reshape(-1, 2)
+    tracks = Tracks(np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy, np.full(2 * count, 0.1))
+    links = _Links(two, tracks, np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2))
+    across = rng.normal(0, noise, count)
+    found = Registration.none(xy[1::2] + np.column_stack([rng.uniform(-5, 5, count), across]))
+    found.sigma[:] = 0.1
+    sigma = links.scaled(found, np.ones(count, dtype=bool))
+    np.testing.assert_allclose(sigma, scaled, rtol=0.3 if scaled > 0.1 else 1e-12)
 
 
 def test_rows_aregrouped_by_equal_keys() -> None:
