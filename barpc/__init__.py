@@ -28,6 +28,11 @@ _PUBLIC = {
     "fit_rpc_points": "barpc.fit",
     "adjust": "barpc.pipeline",
     "check": "barpc.pipeline",
+    "AdjustResult": "barpc.pipeline",
+    "RunOptions": "barpc.options",
+    "TieOptions": "barpc.options",
+    "AdjustOptions": "barpc.options",
+    "FitOptions": "barpc.options",
     "open_camera": "barpc.cameras",
     "BarpcError": "barpc.errors",
     "BarpcWarning": "barpc.errors",
@@ -39,6 +44,11 @@ if TYPE_CHECKING:
     from barpc.errors import BarpcWarning as BarpcWarning
     from barpc.fit import fit_rpc as fit_rpc
     from barpc.fit import fit_rpc_points as fit_rpc_points
+    from barpc.options import AdjustOptions as AdjustOptions
+    from barpc.options import FitOptions as FitOptions
+    from barpc.options import RunOptions as RunOptions
+    from barpc.options import TieOptions as TieOptions
+    from barpc.pipeline import AdjustResult as AdjustResult
     from barpc.pipeline import adjust as adjust
     from barpc.pipeline import check as check
     from barpc.rpcio import read_rpc as read_rpc

@@ -1,4 +1,4 @@
-"""Write docs/options.md from the option records and the verbs' flags.
+"""Write docs/options.md from the declarations of the options and the verbs' flags.
 
 python docs/generate_options.py            # writes it
 python docs/generate_options.py --print    # prints it
@@ -9,33 +9,22 @@ from __future__ import annotations
 import argparse
 import inspect
 import re
-from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any
 
 import click
 
-from barpc.ba import AdjustOptions
-from barpc.ba.loss import LOSSES
-from barpc.ba.options import MODELS
 from barpc.cli.main import COMMANDS, cli
-from barpc.cli.options import ADJUSTMENT_FLAGS, RUN_FLAGS, TIE_FLAGS
-from barpc.fit import FitOptions
-from barpc.pipeline import RunOptions
-from barpc.tie import TieOptions
-from barpc.tie.features import DETECTORS
-from barpc.tie.matching import MATCHERS
+from barpc.cli.options import ADJUSTMENT, RUN, TIE, flag_name
+from barpc.options import AdjustOptions, FitOptions, Options, RunOptions, TieOptions, declared, wanted
 
 PAGE = Path(__file__).with_name("options.md")
 TABLES = {"": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions}
 """Table of an options file -> the record it fills; "" is the file's top level."""
 
-CHOICES = {"model": MODELS, "loss": LOSSES, "detector": DETECTORS, "matcher": MATCHERS}
-"""Options whose values are rows of a table of the code."""
-
 HEAD = """# Options
 
-<!-- Written by docs/generate_options.py. Edit the docstrings and help texts there, then run it again. -->
+<!-- Written by docs/generate_options.py. Edit barpc/options.py and the verbs' help texts, then run it again. -->
 
 Every option has a default. Later ones win: the defaults, then the file given with `--options`, then the flags.
 An unknown name, a wrong type or a value out of range is refused before anything is computed.
@@ -51,34 +40,22 @@ points_per_image = 8000
 sigma_attitude = 3.0
 ```
 
-The same from Python, with the records named in the headings below:
+The same from Python, with the records named in the headings below; `print` shows what differs from the defaults:
 
 ```python
 import barpc
-from barpc.ba import AdjustOptions
-from barpc.ba.loss import LOSSES
-from barpc.ba.options import MODELS
-from barpc.pipeline import RunOptions
 
-options = RunOptions(adjust=AdjustOptions(sigma_attitude=3.0))
+options = barpc.RunOptions(adjust=barpc.AdjustOptions(sigma_attitude=3.0))
+print(options)  # RunOptions(adjust=AdjustOptions(sigma_attitude=3.0))
 result = barpc.adjust(["a.tif", "b.tif"], "adjusted", options)
 ```
+
+`barpc.options.schema()` is the JSON schema of such a file.
 """
 
 
-def described(record: type) -> dict[str, tuple[str, str]]:
-    """Field -> (type, meaning), from the numpydoc section Parameters."""
-    section = inspect.getdoc(record).split("Parameters\n----------\n")[1].split("\n\n")[0]
-    found = {}
-    for names, kind, body in re.findall(r"^(\S[^:\n]*) : (.*)\n((?:    .*\n?)+)", section, re.MULTILINE):
-        for name in names.split(","):
-            found[name.strip()] = (kind, " ".join(body.split()))
-    return found
-
-
-def default(field: Field[Any]) -> str:
-    """A field's default as an options file would spell it."""
-    value = field.default if field.default_factory is MISSING else field.default_factory()
+def default(value: Any) -> str:
+    """A default as an options file would spell it."""
     if value is None or value == {}:
         return "-"
     if isinstance(value, bool):
@@ -93,19 +70,16 @@ def row(*cells: str) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
-def option_table(name: str, record: type, flags: dict[str, str]) -> list[str]:
+def option_table(name: str, record: type[Options], flags: dict[str, str]) -> list[str]:
     """The options of one table of the file, with the flags that set them."""
-    texts = described(record)
     title = f"[{name}]: `{record.__name__}`" if name else f"Top level: `{record.__name__}`"
-    lines = ["", f"### {title}", "", row("option", "type", "default", "flag", "meaning"), row(*["---"] * 5)]
-    for field in fields(record):
-        if field.name in TABLES:
+    lines = ["", f"### {title}", "", row("option", "value", "default", "flag", "meaning"), row(*["---"] * 5)]
+    for field, one in declared(record).items():
+        if field in TABLES:
             continue
-        kind, meaning = texts[field.name]
-        if field.name in CHOICES:
-            meaning += " Values: " + ", ".join(f"`{value}`" for value in CHOICES[field.name]) + "."
-        flag = flags.get(f"{name}.{field.name}" if name else field.name, "")
-        lines.append(row(f"`{field.name}`", kind, default(field), flag and f"`{flag}`", meaning))
+        flag = flags.get(f"{name}.{field}" if name else field, "")
+        kind = wanted(one.kind, one.rule)
+        lines.append(row(f"`{field}`", kind, default(one.default), flag and f"`{flag}`", one.rule.help))
     return lines
 
 
@@ -135,10 +109,7 @@ def help_text(text: str) -> str:
 
 def page() -> str:
     """The whole page."""
-    flags = {}
-    for flag in (*TIE_FLAGS, *ADJUSTMENT_FLAGS, *RUN_FLAGS):
-        option = flag.decorate(lambda: None).__click_params__[0]
-        flags[flag.target] = option.opts[0]
+    flags = {target: flag_name(target) for target in (*TIE, *ADJUSTMENT, *RUN)}
     lines = [HEAD, "## Options of a run"]
     for name, record in TABLES.items():
         lines += option_table(name, record, flags)

@@ -15,7 +15,7 @@ from barpc.ba.consensus import agreeing
 from barpc.ba.gauge import gauge_report
 from barpc.ba.heights import Heights, convergence_angles
 from barpc.ba.incremental import BlockPrior, apply_prior
-from barpc.ba.options import AdjustOptions, prior_sigmas
+from barpc.ba.priors import prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Observations, Outcome, revived, run_rounds
@@ -25,6 +25,7 @@ from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
 from barpc.ba.variances import Variances
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 
 SMOOTH_LEAST = 0.06
@@ -46,6 +47,7 @@ def adjust_tracks(
     *,
     centers: Array | None = None,
     prior: BlockPrior | None = None,
+    keep_largest: bool = False,
 ) -> Adjustment:
     """Correct the cameras of a block so that its tie points agree.
 
@@ -66,6 +68,8 @@ def adjust_tracks(
     prior : BlockPrior or None
         An earlier block, whose views are among these: they start at its corrections, and its joint
         covariance is their prior. `tracks` then holds new observations only.
+    keep_largest : bool
+        Go on with the largest group of views where they are not all connected.
 
     Returns
     -------
@@ -85,7 +89,7 @@ def adjust_tracks(
     start = time.process_time()
     options = AdjustOptions() if options is None else options
     views = tuple(views)
-    block = join(views, tracks, gcps, options)
+    block = join(views, tracks, gcps, options, keep_largest)
     problem = make_problem(block, options, centers, prior)
     drift = problem.cameras.unknowns.drift
     state, heights = _start(problem, block, options, gcps, dem)
@@ -192,7 +196,7 @@ def make_problem(
     drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
         centers = _known_centers(block, options, centers, prior)
-    unknowns = make_unknowns(views, options.model, drift, centers, options.center_method)
+    unknowns = make_unknowns(views, options.model, drift, centers)
     sigma = prior_sigmas(views, options, drift)
     on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma), None
     if prior is not None:
@@ -210,7 +214,7 @@ def make_problem(
 def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior) -> Array:
     """Camera centres (N, 3) [m]: the earlier block's where it had them."""
     if centers is None:
-        centers = make_unknowns(block.views, options.model, 0, None, options.center_method).center
+        centers = make_unknowns(block.views, options.model).center
     known = dict(zip(prior.names, prior.center, strict=True))
     return np.array([known.get(name, center) for name, center in zip(block.names, centers, strict=True)])
 

@@ -10,12 +10,14 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from barpc.ba.options import AdjustOptions
 from barpc.ba.structure import counting_sort
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import Array, ecef_from_ground
+from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, connected_groups
 
+MIN_OBSERVATIONS = 4
+"""A view with fewer observations stops the adjustment: six unknowns need three points, and one to check them."""
 _LISTED = 10  # views named in a message
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -88,14 +90,20 @@ class Block:
         return points
 
 
-def join(views: tuple[View, ...], tracks: Tracks, gcps: GroundPoints | None, options: AdjustOptions) -> Block:
+def join(
+    views: tuple[View, ...],
+    tracks: Tracks,
+    gcps: GroundPoints | None,
+    options: AdjustOptions,
+    keep_largest: bool = False,
+) -> Block:
     """The block of tracks and GCPs.
 
     Parameters
     ----------
     views : tuple of View
         N views.
-    tracks, gcps, options
+    tracks, gcps, options, keep_largest
         As in `barpc.ba.adjust_tracks`.
 
     Returns
@@ -123,14 +131,14 @@ def join(views: tuple[View, ...], tracks: Tracks, gcps: GroundPoints | None, opt
     if not (np.diff(key[rows]) > 0).all():
         raise InputError("tracks: a track is observed twice in one view; keep one observation or none")
     count = np.bincount(view, minlength=len(views))
-    few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero(count < options.min_observations)]
+    few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero(count < MIN_OBSERVATIONS)]
     few = few if len(few) <= _LISTED else [*few[:_LISTED], f"{len(few) - _LISTED} more"]
-    if few and not options.keep_largest:
+    if few and not keep_largest:
         raise TiePointError(
-            f"too few observations in {', '.join(few)}: at least {options.min_observations} are needed; "
+            f"too few observations in {', '.join(few)}: at least {MIN_OBSERVATIONS} are needed; "
             "loosen the matching or leave these views out"
         )
-    left_out = _left_out(names, view[rows], point[rows], tracks.num_points, options)
+    left_out = _left_out(names, view[rows], point[rows], tracks.num_points, keep_largest)
     order, _ = counting_sort(view, len(views))
     weight = np.array([options.view_weights.get(name, 1.0) for name in names])
     use = ~np.isin(view, np.flatnonzero(np.isin(names, left_out)))
@@ -159,7 +167,7 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
 
 
 def _left_out(
-    names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, options: AdjustOptions
+    names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, keep_largest: bool
 ) -> tuple[str, ...]:
     """Views outside the largest connected group, rows sorted by point; GCPs tie their views to each other."""
     point = np.where(point >= num_tracks, num_tracks, point)
@@ -170,7 +178,7 @@ def _left_out(
         return ()
     named = [[names[v] for v in group] for group in groups]
     listed = "; ".join(", ".join(group[:5]) + (", ..." if len(group) > 5 else "") for group in named[:5])
-    if not options.keep_largest:
+    if not keep_largest:
         raise DisconnectedError(
             f"the views fall into {len(groups)} groups without common tie points: {listed}; add overlapping "
             "views, loosen the matching, or keep the largest group only",

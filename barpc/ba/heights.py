@@ -9,11 +9,11 @@ import numpy as np
 
 from barpc.ba.blocks import PointPrior, Terrain, flat_heights, join_point_priors, terrain_heights
 from barpc.ba.cameras import Projected
-from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
 from barpc.ba.structure import Structure
 from barpc.errors import BarpcWarning
 from barpc.geodesy import Array, ground_from_ecef
+from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray
 
 _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given

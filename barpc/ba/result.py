@@ -9,10 +9,10 @@ import numpy as np
 from barpc.ba.cameras import Cameras
 from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import GaugeReport
-from barpc.ba.options import AdjustOptions
 from barpc.ba.smooth import SmoothTest
 from barpc.ba.variances import PriorTest
 from barpc.geodesy import Array
+from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction

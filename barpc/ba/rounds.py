@@ -10,12 +10,12 @@ import numpy as np
 
 from barpc.ba.cameras import Projected
 from barpc.ba.loss import LOSSES
-from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
 from barpc.ba.smooth import SPLINES, Smooth, SmoothTest
-from barpc.ba.solve import Minimum, State, gauss_newton, minimise
+from barpc.ba.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
 from barpc.ba.variances import PriorTest, Variances, same_prior
 from barpc.geodesy import Array
+from barpc.options import AdjustOptions
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
@@ -38,6 +38,8 @@ _CLEAN = 5.0  # sigmas
 _FEW = 0.002  # of the observations farther away than that: there is nothing to be careful about
 _NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
 _SHRINK = 0.25  # of the loss's scale in one round, at most
+MAX_PASSES = 5
+"""Rounds of cutting and solving, at most: they end when nothing changes."""
 _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
 
 
@@ -216,8 +218,7 @@ def run_rounds(
             "sparse"
             if options.solver == "auto" and passes == 1
             else options.solver,  # a second pass follows always
-            options.max_steps,
-            options.tolerance if passes > 1 or not robust else _FIRST_TOLERANCE,
+            TOLERANCE if passes > 1 or not robust else _FIRST_TOLERANCE,
             projected,
         )
         state, projected = found.state, None
@@ -236,7 +237,7 @@ def run_rounds(
         _LOG.info("pass %d: %d of %d observations, noise %.3f", passes, use.sum(), len(use), noise)
         settled = not options.estimate_noise or abs(noise / before - 1.0) < _SAME_NOISE
         settled &= same_prior(prior, problem.camera_prior, _SAME_PRIOR)
-        if passes > options.num_passes or (settled and (same or not robust)):
+        if passes > MAX_PASSES or (settled and (same or not robust)):
             minimum = replace(found, state=state)
             return Outcome(problem, minimum, residual, use, noise, passes, tested, smooth.test(residual, use))
         problem = problem.with_camera_prior(prior)

@@ -27,6 +27,10 @@ from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
+MAX_STEPS = 30
+"""Linearisations of one solve, at most."""
+TOLERANCE = 1e-6
+"""A solve ends when a step would lower the cost by less than this fraction."""
 SCIPY_UNKNOWNS = 200
 """Up to so many camera unknowns (22 views of 9) "auto" takes scipy, whose dense decomposition grows as their cube."""
 
@@ -105,8 +109,7 @@ def minimise(
     state: State,
     weight: Array,
     solver: str = "auto",
-    max_steps: int = 30,
-    tolerance: float = 1e-6,
+    tolerance: float = TOLERANCE,
     projected: Projected | None = None,
 ) -> Minimum:
     """Minimise at fixed weights from a state near the minimum.
@@ -121,8 +124,6 @@ def minimise(
         1 / sigma of every observation [1/px], 0 for one that does not count.
     solver : str
         "scipy", "sparse" or "auto".
-    max_steps : int
-        Linearisations.
     tolerance : float
         The step that is expected to gain less than this fraction of the cost is taken and is the last, and
         so is one that is expected to leave a thousandth of it (see `_settled`).
@@ -145,12 +146,12 @@ def minimise(
     result = None
     if solver == "scipy":
         try:
-            result = _scipy(problem, state, weight, max_steps, tolerance, projected)
+            result = _scipy(problem, state, weight, tolerance, projected)
         except np.linalg.LinAlgError as error:  # its SVD may fail on a finite matrix
             _LOG.warning("least_squares failed (%s): going on by Levenberg-Marquardt", error)
             projected = None
     if result is None:
-        result = _levenberg_marquardt(problem, state, weight, max_steps, tolerance, projected)
+        result = _levenberg_marquardt(problem, state, weight, tolerance, projected)
     _LOG.info(
         "%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, time.process_time() - start
     )
@@ -198,7 +199,6 @@ def _levenberg_marquardt(
     problem: Problem,
     state: State,
     weight: Array,
-    max_steps: int,
     tolerance: float,
     projected: Projected | None,
 ) -> Minimum:
@@ -206,7 +206,7 @@ def _levenberg_marquardt(
     damping, before = 0.0, np.inf
     reduced = problem.reduce(state.params, state.points, weight, projected)
     state = replace(state, cost=_finite(reduced.cost), history=(*state.history, reduced.cost))
-    for _ in range(max_steps):
+    for _ in range(MAX_STEPS):
         try:
             step, gain, factor = camera_step(problem, reduced, damping)
         except np.linalg.LinAlgError:
@@ -231,7 +231,7 @@ def _levenberg_marquardt(
             raise AdjustError(f"no step lowers the cost {state.cost:.6g}: the solution is not usable")
         else:
             damping = max(10.0 * damping, 1e-6)
-    _LOG.warning("the adjustment did not settle in %d steps", max_steps)
+    _LOG.warning("the adjustment did not settle in %d steps", MAX_STEPS)
     return Minimum(state, reduced, status=_status(state, "the number of steps is used up"))
 
 
@@ -303,7 +303,6 @@ def _scipy(
     problem: Problem,
     state: State,
     weight: Array,
-    max_steps: int,
     tolerance: float,
     projected: Projected | None,
 ) -> Minimum:
@@ -317,10 +316,10 @@ def _scipy(
         ftol=tolerance,
         xtol=_XTOL,
         gtol=np.sqrt(tolerance),  # of whitened unknowns: a thousandth of a standard deviation for a millionth
-        max_nfev=max_steps,
+        max_nfev=MAX_STEPS,
     )
     if not found.success:
-        _LOG.warning("the adjustment did not settle in %d steps", max_steps)
+        _LOG.warning("the adjustment did not settle in %d steps", MAX_STEPS)
     compressed.at(found.x)
     _finite(compressed.state.cost)
     status = f"scipy least_squares, {found.nfev} evaluations: {found.message.rstrip('.')}"

@@ -29,7 +29,7 @@ class Unknowns:
     Parameters
     ----------
     model : str
-        A name of `barpc.ba.options.MODELS`.
+        A name of `AdjustOptions.model`.
     drift : int
         Degree of the rotation in the image row.
     center : (N, 3)
@@ -179,7 +179,7 @@ class Unknowns:
 
 
 def make_unknowns(
-    views: Sequence[View], model: str, drift: int = 0, centers: Array | None = None, method: str = "line"
+    views: Sequence[View], model: str, drift: int = 0, centers: Array | None = None
 ) -> Unknowns:
     """The layout for a block of views.
 
@@ -188,11 +188,9 @@ def make_unknowns(
     views : sequence of View
         N views.
     model, drift : str, int
-        As in `barpc.ba.options.AdjustOptions`.
+        As in `barpc.options.AdjustOptions`.
     centers : (N, 3) or None
-        Camera centres [m], ECEF; None: regressed from the sensors by `method`.
-    method : str
-        See `barpc.sensor.geometry.camera_center`.
+        Camera centres [m], ECEF; None: `barpc.sensor.geometry.camera_center` of the sensors.
 
     Returns
     -------
@@ -203,7 +201,7 @@ def make_unknowns(
     if model in _IMAGE_TERMS:
         centers = np.zeros((len(views), 3))
     elif centers is None:
-        found = [camera_center(v.sensor, v.size, v.alt_range, method).ecef for v in views]  # type: ignore[arg-type]
+        found = [camera_center(v.sensor, v.size, v.alt_range).ecef for v in views]
         centers = np.array(found).reshape(-1, 3)
     scene = np.array([_middle_of_scene(view) for view in views]).reshape(-1, 3)
     distance = np.linalg.norm(centers - scene, axis=1)

@@ -18,11 +18,11 @@ from scipy.stats import chi2
 from barpc.ba.blocks import CameraPrior
 from barpc.ba.covariance import Covariance
 from barpc.ba.linear import Matrix, factorize
-from barpc.ba.options import AdjustOptions
 from barpc.ba.problem import Problem
 from barpc.ba.solve import Minimum, free_part
 from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array
+from barpc.options import AdjustOptions
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)

@@ -1,24 +1,33 @@
-"""`barpc adjust`: the main job."""
+"""`barpc adjust`, `match` and `check`: runs of the pipeline."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.options import ADJUSTMENT_FLAGS, RUN_FLAGS, TIE_FLAGS, with_flags
-from barpc.cli.runs import run
+from barpc.cli.options import ADJUSTMENT, MATCH, RUN, TIE, image_paths, run_options, with_flags
+from barpc.cli.progress import executor_for, progress_bars
+from barpc.cli.tables import print_summary
+from barpc.cli.terminal import echo, tell_gate
 
 if TYPE_CHECKING:
-    from barpc.pipeline import AdjustResult, RunOptions
+    from barpc.pipeline import AdjustResult
+
+_images = click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
+_out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the results.")
 
 
 @click.command("adjust")
-@click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
-@click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the results.")
-@with_flags(*RUN_FLAGS, *TIE_FLAGS, *ADJUSTMENT_FLAGS)
+@_images
+@_out_dir
+@with_flags(*RUN, *TIE, *ADJUSTMENT)
 @click.pass_obj
-def command(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
+def adjust(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
     r"""Correct the cameras of overlapping images and write fresh RPCs.
 
     Tie points are matched across the images, a bundle adjustment estimates a rotation and a translation of
@@ -31,9 +40,90 @@ def command(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **fla
       barpc adjust a.tif b.tif --gcp points.gcp --dem srtm.tif --geoid egm96.gtx -o adjusted
       barpc adjust --image-list images.txt -j 8 --keep-going -o adjusted
     """
-    from barpc.pipeline import adjust
+    from barpc import pipeline
 
-    def work(paths: list[str], options: RunOptions, **workers: Any) -> AdjustResult:
-        return adjust(paths, out_dir, options, **workers)
+    return _run(obj, pipeline.adjust, images, flags, out_dir=out_dir)
 
-    return run(obj, work, images, flags)
+
+@click.command("match")
+@_images
+@_out_dir
+@with_flags(*MATCH, *TIE)
+@click.pass_obj
+def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
+    r"""Match tie points and stop, for `barpc adjust --matches` and other tools.
+
+    Writes matches.csv and matches.npz, and a text match file for each pair as ASP reads them (folder asp).
+
+    \b
+    Examples:
+      barpc match scene/*.tif -o ties
+      barpc adjust scene/*.tif --matches ties/matches.npz -o adjusted
+    """
+    from barpc import pipeline
+
+    return _run(obj, pipeline.adjust, images, flags, {"stop_after": "matching"}, out_dir=out_dir)
+
+
+@click.command("check")
+@_images
+@click.option("--against", metavar="PATH", help="Compare with this RPC (one image), or those of this folder.")
+@with_flags(*TIE)
+@click.pass_obj
+def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, **flags: Any) -> int:
+    r"""Measure how well the cameras of overlapping images agree, without adjusting or writing anything.
+
+    With --against, no tie points are matched: each image's RPC is compared with another one over the image and
+    its altitudes; exit 3 where one differs by more than a millionth of a pixel.
+
+    \b
+    Examples:
+      barpc check adjusted/*.vrt
+      barpc check adjusted/*.vrt --against delivered/
+    """
+    from barpc import pipeline
+
+    if against is not None:
+        return _compare(image_paths(images, flags["image_list"]), Path(against), flags["as_json"])
+    return _run(obj, pipeline.check, images, flags)
+
+
+def _run(
+    obj: Mapping[str, Any],
+    work: Callable[..., AdjustResult],
+    images: tuple[str, ...],
+    flags: dict[str, Any],
+    fixed: Mapping[str, Any] | None = None,
+    **where: str,
+) -> int:
+    """Run an entry of the pipeline with what the command line says and what the verb has `fixed`, and tell."""
+    paths = image_paths(images, flags["image_list"])
+    options = replace(run_options(flags, flags["options_file"]), **(fixed or {}))
+    with executor_for(flags["jobs"]) as executor, progress_bars(obj["quiet"]) as progress:
+        result = work(paths, options=options, executor=executor, progress=progress, **where)
+    if flags["as_json"]:
+        echo(json.dumps(result.summary, indent=1))
+    elif not obj["quiet"]:
+        print_summary(result.summary)
+    return 0 if result.passed else tell_gate(result.summary["headline"], result.summary["reasons"])
+
+
+def _compare(images: list[str], against: Path, as_json: bool) -> int:
+    from barpc.cameras import open_camera
+    from barpc.handoff import TOLERANCE, difference
+    from barpc.pipeline import load_views
+    from barpc.rpcio import find_rpc
+
+    found = []
+    for view in load_views(images, min_views=1, distinct=False).views:
+        other = find_rpc(against, Path(view.path)) if against.is_dir() else against
+        far = difference(view.sensor, open_camera(other).model, view.size, view.alt_range)
+        found.append((view.path, str(other), far))
+    if as_json:
+        rows = [dict(zip(("image", "against", "max_px"), row, strict=True)) for row in found]
+        echo(json.dumps(rows, indent=1))
+    else:
+        for path, compared, px in found:
+            echo(f"{path}  {compared}  max {px:.3g} px")
+    off = [f"{path}: {px:.3g} px." for path, _, px in found if not px <= TOLERANCE]
+    return tell_gate(f"{len(off)} of {len(found)} RPCs differ.", off) if off else 0

@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 import numpy as np
 
 from barpc.cameras import Camera, open_camera, split_spec
-from barpc.cli.points import as_json, check_target
-from barpc.cli.terminal import echo, say, tell_gate
-from barpc.errors import InputError
+from barpc.cli.terminal import as_json, echo, say, tell_gate
+from barpc.errors import InputError, OutputError
 from barpc.handoff import Reading, refuse_hiding, unverified, verify
 from barpc.plain import plain_path
 from barpc.raster import open_raster
-from barpc.rpcio import CARRIERS, WRITABLE, find_rpc, shadows, write_camera, write_crop, write_rpc
+from barpc.rpcio import (
+    CARRIERS,
+    FORMATS,
+    WRITABLE,
+    find_rpc,
+    hidden_by,
+    shadows,
+    sidecars,
+    write_camera,
+    write_crop,
+    write_rpc,
+)
 from barpc.sensor.geometry import image_border
+from barpc.sensor.rpc import RPC
 from barpc.workspace import Workspace
 
 Window = tuple[int, int, int, int]
@@ -29,12 +42,7 @@ Box = tuple[float, float, float, float]
 @click.option(
     "--rpc", "rpcs", metavar="PATH", help="With -o: an RPC file, or a folder of them by image name."
 )
-@click.option(
-    "--images",
-    "carrier",
-    type=click.Choice(["vrt", "copy"]),
-    help="With -o: what is written.  [default: vrt]",
-)
+@click.option("--images", "carrier", type=click.Choice(["vrt", "copy"]), help="With -o.  [default: vrt]")
 @click.option(
     "--rpc-format",
     "formats",
@@ -48,7 +56,7 @@ Box = tuple[float, float, float, float]
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing file, or files of an earlier run.")
 @as_json
-def command(
+def convert(
     files: tuple[str, ...],
     out_dir: str | None,
     rpcs: str | None,
@@ -86,35 +94,50 @@ def command(
     check_target(
         target, [split_spec(source)[0], camera.path], overwrite, None if window or bbox else camera.rpc
     )
+    image = split_spec(source)[0]
     if window or bbox:
-        _crop(camera, source, target, _window(camera, window, bbox, alt), overwrite, as_json)
+        window = _window(camera, window, bbox, alt)
+        write_crop(camera.rpc, image, target, window, overwrite=overwrite)
+        text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
+        echo(json.dumps({"path": target, "window": window}) if as_json else text)
+        return 0
+    if formats is None:
+        write_camera(camera.rpc, target, image, overwrite=overwrite)
     else:
-        _convert(camera, source, target, formats, overwrite, as_json)
+        write_rpc(camera.rpc, target, format=formats, overwrite=overwrite)
+    row = {"source": str(camera.path), "format": camera.format, "target": target}
+    echo(json.dumps(row) if as_json else f"{camera.path} ({camera.format}) -> {target}")
+    for note in () if as_json else camera.notes:
+        say(note)
     return 0
 
 
 # --- one file ---------------------------------------------------------------------------------------------
 
 
-def _convert(
-    camera: Camera, source: str, target: str, name: str | None, overwrite: bool, as_json: bool
+def check_target(
+    target: str | Path, sources: Sequence[str | Path], overwrite: bool, rpc: RPC | None = None
 ) -> None:
-    if name is None:
-        write_camera(camera.rpc, target, split_spec(source)[0], overwrite=overwrite)
-    else:
-        write_rpc(camera.rpc, target, format=name, overwrite=overwrite)
-    if as_json:
-        echo(json.dumps({"source": str(camera.path), "format": camera.format, "target": target}))
-    else:
-        echo(f"{camera.path} ({camera.format}) -> {target}")
-        for note in camera.notes:
-            say(note)
+    """Raise if a file to be written is an input, or would be read in place of the RPC that an image has.
 
-
-def _crop(camera: Camera, source: str, target: str, window: Window, overwrite: bool, as_json: bool) -> None:
-    write_crop(camera.rpc, split_spec(source)[0], target, window, overwrite=overwrite)
-    text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
-    echo(json.dumps({"path": target, "window": window}) if as_json else text)
+    The RPC files beside the sources belong to them; none is ever replaced. With `overwrite` an image may get another
+    RPC, and that is said; where it is the `rpc` that the file will hold, nothing changes for it.
+    """
+    target = Path(target)
+    inputs = {p.resolve() for s in sources for p in (Path(s), *(sidecar.path for sidecar in sidecars(s)))}
+    if os.path.lexists(target) and target.resolve() in inputs:
+        raise OutputError(f"{target}: belongs to the input and is never replaced; give another name")
+    text = FORMATS["txt"].write
+    assert text is not None
+    for _, image, now in hidden_by([target]):
+        if rpc is not None and text(rpc) == text(now):
+            continue
+        if not overwrite:
+            raise OutputError(
+                f"{target}: would be read in place of the RPC that {image} has; give another folder or name, or "
+                "--overwrite if that is meant"
+            )
+        say(f"{target} is read in place of the RPC that {image} had")
 
 
 def _window(camera: Camera, window: Window | None, bbox: Box | None, alt: float | None) -> Window:
@@ -153,9 +176,11 @@ def _hand_off(
     """Write images with their RPCs, open every file as its readers do, and say what they see."""
     files = [split_spec(image)[0] for image in images]
     _check(files, folder, formats)
-    sources = images if rpcs is None else [_rpc_file(Path(rpcs), file) for file in files]
-    cameras = [open_camera(source) for source in sources]
-    names = [_names(file, carrier, formats) for file in files]
+    if rpcs is not None:
+        images = tuple(str(find_rpc(Path(rpcs), f)) if Path(rpcs).is_dir() else rpcs for f in files)
+    cameras = [open_camera(image) for image in images]
+    ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
+    names = [[file.stem + end for end in ends] for file in files]
     together = [name for row in names for name in row]
     inputs = [*files, *(camera.path for camera in cameras)]
     refuse_hiding(folder, together, inputs)
@@ -167,16 +192,15 @@ def _hand_off(
                 with workspace.output(name) as partial:
                     write_camera(camera.rpc, partial, file, place=folder / name, overwrite=True)
             written = [folder / name for name in row]
-            readings += verify(written, camera.rpc, _size(file), camera.alt_range)
+            with open_raster(file) as dataset:
+                size = dataset.width, dataset.height
+            readings += verify(written, camera.rpc, size, camera.alt_range)
             reasons += _shadow_reasons(file, written)
     _tell(readings, as_json)
     for sentence in unverified([folder / name for name in names[0]]):
         say(sentence)
-    reasons += [
-        f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}."
-        for r in readings
-        if not r.passed
-    ]
+    off = [reading for reading in readings if not reading.passed]
+    reasons += [f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}." for r in off]
     return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
 
 
@@ -185,36 +209,17 @@ def _tell(readings: list[Reading], as_json: bool) -> None:
         for r in readings:
             echo(f"{r.path}: {r.consumer} {r.note or f'{r.max_error:.1e} px'}")
         return
-    echo(
-        json.dumps(
-            [
-                {
-                    "path": str(r.path),
-                    "consumer": r.consumer,
-                    "max_px": None if r.note else r.max_error,
-                    "note": r.note,
-                }
-                for r in readings
-            ]
-        )
-    )
+    keys = ("path", "consumer", "max_px", "note")
+    rows = [(str(r.path), r.consumer, None if r.note else r.max_error, r.note) for r in readings]
+    echo(json.dumps([dict(zip(keys, row, strict=True)) for row in rows]))
 
 
 def _shadow_reasons(image: Path, written: list[Path]) -> list[str]:
     """What lies beside a new file and hides its RPC; what lies beside the image is only said."""
     for sidecar in shadows(image):
         say(f"beside {image}: {sidecar.path.name} hides an RPC put into the image")
-    return [
-        f"{sidecar.path} hides the RPC of {written[0]}: move it away."
-        for sidecar in shadows(written[0])
-        if sidecar.path not in written
-    ]
-
-
-def _size(image: Path) -> tuple[int, int]:
-    """Width and height of an image [px]."""
-    with open_raster(image) as dataset:
-        return dataset.width, dataset.height
+    hiding = [sidecar.path for sidecar in shadows(written[0]) if sidecar.path not in written]
+    return [f"{path} hides the RPC of {written[0]}: move it away." for path in hiding]
 
 
 def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
@@ -229,13 +234,3 @@ def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
         raise InputError(f"several images named {twins[0]}: apply them one folder at a time")
     if any(image.resolve().parent == folder.resolve() for image in images):
         raise InputError(f"{folder}: the folder of the images; choose a new one")
-
-
-def _names(image: Path, carrier: str, formats: list[str]) -> list[str]:
-    """What is written for an image: the raster, then a file for each format."""
-    ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
-    return [image.stem + end for end in ends]
-
-
-def _rpc_file(rpcs: Path, image: Path) -> str:
-    return str(find_rpc(rpcs, image) if rpcs.is_dir() else rpcs)

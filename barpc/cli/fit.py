@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.terminal import echo, tell_gate
+from barpc.cli.options import flag, run_options
+from barpc.cli.terminal import as_json, echo, tell_gate
 
 if TYPE_CHECKING:
-    from barpc.cameras import Camera
     from barpc.fit import RpcFit
 
 _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third of the accuracy
@@ -20,17 +20,13 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 @click.command("fit")
 @click.argument("source", metavar="SOURCE")
 @click.option(
-    "-o",
-    "--output",
-    metavar="RPC",
-    help="Where to write; the name chooses the format. Without it, only measure.",
+    "-o", "--output", metavar="RPC", help="Where to write; the name chooses the format. Else measure."
 )
 @click.option(
     "--alt-range",
-    nargs=2,
-    type=float,
+    type=(float, float),
     metavar="LOW HIGH",
-    help="Altitudes [m above the ellipsoid] to fit over. [default: the camera's own]",
+    help="Altitudes [m above the ellipsoid] to fit over.  [default: the camera's own]",
 )
 @click.option("--dem", metavar="FILE", help="Take the altitudes of this DEM over the image, with a margin.")
 @click.option(
@@ -42,13 +38,13 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
     help="Margin below and above the DEM.",
 )
 @click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
-@click.option("--tolerance", type=float, metavar="PX", help="Largest error allowed on check points.")
+@flag("fit.tolerance")
 @click.option("--options", "options_file", metavar="FILE", help="TOML file; its table [fit] counts here.")
 @click.option("--keep-going", is_flag=True, help="Write the RPC although it misses the tolerance; exit 3.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-@click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
+@as_json
 @click.pass_obj
-def command(
+def fit(
     obj: dict[str, Any],
     /,
     source: str,
@@ -74,7 +70,7 @@ def command(
 
     image = str(split_spec(source)[0])
     if output is not None:
-        from barpc.cli.points import check_target
+        from barpc.cli.convert import check_target
 
         check_target(output, [image], overwrite)
     fit, tolerance = _fit(source, flags)
@@ -83,30 +79,26 @@ def command(
     if output is not None and (keep_going or not verdict):
         reread = _write(fit, image, output, overwrite)
     if as_json:
-        echo(
-            json.dumps({**fit.summary(), "verdict": verdict, "output": output if reread else None}, indent=1)
-        )
+        summary = {**fit.summary(), "verdict": verdict, "output": output if reread else None}
+        echo(json.dumps(summary, indent=1))
     elif not obj["quiet"]:
         echo(_certificate(fit, verdict))
         if reread:
             echo(f"written       {reread}")
-    if verdict:
-        written = (
-            "written all the same" if reread else "nothing written (--keep-going writes it all the same)"
-        )
-        return tell_gate(f"{verdict}; {written}", [])
-    return 0
+    if not verdict:
+        return 0
+    written = "written all the same" if reread else "nothing written (--keep-going writes it all the same)"
+    return tell_gate(f"{verdict}; {written}", [])
 
 
 def _fit(source: str, flags: dict[str, Any]) -> tuple[RpcFit, float]:
     """The fit and the tolerance [px] that it is to meet."""
     from barpc.cameras import open_camera, read_points, split_spec
-    from barpc.cli.options import run_options
+    from barpc.dem import Dem
     from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
+    from barpc.fit.points import terrain_range
 
-    options = run_options({}, flags["options_file"]).fit
-    if flags["tolerance"] is not None:
-        options = replace(options, tolerance=flags["tolerance"])
+    options = run_options(flags, flags["options_file"]).fit
     points, size = read_points(source)
     if points is not None:
         ground, image = points.ground, points.image
@@ -115,17 +107,12 @@ def _fit(source: str, flags: dict[str, Any]) -> tuple[RpcFit, float]:
     camera = open_camera(source)
     if split_spec(source)[1].get("swath", "").lower() == "mosaic" and options.grid == FitOptions().grid:
         options = replace(options, grid=_MOSAIC_GRID)
-    alt_range = flags["alt_range"] or (_dem_range(camera, flags) if flags["dem"] else camera.alt_range)
+    alt_range = flags["alt_range"] or camera.alt_range
+    if flags["dem"] and not flags["alt_range"]:
+        terrain = Dem.open(flags["dem"], flags["geoid"])
+        alt_range = terrain_range(camera.model, camera.extent, alt_range, terrain, flags["dem_margin"])
     fit = fit_rpc(camera.model, camera.extent, alt_range, options=options, strict=False)
     return fit, options.tolerance
-
-
-def _dem_range(camera: Camera, flags: dict[str, Any]) -> tuple[float, float]:
-    from barpc.dem import Dem
-    from barpc.fit.points import terrain_range
-
-    terrain = Dem.open(flags["dem"], flags["geoid"])
-    return terrain_range(camera.model, camera.extent, camera.alt_range, terrain, flags["dem_margin"])
 
 
 def _write(fit: RpcFit, source: str, output: str, overwrite: bool) -> str:
@@ -142,19 +129,13 @@ def _write(fit: RpcFit, source: str, output: str, overwrite: bool) -> str:
 
 
 def _certificate(fit: RpcFit, verdict: str) -> str:
+    rows = {"control rmse": fit.rmse_cnp, "control max": fit.max_cnp}
+    rows |= {"check rmse": fit.rmse_ckp, "check max": fit.max_ckp}
     lines = [
         f"method        {fit.method}, {fit.iterations} passes, h {fit.h[0]:.2g} {fit.h[1]:.2g}",
         f"points        {fit.num_cnp} control, {fit.num_ckp} check, {fit.coverage:.0%} of the image covered",
         "              col [px]     row [px]",
-    ]
-    rows = (
-        ("control rmse", fit.rmse_cnp),
-        ("control max", fit.max_cnp),
-        ("check rmse", fit.rmse_ckp),
-        ("check max", fit.max_ckp),
-    )
-    lines += [f"{name:14s}{col:<13.3g}{row:.3g}" for name, (col, row) in rows]
-    lines += [
+        *(f"{name:14s}{col:<13.3g}{row:.3g}" for name, (col, row) in rows.items()),
         f"denominators  at least {fit.min_denominator:.3g} over the box and 25 % around it",
         f"round trip    {fit.roundtrip:.1g} px",
         f"verdict       {verdict or 'within tolerance'}",

@@ -1,28 +1,27 @@
-"""`barpc info`: what an image or an RPC file is."""
+"""`barpc info`: what an image or an RPC file is, and whether the installation works."""
 
 from __future__ import annotations
 
+import importlib
 import json
-from collections.abc import Mapping, Sequence
+import platform
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 
+from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
-from barpc.cli.points import as_json
-from barpc.cli.terminal import echo
+from barpc.cli.terminal import as_json, echo
 from barpc.errors import RpcError
 from barpc.fit.rpc import smallest_denominator
-from barpc.geodesy import Array
 from barpc.geojson import collection, feature, polygon
-from barpc.sensor.geometry import (
-    camera_center,
-    convergence_angle,
-    footprint,
-    ground_sample_distance,
-    view_angles,
-)
+from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC
 
 
@@ -37,7 +36,7 @@ from barpc.sensor.rpc import RPC
 )
 @click.option("--doctor", is_flag=True, help="Print versions and try the installation instead.")
 @as_json
-def command(
+def info(
     images: tuple[str, ...],
     at: tuple[float, float, float] | None,
     alt: float | None,
@@ -61,9 +60,7 @@ def command(
       barpc info --doctor
     """
     if doctor:
-        from barpc.cli.doctor import doctor as examine
-
-        return examine(as_json)
+        return _examine(as_json)
     if not images:
         raise click.UsageError("give at least one IMAGE")
     cameras = [open_camera(image) for image in images]
@@ -95,7 +92,7 @@ def _outlines(images: Sequence[str], cameras: Sequence[Camera], alt: float | Non
     features = []
     for image, camera in zip(images, cameras, strict=True):
         height = camera.altitude if alt is None else alt
-        ring = footprint(camera.model, camera.extent, height)
+        ring = geometry.footprint(camera.model, camera.extent, height)
         if not np.isfinite(ring).all():
             raise RpcError(f"{image}: no ground point at its image's border at {height:g} m")
         path = split_spec(image)[0]
@@ -103,20 +100,15 @@ def _outlines(images: Sequence[str], cameras: Sequence[Camera], alt: float | Non
     return collection(features)
 
 
-def _center(camera: Camera, alt: float | None) -> Array:
-    """The ground point (3,) in the middle of the image."""
-    middle = (np.array(camera.extent) - 1) / 2
-    return camera.model.localize(middle, np.asarray(camera.altitude if alt is None else alt))
-
-
 def _pairs(
     images: Sequence[str], cameras: Sequence[Camera], i: int, alt: float | None, at: tuple[float, ...] | None
 ) -> list[dict[str, Any]]:
-    """What an image and each later one see together: the angle between their rays, and B/H."""
-    point = _center(cameras[i], alt) if at is None else np.array(at)
+    """What an image and each later one see together at its centre: the angle between their rays, and B/H."""
+    first, height = cameras[i], np.asarray(cameras[i].altitude if alt is None else alt)
+    point = first.model.localize((np.array(first.extent) - 1) / 2, height) if at is None else np.array(at)
     rows = []
     for image, camera in list(zip(images, cameras, strict=True))[i + 1 :]:
-        angle = float(convergence_angle(cameras[i].model, camera.model, point))
+        angle = float(geometry.convergence_angle(first.model, camera.model, point))
         ratio = 2 * float(np.tan(np.radians(angle) / 2))
         rows.append({"with": split_spec(image)[0].stem, "convergence_deg": angle, "b_over_h": ratio})
     return rows
@@ -158,10 +150,10 @@ def _geometry(
     report: dict[str, Any] = {"size_px": list(size), "center_deg": center[:2].tolist()}
     if not np.isfinite(center).all():
         return report | {"problem": "no ground point at the image's centre"}
-    incidence, azimuth = view_angles(model, center if at is None else np.array(at))
-    metres = ground_sample_distance(model, middle, alt)
-    stand = camera_center(model, size, camera.alt_range)
-    ring = footprint(model, size, alt)
+    incidence, azimuth = geometry.view_angles(model, center if at is None else np.array(at))
+    metres = geometry.ground_sample_distance(model, middle, alt)
+    stand = geometry.camera_center(model, size, camera.alt_range)
+    ring = geometry.footprint(model, size, alt)
     return report | {
         "incidence_deg": float(incidence),
         "azimuth_deg": float(azimuth),
@@ -181,3 +173,90 @@ def _text(value: Any) -> str:
     if isinstance(value, list):
         return " .. ".join(_text(v) for v in value) if value else "none"
     return str(value)
+
+
+# --- the installation -------------------------------------------------------------------------------------
+
+_REQUIRED = [
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "rasterio",
+    "shapely",
+    "click",
+    "filelock",
+    "fastjsonschema",
+]
+_OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
+
+
+def _version(package: str, missing: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return missing
+
+
+def _fit_an_rpc() -> str:
+    from barpc.fit import fit_rpc
+    from barpc.simulate import Look, fly
+
+    camera = fly(np.array([5.4, 43.3, 250.0]), Look(10.0, 30.0), (500, 400), 0.5)
+    fit = fit_rpc(camera, (500, 400), (0.0, 500.0))
+    return f"{float(fit.max_ckp.max()):.0e} px"
+
+
+def _write_and_read_a_raster() -> str:
+    import rasterio
+
+    from barpc.raster import open_raster
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pixels.tif"
+        transform = rasterio.Affine(1, 0, 0, 0, -1, 8)
+        shape = {"width": 8, "height": 8, "count": 1, "dtype": "uint16", "transform": transform}
+        with rasterio.open(path, "w", driver="GTiff", **shape) as out:
+            out.write(np.arange(64, dtype=np.uint16).reshape(1, 8, 8))
+        with open_raster(path) as image:
+            total = int(image.read(1).sum())
+    if total != 2016:
+        raise RuntimeError(f"read back {total}, expected 2016")
+    return f"GDAL {rasterio.__gdal_version__}"
+
+
+def _detect_keypoints() -> str:
+    cv2: Any = importlib.import_module("cv2")
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
+    found = cv2.SIFT_create().detect(cv2.GaussianBlur(noise, (0, 0), 2.0), None)
+    return f"{len(found)} SIFT keypoints in noise"
+
+
+_CHECKS: dict[str, Callable[[], str]] = {
+    "read and write a raster": _write_and_read_a_raster,
+    "detect keypoints": _detect_keypoints,
+    "fit an RPC to a simulated camera": _fit_an_rpc,
+}
+
+
+def _examine(as_json: bool) -> int:
+    """Print the versions of what barpc stands on, try each part once, and give the exit code."""
+    versions = {"barpc": __version__, "python": platform.python_version()}
+    versions |= {name: _version(name, "MISSING") for name in _REQUIRED}
+    for name, extra in _OPTIONAL.items():
+        versions[name] = _version(name, f"not installed (pip install 'barpc[{extra}]')")
+    results = {}
+    for name, check in _CHECKS.items():
+        try:
+            results[name] = {"ok": True, "found": check()}
+        except Exception as error:  # noqa: BLE001  whatever is broken is what this is there to show
+            results[name] = {"ok": False, "found": f"{type(error).__name__}: {error}"}
+    good = all(result["ok"] for result in results.values()) and "MISSING" not in versions.values()
+    if as_json:
+        echo(json.dumps({"versions": versions, "checks": results, "ok": good}, indent=1))
+        return 0 if good else 1
+    for name, found in versions.items():
+        echo(f"{name:<24} {found}")
+    for name, result in results.items():
+        echo(f"{'ok  ' if result['ok'] else 'FAIL'} {name}: {result['found']}")
+    echo(f"platform: {platform.platform()}, {sys.executable}", err=True)
+    return 0 if good else 1

@@ -18,16 +18,15 @@ from typing import Any
 import click
 
 from barpc import __version__
-from barpc.cli.terminal import Formatter, echo, say
+from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
+from barpc.cli.terminal import THREADS, Formatter, echo, say
 from barpc.errors import BarpcError, BarpcWarning
 
 EXIT_FAILED = 1
-EXIT_USAGE = 2
-EXIT_GATE = 3
 EXIT_INTERRUPTED = 130
 
 _NO_ARGUMENTS: Any = getattr(click.exceptions, "NoArgsIsHelpError", click.exceptions.Exit)  # not in click 8.1
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
 
 COMMANDS = {
     "adjust": "Correct the cameras of overlapping images and write fresh RPCs.",
@@ -41,7 +40,12 @@ COMMANDS = {
     "convert": "Write RPCs in other formats, cut out windows, hand images over.",
     "report": "Make report.html of a finished run again, or compare two runs.",
 }
-"""Verb -> its line in `barpc --help`; the code is `barpc.cli.<verb>.command`."""
+"""Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
+_MODULES = {
+    "match": "adjust",
+    "check": "adjust",
+    **dict.fromkeys(("project", "localize", "triangulate"), "points"),
+}
 
 MOVED = {
     "angle": "info IMAGE IMAGE",
@@ -65,29 +69,12 @@ MOVED = {
     "--keep-largest": "--keep-going",
     "--format": "--rpc-format",
     "--stop-after": "barpc match, or stop_after in a file given with --options",
-    **{
-        flag: f"{option} of a file given with --options"
-        for flag, option in (
-            ("--detector", "[tie] detector"),
-            ("--max-pairwise-matches", "[tie] points_per_image"),
-            ("--min-overlap", "[tie] min_overlap"),
-            ("--min-triangulation-angle", "[tie] min_angle"),
-            ("--num-passes", "num_passes"),
-            ("--loss", "[adjust] loss"),
-            ("--robust-threshold", "[adjust] robust_threshold"),
-            ("--center", "[adjust] center_method"),
-            ("--tolerance", "[fit] tolerance"),
-            ("--method", "[fit] method"),
-            ("--joint", "[fit] joint"),
-            ("--grid", "[fit] grid"),
-            ("--space", "[fit] space"),
-            ("--nodes", "[fit] nodes"),
-            ("--for-format", "[fit] precision"),
-            ("--allow-mirrored", "[fit] allow_mirrored"),
-        )
-    },
+    "--max-pairwise-matches": "[tie] points_per_image of a file given with --options",
+    "--min-triangulation-angle": "[tie] angles of a file given with --options",
+    "--joint": "[fit] method of a file given with --options",
+    "--for-format": "[fit] precision of a file given with --options",
 }
-"""Former verb or flag -> how it is said now."""
+"""Former verb or flag -> how it is said now; options that have no flag are found in `barpc.options`."""
 
 _GENERAL = {"-q": "quiet", "--quiet": "quiet", "--debug": "debug", "-v": "verbose", "--verbose": "verbose"}
 
@@ -95,6 +82,19 @@ _GENERAL = {"-q": "quiet", "--quiet": "quiet", "--debug": "debug", "-v": "verbos
 def _kept_lines(text: str | None) -> str | None:
     r"""Turn the written ``\b`` of a raw docstring into the character by which click keeps lines apart."""
     return text and text.replace("\\b\n", "\b\n")
+
+
+def _in_file(flag: str) -> str:
+    """Where an options file says what a flag would, if it is an option."""
+    from barpc.options import Options, RunOptions, declared
+
+    name = flag[2:].replace("-", "_")
+    tables: dict[str, type[Options]] = {"": RunOptions}
+    for table, one in declared(RunOptions).items():
+        if isinstance(one.default, Options):
+            tables[f"[{table}] "] = type(one.default)
+    places = [table for table, record in tables.items() if name in declared(record)]
+    return f"{places[0]}{name} of a file given with --options" if places else ""
 
 
 class Verbs(click.Group):
@@ -108,7 +108,8 @@ class Verbs(click.Group):
         """Import the verb's module and hand out its command."""
         if cmd_name not in COMMANDS:
             return None
-        command: click.Command = import_module(f"barpc.cli.{cmd_name}").command
+        module = import_module(f"barpc.cli.{_MODULES.get(cmd_name, cmd_name)}")
+        command: click.Command = getattr(module, cmd_name)
         command.help = _kept_lines(command.help)
         return command
 
@@ -127,8 +128,10 @@ class Verbs(click.Group):
         known = {flag for parameter in command.params for flag in parameter.opts} if command else set()
         for word in rest[: rest.index("--") if "--" in rest else None]:
             flag = word.split("=")[0]
-            if flag.startswith("-") and flag in MOVED and flag not in known:
-                raise click.UsageError(f"{flag} is said otherwise now: {MOVED[flag]}")
+            if flag.startswith("--") and flag not in known:
+                now = MOVED.get(flag) or ("--options" in known and _in_file(flag))
+                if now:
+                    raise click.UsageError(f"{flag} is said otherwise now: {now}")
         return name, command, rest
 
     def _general(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -175,9 +178,9 @@ cli.help = _kept_lines(cli.help)
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the console script: runs a verb and turns errors into one line and an exit code."""
+    """Run a verb, and turn errors into one line and an exit code."""
     argv = sys.argv[1:] if args is None else args
-    for name in _THREADS:  # sums keep their order whatever the machine; -j spreads the work
+    for name in THREADS:  # sums keep their order whatever the machine; -j spreads the work
         os.environ.setdefault(name, "1")
     with _interruptible(), warnings.catch_warnings():
         try:
@@ -226,11 +229,7 @@ def _interruptible() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-
-    def stop(_number: int, _frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
@@ -246,9 +245,8 @@ def _log_warning(
     line: str | None = None,
 ) -> None:
     """A warning as one line of the log: barpc's own always, those of libraries with -v."""
-    own = issubclass(category, BarpcWarning)
     text = " ".join(str(message).split())
-    if own:
+    if issubclass(category, BarpcWarning):
         logging.getLogger("barpc").warning(text)
     else:
         logging.getLogger("py.warnings").info("%s:%d: %s: %s", filename, lineno, category.__name__, text)

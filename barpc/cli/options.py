@@ -1,124 +1,83 @@
-"""Options that several verbs share: their flags, and how flags and an options file fill a RunOptions."""
+"""The flags that set options, made of the declarations in `barpc.options`, and those of every run."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar, get_origin
 
 import click
 
-if TYPE_CHECKING:
-    from barpc.pipeline.options import RunOptions
+from barpc.errors import InputError
+from barpc.options import Declared, RunOptions, checked, declared, read_options, with_values
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-
-class Flag:
-    """A flag and the field of RunOptions that it sets.
-
-    Parameters
-    ----------
-    name : str
-        As typed.
-    target : str
-        The field, with its table before a dot.
-    help : str
-        A sentence.
-    **kwargs
-        For `click.option`.
-    """
-
-    def __init__(self, name: str, target: str, help: str, **kwargs: Any) -> None:
-        self.target = target
-        self.parameter = "flag_" + target.replace(".", "_")
-        if kwargs.get("is_flag"):
-            kwargs["default"] = None  # not given: the options file decides
-        self.decorate = click.option(name, self.parameter, help=help, **kwargs)
+TIE = ("tie.band", "matches", "overlap_list", "aoi", "tie.keypoints_per_image", "tie.search")
+CAMERA = ("adjust.model", "adjust.drift", "adjust.sigma_attitude", "adjust.sigma_position", "adjust.fixed")
+GROUND = ("gcp", "check_points", "fixed_run", "dem", "adjust.dem_sigma", "geoid")
+ADJUSTMENT = (*CAMERA, *GROUND)
+MATCH = ("overwrite", "keep_going")
+RUN = (*MATCH, "images", "rpc_formats")
+"""Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
+_NAMES = {"tie.keypoints_per_image": "--ip-per-image", "rpc_formats": "--rpc-format"}
 
 
-COUNT = click.IntRange(1)
-TIE_FLAGS = (
-    Flag("--band", "tie.band", "Band of multi-band images, from 1.", type=COUNT),
-    Flag(
-        "--matches", "matches", "Tie points (CSV, npz, ASP text) to use instead of matching.", metavar="FILE"
-    ),
-    Flag("--overlap-list", "overlap_list", "Match only these pairs: two image names a line.", metavar="FILE"),
-    Flag("--aoi", "aoi", "Tie points only inside: polygons in lon/lat (GeoJSON).", metavar="FILE"),
-    Flag("--ip-per-image", "tie.keypoints_per_image", "Keypoints an image, at most.", type=COUNT),
-    Flag("--search", "tie.search", "How far an RPC may be wrong.", type=float, metavar="PX"),
-)
-ADJUSTMENT_FLAGS = (
-    Flag(
-        "--model",
-        "adjust.model",
-        "Unknowns: rotation+translation, rotation, translation, shift, shift-drift or affine.",
-        metavar="NAME",
-    ),
-    Flag(
-        "--drift",
-        "adjust.drift",
-        "Degree of the rotation along the rows.  [default: 1, and 2 where the residuals ask for it]",
-        type=click.IntRange(0, 2),
-    ),
-    Flag(
-        "--sigma-attitude",
-        "adjust.sigma_attitude",
-        "Prior of the rotation, metres on the ground.",
-        type=float,
-        metavar="M",
-    ),
-    Flag("--sigma-position", "adjust.sigma_position", "Prior of the translation.", type=float, metavar="M"),
-    Flag(
-        "--fixed", "adjust.fixed", "A view that keeps its camera (repeatable).", multiple=True, metavar="NAME"
-    ),
-    Flag("--gcp", "gcp", "Ground control points: .gcp, GeoJSON, image tags.", multiple=True, metavar="FILE"),
-    Flag(
-        "--check-points",
-        "check_points",
-        "Ground points measured after the adjustment, not used in it.",
-        multiple=True,
-        metavar="FILE",
-    ),
-    Flag(
-        "--fixed-run",
-        "fixed_run",
-        "Go on from an earlier run: its views keep what it knows about them.",
-        metavar="DIR",
-    ),
-    Flag("--dem", "dem", "Terrain heights that hold weakly seen tie points.", metavar="FILE"),
-    Flag("--dem-sigma", "adjust.dem_sigma", "Standard deviation of the DEM.", type=float, metavar="M"),
-    Flag("--geoid", "geoid", "Geoid grid for a DEM of orthometric heights.", metavar="FILE"),
-)
-RUN_FLAGS = (
-    Flag("--overwrite", "overwrite", "Replace the results of an earlier run.", is_flag=True),
-    Flag(
-        "--images",
-        "images",
-        "Carry the new RPC in a small VRT that points at the image, in a full copy, or not.  [default: vrt]",
-        type=click.Choice(["vrt", "copy", "none"]),
-    ),
-    Flag(
-        "--rpc-format",
-        "rpc_formats",
-        "RPC files to write, of those that 'barpc convert --help' lists.",
-    ),
-    Flag(
-        "--keep-going",
-        "keep_going",
-        "Leave bad files out, keep the largest connected group, write RPCs that miss the tolerance; exit 3.",
-        is_flag=True,
-    ),
-)
-MATCH_FLAGS = tuple(flag for flag in RUN_FLAGS if flag.target in ("overwrite", "keep_going"))
-_BY_PARAMETER = {flag.parameter: flag for flag in (*TIE_FLAGS, *ADJUSTMENT_FLAGS, *RUN_FLAGS)}
+def flag_name(target: str) -> str:
+    """The flag that sets a field."""
+    return _NAMES.get(target) or "--" + target.rpartition(".")[2].replace("_", "-")
 
 
-def with_flags(*flags: Flag) -> Callable[[Function], Function]:
-    """Give a verb these flags, and those of every run: image and options files, workers, JSON."""
+def field_of(target: str) -> Declared:
+    """What is declared of a field, by its name with its table before a dot."""
+    *table, name = target.split(".")
+    record = type(declared(RunOptions)[table[0]].default) if table else RunOptions
+    return declared(record)[name]
+
+
+def flag(target: str) -> Callable[[Function], Function]:
+    """The click option that sets a field: its type, range, choices, help and default are the field's own."""
+    one, name = field_of(target), flag_name(target)
+    rule, kind, parameter = one.rule, one.kind, "flag_" + target.replace(".", "_")
+    if kind is bool:  # None: the options file decides
+        return click.option(name, parameter, help=rule.help, is_flag=True, default=None)
+    several = get_origin(kind) is tuple
+
+    def convert(_context: click.Context, _parameter: click.Parameter, value: Any) -> Any:
+        if value is None or value == ():
+            return None
+        if rule.rows:
+            value = [word.strip() for word in value.split(",")] if several else value
+        elif kind in (int, float):
+            with suppress(ValueError):  # a text is refused by what follows
+                value = kind(value)
+        try:
+            return checked(target.rpartition(".")[2], kind, rule, value)
+        except InputError as error:
+            raise click.BadParameter(str(error)) from error
+
+    listed = "" if rule.rows else "|".join(map(str, rule.choices(kind)))
+    metavar = "NAMES" if rule.rows else f"[{listed}]" if listed else (rule.unit or kind.__name__).upper()
+    notes = [f"default: {_shown(one.default)}"] if one.default not in (None, ()) else []
+    if kind in (int, float) and (bounds := replace(rule, unit="").bounds()):
+        notes.append(bounds.strip())
+    how = " Names of 'barpc convert --help', commas between." if rule.rows else " (repeatable)"
+    text = rule.help + (how if several else "") + (f"  [{'; '.join(notes)}]" if notes else "")
+    repeats = several and not rule.rows
+    return click.option(name, parameter, help=text, metavar=metavar, callback=convert, multiple=repeats)
+
+
+def _shown(default: Any) -> str:
+    return ",".join(default) if isinstance(default, tuple) else str(default)
+
+
+def with_flags(*targets: str) -> Callable[[Function], Function]:
+    """Give a verb the flags of these fields, and those of every run: image and options files, workers, JSON."""
 
     def decorate(function: Function) -> Function:
-        for option in (*_RUN_OPTIONS[::-1], *(flag.decorate for flag in flags[::-1])):
+        for option in (*_RUN_OPTIONS[::-1], *map(flag, targets[::-1])):
             function = option(function)
         return function
 
@@ -143,8 +102,7 @@ _RUN_OPTIONS = (
         metavar="N|ADDRESS",
         callback=_jobs,
         default="1",
-        show_default=True,
-        help="Worker processes, or a dask.distributed cluster (tcp://host:8786).",
+        help="Worker processes, or a dask.distributed cluster (tcp://host:8786).  [default: 1]",
     ),
     click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
 )
@@ -163,18 +121,12 @@ def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
 
 def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOptions:
     """Defaults, then the options file, then the flags that were given."""
-    from barpc.pipeline.options import RunOptions, read_options, with_values
-
     options = RunOptions() if options_file is None else read_options(options_file)
     values: dict[str, Any] = {}
-    for parameter, value in flags.items():
-        if value is None or value == ():
+    for target in (*TIE, *ADJUSTMENT, *RUN, "fit.tolerance"):
+        value = flags.get("flag_" + target.replace(".", "_"))
+        if value is None:
             continue
-        target = _BY_PARAMETER[parameter].target
-        *table, field = target.split(".")
-        place = values.setdefault(table[0], {}) if table else values
-        if target == "rpc_formats":
-            value = [name.strip() for name in value.split(",")]
-        place[field] = list(value) if isinstance(value, tuple) else value
-    result: RunOptions = with_values(options, values, "command line")
-    return result
+        *table, name = target.split(".")
+        (values.setdefault(table[0], {}) if table else values)[name] = value
+    return with_values(options, values, "command line")

@@ -1,83 +1,150 @@
-"""What the verbs on points and cameras share: tables of points, and which files may be written."""
+"""`barpc project`, `localize` and `triangulate`: points through cameras, in tables."""
 
 from __future__ import annotations
 
 import csv
 import json
-import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
-from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
-from barpc.cli.terminal import echo, say, tell_gate
-from barpc.errors import InputError, OutputError
-from barpc.geodesy import Array
-from barpc.rpcio import FORMATS, hidden_by, sidecars
-from barpc.sensor.rpc import RPC
+from barpc.cameras import open_camera
+from barpc.cli.terminal import as_json, echo, tell_gate
+from barpc.dem import Dem, localize_on_terrain
+from barpc.errors import InputError
+from barpc.geodesy import Array, ground_from_ecef
+from barpc.sensor import geometry
 from barpc.sidefile import TABLE, opened_text
 
-NUMBERS = {"ignore_unknown_options": True}
-"""Context settings under which -3.5 is a number, not an option."""
-
-as_json = click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
+_NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option
+_geoid = click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
 
 
-def check_target(
-    target: str | Path, sources: Sequence[str | Path], overwrite: bool, rpc: RPC | None = None
-) -> None:
-    """Raise if a file to be written is an input, or would be read in place of the RPC that an image has.
+def _points(columns: str) -> Callable[..., Any]:
+    return click.option("--points", metavar="FILE", help=f"CSV with {columns}; - is standard input.")
 
-    Parameters
-    ----------
-    target : path
-        The file to be written.
-    sources : sequence of path
-        What was given; the RPC files beside it belong to it.
-    overwrite : bool
-        An image may get another RPC; that is said. An input is never replaced.
-    rpc : RPC, optional
-        What the file will hold: where the image has the same, nothing changes for it.
+
+@click.command("project", context_settings=_NUMBERS)
+@click.argument("image")
+@click.argument("numbers", nargs=-1, type=float, metavar="[LON LAT ALT]...")
+@_points("lon, lat, alt")
+@click.option("--alt", type=float, help="Altitude of points without one [m above the ellipsoid].")
+@click.option("--dem", metavar="FILE", help="Take the altitudes from a DEM.")
+@_geoid
+@as_json
+def project(
+    image: str,
+    numbers: tuple[float, ...],
+    points: str | None,
+    alt: float | None,
+    dem: str | None,
+    geoid: str | None,
+    as_json: bool,
+) -> int:
+    r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
+
+    \b
+    Examples:
+      barpc project image.tif 5.44 43.26 180
+      barpc project image.tif --points ground.csv --json
     """
-    target = Path(target)
-    inputs = {p.resolve() for s in sources for p in (Path(s), *(sidecar.path for sidecar in sidecars(s)))}
-    if os.path.lexists(target) and target.resolve() in inputs:
-        raise OutputError(f"{target}: belongs to the input and is never replaced; give another name")
-    text = FORMATS["txt"].write
-    assert text is not None
-    for _, image, now in hidden_by([target]):
-        if rpc is not None and text(rpc) == text(now):
-            continue
-        if not overwrite:
-            raise OutputError(
-                f"{target}: would be read in place of the RPC that {image} has; give another folder or name, or "
-                "--overwrite if that is meant"
-            )
-        say(f"{target} is read in place of the RPC that {image} had")
+    terrain = Dem.open(dem, geoid) if dem else None
+    camera = open_camera(image)
+    ground = read_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else alt)
+    if terrain is not None:
+        ground[:, 2] = terrain(ground[:, 0], ground[:, 1])
+    found = camera.model.project(ground)
+    _print_points(("col", "row"), found, (6, 6), as_json)
+    return _tell_failures(found, "could not be projected")
+
+
+@click.command("localize", context_settings=_NUMBERS)
+@click.argument("image")
+@click.argument("numbers", nargs=-1, type=float, metavar="[COL ROW]...")
+@_points("col, row and perhaps alt")
+@click.option(
+    "--alt", type=float, help="Altitude of points without one [m].  [default: the middle of the camera's]"
+)
+@click.option("--dem", metavar="FILE", help="Intersect the lines of sight with a DEM.")
+@_geoid
+@as_json
+def localize(
+    image: str,
+    numbers: tuple[float, ...],
+    points: str | None,
+    alt: float | None,
+    dem: str | None,
+    geoid: str | None,
+    as_json: bool,
+) -> int:
+    r"""Print the ground points (lon, lat, alt) seen at image points.
+
+    \b
+    Examples:
+      barpc localize image.tif 512.5 300 --alt 180
+      barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96_15.gtx
+    """
+    camera = open_camera(image)
+    at = read_points(numbers, points, ("col", "row", "alt"), fill=camera.altitude if alt is None else alt)
+    if dem is not None:
+        ground = localize_on_terrain(camera.model, at[:, :2], Dem.open(dem, geoid), camera.alt_range)
+    else:
+        ground = camera.model.localize(at[:, :2], at[:, 2])
+    _print_points(("lon", "lat", "alt"), ground, (10, 10, 4), as_json)
+    return _tell_failures(ground, "have no ground point")
+
+
+@click.command("triangulate", context_settings=_NUMBERS)
+@click.argument("images", nargs=-1, required=True, metavar="IMAGE IMAGE...")
+@click.option("--at", type=(float, float), multiple=True, help="COL ROW, once for each image.")
+@_points("col1, row1, col2, row2, ...")
+@as_json
+def triangulate(
+    images: tuple[str, ...], at: tuple[tuple[float, float], ...], points: str | None, as_json: bool
+) -> int:
+    r"""Print the ground points where the lines of sight of several images meet, and the error that is left.
+
+    A point that an image does not see has nan there. `error` is the root mean square distance between a
+    point's projections and what was given [px].
+
+    \b
+    Examples:
+      barpc triangulate left.tif right.tif --at 512 300 --at 498 301
+      barpc triangulate a.tif b.tif c.tif --points ties.csv
+    """
+    cameras = [open_camera(image) for image in images]
+    if len(cameras) < 2:
+        raise click.UsageError("one image; the lines of sight of at least two can meet")
+    names = [f"{axis}{i}" for i in range(1, len(cameras) + 1) for axis in ("col", "row")]
+    if points is None and len(at) != len(cameras):
+        raise click.UsageError(f"{len(at)} points given with --at for {len(cameras)} images")
+    xy = read_points([v for pair in at for v in pair], points, names).reshape(-1, len(cameras), 2)
+    point, view = np.nonzero(np.isfinite(xy).all(axis=2))
+    models = [camera.model for camera in cameras]
+    found = geometry.triangulate(models, view, point, xy[point, view], alt=cameras[0].altitude)
+    table, count = np.full((len(xy), 4), np.nan), len(found.points)
+    square = np.bincount(point, (found.residuals**2).sum(axis=1), minlength=count)
+    table[:count, :3] = ground_from_ecef(found.points)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        table[:count, 3] = np.sqrt(square / np.bincount(point, minlength=count))
+    _print_points(("lon", "lat", "alt", "error"), table, (10, 10, 4, 4), as_json)
+    return _tell_failures(table[:, :1], "could not be intersected")
+
+
+# --- tables of points -------------------------------------------------------------------------------------
 
 
 def read_points(
     numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None
 ) -> Array:
-    """Points from arguments, a CSV file, or standard input ("-").
+    """Points (N, columns) from arguments, a CSV file, or standard input ("-").
 
-    Parameters
-    ----------
-    numbers : sequence of float
-        Arguments, a multiple of the number of columns.
-    file : str or None
-        CSV with a header that has the columns, or without one in their order; blanks separate, too.
-    names : sequence of str
-        Columns.
-    fill : float, optional
-        Value of the last column where it is not given.
-
-    Returns
-    -------
-    points : (N, len(names))
+    A file has a header with the columns' names, or their order; blanks separate, too. `fill` is the value of the last
+    column where it is not given.
     """
     if file is not None:
         with nullcontext(sys.stdin) if file == "-" else opened_text(file, TABLE, newline="") as stream:
@@ -100,11 +167,12 @@ def _table(lines: Iterable[str], file: str, names: Sequence[str], fill: float | 
             raise InputError(f"{file}: columns {', '.join(names)} expected, found {', '.join(header)}")
     points = np.empty((len(rows), len(names)))
     for i, row in enumerate(rows):
-        for j, column in enumerate(columns):
-            missing = column < 0 or column >= len(row)
-            if missing and not (fill is not None and j == len(names) - 1):
+        texts = [row[column] if 0 <= column < len(row) else None for column in columns]
+        if fill is not None and texts[-1] is None:
+            texts[-1] = str(fill)
+        for j, text in enumerate(texts):
+            if text is None:
                 raise InputError(f"{file}: point {i + 1} has {len(row)} columns, expected {', '.join(names)}")
-            text = str(fill) if missing else row[column]
             if not _is_number(text):
                 raise InputError(f"{file}: point {i + 1}: {text!r} is no number")
             points[i, j] = float(text)
@@ -124,24 +192,19 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_json: bool) -> None:
+def _print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_json: bool) -> None:
     """A table of points as CSV with a header, or as a JSON list of objects (null for NaN)."""
     if as_json:
-        rows = [
-            {
-                name: (round(v, d) if np.isfinite(v) else None)
-                for name, v, d in zip(names, row, digits, strict=True)
-            }
-            for row in values.tolist()
-        ]
-        echo(json.dumps(rows))
+        rounded = [[round(v, d) for v, d in zip(row, digits, strict=True)] for row in values.tolist()]
+        plain = [[v if np.isfinite(v) else None for v in row] for row in rounded]
+        echo(json.dumps([dict(zip(names, row, strict=True)) for row in plain]))
         return
     echo(",".join(names))
     for row in values.tolist():
         echo(",".join(f"{v:.{d}f}" for v, d in zip(row, digits, strict=True)))
 
 
-def tell_failures(points: Array, what: str) -> int:
+def _tell_failures(points: Array, what: str) -> int:
     """The exit code of a verb on points; where some came out without a value, it is said on stderr."""
     count = int((~np.isfinite(points).all(axis=1)).sum())
     return tell_gate(f"{count} of {len(points)} points {what}", []) if count else 0

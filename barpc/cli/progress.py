@@ -8,21 +8,20 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import click
 
+from barpc.cli.terminal import THREADS
 from barpc.plain import visible
 
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
 
-Progress = Callable[[str, int, int], None]
-
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    from barpc.tie.tasks import Progress
 
 
 @contextmanager
@@ -55,14 +54,11 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 @contextmanager
 def executor_for(jobs: int | str) -> Iterator[Executor | None]:
     """The executor of a run: None works in this process."""
-    if isinstance(jobs, str):
-        with _cluster(jobs) as executor:
-            yield executor
-    elif jobs > 1:
-        with _processes(jobs) as executor:
-            yield executor
-    else:
+    if jobs == 1:
         yield None
+        return
+    with _cluster(jobs) if isinstance(jobs, str) else _processes(jobs) as executor:
+        yield executor
 
 
 @contextmanager
@@ -83,9 +79,6 @@ def _cluster(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def _processes(jobs: int) -> Iterator[Executor]:
-    """Worker processes with one BLAS thread each: the work is spread by processes, and sums keep their order."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_enter_worker)
     try:
@@ -95,18 +88,12 @@ def _processes(jobs: int) -> Iterator[Executor]:
         for process in multiprocessing.active_children():
             process.kill()
         raise
-    else:
-        pool.shutdown()
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+    pool.shutdown()
 
 
 def _enter_worker() -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone, however it went."""
+    """One BLAS thread, so that sums keep their order; Ctrl-C is the parent's, and its end the worker's."""
+    os.environ.update(dict.fromkeys(THREADS, "1"))  # before numpy is imported
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("ignore")
     threading.Thread(target=_leave_with_parent, daemon=True).start()

@@ -13,7 +13,7 @@ from barpc.cli.terminal import echo
 @click.argument("run_dir", metavar="RUN_DIR")
 @click.argument("other", required=False, metavar="[OTHER_RUN]")
 @click.option("--json", "as_json", is_flag=True, help="Print the comparison of two runs as JSON on stdout.")
-def command(run_dir: str, other: str | None, as_json: bool) -> int:
+def report(run_dir: str, other: str | None, as_json: bool) -> int:
     r"""Make report.html of a finished run again, from its summary.json and tables; or compare two runs.
 
     Two finished runs of the same images are compared on the terminal: errors, cameras, options.
@@ -31,13 +31,12 @@ def command(run_dir: str, other: str | None, as_json: bool) -> int:
 
         echo(remake_report(run_dir))
         return 0
+    from barpc.cli.tables import print_comparison
     from barpc.report.compare import compare_runs
 
     comparison = compare_runs(run_dir, other)
     if as_json:
         echo(json.dumps(comparison, indent=1))
     else:
-        from barpc.cli.tables import print_comparison
-
         print_comparison(comparison)
     return 0

@@ -42,21 +42,14 @@ def print_comparison(comparison: Mapping[str, Any]) -> None:
     """Two runs side by side, on stdout."""
     width = output_width()
     echo(f"A: {comparison['a']}\nB: {comparison['b']}\n")
-    views = [
-        [
-            "image",
-            "points A",
-            "points B",
-            "error A [px]",
-            "error B [px]",
-            "RPCs differ [px]",
-            "without shift [px]",
-        ]
-    ]
+    heads = ["image", "points A", "points B", "error A [px]", "error B [px]", "RPCs differ [px]"]
+    views = [[*heads, "without shift [px]"]]
     for view in comparison["views"]:
         differences = [view["rpc_difference_px"], view["rpc_difference_without_shift_px"]]
         counts, errors = [str(n) for n in view["num_observations"]], [_number(e) for e in view["rmse"]]
-        views.append([view["name"], *counts, *errors, *(_small(d) for d in differences)])
+        views.append(
+            [view["name"], *counts, *errors, *("-" if d is None else f"{d:.2g}" for d in differences)]
+        )
     _echo_table("Reprojection error (RMS) and RPC files", views, width)
     pairs = [["pair", "matches A", "matches B", "offset A [px]", "offset B [px]"]]
     for pair in comparison["pairs"]:
@@ -75,16 +68,7 @@ def output_width() -> int | None:
 def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
     r"""Lines of a table whose first row are the heads and whose first column is text, the others numbers.
 
-    Parameters
-    ----------
-    table : sequence of rows
-        All of one length.
-    width : int or None
-        Columns there are; None: any number.
-
-    Returns
-    -------
-    lines : list of str
+    The table has `width` columns on the terminal; None: any number.
 
     Examples
     --------
@@ -106,7 +90,8 @@ def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
     narrow = [max(map(len, [*head.split(), *column])) for head, *column in zip(*table, strict=True)]
     room = width - sum(narrow[1:]) - len(GAP) * (len(heads) - 1)
     if room < min(narrow[0], NARROWEST):
-        return [line for row in rows for line in _block(heads, row)]
+        cells = ((f"  {head}: {cell}" for head, cell in zip(heads[1:], row[1:], strict=True)) for row in rows)
+        return [line for row, block in zip(rows, cells, strict=True) for line in (row[0], *block)]
     widths = [min(narrow[0], room), *narrow[1:]]
     broken = [textwrap.wrap(head, size) for head, size in zip(heads, widths, strict=True)]
     depth = max(map(len, broken))
@@ -121,15 +106,8 @@ def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
 
 
 def _line(row: Sequence[str], widths: Sequence[int]) -> str:
-    cells = [
-        row[0].ljust(widths[0]),
-        *(cell.rjust(size) for cell, size in zip(row[1:], widths[1:], strict=True)),
-    ]
-    return GAP.join(cells).rstrip()
-
-
-def _block(heads: Sequence[str], row: Sequence[str]) -> list[str]:
-    return [row[0], *(f"  {head}: {cell}" for head, cell in zip(heads[1:], row[1:], strict=True))]
+    numbers = (cell.rjust(size) for cell, size in zip(row[1:], widths[1:], strict=True))
+    return GAP.join([row[0].ljust(widths[0]), *numbers]).rstrip()
 
 
 def _echo_table(title: str, table: Sequence[Sequence[str]], width: int | None) -> None:
@@ -144,10 +122,6 @@ def _echo_lines(lines: Sequence[str], width: int | None) -> None:
 
 def _number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _small(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2g}"
 
 
 def _views(summary: Summary) -> list[list[str]]:

@@ -9,7 +9,11 @@ import click
 
 from barpc.plain import visible
 
+EXIT_GATE = 3
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _REASONS = 5  # in the line that says why a run does not pass
+
+as_json = click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
 
 
 def echo(text: object = "", *, err: bool = False, nl: bool = True, **style: Any) -> None:
@@ -24,8 +28,6 @@ def say(message: str) -> None:
 
 def tell_gate(headline: str, reasons: list[str]) -> int:
     """Say why a command that finished does not pass; its exit code."""
-    from barpc.cli.main import EXIT_GATE
-
     more = [f"and {len(reasons) - _REASONS} more"] if len(reasons) > _REASONS else []
     say(" ".join([f"exit code {EXIT_GATE}:", headline, *reasons[:_REASONS], *more]))
     return EXIT_GATE

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from barpc.fit.options import FitOptions, Normalization
+from barpc.fit.precision import Normalization
 from barpc.fit.rpc import RpcFit, fit_rpc, fit_rpc_points
+from barpc.options import FitOptions
 
 __all__ = ["FitOptions", "Normalization", "RpcFit", "fit_rpc", "fit_rpc_points"]

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import FitError
-from barpc.fit.options import ALTITUDE_FLOOR, FitOptions, Nodes
+from barpc.fit.precision import ALTITUDE_FLOOR
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.options import FitOptions, Nodes
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprint
 

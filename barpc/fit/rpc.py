@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
-from barpc.fit.options import FitOptions
 from barpc.fit.points import check_points, control_points, extent, numbers, screened, widened
 from barpc.fit.solve import Solution, solve
 from barpc.geodesy import Array, wrap_longitude
+from barpc.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC, monomials
 

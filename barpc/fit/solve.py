@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +28,10 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dtpqrt
 
 from barpc.errors import FitError
-from barpc.fit.options import ALTITUDE_FLOOR, PRECISIONS, FitOptions, Normalization
 from barpc.fit.points import extent
+from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
 from barpc.geodesy import Array, wrap_longitude
+from barpc.options import FitOptions
 from barpc.sensor.rpc import MONOMIALS, RPC, monomials
 
 IntArray = npt.NDArray[np.int64]
@@ -47,6 +49,10 @@ _DEGREE = np.array([0, *(len(monomial) for monomial in MONOMIALS[1:])])
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
 _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
 _SIGMA_STEPS = 2
+TAU = 0.003
+"""Standard deviation that ``ridge`` expects of a denominator coefficient of degree one (no unit)."""
+WEIGHTED = 1
+"""Further passes of ``ridge`` with the residuals weighted by 1 / denominator, where that varies."""
 _EPS = float(np.finfo(np.float64).eps)
 MAX_PASSES = 20
 TOLERANCE = 1e-10
@@ -173,14 +179,14 @@ class Problem:
         return out
 
 
-def expected_size(active: IntArray, tau: float) -> Array:
+def expected_size(active: IntArray) -> Array:
     """Size (k,) expected of each unknown; infinite where nothing is expected.
 
-    Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `tau` of degree one, a tenth of it
+    Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
     of degree two, a hundredth of degree three: what vendors' RPCs show, with room.
     """
     degree = _DEGREE[active]
-    return np.concatenate([_NUMERATOR[degree], tau * _DENOMINATOR[degree[1:]]])
+    return np.concatenate([_NUMERATOR[degree], TAU * _DENOMINATOR[degree[1:]]])
 
 
 def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float]:
@@ -331,12 +337,10 @@ def tidy(values: Array) -> Array:
 def normalization(
     ground: Array, image: Array, options: FitOptions, vendor: RPC | None = None
 ) -> Normalization:
-    """Offsets and scales that take points into [-1, 1]: the options' own, or found and rounded to their precision.
+    """Offsets and scales that take points into [-1, 1], rounded to the options' precision.
 
     Those of the ground are the vendor's where one is given.
     """
-    if options.normalization is not None:
-        return options.normalization
     (low, high), (left, right) = extent(ground), extent(image)
     if vendor is not None:
         offset, scale = vendor.ground_offset, vendor.ground_scale
@@ -374,38 +378,36 @@ def solve(
             f"give {unknowns + 1} points or more"
         )
     quantize = None if options.precision is None else PRECISIONS[options.precision].coeffs
-    coeffs, solved, h, passes = METHODS[method](problem, options, quantize, vendor)
+    coeffs, solved, h, passes = METHODS[method](problem, quantize, vendor)
     rpc = RPC(coeffs, norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
     return Solution(rpc, problem, solved, h, passes, method)
 
 
-def _ridge(problem: Problem, options: FitOptions, quantize: Rounding | None, vendor: RPC | None) -> Found:
-    expected = expected_size(problem.active, options.tau)
+def _ridge(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+    expected = expected_size(problem.active)
     solved, h, passes = [], np.zeros(2), 1
     for axis in range(2):
         denominator = None
-        for done in range(1 + options.weighted):
+        for done in range(1 + WEIGHTED):
             system, sigma = noise_scaled(problem.compressed(axis, denominator), expected)
             denominator = problem.expanded(solution(system))[1]
             passes = max(passes, 1 + done)
             if np.abs(denominator[1:]).sum() < _EVEN:
                 break
         solved.append(system)
-        h[axis] = sigma / options.tau
+        h[axis] = sigma / TAU
     return _coefficients(problem, solved, quantize), solved, h, passes
 
 
-def _lcurve(problem: Problem, options: FitOptions, quantize: Rounding | None, vendor: RPC | None) -> Found:
-    results = [solve_lcurve(problem, axes) for axes in ([[0, 1]] if options.joint else [[0], [1]])]
+def _lcurve(problem: Problem, quantize: Rounding | None, vendor: RPC | None, joint: bool = False) -> Found:
+    results = [solve_lcurve(problem, axes) for axes in ([[0, 1]] if joint else [[0], [1]])]
     parts, systems, sizes, passes = zip(*results, strict=True)
     solved = [system for of_axes in systems for system in of_axes]
     coeffs = np.concatenate(parts) if quantize is None else _coefficients(problem, solved, quantize)
     return coeffs, solved, np.broadcast_to(sizes, 2).copy(), max(passes)
 
 
-def _vendor_denominators(
-    problem: Problem, options: FitOptions, quantize: Rounding | None, vendor: RPC | None
-) -> Found:
+def _vendor_denominators(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     assert vendor is not None
     parts, solved = [], []
     for axis, denominator in enumerate(vendor.coeffs[1::2]):
@@ -413,15 +415,16 @@ def _vendor_denominators(
         if quantize is not None:
             denominator = quantize(denominator)
         raw = problem.compressed(axis, denominator, free=False)
-        system, _ = noise_scaled(raw, expected_size(problem.active, options.tau)[: len(raw.matrix)])
+        system, _ = noise_scaled(raw, expected_size(problem.active)[: len(raw.matrix)])
         parts.append(problem.expanded(solution(system, quantize), denominator))
         solved.append(system)
     return np.concatenate(parts), solved, np.zeros(2), 1
 
 
-METHODS: dict[str, Callable[[Problem, FitOptions, Rounding | None, RPC | None], Found]] = {
+METHODS: dict[str, Callable[[Problem, Rounding | None, RPC | None], Found]] = {
     "ridge": _ridge,
     "lcurve": _lcurve,
+    "lcurve-joint": partial(_lcurve, joint=True),
     "vendor-denominators": _vendor_denominators,
 }
-"""Name -> solver; each takes what it needs of the problem, the options, the rounding and the vendor's RPC."""
+"""Name -> solver of a problem; ``vendor-denominators`` keeps those of the vendor's RPC."""

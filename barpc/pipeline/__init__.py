@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from barpc.pipeline.options import RunOptions
+from barpc.options import RunOptions
 from barpc.pipeline.run import AdjustResult, adjust, check
 from barpc.pipeline.views import LoadedViews, load_views
 

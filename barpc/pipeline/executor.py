@@ -1,12 +1,11 @@
 """Who works on the tasks: an executor that remembers results, and keeps only a few tasks in flight.
 
-The stages hand their tasks (per tile, per pair) to any `concurrent.futures.Executor`. `CachingExecutor` is one:
-it looks each task up among the kept results first, gives the rest to the executor behind it (or works on them
-itself, when asked for the result), and keeps what comes back as soon as it comes back. So a run that was
-interrupted goes on where it was, and a thousand pairs do not stand pickled in a queue. Quick tasks travel in
-batches: what a task costs on the way (0.2 ms to a process, 10 ms over dask) is paid once for half a second of
-work. Large arrays (the keypoints of a view go to all its pairs) are spilled once into the run folder, which all
-workers see as they see the images, and sent as paths: what dask scatters dies with the worker that holds it.
+Stages hand their tasks (per tile, per pair) to any `concurrent.futures.Executor`. `CachingExecutor` looks each up among
+the kept results, gives the rest to the executor behind it (or works on them itself, when asked for the result), and
+keeps what comes back at once: an interrupted run goes on where it was, and a thousand pairs do not stand pickled in a
+queue. Quick tasks travel in batches: what a task costs on the way (0.2 ms to a process, 10 ms over dask) is paid once
+for half a second of work. Large arrays (the keypoints of a view go to all its pairs) are spilled once into the run
+folder, which all workers see as they see the images: what dask scatters dies with the worker that holds it.
 """
 
 from __future__ import annotations
@@ -64,21 +63,19 @@ class CachingExecutor(Executor):
     fingerprints : mapping of str to str
         Path of every input file to the hash of its content: results belong to contents, not to names.
     executor : Executor, optional
-        Works on the tasks; None: they are worked on in this process, one after the other, when their result
-        is asked for.
+        Works on the tasks; None: this process does, one after the other, when their result is asked for.
     """
 
     def __init__(
         self, workspace: Workspace, fingerprints: Mapping[str, str], executor: Executor | None = None
     ) -> None:
-        self.workspace, self._fingerprints = workspace, dict(fingerprints)
-        self.executor = executor
+        self.workspace, self.executor = workspace, executor
+        self._fingerprints = dict(fingerprints)
         self._limit = _PER_WORKER * worker_count(executor)
         self._lock = threading.Lock()
         self._storing = threading.RLock()  # while results are kept: `shutdown` waits for it
         self._waiting: deque[_Task] = deque()
-        self._in_flight = 0
-        self._open = True
+        self._in_flight, self._open = 0, True
         self._seconds: dict[Function, float] = {}
         self._digests: dict[int, tuple[object, str]] = {}
         self._spilled = workspace.cache / "arrays"
@@ -174,21 +171,15 @@ class CachingExecutor(Executor):
         return batch
 
     def _next_task(self, batch: Sequence[_Task]) -> _Task | None:
+        """One more for a batch: as many as take BATCH_SECONDS, as far as the other workers get as many."""
         with self._lock:
             if not self._waiting:
                 return None
             fn = self._waiting[0].fn
-            if batch and (fn is not batch[0].fn or len(batch) >= self._batch_size(fn)):
-                return None
-            return self._waiting.popleft()
-
-    def _batch_size(self, fn: Function) -> int:
-        """As many tasks as take BATCH_SECONDS, as far as the other workers get as many; 1 until it is known."""
-        seconds = self._seconds.get(fn)
-        if seconds is None:
-            return 1
-        share = -(-len(self._waiting) // self._limit)
-        return max(1, min(int(BATCH_SECONDS / max(seconds, 1e-6)), share))
+            seconds, share = self._seconds.get(fn), -(-len(self._waiting) // self._limit)
+            most = 1 if seconds is None else max(1, min(int(BATCH_SECONDS / max(seconds, 1e-6)), share))
+            full = bool(batch) and (fn is not batch[0].fn or len(batch) >= most)
+            return None if full else self._waiting.popleft()
 
     # -- taking back -------------------------------------------------------------------------------
 
@@ -217,7 +208,7 @@ class _Task(Future[Any]):
     def __init__(self, owner: CachingExecutor, fn: Function, args: tuple[Any, ...]) -> None:
         super().__init__()
         self._owner, self.fn, self.args = owner, fn, args
-        self._key = ""
+        self._key, self._stage = "", fn.__name__.strip("_")
 
     def begin(self) -> bool:
         """Whether there is work to do: it was not cancelled, and no result is kept."""
@@ -251,17 +242,11 @@ class _Task(Future[Any]):
             self.finish(self.fn(*self.args), None)
         return super().result(timeout)
 
-    @property
-    def _stage(self) -> str:
-        return self.fn.__name__.strip("_")
-
     def _look_up(self) -> tuple[bool, Any]:
         self._key = self._owner.key(self.fn, self.args)
         record = self._owner.workspace.load(self._stage, self._key)
-        if record is None:
-            return False, None
         try:
-            return True, from_record(record)
+            return record is not None, None if record is None else from_record(record)
         except ValueError as error:
             logger.warning("a kept result is made again: %s", error)
             return False, None
@@ -269,15 +254,7 @@ class _Task(Future[Any]):
 
 @dataclass(frozen=True)
 class Spilled:
-    """The arguments of a task whose large arrays lie in files.
-
-    Parameters
-    ----------
-    small : dict of str to ndarray
-        What `to_record` made of them, without the large arrays.
-    large : mapping of str to str
-        Name of each large array -> its file.
-    """
+    """The arguments of a task whose large arrays lie in files: what `to_record` made of them, name -> file."""
 
     small: Record
     large: Mapping[str, str]
@@ -314,8 +291,7 @@ def run_batch(fn: Function, tasks: Sequence[tuple[Any, ...] | Spilled]) -> list[
 
 def _explained(error: BaseException) -> BaseException:
     """A worker that is lost, in words; any other error as it is."""
-    lost = isinstance(error, (BrokenExecutor, CancelledError)) or type(error).__name__ in _LOST
-    if not lost:
+    if not isinstance(error, (BrokenExecutor, CancelledError)) and type(error).__name__ not in _LOST:
         return error
     died = AdjustError(
         "a worker process died (out of memory?): what was finished is kept, so run the same command again, "

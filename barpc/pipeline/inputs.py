@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from barpc.ba import BlockPrior
 from barpc.dem import Dem
 from barpc.errors import InputError
-from barpc.pipeline.options import RunOptions
+from barpc.options import RunOptions, declared
 from barpc.pointio.gcp import read_gcps
 from barpc.pointio.names import ViewNames
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
@@ -23,48 +23,30 @@ PRIOR = "block.npz"
 """The file in a run folder that a later run starts from."""
 
 
-def load_gcps(paths: Sequence[str], names: Sequence[str]) -> GroundPoints | None:
+def load_gcps(paths: Sequence[str], views: Sequence[str]) -> GroundPoints | None:
     """Control points of several files, one after the other; None without files."""
-    parts = [read_gcps(path, names) for path in paths]
+    parts = [read_gcps(path, views) for path in paths]
     if not parts:
         return None
     starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
-    return GroundPoints(
-        names=tuple(name for part in parts for name in part.names),
-        lonlatalt=np.concatenate([part.lonlatalt for part in parts]),
-        sigma=np.concatenate([part.sigma for part in parts]),
-        point=np.concatenate([part.point + start for part, start in zip(parts, starts, strict=True)]),
-        view=np.concatenate([part.view for part in parts]),
-        xy=np.concatenate([part.xy for part in parts]),
-        xy_sigma=np.concatenate([part.xy_sigma for part in parts]),
-        strangers=tuple(dict.fromkeys(name for part in parts for name in part.strangers)),
-    )
+    point = np.concatenate([part.point + start for part, start in zip(parts, starts, strict=True)])
+    columns = ("lonlatalt", "sigma", "view", "xy", "xy_sigma")
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
+    strangers = tuple(dict.fromkeys(name for part in parts for name in part.strangers))
+    names = tuple(name for part in parts for name in part.names)
+    return GroundPoints(names, point=point, **joined, strangers=strangers)
 
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """Side inputs, read before any work starts.
-
-    Parameters
-    ----------
-    dem : Dem or None
-        The terrain, with its geoid.
-    prior : BlockPrior or None
-        What an earlier run knows about its views.
-    """
+    """Side inputs, read before any work starts: the terrain, and what an earlier run knows about its views."""
 
     dem: Dem | None
     prior: BlockPrior | None
 
     @classmethod
     def read(cls, options: RunOptions, views: Sequence[View]) -> Given:
-        """Read them all; a file that cannot be used stops the run here, and not after an hour.
-
-        Raises
-        ------
-        InputError
-            A file is missing or does not parse, or a DEM holds no height under any of the views.
-        """
+        """Read them all; a file that cannot be used stops the run here (InputError), and not after an hour."""
         names = [view.name for view in views]
         load_gcps(options.gcp, names)
         load_gcps(options.check_points, names)
@@ -87,10 +69,12 @@ def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
 
 def input_files(options: RunOptions) -> list[Path]:
     """Every file that the options name; none of them is ever written."""
-    ties = (options.matches, options.overlap_list, options.aoi)
-    named = [*options.gcp, *options.check_points, options.dem, options.geoid, *ties]
-    prior = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
-    return [*(Path(path) for path in named if path is not None), *prior]
+    found = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
+    for name, one in declared(RunOptions).items():
+        value = getattr(options, name)
+        if one.rule.unit == "file" and value is not None:
+            found += [Path(path) for path in (value if isinstance(value, tuple) else (value,))]
+    return found
 
 
 def read_pairs(
@@ -103,14 +87,9 @@ def read_pairs(
     path : path
         The list. Relative paths in it start from where it lies, or from the current folder.
     views : sequence of View
-        The images.
+        The images, whose indices are returned.
     left_out : sequence of path
         Images that a run was given but does not use: their pairs are passed over.
-
-    Returns
-    -------
-    pairs : list of (int, int)
-        Indices of the views.
 
     Raises
     ------
@@ -118,7 +97,7 @@ def read_pairs(
         The file cannot be read, a line is not two images of the run, or none is left; the message names it.
     """
     lines = read_names(path, "a list of pairs")
-    find = _ViewFinder(Path(path).parent, views, left_out)
+    find = _finder(Path(path).parent, views, left_out)
     pairs = []
     for number, line in enumerate(lines, start=1):
         try:
@@ -137,39 +116,33 @@ def read_pairs(
     return pairs
 
 
-class _ViewFinder:
-    """Views by what a list calls them: a path, from the list's folder or the current one, or a name."""
+def _finder(
+    folder: Path, views: Sequence[View], left_out: Sequence[str | Path]
+) -> Callable[[str], int | None]:
+    """Index of the view that a list in a folder calls by its path, from there or from here, or by its name.
 
-    def __init__(self, folder: Path, views: Sequence[View], left_out: Sequence[str | Path]) -> None:
-        self._starts = (folder, Path())
-        self._views = ViewNames([view.name for view in views], "the list of pairs")
-        self._left_out = ViewNames([Path(path).name for path in left_out], "")
-        self._places: dict[Path, int | None] = {Path(path).resolve(): None for path in left_out}
-        self._places.update({Path(view.path).resolve(): index for index, view in enumerate(views)})
+    None for an image that was left out; a stranger is an InputError.
+    """
+    names = ViewNames([view.name for view in views], "the list of pairs")
+    without = ViewNames([Path(path).name for path in left_out], "")
+    places: dict[Path, int | None] = {Path(path).resolve(): None for path in left_out}
+    places |= {Path(view.path).resolve(): index for index, view in enumerate(views)}
 
-    def __call__(self, word: str) -> int | None:
-        """Index of a view; None for an image that was left out; InputError for a stranger."""
-        for start in self._starts:
-            place = (start / word).resolve()
-            if place in self._places:
-                return self._places[place]
-        if self._views.find(word) is None and self._left_out.find(word) is not None:
-            return None
-        return self._views.index(word)
+    def find(word: str) -> int | None:
+        for place in ((start / word).resolve() for start in (folder, Path())):
+            if place in places:
+                return places[place]
+        unused = names.find(word) is None and without.find(word) is not None
+        return None if unused else names.index(word)
+
+    return find
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
-    """Tracks that tell something an earlier block did not know.
+    """Tracks that tell something an earlier block, of the views `old` (N,), did not know.
 
     Tracks without a new view are left out. Of those seen in several old views one old observation is kept: how
     these views lie to each other is in the earlier block's normal matrix already.
-
-    Parameters
-    ----------
-    tracks : Tracks
-        Tie points of old and new views.
-    old : (N,)
-        Views of the earlier block.
     """
     is_old = old[tracks.view]
     has_new = np.bincount(tracks.point, ~is_old, minlength=tracks.num_points) > 0

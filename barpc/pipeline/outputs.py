@@ -12,9 +12,9 @@ import numpy as np
 from barpc.errors import OutputError
 from barpc.fit import RpcFit
 from barpc.handoff import verify
+from barpc.options import RunOptions
 from barpc.owned import own_files
 from barpc.pipeline.inputs import PRIOR
-from barpc.pipeline.options import RunOptions
 from barpc.report import Run
 from barpc.report.page import can_render, report_html
 from barpc.report.tables import TABLES
@@ -34,25 +34,10 @@ def write_view(
 ) -> dict[str, dict[str, float | str]]:
     """Write one view's corrected RPC, and open every file again as its consumers do.
 
-    Parameters
-    ----------
-    run : Workspace
-        Where to.
-    view : View
-        The image.
-    fit : RpcFit
-        Its refitted RPC.
-    model : SensorModel
-        P_BA, which the files must reproduce.
-    images : {"vrt", "copy", "none"}
-        What carries the RPC.
-    formats : sequence of str
-        RPC files to write, keys of `barpc.rpcio.WRITABLE`.
-
     Returns
     -------
     written : dict of str to dict
-        File name, and for each consumer that was tried the largest difference to P_BA [px], or why it does
+        File name, and for each consumer that was tried the largest difference to P_BA, `model` [px], or why it does
         not read the file.
 
     Raises
@@ -116,17 +101,7 @@ def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
 
 
 def write_tables(workspace: Workspace, run: Run, summary: Mapping[str, Any]) -> None:
-    """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete.
-
-    Parameters
-    ----------
-    workspace : Workspace
-        Where to.
-    run : Run
-        What was found.
-    summary : mapping
-        Its summary.
-    """
+    """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete."""
     for name, content in TABLES.items():
         with workspace.output(name) as partial:
             partial.write_bytes(content(run, summary))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,30 +15,29 @@ from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.handoff import refuse_hiding, unverified
+from barpc.options import RunOptions
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
-from barpc.pipeline.options import RunOptions
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
-from barpc.pipeline.views import Image, LoadedViews, image_path, load_views
+from barpc.pipeline.views import Image, image_path, load_views
 from barpc.plain import plain_path
 from barpc.pointio.matches import asp_text, read_matches, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.report import Run, summarize
 from barpc.report.measures import pair_ties
 from barpc.report.page import remake_report
-from barpc.rpcio import WRITABLE, plain_source
+from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.tie import find_tracks, read_area
+from barpc.tie.tasks import Progress
 from barpc.workspace import Workspace, fingerprint
 
 logger = logging.getLogger(__name__)
 
-Progress = Callable[[str, int, int], None]
 
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class AdjustResult:
     """What a run ends with.
 
@@ -57,6 +56,12 @@ class AdjustResult:
     views: tuple[View, ...]
     run: Run
     summary: dict[str, Any]
+
+    def __repr__(self) -> str:
+        tracks, place = self.run.tracks, self.run.out_dir
+        counts = f"{len(self.views)} views, {tracks.num_points} tie points, {len(tracks)} observations"
+        written = f", in {place if len(place) <= 50 else '...' + place[-47:]}" if place else ""
+        return f"AdjustResult({self.run.kind}: {counts}, {self.summary['status']}{written})"
 
     @property
     def passed(self) -> bool:
@@ -77,10 +82,7 @@ class AdjustResult:
     def report(self) -> Path:
         """Make report.html of this run again (extra `report`), from the files in its folder; its path.
 
-        Raises
-        ------
-        InputError
-            The run wrote no files (a check), or jinja2 is not installed.
+        A run that wrote no files (a check), or jinja2 that is not installed, is an InputError.
         """
         if not self.run.out_dir:
             raise InputError("a check writes no files, so there is nothing to make a report of")
@@ -112,38 +114,20 @@ def adjust(
     progress : callable, optional
         `progress(stage, done, total)`.
 
-    Returns
-    -------
-    AdjustResult
-
     Raises
     ------
     BarpcError
         See `barpc.errors`; nothing is written then.
     """
-    options = options or RunOptions()
-    unknown = [name for name in options.rpc_formats if name not in WRITABLE]
-    if unknown:
-        raise InputError(f"rpc_formats {unknown[0]!r} is not one of {', '.join(WRITABLE)}")
-    plain_path(Path(out_dir).absolute())
-    loaded = _load(images, options)
-    if options.stop_after == "matching":
-        require_pair_names([view.name for view in loaded.views])
-    if options.images == "vrt":
-        for view in loaded.views:
-            plain_source(view.path)  # refuses what no VRT can point at, before any work
-    keep = {
-        Path(path)
-        for view, source in zip(loaded.views, loaded.sources, strict=True)
-        for path in (view.path, source.path)
-    }
-    keep |= set(input_files(options))
-    names = output_names(loaded.views, options, Path(out_dir))
-    refuse_hiding(Path(out_dir), names, keep)
-    refuse_shadows(Path(out_dir), names)
+    options, folder = options or RunOptions(), Path(out_dir)
+    plain_path(folder.absolute())
+    run = _loaded("adjust", images, options)
+    names, keep = _files(run, options, folder)
     with Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names) as workspace:
-        with _caching(loaded, workspace, executor) as caching:
-            run = _solve(loaded, options, workspace, caching, progress)
+        with workspace.stage("fingerprints"):
+            fingerprints = {view.path: fingerprint(view.path) for view in run.views}
+        with CachingExecutor(workspace, fingerprints, executor) as caching:
+            run = _solve(run, options, workspace, caching, progress)
         if run.adjustment is not None and options.stop_after == "all":
             with workspace.stage("fit and write"):
                 run = _fit_and_write(run, options, workspace, progress)
@@ -155,9 +139,8 @@ def adjust(
         summary = summarize(run)
         write_tables(workspace, run, summary)
         workspace.remove_stale()
-    views = (
-        replace(view, sensor=sensor) for view, sensor in zip(run.views, run.after or run.before, strict=True)
-    )
+    sensors = run.after or run.before
+    views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
     return AdjustResult(_as_given(views, images), run, summary)
 
 
@@ -170,9 +153,7 @@ def check(
 ) -> AdjustResult:
     """Measure how well the cameras of overlapping images agree; nothing is adjusted or written."""
     options = options or RunOptions()
-    loaded = _load(images, options)
-    run = _empty_run("check", loaded, options)
-    run = _with_ties(run, options, executor, progress, None)
+    run = _with_ties(_loaded("check", images, options), options, executor, progress)
     return AdjustResult(_as_given(run.views, images), run, summarize(run))
 
 
@@ -181,99 +162,92 @@ def _as_given(views: Iterable[View], images: Sequence[Image]) -> tuple[View, ...
     return tuple(sorted(views, key=lambda view: place[view.path]))
 
 
-def _load(images: Sequence[Image], options: RunOptions) -> LoadedViews:
+def _loaded(kind: str, images: Sequence[Image], options: RunOptions) -> Run:
+    """The run before anything is found."""
     for path in input_files(options):
         plain_path(path)
     least = 1 if options.gcp else 2  # one image and control points are enough
-    return load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
-
-
-def _caching(loaded: LoadedViews, workspace: Workspace, executor: Executor | None) -> CachingExecutor:
-    with workspace.stage("fingerprints"):
-        fingerprints = {view.path: fingerprint(view.path) for view in loaded.views}
-    return CachingExecutor(workspace, fingerprints, executor)
-
-
-def _empty_run(kind: str, loaded: LoadedViews, options: RunOptions) -> Run:
+    loaded = load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
     none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
     return Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options)
 
 
+def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
+    """The files that a run writes and those that it must keep; what stands in the way is refused before any work."""
+    views = run.views
+    if options.stop_after == "matching":
+        require_pair_names([view.name for view in views])
+    if options.images == "vrt":
+        for view in views:
+            plain_source(view.path)
+    keep = {Path(view.path) for view in views} | {Path(source.path) for source in run.sources}
+    keep |= set(input_files(options))
+    names = output_names(views, options, folder)
+    refuse_hiding(folder, names, keep)
+    refuse_shadows(folder, names)
+    return names, keep
+
+
 def _solve(
-    loaded: LoadedViews,
-    options: RunOptions,
-    workspace: Workspace,
-    executor: Executor,
-    progress: Progress | None,
+    run: Run, options: RunOptions, workspace: Workspace, executor: Executor, progress: Progress | None
 ) -> Run:
     """Tie points and the adjustment, as often as there are passes."""
-    run = _empty_run("adjust", loaded, options)
     given = Given.read(options, run.views)
-    adjustment: Adjustment | None = None
-    passes = 1 if options.matches is not None else options.num_passes
-    for number in range(passes):
+    for number in range(1 if options.matches is not None else options.num_passes):
         again = f" (pass {number + 1})" if number else ""
         with workspace.stage("tie points" + again):
-            run = _with_ties(run, options, executor, progress, adjustment)
+            run = _with_ties(run, options, executor, progress)
         if options.stop_after == "matching":
             _write_matches(run, workspace)
             return replace(run, kind="match")
         with workspace.stage("adjustment" + again):
-            run, adjustment = _adjusted(run, options, given)
-    assert adjustment is not None
-    return replace(run, adjustment=adjustment)
+            run = _adjusted(run, options, given)
+    return run
 
 
-def _adjusted(run: Run, options: RunOptions, given: Given) -> tuple[Run, Adjustment]:
-    """One adjustment, and the run with what went into it."""
+def _adjusted(run: Run, options: RunOptions, given: Given) -> Run:
+    """The run with an adjustment and what went into it."""
     names = [view.name for view in run.views]
     if given.prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, given.prior.names)))
     gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
-    centers = tuple(_center(view, options) for view in run.views)
-    ecef = np.array([center.ecef for center in centers])
-    adjusting = replace(options.adjust, keep_largest=options.keep_going or options.adjust.keep_largest)
+    centers = tuple(_center(view) for view in run.views)
     adjustment = adjust_tracks(
         run.views,
         run.tracks,
-        adjusting,
+        options.adjust,
         gcps,
         given.dem,
-        centers=ecef,
+        centers=np.array([center.ecef for center in centers]),
         prior=given.prior,
+        keep_largest=options.keep_going,
     )
-    return replace(run, centers=centers, gcps=gcps, check_points=checks), adjustment
+    return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment)
 
 
-def _with_ties(
-    run: Run,
-    options: RunOptions,
-    executor: Executor | None,
-    progress: Progress | None,
-    adjustment: Adjustment | None,
-) -> Run:
+def _with_ties(run: Run, options: RunOptions, executor: Executor | None, progress: Progress | None) -> Run:
     """The run with tie points: from a file, or matched, with the corrected cameras in a later pass."""
-    if options.matches is not None:
-        return replace(run, tracks=read_matches(options.matches, [view.name for view in run.views]))
-    if len(run.views) < 2:
-        return run
     views = run.views
-    if adjustment is not None:
-        corrected = zip(views, adjustment.sensors, strict=True)
+    if options.matches is not None:
+        return replace(run, tracks=read_matches(options.matches, [view.name for view in views]))
+    if len(views) < 2:
+        return run
+    if run.adjustment is not None:
+        corrected = zip(views, run.adjustment.sensors, strict=True)
         views = tuple(replace(view, sensor=sensor) for view, sensor in corrected)
     given: dict[str, Any] = {"executor": executor, "progress": progress}
     if options.overlap_list is not None:
-        given["only"] = read_pairs(options.overlap_list, run.views, [path for path, _ in run.left_out])
+        given["only"] = read_pairs(options.overlap_list, views, [path for path, _ in run.left_out])
     if options.aoi is not None:
         given["area"] = read_area(options.aoi)
     try:
         ties = find_tracks(views, options.tie, **given)
     except DisconnectedError as error:
-        if not (options.keep_going or options.adjust.keep_largest) or len(error.groups[0]) < 2:
+        if not options.keep_going or len(error.groups[0]) < 2:
             raise
         kept = _only(run, frozenset(error.groups[0]))
-        logger.warning("%d of %d images are tied together and kept", len(kept.views), len(run.views))
-        return _with_ties(kept, options, executor, progress, None)
+        logger.warning("%d of %d images are tied together and kept", len(kept.views), len(views))
+        return _with_ties(kept, options, executor, progress)
     return replace(run, tracks=ties.tracks, matched=ties.pairs)
 
 
@@ -289,35 +263,36 @@ def _write_matches(run: Run, workspace: Workspace) -> None:
 
 
 def _only(run: Run, names: frozenset[str]) -> Run:
-    """The run without the views that the others are not tied to."""
-    kept = [i for i, view in enumerate(run.views) if view.name in names]
+    """The run as it was loaded, without the views that the others are not tied to."""
     why = "it shares no tie points with the largest group of images"
     dropped = tuple((view.path, why) for view in run.views if view.name not in names)
+    kept = [i for i, view in enumerate(run.views) if view.name in names]
     return replace(
         run,
         views=tuple(run.views[i] for i in kept),
         sources=tuple(run.sources[i] for i in kept),
         left_out=(*run.left_out, *dropped),
+        adjustment=None,
     )
 
 
-def _center(view: View, options: RunOptions) -> CameraCenter:
-    method: Any = options.adjust.center_method
-    center = camera_center(view.sensor, view.size, view.alt_range, method)
-    if center.method != method:
-        logger.warning(
-            "%s: the camera centre is not to be had from its RPC; a nominal one is used", view.name
-        )
+def _center(view: View) -> CameraCenter:
+    center = camera_center(view.sensor, view.size, view.alt_range)
+    if center.method == "nominal":
+        logger.warning("%s: its RPC does not tell the camera centre; a nominal one is used", view.name)
     return center
 
 
 def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress: Progress | None) -> Run:
     """Refit every P_BA first, and write only when all can be written."""
     assert run.adjustment is not None
-    fits: list[RpcFit] = []
+    pairs = list(zip(run.views, run.adjustment.sensors, strict=True))
+    told = progress or (lambda _stage, _done, _total: None)
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
-    for i, (view, model) in enumerate(zip(run.views, run.adjustment.sensors, strict=True)):
+    known = bias if np.isfinite(bias) and bias > 0 else None
+    fits: list[RpcFit] = []
+    for view, model in pairs:
         try:
             fit = fit_rpc(
                 model, view.size, view.alt_range, options=options.fit, strict=not options.keep_going
@@ -325,15 +300,12 @@ def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress
         except FitError as error:
             raise FitError(f"{view.name}: {error}") from error
         rand = view.sensor.err_rand if isinstance(view.sensor, RPC) else None
-        known = bias if np.isfinite(bias) and bias > 0 else None
         fits.append(replace(fit, rpc=replace(fit.rpc, err_bias=known, err_rand=rand)))
-        if progress is not None:
-            progress("fit", i + 1, len(run.views))
-    written = []
-    for i, (view, fit, model) in enumerate(zip(run.views, fits, run.adjustment.sensors, strict=True)):
+        told("fit", len(fits), len(pairs))
+    written: list[Any] = []
+    for (view, model), fit in zip(pairs, fits, strict=True):
         written.append(write_view(workspace, view, fit, model, options.images, options.rpc_formats))
-        if progress is not None:
-            progress("write", i + 1, len(run.views))
+        told("write", len(written), len(pairs))
     for sentence in unverified([workspace.folder / name for name in written[0]]):
         logger.warning(sentence)
     return replace(run, fits=tuple(fits), written=tuple(written))

@@ -6,18 +6,23 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from barpc.geodesy import Array
+from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
-from barpc.tie.options import Progress, TieOptions, ordered
 from barpc.tie.pairs import Area, Pair, shared_tiles
-from barpc.tie.raster import Box, ByteImage, Stretch, grow, read_pixels, sample_stretch, tiles
+from barpc.tie.raster import CELL, Box, ByteImage, Stretch, grow, read_pixels, sample_stretch, tiles
+from barpc.tie.tasks import Progress, ordered
 
+PER_CELL = 40
+"""Strongest keypoints kept in a cell."""
+CONTRAST = 0.01
+"""SIFT's contrast threshold."""
 _DEFAULTS = TieOptions()
 _MARGIN = 48  # px read around a tile, so that keypoints at its border are those of the whole image
 
@@ -49,19 +54,11 @@ def join(parts: Sequence[Keypoints]) -> Keypoints:
     return Keypoints(*columns)
 
 
-class Detector(Protocol):
-    """Finds and describes the keypoints of an 8-bit picture."""
-
-    def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
-        """Keypoints for which `keep(xy, scale, response)` is true."""
-        ...
-
-
 class Sift:
     """SIFT (Lowe 2004) with RootSIFT descriptors (Arandjelovic and Zisserman 2012)."""
 
-    def __init__(self, options: TieOptions) -> None:
-        self._sift: Any = cv2.SIFT.create(contrastThreshold=options.contrast)
+    def __init__(self) -> None:
+        self._sift: Any = cv2.SIFT.create(contrastThreshold=CONTRAST)
 
     def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
         """Keypoints for which `keep(xy, scale, response)` is true; only those are described."""
@@ -74,10 +71,6 @@ class Sift:
         root = np.sqrt(raw / np.maximum(np.abs(raw).sum(axis=1, keepdims=True), 1e-9))
         angle = np.radians([k.angle for k in described])
         return Keypoints(xy, scale, angle, response, np.rint(255 * root).astype(np.uint8))
-
-
-DETECTORS: dict[str, Callable[[TieOptions], Detector]] = {"sift": Sift}
-"""Name -> detector."""
 
 
 def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
@@ -106,10 +99,10 @@ def detect_tile(
         inside = ((place >= np.array(box[:2]) - 0.5) & (place < np.add(box[:2], box[2:]) - 0.5)).all(axis=1)
         inside &= distance[row.clip(0, window[3] - 1), col.clip(0, window[2] - 1)] > np.maximum(3.0, scale)
         index = np.flatnonzero(inside)
-        strongest = quota(place[index], response[index], options.cell, options.keypoints_per_cell)
+        strongest = quota(place[index], response[index], CELL, PER_CELL)
         return np.isin(np.arange(len(xy)), index[strongest])
 
-    found = DETECTORS[options.detector](options).detect(stretch.apply(pixels, valid), keep)
+    found = Sift().detect(stretch.apply(pixels, valid), keep)
     found = found.select(np.lexsort((found.angle, found.xy[:, 0], found.xy[:, 1])))
     return replace(found, xy=found.xy + origin)
 
@@ -130,10 +123,10 @@ def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
 
 def bounded(keypoints: Keypoints, options: TieOptions) -> Keypoints:
     """At most `keypoints_per_image` keypoints, the strongest of every cell, evenly."""
-    most = options.keypoints_per_cell
+    most = PER_CELL
     while len(keypoints) > options.keypoints_per_image and most > 1:
         most = max(1, int(most * options.keypoints_per_image / len(keypoints)))
-        keypoints = keypoints.select(quota(keypoints.xy, keypoints.response, options.cell, most))
+        keypoints = keypoints.select(quota(keypoints.xy, keypoints.response, CELL, most))
     if len(keypoints) > options.keypoints_per_image:
         strongest = np.argsort(-keypoints.response, kind="stable")[: options.keypoints_per_image]
         keypoints = keypoints.select(np.sort(strongest))

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.geodesy import Array
+from barpc.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.epipolar import Frame, grouped
 from barpc.tie.features import Keypoints
 from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.options import TieOptions
 
 FloatArray = npt.NDArray[np.float32]
 

@@ -16,10 +16,10 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from barpc.geodesy import Array
+from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.epipolar import Frame
 from barpc.tie.features import Keypoints
-from barpc.tie.options import TieOptions
 from barpc.tie.raster import Box
 
 

@@ -18,17 +18,20 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from barpc.geodesy import Array
+from barpc.options import TieOptions
 from barpc.scene import View
 from barpc.tie.epipolar import Frame, agreeing, frame, mad, robust_affine
 from barpc.tie.features import Keypoints
 from barpc.tie.guided import Guided
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
-from barpc.tie.options import Progress, TieOptions, ordered
 from barpc.tie.pairs import Pair, shared_tiles
+from barpc.tie.tasks import Progress, ordered
 
 MATCHERS: dict[str, type[Matcher]] = {"guided": Guided}
 """Name -> matcher."""
 
+TOLERANCE = 3.0
+"""Half the width of the band about the corrected epipolar line, at most [px]."""
 _DEFAULTS = TieOptions()
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
@@ -211,9 +214,7 @@ class _Search:
             where, same = self._frame(xy).moved(across(xy)), np.ones(len(xy))
             return replace(where, before=first * same, after=last * same)
 
-        return _Peak(
-            self._predicted(corrected, self._options.tolerance), most / len(values), float(significance)
-        )
+        return _Peak(self._predicted(corrected, TOLERANCE), most / len(values), float(significance))
 
     def local(self, tight: Matches) -> Prediction:
         """Prediction corrected by the matches so far, for each point in a band about its neighbours' places."""
@@ -226,4 +227,4 @@ class _Search:
             half = 4.0 + 3.0 * 1.4826 * np.median(np.abs(along - middle[:, None]), axis=1)
             return replace(self._frame(xy).moved(across(xy)), before=middle - half, after=middle + half)
 
-        return self._predicted(nearby, float(np.clip(4.0 * across.spread, 0.6, self._options.tolerance)))
+        return self._predicted(nearby, float(np.clip(4.0 * across.spread, 0.6, TOLERANCE)))

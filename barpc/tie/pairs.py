@@ -18,11 +18,11 @@ from shapely import affinity
 
 from barpc.errors import DisconnectedError, InputError, TiePointError
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.options import TieOptions
 from barpc.scene import BoolArray, View, connected_groups
 from barpc.sensor.geometry import convergence_angle, footprint
 from barpc.sidefile import GEOJSON, read_json
 from barpc.tie.epipolar import common_range
-from barpc.tie.options import TieOptions
 from barpc.tie.raster import Box, tiles
 
 logger = logging.getLogger(__name__)
@@ -193,7 +193,7 @@ def _overlapping_at(prints: Footprints, views: Sequence[View], options: TieOptio
             continue
         ground = prints.ground(common.point_on_surface())
         angle = float(convergence_angle(views[i].sensor, views[j].sensor, ground))
-        if options.min_angle <= angle <= options.max_angle:
+        if options.angles[0] <= angle <= options.angles[1]:
             pairs.append(Pair((i, j), float(overlap), angle))
     return pairs
 
@@ -212,7 +212,7 @@ def select_pairs(
     views : sequence of View
         At least two.
     options : TieOptions
-        `min_overlap`, `min_angle`, `max_angle`, `neighbours`.
+        `min_overlap`, `angles`, `neighbours`.
     only : sequence of (int, int)
         These pairs, all that overlap, and no others.
     area : Area, optional
@@ -234,8 +234,8 @@ def select_pairs(
     require_connected(
         views,
         [pair.views for pair in pairs],
-        f"no overlap of at least {options.min_overlap:.0%} under {options.min_angle:g} to "
-        f"{options.max_angle:g} deg {where}; remove the stray images or lower the minimum overlap",
+        f"no overlap of at least {options.min_overlap:.0%} under {options.angles[0]:g} to "
+        f"{options.angles[1]:g} deg {where}; remove the stray images or lower the minimum overlap",
     )
     for i, j in sorted(wanted - {pair.views for pair in pairs}):
         logger.warning("%s - %s: listed, but they do not overlap as asked", views[i].name, views[j].name)

@@ -13,9 +13,9 @@ from rasterio.windows import Window
 
 from barpc.errors import ImageError
 from barpc.geodesy import Array
+from barpc.options import TieOptions
 from barpc.raster import open_raster
 from barpc.scene import BoolArray
-from barpc.tie.options import TieOptions
 
 FloatImage = npt.NDArray[np.float32]
 Pixels = npt.NDArray[np.float32] | npt.NDArray[np.float64]
@@ -24,6 +24,8 @@ ByteImage = npt.NDArray[np.uint8]
 Box = tuple[int, int, int, int]
 """col, row of the first pixel, width, height [px]."""
 
+CELL = 64
+"""Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
 _SAMPLE_SIDE = 128  # px
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
@@ -139,6 +141,6 @@ def tiles(size: tuple[int, int], options: TieOptions) -> list[Box]:
     edges = []
     for length in size:
         step = -(-length // -(-length // options.tile))  # equal tiles, none larger than asked
-        step = -(-step // options.cell) * options.cell
+        step = -(-step // CELL) * CELL
         edges.append([(start, min(step, length - start)) for start in range(0, length, step)])
     return [(col, row, width, height) for row, height in edges[1] for col, width in edges[0]]

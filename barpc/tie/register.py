@@ -17,11 +17,14 @@ import cv2
 import numpy as np
 
 from barpc.geodesy import Array
+from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
 from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, mad
-from barpc.tie.options import Progress, TieOptions, ordered
 from barpc.tie.raster import FloatImage, grow, levelled, read_pixels
+from barpc.tie.tasks import Progress, ordered
 
+PATCH = 21
+"""Side of the patches that are registered [px], odd."""
 _CHUNK = 256  # patches worked on at a time: they stay in cache
 _STEPS = 12
 _SETTLED = 0.003  # px; a step below it is the last
@@ -308,7 +311,7 @@ class _Links:
         for part in parts:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
-            tasks.append((images, options.band, origin[part], start[part], linear[part], options.patch))
+            tasks.append((images, options.band, origin[part], start[part], linear[part], PATCH))
         done: list[Registration] = ordered(executor, register_places, tasks, "refine", progress)
         found = Registration.none(start)
         for part, one in zip(parts, done, strict=True):

@@ -10,16 +10,17 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from barpc.errors import InputError, TiePointError
+from barpc.errors import TiePointError
 from barpc.geodesy import Array, ground_from_ecef
+from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
 from barpc.sensor.geometry import triangulate
-from barpc.tie.features import DETECTORS, detect, join
+from barpc.tie.features import detect, join
 from barpc.tie.matcher import Matches
 from barpc.tie.matching import MATCHERS, PairReport, match
-from barpc.tie.options import Progress, TieOptions
 from barpc.tie.pairs import Area, Pair, require_connected, select_pairs
 from barpc.tie.register import refine
+from barpc.tie.tasks import Progress
 
 _DEFAULTS = TieOptions()
 _SPARE = 1.3  # tracks registered for each one kept
@@ -69,7 +70,6 @@ def find_tracks(
     ImageError
         An image cannot be read.
     """
-    require_known(options)
     pairs = select_pairs(views, options, only=only, area=area)
     keypoints = [join([])] * len(views)
     if MATCHERS[options.matcher].detects:
@@ -85,14 +85,6 @@ def find_tracks(
     tracks = thin(inside(views, tracks, area), sizes, most)
     require_tracks(views, tracks, pairs, reports, options)
     return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
-
-
-def require_known(options: TieOptions) -> None:
-    """Raise InputError unless the detector and the matcher have a row in their tables."""
-    asked = ("detector", options.detector, DETECTORS), ("matcher", options.matcher, MATCHERS)
-    for what, name, table in asked:
-        if name not in table:
-            raise InputError(f"{what} {name!r} is not one of {', '.join(table)}")
 
 
 def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:

@@ -9,6 +9,7 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.simulate import Block, simulate_block
+from tests.constants import chosen
 
 INDEPENDENT = {"noise_floor": 0.0, "sigma_attitude": 10.4, "sigma_position": 1.0, "min_convergence": 0.01}
 """What simulated blocks are: white noise, 15 urad at 694 km, 1 m."""
@@ -21,8 +22,8 @@ def centers_of(block: Block) -> np.ndarray:
 
 def solve(block: Block, **options: Any) -> Adjustment:
     """The block adjusted with priors that are true of it."""
-    chosen = AdjustOptions(**{**INDEPENDENT, **options})
-    return adjust_tracks(block.views, block.tracks, chosen, centers=centers_of(block))
+    with chosen(AdjustOptions, **{**INDEPENDENT, **options}) as given:
+        return adjust_tracks(block.views, block.tracks, given, centers=centers_of(block))
 
 
 @pytest.fixture(scope="session")

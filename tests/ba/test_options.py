@@ -13,12 +13,13 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.block import join
-from barpc.ba.options import prior_sigmas, stated_accuracy
+from barpc.ba.priors import prior_sigmas, stated_accuracy
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of
+from tests.constants import CONSTANTS, chosen
 
 BASE: dict[str, Any] = {"noise_floor": 0.0, "min_convergence": 0.01}
 
@@ -99,9 +100,7 @@ ROWS = [
 ]
 ELSEWHERE = {
     "min_observations": "test_a_view_needs_as_many_observations_as_asked_for",
-    "keep_largest": "test_the_largest_group_goes_on_alone_where_asked",
     "solver": "test_the_solver_that_is_asked_for_is_the_one_that_runs",
-    "center_method": "test_the_centre_is_found_by_the_method_that_is_asked_for",
 }
 
 
@@ -114,16 +113,20 @@ def dirty() -> Block:
     return replace(made, tracks=told)
 
 
-def run(block: Block, dem: float | None = None, **options: Any) -> Adjustment:
+def run(block: Block, dem: float | None = None, keep_largest: bool = False, **options: Any) -> Adjustment:
     terrain = None if dem is None else lambda lon, lat: np.full(len(lon), dem)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), chosen(AdjustOptions, **{**BASE, **options}) as given:
         warnings.simplefilter("ignore", BarpcWarning)
-        chosen = AdjustOptions(**{**BASE, **options})
-        return adjust_tracks(block.views, block.tracks, chosen, dem=terrain, centers=centers_of(block))
+        centers = centers_of(block)
+        return adjust_tracks(
+            block.views, block.tracks, given, dem=terrain, centers=centers, keep_largest=keep_largest
+        )
 
 
 def test_every_option_has_a_row():
-    assert {row.field for row in ROWS} | set(ELSEWHERE) == {field.name for field in fields(AdjustOptions)}
+    assert {row.field for row in ROWS} | set(ELSEWHERE) == {
+        field.name for field in fields(AdjustOptions)
+    } | set(CONSTANTS[AdjustOptions])
     assert set(ELSEWHERE.values()) <= set(globals())
 
 
@@ -179,17 +182,7 @@ def test_auto_leaves_scipy_where_unknowns_are_many(dirty, caplog, monkeypatch):
         assert caplog.records[-1].getMessage().split(":")[0] == runs
 
 
-def test_the_centre_is_found_by_the_method_that_is_asked_for(dirty):
-    centers = {}
-    for method in ("line", "projective"):
-        options = AdjustOptions(**BASE, center_method=method)
-        centers[method] = adjust_tracks(dirty.views, dirty.tracks, options).cameras.unknowns.center
-    assert np.linalg.norm(centers["line"] - centers["projective"], axis=1).min() > 1.0
-
-
-@pytest.mark.parametrize(
-    "name", ["sigma_attitude", "sigma_position", "sigma_drift", "sigma_shift", "dem_sigma"]
-)
+@pytest.mark.parametrize("name", ["sigma_attitude", "sigma_position", "sigma_drift", "dem_sigma"])
 def test_a_sigma_must_be_positive(name):
     AdjustOptions(**{name: 1e-9})
     for wrong in (0.0, -1.0, float("nan")):
@@ -213,7 +206,8 @@ def test_prior_sigmas_stand_at_their_unknowns(dirty):
     options = AdjustOptions(drift=2, sigma_attitude=2.0, sigma_position=3.0, sigma_drift=5.0)
     np.testing.assert_array_equal(prior_sigmas(dirty.views, options, 2), [np.repeat([2, 3, 5, 5], 3)] * 4)
     for model, size in (("shift", 2), ("shift-drift", 4), ("affine", 6)):
-        sigma = prior_sigmas(dirty.views, AdjustOptions(model=model, sigma_shift=7.0), 0)
+        with chosen(AdjustOptions, model=model, sigma_shift=7.0) as given:
+            sigma = prior_sigmas(dirty.views, given, 0)
         np.testing.assert_array_equal(sigma, np.full((4, size), 7.0))
 
 

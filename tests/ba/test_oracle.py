@@ -22,6 +22,7 @@ from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
 from tests.ba.oracle import Plain, ecef_of, enu_of, ground_of
+from tests.constants import chosen
 
 SIGMAS = {"sigma_attitude": 7.0, "sigma_position": 2.0, "sigma_drift": 3.0}
 EAST, NORTH = 0.3, -0.2  # slopes of the terrain
@@ -61,9 +62,10 @@ def make_case(drift: int = 0, fixed: tuple[str, ...] = ()) -> Case:
     made = simulate_block(4, 10, seed=7, num_gcps=2, noise=0.3)
     gcps = replace(made.gcps, sigma=np.array([[0.1, 0.5, 2.0], [3.0, 0.2, 0.7]]))
     weights = {made.views[1].name: 3.0}
-    options = AdjustOptions(drift=drift, view_weights=weights, min_observations=1, fixed=fixed, **SIGMAS)
+    options = AdjustOptions(drift=drift, view_weights=weights, fixed=fixed, **SIGMAS)
     centers, tracks = centers_of(made), made.tracks
-    block = join(made.views, tracks, gcps, options)
+    with chosen(AdjustOptions, min_observations=1):
+        block = join(made.views, tracks, gcps, options)
     problem = make_problem(block, options, centers, None)
     rng = np.random.default_rng(1)
     params = rng.normal(0, 3, (4, problem.cameras.unknowns.size))
@@ -310,8 +312,8 @@ def test_the_convergence_angle_of_two_views_is_the_angle_of_their_rays():
 def observations() -> tuple[Observations, Any]:
     """Ten tracks and two GCPs, a noise floor."""
     made = simulate_block(3, 10, seed=4, num_gcps=2, visible=0.8)
-    options = AdjustOptions(min_observations=1)
-    block = join(made.views, made.tracks, made.gcps, options)
+    with chosen(AdjustOptions, min_observations=1) as options:
+        block = join(made.views, made.tracks, made.gcps, options)
     problem = make_problem(block, options, centers_of(made), None)
     problem = problem.with_point_prior(ground_control(made.gcps, np.array([10, 11])))
     return Observations(problem, block.sigma, 0.05, block.point < 10), block, problem

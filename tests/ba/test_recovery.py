@@ -226,9 +226,9 @@ def test_groups_without_common_tie_points_are_named(block):
     with pytest.raises(DisconnectedError) as caught:
         adjust_tracks(block.views, split, centers=centers_of(block))
     assert sorted(len(group) for group in caught.value.groups) == [5, 5]
-    options = AdjustOptions(keep_largest=True, min_convergence=0.01)
+    options = AdjustOptions(min_convergence=0.01)
     with pytest.warns(BarpcWarning, match="keep their cameras"):
-        found = adjust_tracks(block.views, split, options, centers=centers_of(block))
+        found = adjust_tracks(block.views, split, options, centers=centers_of(block), keep_largest=True)
     assert len(found.left_out) == 5
     left = [found.names.index(name) for name in found.left_out]
     assert np.abs(found.params[left]).max() < 1e-9

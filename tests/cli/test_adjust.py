@@ -109,7 +109,7 @@ def test_images_can_be_copied_or_left_out_and_formats_chosen(crops, tmp_path):
     assert code == 0
     assert not list((tmp_path / "b").glob("*.vrt"))
     code, out, err = barpc("adjust", *crops, "-o", tmp_path / "c", "--rpc-format", "doc")
-    assert_refused(code, out, err, tmp_path / "c", "doc", "txt, rpb")
+    assert_refused(code, out, err, tmp_path / "c", "doc", "txt, rpb", exit_code=2)
 
 
 def test_an_existing_folder_needs_overwrite(crops, tmp_path):
@@ -227,7 +227,7 @@ def test_options_from_a_file_and_flags_that_win(crops, tmp_path):
         ("[adjust\n", ("run.toml", "TOML")),
         ("colour = 3\n", ("run.toml", "unknown option 'colour'")),
         ('[adjust]\nmodel = "magic"\n', ("run.toml", "magic", "rotation")),
-        ('[tie]\nband = "one"\n', ("run.toml", "band", "int")),
+        ('[tie]\nband = "one"\n', ("run.toml", "band", "whole number")),
         ("tie = 3\n", ("run.toml", "[tie]")),
     ],
 )

@@ -10,7 +10,7 @@ import click
 import pytest
 
 from barpc.cli.main import COMMANDS, cli
-from barpc.pipeline.options import read_options
+from barpc.options import read_options
 from tests.docs.pages import DOCS, PAGES, ROOT, blocks
 
 GENERAL = {"--help", "-h", "--version", "-q", "-v", "-vv", "--quiet", "--verbose", "--debug"}

@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 
@@ -49,14 +48,6 @@ def test_pages_of_the_site_link_to_pages_of_the_site_only():
 def test_the_page_of_options_is_what_the_code_says():
     generator = script("generate_options")
     assert (DOCS / "options.md").read_text(encoding="utf-8") == generator.page()
-
-
-def test_every_option_has_a_meaning():
-    generator = script("generate_options")
-    for record in generator.TABLES.values():
-        texts = generator.described(record)
-        missing = [f.name for f in fields(record) if f.name not in texts]
-        assert not missing, f"{record.__name__}: {missing} are not in its docstring"
 
 
 def test_every_page_of_the_navigation_exists_and_every_page_is_in_it():

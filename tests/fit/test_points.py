@@ -84,7 +84,7 @@ def test_the_papers_radar_points_are_met_as_well_as_by_its_own_code(shared_data:
     assert fit.rmse_ckp[1] <= 1.11e-4
     assert fit.rmse_ckp[0] <= 1.08e-4
     assert fit.min_denominator >= 0.5
-    paper = fit_rpc_points(*train, check=(test[0], test[1]), options=FitOptions(method="lcurve", joint=True))
+    paper = fit_rpc_points(*train, check=(test[0], test[1]), options=FitOptions(method="lcurve-joint"))
     assert paper.rmse_ckp == pytest.approx([1.073e-4, 1.102e-4], rel=2e-3)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.fit import Normalization
-from barpc.fit.options import PRECISIONS
+from barpc.fit.precision import PRECISIONS
 from barpc.fit.solve import (
     ALL,
     Compressed,
@@ -66,7 +66,7 @@ def test_the_penalised_solution_is_that_of_the_normal_equations(problem: Problem
 
 def test_the_penalty_follows_the_noise(camera: Camera, problem: Problem) -> None:
     system = problem.compressed(0, camera.rpc.coeffs[1])
-    expected = expected_size(ALL, 0.003)
+    expected = expected_size(ALL)
     assert expected[:4].tolist() == [np.inf] * 4
     added, sigma = noise_scaled(system, expected)
     assert sigma * 10100 == pytest.approx(0.3, rel=0.05)
@@ -135,7 +135,7 @@ def test_weighted_by_its_own_denominator_the_residual_is_that_of_the_image(
 
 
 def test_coefficients_rounded_in_turn_make_up_for_each_other(problem: Problem) -> None:
-    system, _ = noise_scaled(problem.compressed(0), expected_size(ALL, 0.003))
+    system, _ = noise_scaled(problem.compressed(0), expected_size(ALL))
     exact = solution(system)
     coarse = lambda x: np.round(x, 4)  # noqa: E731
     together, in_turn = coarse(exact), solution(system, coarse)

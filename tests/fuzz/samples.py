@@ -24,8 +24,8 @@ from barpc.cli.points import read_points
 from barpc.cli.tables import print_comparison
 from barpc.dem import Dem
 from barpc.errors import RpcError
+from barpc.options import read_options
 from barpc.pipeline.inputs import read_pairs
-from barpc.pipeline.options import read_options
 from barpc.pointio.gcp import read_gcps
 from barpc.pointio.matches import read_matches
 from barpc.pointio.tables import read_correspondences

@@ -103,8 +103,7 @@ def test_a_stray_image_is_named_and_left_out_when_asked(shared_data, tmp_path):
     with pytest.raises(DisconnectedError) as caught:
         adjust([*IMAGES, stray], tmp_path / "out")
     assert caught.value.groups[1] == ("img_01",)
-    options = RunOptions(matches=None)
-    options = replace(options, adjust=replace(options.adjust, keep_largest=True))
+    options = RunOptions(keep_going=True)
     result = adjust([*IMAGES, stray], tmp_path / "out", options)
     assert [view.name for view in result.views] == ["view_00", "view_01", "view_02"]
     assert not result.passed

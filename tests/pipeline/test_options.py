@@ -70,7 +70,7 @@ def rpc_formats(run: Run, out: Path, scene: Path) -> None:
     run("a", rpc_formats=("rpb", "geom"))
     assert _names(out / "a") & {".RPB", ".geom", ".TXT"} == {".RPB", ".geom"}
     with pytest.raises(InputError, match="rpc_formats 'nitf'"):
-        run("b", rpc_formats=("nitf",))
+        RunOptions(rpc_formats=("nitf",))
 
 
 def num_passes(run: Run, out: Path, scene: Path) -> None:
@@ -232,3 +232,10 @@ def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene:
 def test_options_that_contradict_each_other_are_refused(given: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         RunOptions(**given)
+
+
+def test_a_result_prints_its_counts(run: Run) -> None:
+    found = run("a" * 200, stop_after="adjustment")
+    assert len(repr(found)) < 150
+    assert repr(found).startswith(f"AdjustResult(adjust: 3 views, {found.tracks.num_points} tie points, ")
+    assert found.summary["status"] in repr(found)

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions
 from barpc.errors import DisconnectedError, InputError
 from barpc.geodesy import ground_from_ecef
 from barpc.pipeline import RunOptions, adjust
@@ -151,6 +150,6 @@ def test_an_image_that_the_list_leaves_alone_can_be_left_out(tmp_path) -> None:
     options = RunOptions(overlap_list=str(pairs), stop_after="matching")
     with pytest.raises(DisconnectedError, match=r"view_00, view_01; view_02\).*among the listed pairs"):
         adjust(IMAGES, tmp_path / "out", options)
-    kept = adjust(IMAGES, tmp_path / "out", replace(options, adjust=AdjustOptions(keep_largest=True)))
+    kept = adjust(IMAGES, tmp_path / "out", replace(options, keep_going=True))
     assert [view.name for view in kept.run.views] == ["view_00", "view_01"]
     assert kept.tracks.num_points > 500

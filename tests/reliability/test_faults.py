@@ -263,7 +263,7 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     ),
     "images from the same place, where that is refused": (
         lambda s: [
-            *given("--options", "o.toml", o__toml=b"[tie]\nmin_angle = 1.0\n")(s)[2:],
+            *given("--options", "o.toml", o__toml=b"[tie]\nangles = [1.0, 60.0]\n")(s)[2:],
             s.a,
             twin(s, lambda v: v + 1),
         ],
@@ -298,22 +298,22 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
         1,
         ("magic", "cauchy"),
     ),
-    "an unknown model": (given("--model", "magic"), 1, ("magic", "rotation")),
-    "an unknown detector": (
-        given("--options", "o.toml", o__toml=b"[tie]\ndetector = 'magic'\n"),
+    "an unknown model": (given("--model", "magic"), 2, ("magic", "rotation")),
+    "an unknown matcher": (
+        given("--options", "o.toml", o__toml=b"[tie]\nmatcher = 'magic'\n"),
         1,
-        ("magic", "sift"),
+        ("magic", "guided"),
     ),
-    "an unknown RPC format": (given("--rpc-format", "doc"), 1, ("doc", "txt")),
+    "an unknown RPC format": (given("--rpc-format", "doc"), 2, ("doc", "txt")),
     "a fixed view that is not there": (given("--fixed", "nobody"), 1, ("nobody",)),
     "all views fixed": (given("--fixed", "view_00", "--fixed", "view_01"), 3, ()),
-    "a negative sigma": (given("--sigma-attitude", "-1"), 1, ("sigma",)),
+    "a negative sigma": (given("--sigma-attitude", "-1"), 2, ("sigma",)),
     "a share above one": (
         given("--options", "o.toml", o__toml=b"[tie]\nmin_overlap = 2.0\n"),
         1,
         ("min_overlap",),
     ),
-    "a negative search": (given("--search", "-5"), 1, ("search",)),
+    "a negative search": (given("--search", "-5"), 2, ("search",)),
     "a tolerance that cannot be met": (
         given("--options", "o.toml", o__toml=b"[fit]\ntolerance = 1e-30\n"),
         1,

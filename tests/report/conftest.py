@@ -10,7 +10,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.fit import fit_rpc
-from barpc.pipeline.options import RunOptions
+from barpc.options import RunOptions
 from barpc.pipeline.outputs import write_tables
 from barpc.report import Run, summarize
 from barpc.rpcio import write_rpc

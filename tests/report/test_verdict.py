@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba import adjust_tracks
 from barpc.ba.gauge import MOTIONS, Mode
 from barpc.errors import BarpcWarning
 from barpc.fit import FitOptions
-from barpc.pipeline.options import RunOptions
+from barpc.options import RunOptions
 from barpc.report import Run, summarize
 from barpc.report.verdict import metres, mode_in_words
 
@@ -50,7 +50,7 @@ def test_a_view_without_tie_points_to_the_others_is_not_adjusted(block_run):
     run = block_run.run
     tracks = run.tracks.select(run.tracks.view != 8)
     with pytest.warns(BarpcWarning, match="keep their cameras"):
-        adjustment = adjust_tracks(run.views, tracks, AdjustOptions(keep_largest=True))
+        adjustment = adjust_tracks(run.views, tracks, keep_largest=True)
     summary = summarize(Run("adjust", run.views, (), tracks, adjustment=adjustment))
     assert summary["views"][8]["status"] == "failed"
     assert summary["headline"] == "1 image is not adjusted (of 9)."

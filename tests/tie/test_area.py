@@ -18,6 +18,7 @@ from barpc.sensor.geometry import triangulate
 from barpc.tie import TieOptions, features, find_tracks, read_area, select_pairs
 from barpc.tie.pairs import Footprints, shared_tiles
 from barpc.tie.raster import tiles
+from tests.constants import chosen
 
 from .test_pairs import METRE, camera, views
 
@@ -183,11 +184,11 @@ def test_only_windows_in_the_area_are_read(tmp_path, lon) -> None:
     side = METRE * np.array([-240, -240, -140, 240])  # the western quarter, not up to its border
     west, south, east, north = side + [lon, 0.0, lon, 0.0]
     area = read_area(written(tmp_path / "a.json", box(west, south, east, north)))
-    options = TieOptions(search=10, tile=250, cell=50)
-    (pair,) = select_pairs(two, options, area=area)
+    with chosen(TieOptions, search=10, tile=250, cell=50) as options:
+        (pair,) = select_pairs(two, options, area=area)
+        boxes, shared = tiles((1000, 1000), options), shared_tiles(two, [pair], options, area)
     assert pair.overlap == pytest.approx(1.0)
-    boxes = tiles((1000, 1000), options)
-    for kept in shared_tiles(two, [pair], options, area):
+    for kept in shared:
         assert [box in kept for box in boxes] == [True, False, False, False] * 4
 
 

@@ -14,6 +14,7 @@ from barpc.tie import TieOptions, detect
 from barpc.tie.features import quota
 from barpc.tie.raster import tiles
 from barpc.workspace import Workspace
+from tests.constants import chosen
 
 from .conftest import write_image
 
@@ -29,7 +30,7 @@ def view(path, size=(500, 400)) -> View:
 
 
 def test_tiles_cover_the_image_once_and_are_cut_at_whole_cells() -> None:
-    options = TieOptions(tile=256, cell=64)
+    options = TieOptions(tile=256)
     count = np.zeros((700, 1000), int)
     for col, row, width, height in tiles((1000, 700), options):
         count[row : row + height, col : col + width] += 1
@@ -41,8 +42,8 @@ def test_tiles_cover_the_image_once_and_are_cut_at_whole_cells() -> None:
 
 def test_an_image_read_in_tiles_has_the_keypoints_of_the_image_read_at_once(tmp_path, texture) -> None:
     path = write_image(tmp_path / "a.tif", texture)
-    whole = detect([view(path)], TieOptions(keypoints_per_cell=1000))[0]
-    tiled = detect([view(path)], TieOptions(keypoints_per_cell=1000, tile=192))[0]
+    with chosen(TieOptions, keypoints_per_cell=1000) as options:
+        whole, tiled = (detect([view(path)], each)[0] for each in (options, replace(options, tile=192)))
     small = whole.scale < 12  # larger neighbourhoods reach beyond the margin
     seen = {tuple(p) for p in np.round(tiled.xy, 1)}
     share = np.mean([tuple(p) in seen for p in np.round(whole.xy[small], 1)])
@@ -52,7 +53,8 @@ def test_an_image_read_in_tiles_has_the_keypoints_of_the_image_read_at_once(tmp_
 
 def test_no_cell_holds_more_than_its_quota_and_the_strongest_stay(tmp_path, texture) -> None:
     path = write_image(tmp_path / "a.tif", texture)
-    found = detect([view(path)], TieOptions(keypoints_per_cell=5))[0]
+    with chosen(TieOptions, keypoints_per_cell=5) as options:
+        found = detect([view(path)], options)[0]
     cells = np.floor((found.xy + 0.5) / 64).astype(int)
     assert np.unique(cells, axis=0, return_counts=True)[1].max() == 5
     response = np.arange(10.0)

@@ -13,6 +13,7 @@ from barpc.tie.features import Keypoints, Sift, bounded, detect_tile, join, quot
 from barpc.tie.guided import Guided
 from barpc.tie.matcher import Matches, Prediction
 from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch, tiles
+from tests.constants import chosen
 from tests.tie.conftest import write_image
 
 ACROSS = 4.0
@@ -136,10 +137,10 @@ def test_a_cell_keeps_its_strongest_and_cells_begin_at_the_corner_of_a_pixel() -
 def test_an_image_holds_at_most_its_bound(pair) -> None:
     a = pair[0]
     for most in (400, 120, 30, 3):
-        found = bounded(a, TieOptions(keypoints_per_image=most, cell=64))
+        found = bounded(a, TieOptions(keypoints_per_image=most))
         assert 0.4 * most <= len(found) <= most
     assert bounded(a, TieOptions(keypoints_per_image=500)) is a
-    few = bounded(a, TieOptions(keypoints_per_image=3, cell=64))  # fewer than there are cells: the strongest
+    few = bounded(a, TieOptions(keypoints_per_image=3))  # fewer than there are cells: the strongest
     assert sorted(few.response) == sorted(np.sort(a.response)[-3:])
 
 
@@ -151,7 +152,8 @@ def test_an_image_holds_at_most_its_bound(pair) -> None:
     ],
 )  # fmt: skip
 def test_tiles_are_equal_and_cut_at_whole_cells(size, tile, cell, edges) -> None:
-    boxes = tiles(size, TieOptions(tile=tile, cell=cell))
+    with chosen(TieOptions, tile=tile, cell=cell) as options:
+        boxes = tiles(size, options)
     assert [(c, r) for c, r, _, _ in boxes] == [(c, r) for r in edges[1] for c in edges[0]]
     for c, r, w, h in boxes:
         right = min((e for e in edges[0] if e > c), default=size[0])
@@ -162,13 +164,13 @@ def test_tiles_are_equal_and_cut_at_whole_cells(size, tile, cell, edges) -> None
 def test_descriptors_are_square_roots_of_shares_and_angles_are_radians(tmp_path) -> None:
     picture = np.full((200, 200), 40, np.uint8)
     picture[90:112, 95:107] = 220
-    everything = Sift(TieOptions()).detect(picture, lambda xy, scale, response: np.ones(len(xy), bool))
+    everything = Sift().detect(picture, lambda xy, scale, response: np.ones(len(xy), bool))
     assert len(everything)
     np.testing.assert_allclose((everything.descriptors.astype(float) ** 2).sum(axis=1), 255.0**2, rtol=0.03)
     assert (everything.angle >= 0).all()
     assert (everything.angle < 2 * np.pi + 1e-6).all()
     assert everything.angle.max() > 1.0
-    nothing = Sift(TieOptions()).detect(picture, lambda xy, scale, response: np.zeros(len(xy), bool))
+    nothing = Sift().detect(picture, lambda xy, scale, response: np.zeros(len(xy), bool))
     assert len(nothing) == 0
     assert join([]).descriptors.shape == (0, 128)
 
@@ -178,11 +180,12 @@ def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path)
     data = (rng.integers(0, 2, (40, 40)).repeat(8, 0).repeat(8, 1) * 800 + 100).astype(np.uint16)
     data[:, 250:] = 0
     path = write_image(tmp_path / "a.tif", data, nodata=0)
-    options = TieOptions(keypoints_per_cell=10_000, tile=160, cell=32)
     stretch = sample_stretch(path)
     assert stretch is not None
-    found = [detect_tile(str(path), (320, 320), box, stretch, options) for box in tiles((320, 320), options)]
-    for (col, row, width, height), part in zip(tiles((320, 320), options), found, strict=True):
+    with chosen(TieOptions, keypoints_per_cell=10_000, tile=160, cell=32) as options:
+        boxes = tiles((320, 320), options)
+        found = [detect_tile(str(path), (320, 320), box, stretch, options) for box in boxes]
+    for (col, row, width, height), part in zip(boxes, found, strict=True):
         assert (part.xy >= [col - 0.5, row - 0.5]).all()
         assert (part.xy < [col + width - 0.5, row + height - 0.5]).all()
         assert np.lexsort((part.xy[:, 0], part.xy[:, 1])).tolist() == list(range(len(part)))

@@ -13,6 +13,7 @@ from barpc.sensor.rpc import RPC
 from barpc.tie import TieOptions, select_pairs
 from barpc.tie.pairs import shared_tiles
 from barpc.tie.raster import tiles
+from tests.constants import chosen
 
 
 def camera(lon: float, lat: float = 0.0, lean: float = 0.1) -> RPC:
@@ -107,16 +108,20 @@ def test_listed_pairs_that_leave_groups_are_refused() -> None:
 
 def test_too_small_an_angle_and_too_small_an_overlap_are_left_out() -> None:
     two = views(camera(0.0, lean=0.0), camera(250 * METRE, lean=0.05))
-    for options in (TieOptions(min_angle=5.0), TieOptions(min_overlap=0.9), TieOptions(max_angle=0.5)):
+    for options in (
+        TieOptions(angles=(5.0, 60.0)),
+        TieOptions(min_overlap=0.9),
+        TieOptions(angles=(0.0, 0.5)),
+    ):
         with pytest.raises(DisconnectedError):
             select_pairs(two, replace(options, search=1.0))
 
 
 def test_only_windows_that_a_partner_may_see_are_read() -> None:
     two = views(camera(0.0, lean=0.0), camera(250 * METRE, lean=0.0))
-    options = TieOptions(search=50, tile=250, cell=50)
-    pairs = select_pairs(two, options)
-    boxes = tiles((1000, 1000), options)
-    left, right = ([box in kept for box in boxes] for kept in shared_tiles(two, pairs, options))
+    with chosen(TieOptions, search=50, tile=250, cell=50) as options:
+        pairs = select_pairs(two, options)
+        boxes = tiles((1000, 1000), options)
+        left, right = ([box in kept for box in boxes] for kept in shared_tiles(two, pairs, options))
     assert left == [False, True, True, True] * 4  # the second one within the search
     assert right == [True, True, True, False] * 4

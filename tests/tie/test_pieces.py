@@ -31,7 +31,8 @@ from barpc.tie.matching import MATCHERS, PairReport, _Search
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import sample_stretch, tiles
 from barpc.tie.register import Registration, _Links, _shared, references
-from barpc.tie.tracks import require_known, require_tracks, thin
+from barpc.tie.tracks import require_tracks, thin
+from tests.constants import CONSTANTS, chosen
 from tests.tie.conftest import Rendered, write_image
 from tests.tie.test_pairs import METRE, camera, views
 
@@ -78,12 +79,10 @@ ROWS = [
 ]
 ELSEWHERE = {
     "band": "test_the_band_that_is_asked_for_is_matched",
-    "detector": "test_names_are_those_of_the_tables",
     "matcher": "test_names_are_those_of_the_tables",
     "tile": "test_tiles_are_as_large_as_asked_for",
     "min_overlap": "test_pairs_are_those_within_the_bounds",
-    "min_angle": "test_pairs_are_those_within_the_bounds",
-    "max_angle": "test_pairs_are_those_within_the_bounds",
+    "angles": "test_pairs_are_those_within_the_bounds",
     "neighbours": "test_a_view_gets_as_many_partners_as_asked_for",
     "search": "test_the_search_reaches_as_far_as_asked_for",
     "min_matches": "test_a_pair_needs_as_many_matches_as_asked_for",
@@ -91,16 +90,19 @@ ELSEWHERE = {
 
 
 def test_every_option_has_a_row() -> None:
-    assert {row.field for row in ROWS} | set(ELSEWHERE) == {field.name for field in fields(TieOptions)}
+    assert {row.field for row in ROWS} | set(ELSEWHERE) == {field.name for field in fields(TieOptions)} | set(
+        CONSTANTS[TieOptions]
+    )
     assert set(ELSEWHERE.values()) <= set(globals())
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.field)
 def test_an_option_changes_the_result_in_its_direction(scene: Rendered, row: Row) -> None:
-    few, many = (
-        row.observable(find_tracks(scene.views, TieOptions(**{**row.rest, row.field: value})))
-        for value in (row.low, row.high)
-    )
+    found = []
+    for value in (row.low, row.high):
+        with chosen(TieOptions, **{**row.rest, row.field: value}) as options:
+            found.append(row.observable(find_tracks(scene.views, options)))
+    few, many = found
     assert (many / few if row.sign > 0 else few / many) > 1.05, (few, many)
 
 
@@ -148,14 +150,12 @@ def test_the_band_that_is_asked_for_is_matched(scene: Rendered, tmp_path) -> Non
 
 
 def test_names_are_those_of_the_tables() -> None:
-    require_known(TieOptions())
-    for name in ("detector", "matcher"):
-        with pytest.raises(InputError, match=f"{name} 'other' is not one of"):
-            require_known(TieOptions(**{name: "other"}))
+    with pytest.raises(InputError, match="matcher 'other' is not one of guided"):
+        TieOptions(matcher="other")
 
 
 def test_tiles_are_as_large_as_asked_for(scene: Rendered) -> None:
-    boxes = tiles((1000, 700), TieOptions(tile=256, cell=64))
+    boxes = tiles((1000, 700), TieOptions(tile=256))
     assert {(c, r) for c, r, _, _ in boxes} == {
         (c, r) for c in range(0, 1000, 256) for r in range(0, 700, 256)
     }
@@ -174,11 +174,11 @@ def test_pairs_are_those_within_the_bounds(shift: float, overlap: float) -> None
     (pair,) = select_pairs(two, TieOptions())
     angle = float(np.degrees(np.arctan(0.05)))
     assert pair.angle == pytest.approx(angle, abs=0.05)
-    within: list[dict[str, float]] = [
-        {"min_overlap": pair.overlap - 0.01}, {"min_angle": pair.angle - 0.01}, {"max_angle": pair.angle + 0.01},
+    within: list[dict[str, Any]] = [
+        {"min_overlap": pair.overlap - 0.01}, {"angles": (pair.angle - 0.01, 60)}, {"angles": (0, pair.angle + 0.01)},
     ]  # fmt: skip
-    beyond: list[dict[str, float]] = [
-        {"min_overlap": pair.overlap + 0.01}, {"min_angle": pair.angle + 0.01}, {"max_angle": pair.angle - 0.01},
+    beyond: list[dict[str, Any]] = [
+        {"min_overlap": pair.overlap + 0.01}, {"angles": (pair.angle + 0.01, 60)}, {"angles": (0, pair.angle - 0.01)},
     ]  # fmt: skip
     for given in within:
         assert select_pairs(two, TieOptions(**given, search=0.1)) == [pair]
@@ -220,18 +220,19 @@ def test_a_pair_needs_as_many_matches_as_asked_for(scene: Rendered) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"patch": 20}, {"patch": 7}, {"tile": 127}, {"cell": 7}, {"min_matches": 3}, {"min_overlap": 1.01},
-        {"ratio": 1.01}, {"min_correlation": 1.0}, {"min_angle": -0.1}, {"search": 0.0}, {"band": 0},
+        {"tile": 127}, {"min_matches": 3}, {"min_overlap": 1.01},
+        {"ratio": 1.01}, {"min_correlation": 1.0}, {"angles": (-0.1, 9.0)}, {"angles": (9.0, 8.0)},
+        {"search": 0.0}, {"band": 0},
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="tie points"):
+    with pytest.raises(InputError, match=next(iter(wrong))):
         TieOptions(**wrong)
 
 
 def test_options_at_the_end_of_their_range_are_taken() -> None:
-    low = TieOptions(patch=9, tile=128, cell=8, min_matches=4, min_overlap=0.0, min_angle=0.0, ratio=1.0)
-    assert (low.patch, low.ratio) == (9, 1.0)
+    low = TieOptions(tile=128, min_matches=4, min_overlap=0.0, angles=(0.0, 0.0), ratio=1.0)
+    assert (low.tile, low.ratio) == (128, 1.0)
     assert TieOptions(min_overlap=1.0, min_correlation=0.99, band=1).min_overlap == 1.0
 
 

@@ -1,0 +1,497 @@
+"""Everything a run may be told: four records whose fields say type, range, unit and meaning once.
+
+A record checks what is put into it, whoever does it: Python, an options file, a flag, or `replace`. The flags of the
+command line, the page of options, the JSON schema and `help(AdjustOptions)` are made of the same declarations.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import reprlib
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from importlib import import_module
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from barpc.errors import InputError
+from barpc.sidefile import OPTIONS, read_text
+
+T = TypeVar("T")
+Record = TypeVar("Record", bound="Options")
+
+Nodes = Literal["uniform", "chebyshev"]
+Model = Literal["rotation+translation", "rotation", "translation", "shift", "shift-drift", "affine"]
+
+_MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
+_SHORT = reprlib.Repr()
+_SHORT.maxstring, _SHORT.maxother = 60, 200
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a field may hold beside its type, and what it means.
+
+    Parameters
+    ----------
+    help : str
+        Sentences; Markdown's back quotes mark code.
+    unit : str
+        Of numbers; of texts what they are: "file", "dir", "name".
+    least, above, most, below : float, optional
+        Bounds of a number, or of each in a list; `above` and `below` are not reached.
+    rows : str
+        The table whose keys are the values allowed, as module and name.
+    """
+
+    help: str
+    unit: str = ""
+    least: float | None = None
+    above: float | None = None
+    most: float | None = None
+    below: float | None = None
+    rows: str = ""
+
+    def holds(self, number: float) -> bool:
+        """Whether a number lies within the bounds; NaN and the infinities do not."""
+        return (
+            math.isfinite(number)
+            and (self.least is None or number >= self.least)
+            and (self.above is None or number > self.above)
+            and (self.most is None or number <= self.most)
+            and (self.below is None or number < self.below)
+        )
+
+    def bounds(self) -> str:
+        """The bounds and the unit in words, with a blank before them."""
+        ends = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
+        words = " and ".join(f"{word} {value:g}" for word, value in ends.items() if value is not None)
+        if self.least is not None and self.most is not None:
+            words = f"from {self.least:g} to {self.most:g}"
+        return (f" {words}" if words else "") + (f" [{self.unit}]" if self.unit else "")
+
+    def choices(self, kind: Any) -> tuple[Any, ...]:
+        """The values allowed where they are listed: of a Literal, or the rows of a table; else none."""
+        if get_origin(kind) is Literal:
+            return get_args(kind)
+        if self.rows:
+            module, _, name = self.rows.rpartition(".")
+            return tuple(getattr(import_module(module), name))
+        return ()
+
+
+def option(default: T, help: str, **rule: Any) -> T:
+    """A field of an option record: its default, its meaning, and the rest of its `Rule`."""
+    metadata = {"rule": Rule(" ".join(help.split()), **rule)}
+    given: dict[str, Any] = (
+        {"default_factory": default.copy} if isinstance(default, dict) else {"default": default}
+    )
+    made: T = field(**given, metadata=metadata)
+    return made
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A field as declared: its type (without None), whether it may be None, its rule and its default."""
+
+    kind: Any
+    optional: bool
+    rule: Rule
+    default: Any
+
+
+def declared(record: type[Options]) -> dict[str, Declared]:
+    """Field -> what is declared of it; a nested record has an empty rule."""
+    hints, found = get_type_hints(record), {}
+    for one in fields(record):  # type: ignore[arg-type]  # children are dataclasses
+        kind, optional = hints[one.name], False
+        if get_origin(kind) in (Union, UnionType):
+            kind, optional = next(part for part in get_args(kind) if part is not NoneType), True
+        default = one.default if one.default_factory is MISSING else one.default_factory()
+        found[one.name] = Declared(kind, optional, one.metadata.get("rule", Rule("")), default)
+    return found
+
+
+class Options:
+    """Base of the option records (frozen dataclasses with ``repr=False``): checked when made, short when printed."""
+
+    def __post_init__(self) -> None:
+        for name, one in declared(type(self)).items():
+            value = getattr(self, name)
+            known = value is None if one.optional else bool(one.rule.rows) and value == one.default
+            if not known:  # a default is a row of its table: it is not imported for that
+                object.__setattr__(self, name, checked(name, one.kind, one.rule, value))
+
+    def __repr__(self) -> str:
+        known = declared(type(self))
+        given = {name: getattr(self, name) for name in known}
+        shown = (f"{name}={_SHORT.repr(v)}" for name, v in given.items() if v != known[name].default)
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+
+def wanted(kind: Any, rule: Rule) -> str:
+    """What a field may hold, in words."""
+    parts = get_args(kind)
+    if get_origin(kind) is Mapping:
+        return f"a table, each value {wanted(parts[1], rule)}"
+    if get_origin(kind) is tuple:
+        count = "a list" if parts[-1] is ... else f"{len(parts)} values"
+        return f"{count}, each {wanted(parts[0], rule)}"
+    if choices := rule.choices(kind):
+        return f"one of {', '.join(map(str, choices))}"
+    words = {
+        bool: "true or false",
+        int: "a whole number",
+        float: "a number",
+        str: f"a {rule.unit}" if rule.unit else "text",
+    }
+    return words.get(kind, f"of class {kind.__name__}") + (rule.bounds() if kind in (int, float) else "")
+
+
+def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
+    """A value as its field holds it; InputError names the field where it is of another type or out of range."""
+    parts, found = get_args(kind), None
+    if get_origin(kind) is Mapping:
+        if isinstance(value, Mapping):
+            return {str(key): checked(f"{name}.{key}", parts[1], rule, item) for key, item in value.items()}
+    elif get_origin(kind) is tuple:
+        if isinstance(value, (list, tuple)) and (parts[-1] is ... or len(parts) == len(value)):
+            return tuple(checked(name, parts[0], rule, item) for item in value)
+    elif choices := rule.choices(kind):
+        if type(value) not in (str, int) or value not in choices:
+            raise InputError(f"{name} {value!r} is not one of {', '.join(map(str, choices))}")
+        found = value
+    else:
+        found = _plain(kind, rule, value)
+    if found is None:
+        raise InputError(f"{name} must be {wanted(kind, rule)}, found {value!r}")
+    return found
+
+
+def _plain(kind: Any, rule: Rule, value: Any) -> Any:
+    """A single value as its type, numpy's numbers and paths included; None where it is not one, or out of range."""
+    if kind is str:
+        text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
+        return text if isinstance(text, str) else None
+    if kind not in (int, float):
+        return value if isinstance(value, kind) else None
+    if isinstance(value, bool) or not isinstance(value, Integral if kind is int else Real):
+        return None
+    if isinstance(value, Integral) and abs(int(value)) >= _MOST:
+        return None
+    number = kind(value)
+    return number if rule.holds(number) else None
+
+
+# --- the records ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, repr=False)
+class TieOptions(Options):
+    """How tie points are found; every length is in pixels of the full image."""
+
+    band: int = option(1, "Band of multi-band images, from 1.", least=1)
+    matcher: str = option("guided", "What matches a pair.", rows="barpc.tie.matching.MATCHERS")
+    tile: int = option(
+        1024, "Side of the tiles that are read and searched for keypoints.", unit="px", least=128
+    )
+    keypoints_per_image: int = option(
+        100_000, "Keypoints an image, at most; its cells hold fewer where more would be found.", least=1
+    )
+    min_overlap: float = option(
+        0.05, "Share of the smaller footprint that a pair of views must have in common.", least=0, most=1
+    )
+    angles: tuple[float, float] = option(
+        (0.0, 60.0), "Smallest and largest convergence angle of a pair.", unit="deg", least=0, most=180
+    )
+    neighbours: int = option(8, "Best partners tried for a view, on top of what connects all views.", least=1)
+    search: float = option(700.0, "How far a camera may be wrong, in any direction.", unit="px", above=0)
+    ratio: float = option(
+        0.85,
+        "Largest descriptor distance of the best candidate over that of the second best.",
+        above=0,
+        most=1,
+    )
+    false_share: float = option(
+        0.01, "Share of false matches that is accepted, as control bands estimate it.", above=0, most=1
+    )
+    min_matches: int = option(12, "Verified matches that a pair needs to count.", least=4)
+    min_correlation: float = option(0.8, "Smallest correlation of two registered patches.", above=0, below=1)
+    points_per_image: int = option(5000, "Observations kept in an image, at most, evenly spread.", least=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.angles[0] > self.angles[1]:
+            raise InputError(f"angles: the smallest comes first, found {self.angles}")
+
+
+@dataclass(frozen=True, repr=False)
+class AdjustOptions(Options):
+    """How the adjustment runs."""
+
+    model: Model = option(
+        "rotation+translation", "Unknowns of each view; the last three act in the image, for comparison."
+    )
+    drift: int | None = option(
+        None,
+        """Degree of the rotation as a polynomial of the image row, 0: constant. Without: 1 for models with a
+        rotation, and 2 where the residuals ask for it.""",
+        least=0,
+        most=2,
+    )
+    sigma_attitude: float | None = option(
+        None,
+        """Prior standard deviation of the rotation, on the ground (angle x distance). Without: the accuracy that
+        the RPC states where it is usable, else 5 m.""",
+        unit="m",
+        above=0,
+    )
+    sigma_position: float | None = option(
+        None,
+        "Prior standard deviation of the translation along an axis. Without: as for the attitude.",
+        unit="m",
+        above=0,
+    )
+    sigma_drift: float | None = option(
+        None,
+        """Prior standard deviation of the drift at the first and last row, on the ground. Without: learnt from the
+        block, 0.2 m counting as a few observations of it.""",
+        unit="m",
+        above=0,
+    )
+    learn_priors: bool = option(
+        True,
+        """Widen the priors of rotation and translation where the corrections contradict them, of all views or of an
+        odd one, and learn the drift's.""",
+    )
+    noise_floor: float = option(
+        0.02,
+        """Part of a view's tie-point errors that does not average away: however many observations a view has, their
+        information together is at most 1 / noise_floor^2. 0 for independent errors.""",
+        unit="px",
+        least=0,
+    )
+    loss: str = option(
+        "geman_mcclure", "Robust loss of the first rounds; `linear` skips them.", rows="barpc.ba.loss.LOSSES"
+    )
+    robust_threshold: float = option(
+        4.0, "Observations beyond so many standard deviations are cut after the robust rounds.", above=0
+    )
+    estimate_noise: bool = option(True, "Scale the observations' sigmas by what the residuals show.")
+    fixed: tuple[str, ...] = option((), "A view that keeps the camera it came with.", unit="name")
+    view_weights: Mapping[str, float] = option(
+        {}, "Weight of a view's observations (1 where absent): their sigmas are divided by it.", above=0
+    )
+    dem_sigma: float = option(10.0, "Standard deviation of the DEM.", unit="m", above=0)
+    dem_for_all: bool = option(
+        False, "Hold every track to the DEM; otherwise only those seen under too small an angle."
+    )
+    min_convergence: float = option(
+        1.0, "Tracks whose rays meet under a smaller angle are held in height.", unit="deg", least=0, most=180
+    )
+    solver: Literal["auto", "scipy", "sparse"] = option(
+        "auto",
+        """scipy's `least_squares` on the compressed problem, or a sparse Levenberg-Marquardt; `auto` goes by the
+        number of unknowns.""",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.drift and "rotation" not in self.model:
+            raise InputError(f"drift {self.drift} needs a model with a rotation, not {self.model!r}")
+
+
+@dataclass(frozen=True, repr=False)
+class FitOptions(Options):
+    """How an RPC is fitted to a sensor model or to points."""
+
+    method: Literal["auto", "ridge", "lcurve", "lcurve-joint", "vendor-denominators"] = option(
+        "auto",
+        """`ridge`: QR compression and a noise-scaled ridge. `lcurve`: the paper's solver; `lcurve-joint` with one h
+        for col and row (78 unknowns) instead of one each (39 + 39). `vendor-denominators`: numerators only. `auto`:
+        `ridge`, and another one where the certificate says that it is better.""",
+    )
+    grid: tuple[int, int, int] = option(
+        (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4
+    )
+    space: Literal["image", "ground"] = option(
+        "image", "Whether the grid is regular in (col, row, alt), or in (lon, lat, alt) as in the paper."
+    )
+    nodes: Nodes = option(
+        "chebyshev", "Spacing of the control points; Chebyshev-Lobatto nodes crowd towards the ends."
+    )
+    tolerance: float = option(
+        0.01, "A fit whose check points miss by more in one coordinate is refused.", unit="px", above=0
+    )
+    precision: Literal["nitf", "rpcm"] | None = option(
+        None, "Fit numbers that a format with few digits can hold."
+    )
+    allow_mirrored: bool = option(
+        False,
+        """Accept points that show the ground mirrored (as radar images do) without suspecting that two columns are
+        swapped.""",
+    )
+
+
+@dataclass(frozen=True, repr=False)
+class RunOptions(Options):
+    """How `barpc.adjust` runs: files, passes, outputs, and the records of its stages."""
+
+    tie: TieOptions = field(default_factory=TieOptions)
+    adjust: AdjustOptions = field(default_factory=AdjustOptions)
+    fit: FitOptions = field(default_factory=FitOptions)
+    images: Literal["vrt", "copy", "none"] = option(
+        "vrt",
+        """What carries the corrected RPC: a small VRT that points at the untouched image, a full copy, or no image
+        at all.""",
+    )
+    rpc_formats: tuple[str, ...] = option(("txt",), "RPC files to write.", rows="barpc.rpcio.WRITABLE")
+    num_passes: int = option(
+        1, "Passes of matching and adjustment; the second matches with the adjusted cameras.", least=1
+    )
+    stop_after: Literal["matching", "adjustment", "all"] = option(
+        "all", "End early: after the tracks, or before RPCs are written."
+    )
+    keep_going: bool = option(
+        False,
+        """Do what can be done instead of stopping: leave out a file that cannot be used and images that the largest
+        connected group is not tied to, write an RPC that misses the fit's tolerance. Such a run ends with exit code
+        3.""",
+    )
+    overwrite: bool = option(False, "Replace the results of an earlier run in the same folder.")
+    matches: str | None = option(
+        None, "Tie points to use instead of matching (CSV, npz, ASP text).", unit="file"
+    )
+    overlap_list: str | None = option(
+        None, "Match only these pairs: two image names or paths a line.", unit="file"
+    )
+    aoi: str | None = option(
+        None,
+        "Tie points only inside polygons in lon/lat (GeoJSON), and only what may show them is read.",
+        unit="file",
+    )
+    gcp: tuple[str, ...] = option((), "Ground control points: .gcp, GeoJSON, image tags.", unit="file")
+    check_points: tuple[str, ...] = option(
+        (), "Ground points that stay out of the adjustment and are measured after it.", unit="file"
+    )
+    fixed_run: str | None = option(
+        None,
+        "An earlier run some of whose views are among these: they keep what it knows about them.",
+        unit="dir",
+    )
+    dem: str | None = option(None, "Terrain heights that hold weakly seen tie points.", unit="file")
+    geoid: str | None = option(None, "Geoid grid for a DEM of orthometric heights.", unit="file")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.geoid is not None and self.dem is None:
+            raise InputError("geoid is given without dem: there are no heights to convert")
+        for name in ("overlap_list", "aoi"):
+            if self.matches is not None and getattr(self, name) is not None:
+                raise InputError(
+                    f"{name} is given with matches: nothing is matched then; leave one of them out"
+                )
+
+
+# --- what is made of them ---------------------------------------------------------------------------------
+
+
+def with_values(options: Record, values: Mapping[str, Any], where: str = "options") -> Record:
+    """A copy of a record with some fields changed, nested records by nested mappings.
+
+    Parameters
+    ----------
+    options : Options
+        The record.
+    values : mapping of str to object
+        New values.
+    where : str
+        What a message calls the source.
+
+    Raises
+    ------
+    InputError
+        An unknown field, or a value of the wrong type or out of range; the message names it.
+    """
+    known, changed = declared(type(options)), dict(values)
+    for name, value in values.items():
+        if name not in known:
+            raise InputError(f"{where}: unknown option {name!r}; known are {', '.join(known)}")
+        nested = getattr(options, name)
+        if isinstance(nested, Options):
+            if not isinstance(value, Mapping):
+                raise InputError(f"{where}: [{name}] must be a table, found {value!r}")
+            changed[name] = with_values(nested, value, f"{where} [{name}]")
+    try:
+        return replace(options, **changed)  # type: ignore[type-var]  # children are dataclasses
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def read_options(path: str | Path, options: RunOptions | None = None) -> RunOptions:
+    """Options from a TOML file: top-level keys, and the tables [tie], [adjust], [fit].
+
+    Raises
+    ------
+    InputError
+        The file does not exist or parse, or holds an option that does not exist or a value that it cannot have.
+    """
+    text = read_text(path, OPTIONS)
+    try:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # a date or a number that is none is not its own class
+        raise InputError(f"{path}: not an options file (TOML): {error}") from error
+    return with_values(options or RunOptions(), data, str(path))
+
+
+def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
+    """The JSON schema (draft 7) of a record, as an options file spells it."""
+    properties = {}
+    for name, one in declared(record).items():
+        if isinstance(one.default, Options):
+            properties[name] = schema(type(one.default))
+        else:
+            properties[name] = {**_schema(one.kind, one.rule), "description": one.rule.help}
+            if one.default is not None:
+                properties[name]["default"] = _listed(one.default)
+    return {"type": "object", "additionalProperties": False, "properties": properties}
+
+
+def _schema(kind: Any, rule: Rule) -> dict[str, Any]:
+    parts = get_args(kind)
+    if get_origin(kind) is Mapping:
+        return {"type": "object", "additionalProperties": _schema(parts[1], rule)}
+    if get_origin(kind) is tuple:
+        count = {} if parts[-1] is ... else {"minItems": len(parts), "maxItems": len(parts)}
+        return {"type": "array", "items": _schema(parts[0], rule), **count}
+    if choices := rule.choices(kind):
+        return {"enum": list(choices)}
+    bounds = {
+        "minimum": rule.least,
+        "exclusiveMinimum": rule.above,
+        "maximum": rule.most,
+        "exclusiveMaximum": rule.below,
+    }
+    name = {bool: "boolean", int: "integer", float: "number", str: "string"}[kind]
+    return {"type": name, **{key: value for key, value in bounds.items() if value is not None}}
+
+
+def _listed(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _documented(record: type[Options]) -> str:
+    """The docstring of a record, with its fields as numpydoc has them."""
+    rows = []
+    for name, one in declared(record).items():
+        rows += [f"{name} : {wanted(one.kind, Rule('') if one.rule.rows else one.rule)}"]
+        rows += [f"    {one.rule.help or 'See there.'} Default: {one.default!r}."]
+    return "\n".join([str(record.__doc__), "", "Parameters", "----------", *rows])
+
+
+for _record in (TieOptions, AdjustOptions, FitOptions, RunOptions):
+    _record.__doc__ = _documented(_record)

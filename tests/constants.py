@@ -1,0 +1,43 @@
+"""Constants that stand beside the code that uses them, set like options: whatever is tuned is shown to act."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, TypeVar
+from unittest import mock
+
+from barpc.options import AdjustOptions, FitOptions, Options, TieOptions
+
+Record = TypeVar("Record", bound=Options)
+
+CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
+    TieOptions: {
+        "cell": ("barpc.tie.raster.CELL", "barpc.tie.features.CELL"),
+        "keypoints_per_cell": ("barpc.tie.features.PER_CELL",),
+        "contrast": ("barpc.tie.features.CONTRAST",),
+        "tolerance": ("barpc.tie.matching.TOLERANCE",),
+        "patch": ("barpc.tie.register.PATCH",),
+    },
+    AdjustOptions: {
+        "sigma_shift": ("barpc.ba.priors.IMAGE_SIGMA",),
+        "num_passes": ("barpc.ba.rounds.MAX_PASSES",),
+        "max_steps": ("barpc.ba.solve.MAX_STEPS",),
+        "tolerance": ("barpc.ba.rounds.TOLERANCE",),
+        "min_observations": ("barpc.ba.block.MIN_OBSERVATIONS",),
+    },
+    FitOptions: {"tau": ("barpc.fit.solve.TAU",), "weighted": ("barpc.fit.solve.WEIGHTED",)},
+}
+"""Record -> name -> where the constant is read."""
+
+
+@contextmanager
+def chosen(record: type[Record], **values: Any) -> Iterator[Record]:
+    """The record of options; values of constants hold as long as the context does."""
+    with ExitStack() as stack:
+        for name, places in CONSTANTS[record].items():
+            if name in values:
+                value = values.pop(name)
+                for place in places:
+                    stack.enter_context(mock.patch(place, value))
+        yield record(**values)

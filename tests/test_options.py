@@ -1,0 +1,267 @@
+"""One layer of options: what is declared beside a field is what every path refuses, prints and writes down."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+import click
+import fastjsonschema
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import barpc
+from barpc.cli.main import cli
+from barpc.cli.options import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
+from barpc.errors import InputError
+from barpc.options import (
+    AdjustOptions,
+    Declared,
+    FitOptions,
+    Options,
+    RunOptions,
+    TieOptions,
+    declared,
+    read_options,
+    schema,
+    with_values,
+)
+
+TABLES: dict[str, type[Options]] = {
+    "": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions
+}  # fmt: skip
+FLAGS = {target: flag_name(target) for target in (*TIE, *ADJUSTMENT, *RUN, "fit.tolerance")}
+FIELDS = [
+    (table, name, one)
+    for table, record in TABLES.items()
+    for name, one in declared(record).items()
+    if name not in TABLES
+]
+NAN = float("nan")
+
+
+def whole(value: Any, one: Declared) -> Any:
+    """A single value as the field holds it: the first of a list or a table, the others as they are by default."""
+    if get_origin(one.kind) is tuple:
+        return (value, *one.default[1:])
+    return {"view_00": value} if get_origin(one.kind) is Mapping else value
+
+
+def element(one: Declared) -> Any:
+    """The type of a single value."""
+    return get_args(one.kind)[-1 if get_origin(one.kind) is Mapping else 0] if get_origin(one.kind) in (
+        tuple,
+        Mapping,
+    ) else one.kind  # fmt: skip
+
+
+def wrong_values(one: Declared) -> Iterator[Any]:
+    """Values of another type, out of range, and what is no number."""
+    kind, rule = element(one), one.rule
+    yield from (object(), whole(NAN, one), whole(float("inf"), one), whole(object(), one), [[]])
+    if kind is bool:
+        yield from (1, 0, "true", 1.0)
+    elif kind in (int, float):
+        yield from (whole(value, one) for value in ("1", True, 10**400, -(10**17)))
+        bounds = [(rule.least, -1), (rule.above, 0), (rule.most, 1), (rule.below, 0)]
+        step = 1 if kind is int else 1e-6
+        yield from (whole(kind(bound + step * sign), one) for bound, sign in bounds if bound is not None)
+        if kind is int:
+            yield whole(2.5, one)
+    else:
+        yield from (whole(value, one) for value in (1, True, b"guided", ["txt"]))
+    if rule.choices(kind) or rule.choices(one.kind):
+        yield from (whole(value, one) for value in ("", "chebychev", "TXT"))
+    if not one.optional:
+        yield None
+
+
+def toml(value: Any) -> str | None:
+    """A value in an options file; None where TOML cannot spell it."""
+    if isinstance(value, (list, tuple)):
+        inner = [toml(item) for item in value]
+        return None if None in inner else f"[{', '.join(str(item) for item in inner)}]"
+    if isinstance(value, dict):
+        return f"{{ view_00 = {toml(value['view_00'])} }}" if toml(value["view_00"]) else None
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value)
+    return str(value) if isinstance(value, (int, float)) else None
+
+
+def one_line(error: BaseException, name: str) -> None:
+    assert name in str(error)
+    assert "\n" not in str(error)
+    assert len(str(error)) < 400 or "1000000000" in str(error)
+
+
+@pytest.mark.parametrize(("table", "name", "one"), FIELDS, ids=[f"{t}.{n}" if t else n for t, n, _ in FIELDS])
+def test_what_a_field_cannot_hold_is_refused_on_every_path(
+    table: str, name: str, one: Declared, tmp_path: Path
+) -> None:
+    record, path = TABLES[table], tmp_path / "options.toml"
+    option = FLAGS.get(f"{table}.{name}".lstrip("."))
+    verb = "fit" if f"{table}.{name}" == "fit.tolerance" else "adjust"
+    tried = 0
+    for wrong in wrong_values(one):
+        with pytest.raises(InputError) as caught:
+            record(**{name: wrong})
+        one_line(caught.value, name)
+        with pytest.raises(InputError) as caught:
+            replace(record(), **{name: wrong})  # type: ignore[type-var]
+        one_line(caught.value, name)
+        if (text := toml(wrong)) is not None:
+            path.write_text(f"[{table}]\n{name} = {text}\n" if table else f"{name} = {text}\n")
+            with pytest.raises(InputError) as caught:
+                read_options(path)
+            one_line(caught.value, name)
+            assert str(path) in str(caught.value)
+            tried += 1
+        number = wrong[0] if isinstance(wrong, (list, tuple)) and wrong else wrong
+        if option and element(one) is not str and isinstance(number, (int, float, str)) and text:
+            if element(one) is bool:
+                continue  # it takes no value
+            if isinstance(number, str) and number.isdecimal():
+                continue  # on a command line every number is a text
+            given = ["SOURCE"] if verb == "fit" else ["a.tif", "-o", str(tmp_path / "out")]
+            found = CliRunner().invoke(cli, [verb, *given, f"{option}={number}"])
+            assert isinstance(found.exception, (click.UsageError, SystemExit, InputError)), (number, found)
+            assert found.exit_code != 0
+            assert name in found.output + str(found.exception), number
+    assert tried or one.kind is str
+
+
+@pytest.mark.parametrize(("table", "name", "one"), FIELDS, ids=[f"{t}.{n}" if t else n for t, n, _ in FIELDS])
+def test_what_a_field_can_hold_is_taken_as_it_is(table: str, name: str, one: Declared) -> None:
+    """The default, the choices, the bounds that belong to the range; numpy's numbers and paths become plain."""
+    record, rule, kind = TABLES[table], one.rule, element(one)
+    given = [one.default, *rule.choices(kind), *rule.choices(one.kind)]
+    given += [kind(bound) for bound in (rule.least, rule.most) if bound is not None]
+    if kind is float:
+        given += [np.float64(0.5), np.float32(0.5), 1 if rule.holds(1) else 0.5]
+    elif kind is int:
+        given += [np.int64(rule.least or 1)]
+    elif kind is str and not rule.choices(kind):
+        given += ["view_00", Path("view_00")]
+    rest = {"dem": "dem.tif"} if name == "geoid" else {}
+    for value in given:
+        value = value if isinstance(value, type(one.default)) and value is one.default else whole(value, one)
+        if name == "angles":
+            value = (value[0], 180.0)
+        made = getattr(record(**{name: value, **rest}), name)
+        first = made[0] if isinstance(made, tuple) and made else made
+        first = first.get("view_00", 1.0) if isinstance(first, dict) else first
+        assert first in (None, ()) or type(first) in (bool, int, float, str)
+        assert record(**{name: made, **rest}) == record(**{name: value, **rest})
+
+
+def test_there_are_at_most_fifty_and_each_has_a_meaning() -> None:
+    assert len(FIELDS) <= 50
+    for table, name, one in FIELDS:
+        assert len(one.rule.help) > 15, (table, name)
+        if element(one) is float:
+            assert one.rule.least is not None or one.rule.above is not None, (table, name)
+        for record in TABLES.values():
+            assert "Parameters\n----------\n" in (record.__doc__ or "")
+
+
+@pytest.mark.parametrize("target", FLAGS)
+def test_a_flag_says_what_is_declared(target: str) -> None:
+    table, _, name = target.rpartition(".")
+    one = declared(TABLES[table])[name]
+    option = flag(target)(lambda: None).__click_params__[0]  # type: ignore[attr-defined]
+    assert option.help.startswith(one.rule.help)
+    names, text = option.get_help_record(click.Context(click.Command("adjust")))
+    if one.rule.unit:
+        assert one.rule.unit.upper() in names
+    for choice in () if one.rule.rows else one.rule.choices(one.kind):
+        assert choice in names
+    if one.default not in (None, (), False):
+        assert f"default: {one.default[0] if isinstance(one.default, tuple) else one.default}" in text
+
+
+def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "o.toml"
+    path.write_text('fixed_run = "earlier"\n[tie]\nband = 2\nsearch = 9\n[adjust]\nfixed = ["a"]\n')
+    flags = {"flag_tie_band": 3, "flag_adjust_fixed": ("b", "c"), "flag_matches": None, "flag_gcp": ()}
+    found = run_options(flags, str(path))
+    assert (found.tie.band, found.tie.search, found.adjust.fixed) == (3, 9.0, ("b", "c"))
+    assert (found.fixed_run, found.matches, found.gcp) == ("earlier", None, ())
+
+
+def test_the_schema_and_the_records_agree(tmp_path: Path) -> None:
+    """On the defaults, on every bound and beyond: the schema is the declarations in another language."""
+    written = schema()
+    json.dumps(written)
+    validate = fastjsonschema.compile(written)
+    validate({})
+    with pytest.raises(fastjsonschema.JsonSchemaException):
+        validate({"colour": 3})
+    for table, name, one in FIELDS:
+        for wrong in wrong_values(one):
+            if toml(wrong) is None or "inf" in str(wrong) or "nan" in str(wrong) or "0000000" in str(wrong):
+                continue  # not JSON, or beyond what a schema says
+            wrong = json.loads(json.dumps(wrong))
+            with pytest.raises(fastjsonschema.JsonSchemaException):
+                validate({table: {name: wrong}} if table else {name: wrong})
+        if one.default is not None:
+            plain = json.loads(json.dumps(one.default))
+            validate({table: {name: plain}} if table else {name: plain})
+
+
+def test_records_print_what_differs_from_the_defaults() -> None:
+    for record in TABLES.values():
+        assert repr(record()) == f"{record.__name__}()"
+    many = RunOptions(
+        adjust=AdjustOptions(robust_threshold=3),
+        gcp=tuple(f"points_{i}.gcp" for i in range(99)),
+        keep_going=True,
+    )
+    assert repr(many).startswith(
+        "RunOptions(adjust=AdjustOptions(robust_threshold=3.0), keep_going=True, gcp=("
+    )
+    assert len(repr(many)) < 250
+    assert eval(repr(AdjustOptions(drift=0, fixed=("a",)))) == AdjustOptions(drift=0, fixed=("a",))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"colour": 3}, r"here: unknown option 'colour'; known are tie, adjust"),
+        ({"tie": {"colour": 3}}, r"here \[tie\]: unknown option 'colour'; known are band"),
+        ({"tie": 3}, r"here: \[tie\] must be a table, found 3"),
+        (
+            {"fit": {"nodes": "chebychev"}},
+            r"here \[fit\]: nodes 'chebychev' is not one of uniform, chebyshev",
+        ),
+        ({"adjust": {"robust_threshold": -1}}, r"here \[adjust\]: robust_threshold must be a number above 0"),
+        ({"adjust": {"center_method": "foo"}}, r"here \[adjust\]: unknown option 'center_method'"),
+        ({"adjust": {"model": "shift", "drift": 1}}, "drift 1 needs a model with a rotation"),
+    ],
+)
+def test_a_message_says_where_and_what(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        with_values(RunOptions(), values, "here")
+
+
+def test_the_names_are_public_and_cost_no_numpy() -> None:
+    assert {"RunOptions", "AdjustOptions", "TieOptions", "FitOptions", "AdjustResult", "check"} <= set(
+        barpc.__all__
+    )
+    assert barpc.AdjustOptions is AdjustOptions
+    code = (
+        "import sys, barpc\nfrom barpc.cli import main\n"
+        "print(barpc.RunOptions(tie=barpc.TieOptions(search=5)))\n"
+        "try:\n    main(['adjust', '--help'])\nexcept SystemExit:\n    pass\n"
+        "assert 'numpy' not in sys.modules, [m for m in sys.modules if 'barpc' in m]\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "--sigma-attitude M" in done.stdout
