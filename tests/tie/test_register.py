@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.tie.register import _Template, _upsampled, register
+from barpc.tie.register import _Template, _upsampled, register, register_places
+from tests.tie.conftest import write_image
 
 SIZE = 400
 
@@ -58,6 +59,27 @@ def test_a_known_affine_map_is_found_to_a_hundredth_of_a_pixel(texture, referenc
     assert found.ok.mean() > 0.95
     assert np.sqrt((error**2).mean()) < 0.01
     assert np.abs(error.mean(axis=0)).max() < 0.001
+
+
+@pytest.mark.parametrize("zoom", [1.0, 1.3])
+def test_enough_is_read_about_a_place_for_the_patch_and_its_interpolation(texture, tmp_path, zoom) -> None:
+    """One place at a time, from files, is registered as in the whole images."""
+    first = np.rint(texture)
+    second = np.rint(warped(first, zoom * np.eye(2), np.array([0.4, -0.3])))
+    files = []
+    for name, image in (("a.tif", first), ("b.tif", second)):
+        write_image(tmp_path / name, image.astype(np.uint16))
+        files.append((str(tmp_path / name), (SIZE, SIZE)))
+    places = np.random.default_rng(5).integers(120, SIZE - 120, (20, 2)).astype(np.float64)
+    start = (places - SIZE / 2) * zoom + SIZE / 2 + [0.9, -0.8]
+    many = np.broadcast_to(zoom * np.eye(2), (20, 2, 2))
+    whole = run(first, second, places, start, zoom * np.eye(2))
+    assert whole.ok.mean() > 0.8
+    for k in range(20):
+        alone = register_places(tuple(files), 1, places[k : k + 1], start[k : k + 1], many[k : k + 1], 21)
+        assert alone.ok[0] == whole.ok[k]
+        np.testing.assert_allclose(alone.xy[0], whole.xy[k], atol=2e-4)
+        np.testing.assert_allclose(alone.correlation[0], whole.correlation[k], atol=1e-5)
 
 
 def test_gain_and_offset_between_the_images_do_not_matter(texture, reference) -> None:
