@@ -68,12 +68,8 @@ def load_views(
     images : sequence of path or View
         The image files, perhaps with choices behind them (`barpc.cameras.open_camera`), or views of them with
         a camera of one's own.
-    min_views : int
-        So many are needed.
-    keep_going : bool
-        Leave a bad file out instead of stopping.
-    band : int
-        The band that will be read, from 1.
+    min_views, keep_going, band : int, bool, int
+        How many are needed; leave a bad file out instead of stopping; the band that will be read, from 1.
     distinct : bool
         Refuse an image that is there twice, also as other files or under another RPC (see `Twins`).
 

@@ -353,7 +353,7 @@ AREA = (
 )
 OPTIONS = (
     b'images = "none"\nrpc_formats = ["txt", "rpb"]\nnum_passes = 2\nkeep_going = true\ngcp = ["a.gcp"]\n'
-    b'[tie]\nband = 2\nmin_overlap = 0.1\ndetector = "sift"\n[adjust]\nmodel = "rotation"\nfixed = ["left"]\n'
+    b'[tie]\nband = 2\nangles = [1, 40.5]\nmatcher = "guided"\n[adjust]\nmodel = "rotation"\nfixed = ["left"]\n'
     b"sigma_attitude = 3.0\nview_weights = {left = 0.5}\n[fit]\ngrid = [12, 12, 7]\ntolerance = 1e-3\n"
 )
 ASP_GCPS = (
