@@ -313,6 +313,18 @@ def test_an_affine_function_is_found_among_outliers_with_its_spread() -> None:
     assert (robust_affine(xy[:30], truth[:30]).coefficients[1:] != 0).all()
 
 
+def test_an_affine_function_is_that_of_its_own_weights() -> None:
+    """Tukey's biweight at the end of the iteration: the weighted residuals are orthogonal to 1, x and y."""
+    rng = np.random.default_rng(6)
+    xy = rng.uniform(0, 5000, (400, 2))
+    values = 1e-3 * xy[:, 0] + rng.normal(0, 0.2, 400)
+    values[:120] += rng.uniform(1, 10, 120)
+    residual = values - robust_affine(xy, values)(xy)
+    weight = np.maximum(0.0, 1.0 - (residual / (4.685 * mad(residual))) ** 2) ** 2
+    design = np.column_stack([np.ones(400), (xy - 2500) / 5000])
+    assert np.abs(design.T @ (weight * residual)).max() < 1e-3 * np.abs(design.T @ np.abs(residual)).max()
+
+
 def test_the_mad_is_a_standard_deviation_about_zero() -> None:
     assert mad(np.array([-2.0, 1.0, 3.0])) == pytest.approx(1.4826 * 2.0)
     assert mad(np.empty(0)) == 0.0
