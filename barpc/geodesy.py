@@ -34,13 +34,15 @@ def pointwise(
     shapes: Sequence[tuple[int, ...]],
     points: npt.ArrayLike,
     alt: npt.ArrayLike | None = None,
+    rows: int = 0,
 ) -> list[Array]:
     """What a function of a batch of points gives for points with any leading axes, in pieces that stay in cache.
 
     Parameters
     ----------
     function : callable
-        (n, k) points, and (n,) altitudes if there are any -> arrays (n, ...); what is not finite is no news.
+        (n, k) points, (n,) altitudes if there are any, and (rows, n) memory to overwrite if it asks for `rows`
+        -> arrays (n, ...); what is not finite is no news.
     chunk : int
         Points worked on at a time.
     shapes : sequence of tuple of int
@@ -48,6 +50,8 @@ def pointwise(
     points : (..., k)
     alt : (...), optional
         Broadcast with `points`.
+    rows : int
+        Of memory that is kept for all pieces: fresh memory costs more than sums.
     """
     points = np.asarray(points, dtype=np.float64)
     lead, k = points.shape[:-1], points.shape[-1]
@@ -58,10 +62,14 @@ def pointwise(
         flat = [np.broadcast_to(points, (*lead, k)).reshape(-1, k), np.broadcast_to(alt, lead).reshape(-1)]
     count = len(flat[0])
     out = [np.empty((count, *shape)) for shape in shapes]
+    memory = np.empty((rows, min(count, chunk)))
     with np.errstate(all="ignore"):
         for start in range(0, count, chunk):
             part = slice(start, start + chunk)
-            for whole, piece in zip(out, function(*(array[part] for array in flat)), strict=True):
+            given = [array[part] for array in flat]
+            if rows:
+                given.append(memory[:, : len(given[0])])
+            for whole, piece in zip(out, function(*given), strict=True):
                 whole[part] = piece
     return [whole.reshape(*lead, *shape) for whole, shape in zip(out, shapes, strict=True)]
 
@@ -211,6 +219,13 @@ def enu_basis(ground: npt.ArrayLike) -> Array:
     basis[..., 1, 0], basis[..., 1, 1], basis[..., 1, 2] = -sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat
     basis[..., 2, 0], basis[..., 2, 1], basis[..., 2, 2] = cos_lat * cos_lon, cos_lat * sin_lon, sin_lat
     return basis
+
+
+def up(ground: Array) -> Array:
+    """Unit vectors (3, N) up at ground points (N, 3), ECEF."""
+    lon, lat = ground[:, 0] * _RAD, ground[:, 1] * _RAD
+    cos_lat = np.cos(lat)
+    return np.stack([cos_lat * np.cos(lon), cos_lat * np.sin(lon), np.sin(lat)])
 
 
 def metres_per_unit(ground: npt.ArrayLike) -> Array:

@@ -37,7 +37,7 @@ from barpc.ba.block import join
 from barpc.ba.rounds import Observations
 from barpc.ba.solve import State, camera_step
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
-from barpc.sensor.corrected import rotation_matrix
+from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
 

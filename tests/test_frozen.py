@@ -13,9 +13,9 @@ from barpc.errors import FitError, InputError, RpcError
 from barpc.fit import Normalization
 from barpc.frozen import Frozen
 from barpc.scene import GroundPoints, Tracks, View
+from barpc.sensor.corrected import ImageAffine
 from barpc.sensor.curve import Curve
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.imagespace import ImageAffine
 from barpc.sensor.rpc import RPC
 from barpc.simulate import Look, fly
 

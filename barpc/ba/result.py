@@ -15,8 +15,7 @@ from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.imagespace import ImageAffine, ImageCorrected
+from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 
 
 @dataclass(frozen=True, eq=False)

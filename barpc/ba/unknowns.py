@@ -14,9 +14,8 @@ import numpy as np
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.geometry import camera_center
-from barpc.sensor.imagespace import ImageAffine, ImageCorrected
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
 """Image models: which of the terms 1, col, row each coordinate's correction has."""

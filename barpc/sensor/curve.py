@@ -1,18 +1,32 @@
-"""A vector that changes with time: the orbit or the attitude of a satellite, as polynomial pieces."""
+"""Position and attitude over time: vectors as polynomial pieces, and what a rotation vector does to others."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial import chebyshev
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array
+
+EXTRAPOLATION = 1.0
+"""Seconds beyond its knots that a curve is still believed."""
+MARGIN = 70.0
+"""State vectors so far before and after the image take part in the fit of an orbit [s]."""
+MIN_VECTORS = 4
+MIN_DEGREE, MAX_DEGREE = 5, 11
+
+_TOLERANCE = 1.0  # m: state vectors that scatter more are not one orbit
+_FLOOR = 2e-5  # m: a residual across the track that no pixel sees
+_DIGITS = np.array([1e-5, 1e-5, 1e-6])  # m, m, m/s: no standard deviation is smaller
+_ROUNDS = 5  # of estimating them: they settle in three
+_GAIN = 1.5  # a higher degree must lower the residual across the track by this factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,20 +35,25 @@ class Curve(Frozen):
 
     Parameters
     ----------
-    knots : (M + 1,)
-        Times [s], ascending; piece m holds between knots m and m + 1.
-    coeffs : (M, K, 3)
-        Piece m is the sum over k of coeffs[m, k] (t - knots[m])^k.
+    knots : (M + 1,), times [s], ascending; piece m holds between knots m and m + 1
+    coeffs : (M, K, 3), piece m is the sum over k of coeffs[m, k] (t - knots[m])^k
     """
 
     knots: Array
     coeffs: Array
+    _table: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         knots = self._array("knots", (None,), RpcError)
-        self._array("coeffs", (len(knots) - 1, None, 3), RpcError)
+        coeffs = self._array("coeffs", (len(knots) - 1, None, 3), RpcError)
         if not (np.diff(knots) > 0).all():
             raise RpcError("Curve knots: they must ascend")
+        power = np.arange(1, coeffs.shape[1])[:, None]
+        table = np.zeros((9, coeffs.shape[1], len(coeffs)))  # value, rate, acceleration by power and piece
+        table[:3] = coeffs.transpose(2, 1, 0)
+        table[3:6, :-1] = table[:3, 1:] * power
+        table[6:, :-1] = table[3:6, 1:] * power
+        self._keep("_table", table)
 
     @classmethod
     def polynomial(cls, coeffs: npt.ArrayLike, start: float, stop: float) -> Curve:
@@ -47,10 +66,8 @@ class Curve(Frozen):
 
         Parameters
         ----------
-        times : (N,)
-            [s], ascending.
-        values : (N, 3)
-            Positions [m] or rotation vectors [rad].
+        times : (N,) [s], ascending
+        values : (N, 3), positions [m] or rotation vectors [rad]
         degree : int
             3 or 5; less where there are too few samples. A quintic through positions every 10 s is true to
             1e-4 m between them.
@@ -60,8 +77,7 @@ class Curve(Frozen):
         RpcError
             Fewer than two samples, times that do not ascend, numbers that are not finite.
         """
-        times = np.asarray(times, dtype=np.float64)
-        values = np.asarray(values, dtype=np.float64)
+        times, values = np.asarray(times, dtype=np.float64), np.asarray(values, dtype=np.float64)
         if times.ndim != 1 or len(times) < 2 or values.shape != (len(times), 3):
             raise RpcError(f"curve: {values.shape} values at {times.shape} times; two samples or more needed")
         if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
@@ -72,31 +88,48 @@ class Curve(Frozen):
         taylor = [spline(knots[:-1], nu=k) / math.factorial(k) for k in range(spline.k + 1)]
         return cls(knots, np.stack(taylor, axis=1))
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time that the curve is believed for [s]."""
+        return float(self.knots[0]) - EXTRAPOLATION, float(self.knots[-1]) + EXTRAPOLATION
+
+    @property
+    def degree(self) -> int:
+        """Degree of the polynomials."""
+        return int(self.coeffs.shape[1]) - 1
+
     def __call__(self, time: Array) -> tuple[Array, Array]:
-        """Values and their derivatives by time.
+        """Values (3, N) and their derivatives by time (3, N) at times (N,) [s]."""
+        out = self._evaluate(time, 6)
+        return out[:3], out[3:]
 
-        Parameters
-        ----------
-        time : (N,)
-            [s].
+    def states(self, time: Array) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration (3, N) at times (N,) [s]."""
+        out = self._evaluate(time, 9)
+        return out[:3], out[3:6], out[6:]
 
-        Returns
-        -------
-        value, rate : (3, N)
-        """
-        if len(self.coeffs) == 1:
-            powers = self.coeffs[0][:, :, None]
+    def _evaluate(self, time: Array, count: int) -> Array:
+        """The first `count` rows of the table's polynomials (count, N)."""
+        table = self._table[:count]
+        if len(self.coeffs) == 1:  # one matrix product: a fifth of the time of Horner's scheme
             dt = time - self.knots[0]
-        else:
-            piece = np.searchsorted(self.knots[1:-1], time, side="right")
-            powers = np.moveaxis(self.coeffs[piece], 0, 2)
-            dt = time - self.knots[piece]
-        value = np.broadcast_to(powers[-1], (3, len(dt)))
-        rate = np.zeros((3, 1))
-        for power in powers[-2::-1]:
-            rate = rate * dt + value
-            value = value * dt + power
-        return value, np.broadcast_to(rate, value.shape)
+            powers = np.ones((table.shape[1], len(time)))
+            for k in range(1, len(powers)):
+                np.multiply(powers[k - 1], dt, out=powers[k])
+            return np.asarray(table[:, :, 0] @ powers)
+        piece = np.searchsorted(self.knots[1:-1], time, side="right")
+        dt = time - self.knots[piece]
+        out = table[:, -1].take(piece, axis=1)
+        for k in range(table.shape[1] - 2, -1, -1):
+            out *= dt
+            out += table[:, k].take(piece, axis=1)
+        return out
+
+
+def about_middle(rotations: Rotation) -> tuple[Array, Array]:
+    """The middle one (3, 3) of N rotations, and the rotation vectors (N, 3) [rad] from there, in its axes."""
+    middle = rotations[len(rotations) // 2]
+    return np.asarray(middle.as_matrix()), np.asarray((middle.inv() * rotations).as_rotvec())
 
 
 def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[Array, Curve]:
@@ -104,17 +137,13 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
     Parameters
     ----------
-    times : (N,)
-        [s], ascending.
-    quaternions : (N, 4)
-        ecef_from_camera, scalar first; of any sign and length but zero.
+    times : (N,) [s], ascending
+    quaternions : (N, 4), ecef_from_camera, scalar first; of any sign and length but zero
 
     Returns
     -------
-    mount : (3, 3)
-        ecef_from_camera at the middle sample.
-    attitude : Curve
-        Rotation vector [rad] in the axes of `mount`: a cubic spline.
+    mount : (3, 3), ecef_from_camera at the middle sample
+    attitude : Curve, rotation vector [rad] in the axes of `mount`: a cubic spline
 
     Raises
     ------
@@ -124,9 +153,163 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
     q = np.asarray(quaternions, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != 4 or not (np.isfinite(q).all() and q.any(axis=1).all()):
         raise RpcError(f"attitude: quaternions {q.shape} must be finite, not zero, four numbers each")
-    rotations = Rotation.from_quat(np.roll(q, -1, axis=1))
-    middle = rotations[len(q) // 2]
-    vectors = (middle.inv() * rotations).as_rotvec()
+    mount, vectors = about_middle(Rotation.from_quat(q, scalar_first=True))
     if np.linalg.norm(vectors, axis=1).max() > 2.0:
         raise RpcError("attitude: it turns by more than 2 rad; cut the samples to the image")
-    return np.asarray(middle.as_matrix()), Curve.through(times, vectors, degree=3)
+    return mount, Curve.through(times, vectors, degree=3)
+
+
+@dataclass(frozen=True, eq=False)
+class Orbit(Curve):
+    """The polynomial through state vectors.
+
+    Parameters
+    ----------
+    sigma : (3,)
+        Standard deviations of the state vectors: positions along and across the track [m], velocities [m/s].
+    """
+
+    sigma: Array
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._array("sigma", (3,), RpcError)
+
+
+def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float, float]) -> Orbit:
+    """The orbit through state vectors around the time of an image: one polynomial of time.
+
+    Least squares on positions AND velocities. How far each can be trusted differs from product to product
+    (Sentinel-1: positions to 2e-6 m in auxiliary products and 2e-4 m in downlinked ones, velocities to 1e-5 and
+    6e-3 m/s, and where the annotated times, whole microseconds, are not the true ones, positions ALONG the track
+    to 3 mm only), so the standard deviations of positions along the track and across it and of velocities are
+    estimated along with the orbit, from the residuals. The degree is the lowest that no higher one (`MIN_DEGREE`
+    to `MAX_DEGREE`) betters by more than half in the residual ACROSS the track: about 5 for downlinked vectors, 6
+    for auxiliary ones, more for a long span. Along the track a high degree would follow the rounding of the times.
+
+    Parameters
+    ----------
+    time : (N,) [s from the epoch]
+    position, velocity : (N, 3), ECEF [m, m/s]
+    window : (float, float), first and last time of the image [s]; vectors within `MARGIN` of it are used
+
+    Raises
+    ------
+    RpcError
+        Fewer than `MIN_VECTORS` vectors, an image more than `EXTRAPOLATION` beyond them, or vectors that
+        are not one orbit.
+    """
+    time, first = np.unique(time, return_index=True)
+    use = (time >= window[0] - MARGIN) & (time <= window[1] + MARGIN)
+    time, position, velocity = time[use], position[first][use], velocity[first][use]
+    if len(time) < MIN_VECTORS:
+        raise RpcError(
+            f"orbit: {len(time)} state vectors within {MARGIN:g} s of the image, at least {MIN_VECTORS} "
+            "needed; give a precise orbit file of that day"
+        )
+    if window[0] < time[0] - EXTRAPOLATION or window[1] > time[-1] + EXTRAPOLATION:
+        raise RpcError(
+            f"orbit: the image lasts from {window[0]:.1f} to {window[1]:.1f} s, the state vectors from "
+            f"{time[0]:.1f} to {time[-1]:.1f} s; give a precise orbit file that covers it"
+        )
+    degrees = range(min(MIN_DEGREE, len(time)), min(MAX_DEGREE, len(time)) + 1)
+    fits = [_fit_orbit(time, position, velocity, degree) for degree in degrees]
+    limit = _GAIN * max(_FLOOR, min(float(fit.sigma[1]) for fit in fits))
+    orbit = next(fit for fit in fits if fit.sigma[1] <= limit)
+    if not orbit.sigma[:2].max() <= _TOLERANCE:
+        raise RpcError(
+            f"orbit: the state vectors scatter by {orbit.sigma.max():.3g} m about any smooth orbit"
+        )
+    return orbit
+
+
+def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Orbit:
+    """Least squares of one degree, weighted by the standard deviations that its own residuals show."""
+    half = 0.5 * (time[-1] - time[0])
+    x = (time - time[0]) / half - 1.0
+    basis = chebyshev.chebvander(x, degree)
+    slope = chebyshev.chebval(x, chebyshev.chebder(np.eye(degree + 1))).T / half
+    along = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
+    across = np.eye(3) - along[:, :, None] * along[:, None, :]
+    groups = [  # observations along directions (N, C, 3): rows (N C), columns (D + 1, 3)
+        (np.einsum("nci,nd->ncdi", directions, functions).reshape(-1, 3 * (degree + 1)), values.ravel())
+        for directions, functions, values in (
+            (along[:, None, :], basis, (along * position).sum(axis=1)),
+            (across, basis, np.einsum("nij,nj->ni", across, position)),
+            (np.broadcast_to(np.eye(3), across.shape), slope, velocity),
+        )
+    ]
+    share = 1.0 - 0.5 * (degree + 1) / len(time)  # of the observations that the unknowns leave over
+    count = len(time) * np.array([1.0, 2.0, 3.0]) * share
+    sigma = np.ones(3)
+    for _ in range(_ROUNDS):
+        matrix = np.concatenate([a / s for (a, _), s in zip(groups, sigma, strict=True)])
+        target = np.concatenate([y / s for (_, y), s in zip(groups, sigma, strict=True)])
+        scale = np.linalg.norm(matrix, axis=0)
+        solution = np.linalg.lstsq(matrix / scale, target, rcond=None)[0] / scale
+        squares = np.array([((y - a @ solution) ** 2).sum() for a, y in groups])
+        sigma = np.maximum(np.sqrt(squares / count), _DIGITS)
+    series = solution.reshape(degree + 1, 3)
+    taylor = [
+        chebyshev.chebval(-1.0, chebyshev.chebder(series, k)) / (half**k * math.factorial(k))
+        for k in range(degree + 1)
+    ]
+    return Orbit(time[[0, -1]], np.array(taylor)[None], sigma)
+
+
+class Turn:
+    """The rotations exp([w]x) and their derivatives.
+
+    Parameters
+    ----------
+    w : (..., 3, N), rotation vectors [rad]
+    """
+
+    def __init__(self, w: Array) -> None:
+        x = (w * w).sum(axis=-2, keepdims=True)  # the angles, squared
+        self._w = w
+        if x.max(initial=0.0) < 1e-4:  # sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3: to 3e-16
+            self._a, self._b, self._c = 1 - x / 6 * (1 - x / 20), 0.5 - x / 24 * (1 - x / 30), 1 / 6 - x / 120
+            return
+        angle = np.sqrt(x)
+        self._a = np.sinc(angle / np.pi)
+        self._b = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # without cancellation
+        with np.errstate(all="ignore"):
+            self._c = np.where(x > 1e-4, (1.0 - self._a) / x, 1.0 / 6 - x / 120)
+
+    def forth(self, v: Array) -> Array:
+        """exp([w]x) v of vectors (..., 3, N): Rodrigues."""
+        bent = cross(self._w, v)
+        return np.asarray(v + self._a * bent + self._b * cross(self._w, bent))
+
+    def back(self, v: Array) -> Array:
+        """exp(-[w]x) v of vectors (..., 3, N)."""
+        bent = cross(self._w, v)
+        return np.asarray(v - self._a * bent + self._b * cross(self._w, bent))
+
+    def rate(self, v: Array) -> Array:
+        """The right Jacobian times v: exp([w + v]x) is exp([w]x) exp([rate]x) to first order in v (..., 3, N)."""
+        bent = cross(self._w, v)
+        return np.asarray(v - self._b * bent + self._c * cross(self._w, bent))
+
+
+def rotation_matrix(rotation: npt.ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    return Turn(np.asarray(rotation, dtype=np.float64)[..., None]).forth(np.eye(3))
+
+
+def rotation_left_jacobian(rotation: npt.ArrayLike) -> Array:
+    """Left Jacobians (..., 3, 3) of rotation vectors (..., 3) [rad].
+
+    R(w + dw) = R(J dw) R(w) to first order: d(R v)/dw = -skew(R v) J.
+    """
+    return Turn(-np.asarray(rotation, dtype=np.float64)[..., None]).rate(np.eye(3))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Cross products along the last axis but one of (..., 3, N) arrays, broadcast."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.multiply(a[..., j, :], b[..., k, :], out=out[..., i, :])
+        out[..., i, :] -= a[..., k, :] * b[..., j, :]
+    return out

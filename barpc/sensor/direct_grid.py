@@ -10,21 +10,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import NdBSpline, make_interp_spline
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
-from barpc.sensor.rational import monomials
+from barpc.sensor.rational import DERIVATIVE, monomials
 
 CHUNK = 2048
 """Points worked on at a time: what belongs to them stays in cache."""
 
-Basis = tuple[npt.NDArray[np.int64], Array, Array]
-
 _FAR = 1e9  # px and m: beyond it no node lies
 _STEPS = 8
-_SETTLED = 1e-5  # px: Newton is quadratic, what is left after a step of this size is below rounding
+_SETTLED = 1e-5  # px: what is left after a step of this size is below rounding
+_SHRINK = 1e-4  # of a step to the next: more asks for new derivatives
+
+_VALUE, _BY_COL, _BY_ROW, _BY_ALT = (0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +34,10 @@ class DirectGrid(Frozen):
 
     Parameters
     ----------
-    cols : (W,)
-        Columns of the nodes [px], ascending; (0, 0) is the centre of the top-left pixel.
-    rows : (H,)
-        Rows of the nodes [px], ascending.
-    alts : (L,)
-        Altitudes of the layers [m], ascending.
-    lonlat : (L, H, W, 2)
-        lon, lat [deg] of the nodes.
+    cols : (W,), columns of the nodes [px], ascending; (0, 0) is the centre of the top-left pixel
+    rows : (H,), rows of the nodes [px], ascending
+    alts : (L,), altitudes of the layers [m], ascending
+    lonlat : (L, H, W, 2), lon, lat [deg] of the nodes
 
     Raises
     ------
@@ -57,8 +54,7 @@ class DirectGrid(Frozen):
     rows: Array
     alts: Array
     lonlat: Array
-    _knots: tuple[Array, Array, Array] = field(init=False, repr=False)
-    _spline: Array = field(init=False, repr=False)
+    _spline: NdBSpline = field(init=False, repr=False)
     _inverse: Array = field(init=False, repr=False)
     _lon: float = field(init=False, repr=False)
 
@@ -77,16 +73,13 @@ class DirectGrid(Frozen):
         coeffs = self.lonlat.copy()
         coeffs[..., 0] = wrap_longitude(coeffs[..., 0], center)
         coeffs -= [center, 0.0]
-        inverse = _inverse_cubic(axes, coeffs)
-        knots = []
+        self._keep("_inverse", _inverse_cubic(axes, coeffs))
+        splines = []
         for i, axis in enumerate(axes):
-            spline = make_interp_spline(axis, coeffs, k=min(3, len(axis) - 1), axis=i)
-            knots.append(np.asarray(spline.t))
-            coeffs = np.moveaxis(np.asarray(spline.c), 0, i) if i else np.asarray(spline.c)
-        table = np.ascontiguousarray(coeffs.reshape(-1, 2).T)  # (2, nodes)
-        self._keep("_inverse", inverse)
-        self._keep("_spline", table)
-        self._keep("_knots", tuple(knots))
+            splines.append(make_interp_spline(axis, coeffs, k=min(3, len(axis) - 1), axis=i))
+            coeffs = np.moveaxis(splines[-1].c, 0, i)
+        knots, degrees = tuple(s.t for s in splines), tuple(s.k for s in splines)
+        self._keep("_spline", NdBSpline(knots, np.ascontiguousarray(coeffs), degrees))
         self._keep("_lon", center)
 
     @classmethod
@@ -95,10 +88,8 @@ class DirectGrid(Frozen):
 
         Parameters
         ----------
-        ground : (N, 3)
-            lon, lat [deg], alt [m] of every node.
-        image : (N, 2)
-            col, row [px].
+        ground : (N, 3), lon, lat [deg], alt [m] of every node
+        image : (N, 2), col, row [px]
 
         Raises
         ------
@@ -131,106 +122,67 @@ class DirectGrid(Frozen):
 
     def _localize(self, image: Array, alt: Array) -> list[Array]:
         """`localize` of points (N, 2) at altitudes (N,)."""
-        return [np.column_stack([self._value(image, alt)[0] + [self._lon, 0.0], alt])]
+        return [np.column_stack([self._value(image, alt) + np.array([self._lon, 0.0]), alt])]
 
     def _jacobian(self, ground: Array) -> tuple[Array, Array]:
         """`project_jacobian` of points (N, 3)."""
-        image = self._solve(ground)
-        _, rate = self._value(image, ground[:, 2])
-        by_lonlat = _inverse_2x2(rate[:, :2])  # (N, 2, 2): d(col, row)/d(lon, lat)
-        by_alt = -np.einsum("nij,nj->ni", by_lonlat, rate[:, 2])
-        return image, np.concatenate([by_lonlat, by_alt[:, :, None]], axis=2)
+        image, alt = self._solve(ground), ground[:, 2]
+        by_lon, by_lat = self._inverse_2x2(image, alt)
+        rise = self._value(image, alt, _BY_ALT)
+        by_alt = -by_lon * rise[:, :1] - by_lat * rise[:, 1:]
+        return image, np.stack([by_lon, by_lat, by_alt], axis=2)
 
     def _solve(self, ground: Array) -> Array:
-        """Image points (N, 2) of ground points (N, 3): Newton from an inverse cubic polynomial."""
-        target = ground[:, :2].copy()
+        """Image points (N, 2) of ground points (N, 3): Newton from an inverse cubic polynomial.
+
+        Its derivatives serve for all steps where these shrink fast enough, and make way for the spline's where not.
+        """
+        target, alt = ground[:, :2].copy(), ground[:, 2]
         target[:, 0] = wrap_longitude(target[:, 0], self._lon) - self._lon
         with np.errstate(all="ignore"):
-            image = self._guess(target, ground[:, 2])
-            settled = np.zeros(len(ground), dtype=bool)
+            image, by_lon, by_lat = self._guess(target, alt)
+            before = np.full(len(target), np.inf)
             for _ in range(_STEPS):
-                value, rate = self._value(image, ground[:, 2])
-                step = np.einsum("nij,nj->ni", _inverse_2x2(rate[:, :2]), target - value)
+                miss = target - self._value(image, alt)
+                step = by_lon * miss[:, :1] + by_lat * miss[:, 1:]
                 image = image + step
-                settled = np.abs(step).max(axis=1) < _SETTLED
-                if not (~settled & np.isfinite(step).all(axis=1)).any():
+                length = np.abs(step).max(axis=1)
+                todo = ~(length < _SETTLED) & np.isfinite(length)
+                if not todo.any():
                     break
-        image[~settled] = np.nan
+                if (length > _SHRINK * before)[todo].any():
+                    by_lon, by_lat = self._inverse_2x2(image, alt)
+                before = length
+            image[~(length < _SETTLED)] = np.nan
         return image
 
-    def _guess(self, lonlat: Array, alt: Array) -> Array:
-        """Image points (N, 2) by the inverse cubic, brought back onto the grid."""
-        offset, scale = self._inverse[0, :3], self._inverse[1, :3]
-        image = monomials(((np.column_stack([lonlat, alt]) - offset) / scale).T).T @ self._inverse[2:, :2]
+    def _guess(self, lonlat: Array, alt: Array) -> tuple[Array, Array, Array]:
+        """Image points (N, 2) by the inverse cubic, brought back onto the grid, and their derivatives by lon, lat."""
+        offset, scale, coeffs = self._inverse[0, :3], self._inverse[1, :3], self._inverse[2:, :2]
+        basis = monomials(((np.column_stack([lonlat, alt]) - offset) / scale).T)
+        image = basis.T @ coeffs
         for k, axis in enumerate((self.cols, self.rows)):
             cell = 0.9 * (axis[1] - axis[0])
             image[:, k] = np.clip(image[:, k], axis[0] - cell, axis[-1] + cell)
-        return np.asarray(image)
+        by_lon, by_lat = (basis[:10].T @ (DERIVATIVE[k].T @ coeffs) / scale[k] for k in (0, 1))
+        return image, by_lon, by_lat
 
-    def _value(self, image: Array, alt: Array) -> tuple[Array, Array]:
-        """East of the centre and lat (N, 2) [deg], and their derivatives (N, 3, 2) by col, row, alt."""
-        places = (alt, image[:, 1], image[:, 0])
-        margins = (0.1 * np.ptp(self.alts), self.rows[1] - self.rows[0], self.cols[1] - self.cols[0])
-        inside = np.ones(len(alt), dtype=bool)
-        bases = []
-        for place, margin, knots in zip(places, margins, self._knots, strict=True):
-            ok = (place >= knots[0] - margin) & (place <= knots[-1] + margin)
-            inside &= ok
-            bases.append(_basis(knots, np.where(ok, place, knots[0])))
-        total = self._contract(bases)
-        total[:, :, ~inside] = np.nan
-        return total[0].T, np.moveaxis(total[1:], 2, 0)
+    def _value(self, image: Array, alt: Array, derivative: tuple[int, int, int] = _VALUE) -> Array:
+        """East of the centre and lat (N, 2) [deg], or a derivative of them; NaN off the grid."""
+        place = np.column_stack([alt, image[:, 1], image[:, 0]])
+        margin = [0.1 * np.ptp(self.alts), self.rows[1] - self.rows[0], self.cols[1] - self.cols[0]]
+        low, high = np.array([(axis[0], axis[-1]) for axis in (self.alts, self.rows, self.cols)]).T
+        off = ~((place >= low - margin) & (place <= high + margin)).all(axis=1)
+        place[off] = low
+        value = np.asarray(self._spline(place, nu=derivative))
+        value[off] = np.nan
+        return value
 
-    def _contract(self, bases: list[Basis]) -> Array:
-        """Value, d/dcol, d/drow, d/dalt (4, 2, N) from the B-splines along altitude, row and column."""
-        (k, layers, by_alt), (i, rows, by_row), (j, cols, by_col) = bases
-        height, width = self.lonlat.shape[1:3]
-        start = (k * height + i) * width + j
-        total = np.zeros((4, 2, len(start)))
-        for dk in range(len(layers)):
-            plane = np.zeros((3, 2, len(start)))
-            for di in range(len(rows)):
-                line, line_rate = np.zeros((2, 2, len(start)))
-                for dj in range(len(cols)):
-                    node = self._spline.take(start + ((dk * height + di) * width + dj), axis=1)
-                    line += cols[dj] * node
-                    line_rate += by_col[dj] * node
-                plane[0] += rows[di] * line
-                plane[1] += rows[di] * line_rate
-                plane[2] += by_row[di] * line
-            total[:3] += layers[dk] * plane
-            total[3] += by_alt[dk] * plane[0]
-        return total
-
-
-def _basis(knots: Array, x: Array) -> Basis:
-    """First index (N,), values and slopes (k + 1, N) of the B-splines that are not zero at x (N,).
-
-    Cox and de Boor's recursion; the end pieces are continued beyond the outer knots.
-    """
-    degree = int(np.argmax(knots > knots[0])) - 1
-    span = np.clip(np.searchsorted(knots, x, side="right") - 1, degree, len(knots) - degree - 2)
-    values = [np.ones(len(x))]
-    slopes: list[Array] = []
-    for order in range(1, degree + 1):
-        zero = np.zeros(len(x))
-        grown, slopes = [zero] * (order + 1), [zero] * (order + 1)
-        for r in range(order):
-            right, left = knots[span + r + 1], knots[span + r + 1 - order]
-            part = values[r] / (right - left)
-            grown[r] = grown[r] + (right - x) * part
-            grown[r + 1] = (x - left) * part
-            slopes[r] = slopes[r] - order * part
-            slopes[r + 1] = order * part
-        values = grown
-    return span - degree, np.stack(values), np.stack(slopes)
-
-
-def _inverse_2x2(matrix: Array) -> Array:
-    """Inverses d(col, row)/d(lon, lat) of (N, 2, 2) derivatives of (lon, lat) by col and by row."""
-    (a, b), (c, d) = np.moveaxis(matrix, 0, 2)  # a, b: lon, lat by col; c, d: by row
-    out = np.stack([np.stack([d, -c], axis=-1), np.stack([-b, a], axis=-1)], axis=1)
-    return np.asarray(out / (a * d - b * c)[:, None, None])
+    def _inverse_2x2(self, image: Array, alt: Array) -> tuple[Array, Array]:
+        """d(col, row)/dlon and d(col, row)/dlat (N, 2)."""
+        (a, b), (c, d) = self._value(image, alt, _BY_COL).T, self._value(image, alt, _BY_ROW).T
+        det = a * d - b * c
+        return np.stack([d / det, -b / det], axis=1), np.stack([-c / det, a / det], axis=1)
 
 
 def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:

@@ -21,7 +21,10 @@ from barpc.geodesy import (
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
 CenterMethod = Literal["line", "projective", "nominal"]
+_Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
 NOMINAL_ALTITUDE = 650e3
 """Orbit altitude [m] assumed where a model does not tell its own."""
@@ -37,19 +40,10 @@ def altitude_range(rpc: RPC) -> tuple[float, float]:
 
 def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
     """Points (4 per_side, 2) [px] along the outline of an image, from the top-left corner, clockwise."""
-    width, height = size
-    t = np.arange(per_side) / per_side
-    col, row = t * width - 0.5, t * height - 0.5
-    right, bottom = np.full(per_side, width - 0.5), np.full(per_side, height - 0.5)
-    left, top = np.full(per_side, -0.5), np.full(per_side, -0.5)
-    return np.concatenate(
-        [
-            np.column_stack([col, top]),
-            np.column_stack([right, row]),
-            np.column_stack([width - 1 - col, bottom]),
-            np.column_stack([left, height - 1 - row]),
-        ]
-    )
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    t = np.arange(per_side)[:, None] / per_side
+    sides = corners[:, None] + t * (np.roll(corners, -1, axis=0) - corners)[:, None]
+    return np.asarray(sides.reshape(-1, 2) * size - 0.5)
 
 
 def footprint(
@@ -60,9 +54,7 @@ def footprint(
     Parameters
     ----------
     sensor : SensorModel
-        The camera.
-    size : (width, height)
-        [px].
+    size : (width, height) [px]
     alt : float or (4 per_side,)
         Altitude of the ground [m above the ellipsoid].
     per_side : int
@@ -86,7 +78,6 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
     Parameters
     ----------
     sensor : SensorModel
-        The camera.
     image : (..., 2)
         col, row [px].
     alt_range : (low, high)
@@ -127,7 +118,6 @@ def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
     Parameters
     ----------
     sensor : SensorModel
-        The camera.
     ground : (..., 3)
         lon, lat [deg], alt [m].
 
@@ -138,28 +128,18 @@ def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
     azimuth : (...)
         Direction to the sensor, clockwise from north [deg, 0 to 360].
     """
-    sight = sight_enu(sensor, ground)
-    incidence = np.degrees(np.arctan2(np.hypot(sight[..., 0], sight[..., 1]), sight[..., 2]))
-    azimuth = np.degrees(np.arctan2(sight[..., 0], sight[..., 1])) % 360.0
-    return incidence, azimuth
+    east, north, up = np.moveaxis(sight_enu(sensor, ground), -1, 0)
+    return np.degrees(np.arctan2(np.hypot(east, north), up)), np.degrees(np.arctan2(east, north)) % 360.0
 
 
 def ground_sample_distance(sensor: SensorModel, image: Array, alt: npt.ArrayLike) -> Array:
-    """Metres on the ground (..., 2) between the centres of neighbouring pixels along col and along row.
-
-    Parameters
-    ----------
-    sensor : SensorModel
-        The camera.
-    image : (..., 2)
-        col, row [px].
-    alt : (...)
-        Altitude of the ground [m].
-    """
-    image = np.asarray(image, dtype=np.float64)
-    here = ecef_from_ground(sensor.localize(image, np.asarray(alt, dtype=np.float64)))
-    steps = [sensor.localize(image + step, np.asarray(alt, dtype=np.float64)) for step in np.eye(2)]
-    return np.stack([np.linalg.norm(ecef_from_ground(s) - here, axis=-1) for s in steps], axis=-1)
+    """Metres on the ground (..., 2) from pixels (..., 2) to the next along col and row, at altitudes (...) [m]."""
+    steps = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    ground = sensor.localize(
+        np.asarray(image)[..., None, :] + steps, np.asarray(alt, dtype=np.float64)[..., None]
+    )
+    ecef = ecef_from_ground(ground)
+    return np.asarray(np.linalg.norm(ecef[..., 1:, :] - ecef[..., :1, :], axis=-1))
 
 
 def convergence_angle(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) -> Array:
@@ -175,12 +155,9 @@ class CameraCenter:
 
     Parameters
     ----------
-    ecef : (3,)
-        [m].
-    altitude : float
-        [m above the ellipsoid].
-    method : str
-        How it was found: "line", "projective", or "nominal" where the first was not plausible.
+    ecef : (3,) [m]
+    altitude : float [m above the ellipsoid]
+    method : str, how it was found: "line", "projective", or "nominal" where the first was not plausible
     """
 
     ecef: Array
@@ -196,27 +173,18 @@ def camera_center(
 ) -> CameraCenter:
     """Camera centre regressed from a sensor model.
 
-    ``line``: one image line of a pushbroom camera IS a perspective camera, so its rays meet in one
-    point, found by least squares. ``projective``: a 3x4 projective camera by direct linear
-    transformation over the whole image, as in the paper; of a pushbroom image it finds a point at about
-    twice the distance, for the image is perspective across the track and affine along it.
-
     Parameters
     ----------
     sensor : SensorModel
-        The camera.
-    size : (width, height)
-        [px].
+    size : (width, height) [px]
     alt_range : (low, high)
         Altitudes [m] between which rays are drawn.
     method : {"line", "projective"}
-        See above.
-
-    Returns
-    -------
-    CameraCenter
-        With ``line``, a point outside `PLAUSIBLE_ALTITUDE` is replaced by one at `NOMINAL_ALTITUDE` on
-        the central ray, and says so in its ``method``.
+        ``line``: one image line of a pushbroom camera IS a perspective camera, so its rays meet in one point, found
+        by least squares; a point outside `PLAUSIBLE_ALTITUDE` is replaced by one at `NOMINAL_ALTITUDE` on the central
+        ray, and says so in its ``method``. ``projective``: a 3x4 projective camera by direct linear transformation
+        over the whole image, as in the paper; of a pushbroom image it finds a point at about twice the distance, for
+        the image is perspective across the track and affine along it.
 
     Raises
     ------
@@ -250,16 +218,10 @@ def _center_of_line(sensor: SensorModel, size: tuple[int, int], alt_range: tuple
 
 
 def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    width, height = size
     low, high = alt_range[0], max(alt_range[1], alt_range[0] + 100.0)
-    grid = np.meshgrid(
-        np.linspace(0, width - 1, 10),
-        np.linspace(0, height - 1, 10),
-        np.linspace(low, high, 6),
-        indexing="ij",
-    )
-    col, row, alt = (g.ravel() for g in grid)
-    image = np.column_stack([col, row])
+    axes = np.linspace(0, size[0] - 1, 10), np.linspace(0, size[1] - 1, 10), np.linspace(low, high, 6)
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    image, alt = nodes[:, :2], nodes[:, 2]
     ecef = ecef_from_ground(sensor.localize(image, alt))
     if not np.isfinite(ecef).all():
         return np.full(3, np.nan)
@@ -276,12 +238,11 @@ def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tu
 def _center_nominal(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
     image = np.array([(size[0] - 1) / 2, (size[1] - 1) / 2])
     origin, direction = lines_of_sight(sensor, image, alt_range)
-    up = enu_basis(ground_from_ecef(origin))[2]
-    distance = NOMINAL_ALTITUDE / max(float(direction @ up), 0.3)
-    for _ in range(5):  # the Earth curves away: a few steps along the ray reach the altitude
-        altitude = float(ground_from_ecef(origin + distance * direction)[2])
-        distance += (NOMINAL_ALTITUDE - altitude) / max(float(direction @ up), 0.3)
-    return np.asarray(origin + distance * direction)
+    cosine = max(float(direction @ enu_basis(ground_from_ecef(origin))[2]), 0.3)
+    point = origin
+    for _ in range(6):  # the Earth curves away: a few steps along the ray reach the altitude
+        point = point + (NOMINAL_ALTITUDE - float(ground_from_ecef(point)[2])) / cosine * direction
+    return np.asarray(point)
 
 
 def epipolar_offset(
@@ -300,21 +261,16 @@ def epipolar_offset(
     Parameters
     ----------
     sensor_a, sensor_b : SensorModel
-        The two cameras.
-    image_a, image_b : (N, 2)
-        col, row [px] of the matches.
-    alt : float or (N,)
-        First guess of the altitude [m].
-    steps : int
-        Gauss-Newton steps.
+    image_a, image_b : (N, 2), col, row [px] of the matches
+    alt : float or (N,), first guess of the altitude [m]
+    steps : int, Gauss-Newton steps
 
     Returns
     -------
     offset : (N,)
         Signed distance in image b [px], positive to the right of the direction of rising altitude
         (columns to the right, rows down: clockwise); NaN where the rays are parallel.
-    alt : (N,)
-        The altitudes [m].
+    alt : (N,), the altitudes [m]
     """
     alt = np.array(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(image_a)))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -340,15 +296,13 @@ class Triangulation:
     ----------
     points : (P, 3)
         ECEF [m]; NaN where the rays do not meet (fewer than two, parallel, or outside a model's domain).
-    residuals : (K, 2)
-        Projected - observed [px]; NaN for the rows of such points.
-    ok : (P,)
-        Whether the point is usable.
+    residuals : (K, 2), projected - observed [px]; NaN for the rows of such points
+    ok : (P,), whether the point is usable
     """
 
     points: Array
     residuals: Array
-    ok: npt.NDArray[np.bool_]
+    ok: BoolArray
 
 
 def triangulate(
@@ -366,7 +320,7 @@ def triangulate(
     Parameters
     ----------
     sensors : sequence of SensorModel
-        One a view.
+        One for each view.
     view, point : (K,)
         View and track of each observation.
     xy : (K, 2)
@@ -377,11 +331,6 @@ def triangulate(
         Altitude [m] that the first guess is localised at.
     steps : int
         At most so many steps.
-
-    Returns
-    -------
-    Triangulation
-        Points (P, 3) in ECEF [m], residuals (K, 2) [px], and which points are usable.
     """
     view, point = np.asarray(view, dtype=np.int64), np.asarray(point, dtype=np.int64)
     xy = np.asarray(xy, dtype=np.float64)
@@ -395,10 +344,9 @@ def triangulate(
         (sensors[view[order[i]]], slice(i, j)) for i, j in zip(first, [*first[1:], len(view)], strict=True)
     ]
     weight = np.ones(len(xy)) if sigma is None else 1.0 / np.asarray(sigma, dtype=np.float64)[order]
-    ground = _first_guess(rows, at, goal, np.broadcast_to(np.asarray(alt, dtype=np.float64), num))
     left = np.empty((len(xy), 2))
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        ok = _intersect(rows, at, goal, weight, ground, steps)
+        ground, ok = _intersect(rows, at, goal, weight, np.broadcast_to(alt, num), steps)
         for sensor, part in rows:
             left[order[part]] = sensor.project(ground[at[part]]) - goal[part]
     ok &= np.bincount(point, minlength=num) > 0
@@ -409,17 +357,17 @@ def triangulate(
 
 
 def _intersect(
-    rows: list[tuple[SensorModel, slice]],
-    point: npt.NDArray[np.int64],
-    xy: Array,
-    weight: Array,
-    ground: Array,
-    steps: int,
-) -> npt.NDArray[np.bool_]:
-    """Gauss-Newton on `ground` (P, 3) in place; for which points the rays determine a step.
+    rows: _Rows, point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
+) -> tuple[Array, BoolArray]:
+    """Gauss-Newton from where one of a track's views sees it at `alt`: ground (P, 3), and whether a step was possible.
 
     The unknowns of a step are metres east, north and up at the point: the step in ECEF without the conversions.
     """
+    ground = np.full((len(alt), 3), np.nan)
+    for sensor, part in rows:
+        new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start
+        if len(new):
+            ground[point[new]] = sensor.localize(xy[new], alt[point[new]])
     jacobian, residual = np.empty((3, 2, len(xy))), np.empty((2, len(xy)))
     ok = np.ones(len(ground), dtype=bool)
     for _ in range(steps):
@@ -432,27 +380,10 @@ def _intersect(
         ground -= np.where(ok, step, 0.0).T / scale
         if not np.abs(step[:, ok]).max(initial=0.0) > 1e-3:  # metres; quadratic: the next is below 1e-9
             break
-    return ok
+    return ground, ok
 
 
-def _first_guess(
-    rows: list[tuple[SensorModel, slice]],
-    point: npt.NDArray[np.int64],
-    xy: Array,
-    alt: Array,
-) -> Array:
-    """Each track localised at `alt` in one of its views."""
-    ground = np.full((len(alt), 3), np.nan)
-    for sensor, part in rows:
-        new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start
-        if len(new):
-            ground[point[new]] = sensor.localize(xy[new], alt[point[new]])
-    return ground
-
-
-def _normal_step(
-    jacobian: Array, residual: Array, point: npt.NDArray[np.int64], scale: Array
-) -> tuple[Array, npt.NDArray[np.bool_]]:
+def _normal_step(jacobian: Array, residual: Array, point: IntArray, scale: Array) -> tuple[Array, BoolArray]:
     """Gauss-Newton steps (3, num) [m], and for which points the rays determine one.
 
     `jacobian` (3, 2, K) by (lon, lat, alt) and `residual` (2, K) are weighted; `scale` (3, num) holds the

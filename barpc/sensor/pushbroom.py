@@ -27,27 +27,16 @@ from barpc.geodesy import (
     ecef_from_ground_jacobian,
     ground_from_ecef,
     pointwise,
+    up,
     wrap_longitude,
 )
-from barpc.sensor.curve import Curve
+from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
 CHUNK = 4096
 """Points worked on at a time, so that what Newton's method needs stays in cache."""
 
-EXTRAPOLATION = 1.0
-"""Seconds beyond the orbit's and the attitude's knots that are still believed; NaN farther out."""
-
 _STEPS = 12
 _SETTLED = 1e-4  # px: Newton is quadratic, what is left after a step of this size is below rounding
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross products of (3, N) vectors."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +82,9 @@ class Pushbroom(Frozen):
         self._array("mount", (3, 3), RpcError)
         self._array("look", (2, None), RpcError)
         self._check()
-        row = (self._middle - self.first_line) / self.line_period
+        middle = [self.look_origin, (sum(self._span) / 2 - self.first_line) / self.line_period]
         with np.errstate(all="ignore"):
-            center = self._meet(np.array([[self.look_origin, row]]), np.zeros(1))
+            center = self._meet(np.array([middle]), np.zeros(1))
         self._keep("_lon", float(np.nan_to_num(center[0, 0])))
 
     def _check(self) -> None:
@@ -107,22 +96,14 @@ class Pushbroom(Frozen):
             raise RpcError(f"pushbroom: line period {self.line_period} s is not positive")
         if np.abs(self.mount @ self.mount.T - np.eye(3)).max() > 1e-9 or np.linalg.det(self.mount) < 0:
             raise RpcError("pushbroom: mount is not a rotation matrix")
-        if not self._span[0] < self._span[1]:
+        if not self._span[1] - self._span[0] > 2 * EXTRAPOLATION:
             raise RpcError("pushbroom: orbit and attitude share no time")
 
     @property
-    def _middle(self) -> float:
-        """Middle of the time that both curves cover [s]."""
-        start, stop = self._span
-        return 0.5 * (start + stop)
-
-    @property
     def _span(self) -> tuple[float, float]:
-        """First and last time that both curves cover [s]."""
-        return (
-            max(self.orbit.knots[0], self.attitude.knots[0]),
-            min(self.orbit.knots[-1], self.attitude.knots[-1]),
-        )
+        """First and last time that both curves are believed for [s]."""
+        (a, b), (c, d) = self.orbit.span, self.attitude.span
+        return max(a, c), min(b, d)
 
     def time(self, row: npt.ArrayLike) -> Array:
         """Time [s] of rows (...) [px]."""
@@ -134,74 +115,28 @@ class Pushbroom(Frozen):
         return np.moveaxis(self.orbit(time.reshape(-1))[0], 0, -1).reshape(*time.shape, 3)
 
     def project(self, ground: Array) -> Array:
-        """Image points of ground points.
+        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m].
 
-        Parameters
-        ----------
-        ground : (..., 3)
-            lon, lat [deg], alt [m above the WGS84 ellipsoid].
-
-        Returns
-        -------
-        image : (..., 2)
-            col, row [px]; NaN behind the camera and more than `EXTRAPOLATION` beyond the orbit or attitude.
+        NaN behind the camera and more than `curve.EXTRAPOLATION` beyond the orbit or attitude.
         """
         return pointwise(lambda part: [self._solve(ecef_from_ground(part).T).T], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points of ground points, with the derivative.
-
-        Parameters
-        ----------
-        ground : (..., 3)
-            lon, lat [deg], alt [m].
-
-        Returns
-        -------
-        image : (..., 2)
-            col, row [px].
-        jacobian : (..., 2, 3)
-            d(col, row) / d(lon, lat, alt) [px/deg, px/deg, px/m].
-        """
+        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points seen at image points, at known altitudes (the inverse of `project`).
+        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
 
         The line of sight meets the ellipsoid whose axes are longer by the altitude in closed form; Newton's
-        method on the distance brings it to the altitude itself.
-
-        Parameters
-        ----------
-        image : (..., 2)
-            col, row [px].
-        alt : (...)
-            Altitude above the WGS84 ellipsoid [m]; broadcast with `image`.
-
-        Returns
-        -------
-        ground : (..., 3)
-            lon (continuous across the antimeridian), lat [deg], alt [m]. NaN where the line of sight misses
-            the Earth or the row lies more than `EXTRAPOLATION` beyond the orbit or attitude.
+        method on the distance brings it to the altitude itself. Longitudes run on across the antimeridian; NaN where
+        the line of sight misses the Earth, or more than `curve.EXTRAPOLATION` beyond the orbit or attitude.
         """
         return pointwise(lambda *part: [self._meet(*part)], CHUNK, [(3,)], image, alt)[0]
 
     def line_of_sight(self, image: Array) -> tuple[Array, Array]:
-        """Lines of sight of image points.
-
-        Parameters
-        ----------
-        image : (..., 2)
-            col, row [px].
-
-        Returns
-        -------
-        origin : (..., 3)
-            Camera centre [m], ECEF.
-        direction : (..., 3)
-            Unit vector from the camera to the ground, ECEF.
-        """
+        """Camera centres [m] and unit directions to the ground, (..., 3) in ECEF, of image points (..., 2) [px]."""
         image = np.asarray(image, dtype=np.float64)
         origin, direction = self._rays(image.reshape(-1, 2))
         return origin.T.reshape(*image.shape[:-1], 3), direction.T.reshape(*image.shape[:-1], 3)
@@ -210,9 +145,8 @@ class Pushbroom(Frozen):
         """Camera centres and unit directions to the ground, (3, N), of image points (N, 2)."""
         time = self.time(image[:, 1])
         tangents = self._look(image[:, 0])[0]
-        w, _ = self.attitude(time)
         inside = np.stack([tangents[0], tangents[1], np.ones(len(time))])
-        direction = self.mount @ _turn(w, inside)
+        direction = self.mount @ Turn(self.attitude(time)[0]).forth(inside)
         direction /= np.sqrt((direction * direction).sum(axis=0))
         return self.orbit(time)[0], direction
 
@@ -225,18 +159,13 @@ class Pushbroom(Frozen):
         distance = c / (np.sqrt(b * b - a * c) - b)  # the nearer root, without cancellation
         for _ in range(2):
             ground = ground_from_ecef((origin + distance * direction).T)
-            up = _up(ground)
-            distance += (alt - ground[:, 2]) / (up * direction).sum(axis=0)
+            distance += (alt - ground[:, 2]) / (up(ground) * direction).sum(axis=0)
         ground = ground_from_ecef((origin + distance * direction).T)
         ground[:, 0] = wrap_longitude(ground[:, 0], self._lon)
         ground[:, 2] = alt
-        ground[~(distance > 0) | self._beyond(self.time(image[:, 1]))] = np.nan
+        time, (start, stop) = self.time(image[:, 1]), self._span
+        ground[~((distance > 0) & (time >= start) & (time <= stop))] = np.nan
         return ground
-
-    def _beyond(self, time: Array) -> npt.NDArray[np.bool_]:
-        """Which times (N,) lie outside what the curves are believed for."""
-        start, stop = self._span
-        return np.asarray(~((time >= start - EXTRAPOLATION) & (time <= stop + EXTRAPOLATION)))
 
     def _look(self, col: Array) -> tuple[Array, Array]:
         """Tangents (2, N) of the line of sight and their derivatives by the column."""
@@ -252,18 +181,16 @@ class Pushbroom(Frozen):
         """Tangents (2, N) under which points (3, N) are seen at times (N,), their rates, and p_z (N,)."""
         origin, velocity = self.orbit(time)
         w, w_rate = self.attitude(time)
-        sine, cosine, third = _series(w)
-        p = _turn_back(w, self.mount.T @ (ecef - origin), sine, cosine)
-        bent = _cross(w, w_rate)
-        omega = w_rate - cosine * bent + third * _cross(w, bent)  # angular rate in the camera's axes
-        p_rate = _cross(p, omega) - _turn_back(w, self.mount.T @ velocity, sine, cosine)
+        turn = Turn(w)
+        p = turn.back(self.mount.T @ (ecef - origin))
+        p_rate = cross(p, turn.rate(w_rate)) - turn.back(self.mount.T @ velocity)
         tangents = p[:2] / p[2]
         return tangents, (p_rate[:2] - tangents * p_rate[2]) / p[2], p[2]
 
     def _solve(self, ecef: Array) -> Array:
         """Image points (2, N) of ECEF points (3, N): Newton on (col, row)."""
         start, stop = self._span
-        time = np.full(ecef.shape[1], self._middle)
+        time = np.full(ecef.shape[1], (start + stop) / 2)
         col = np.full(ecef.shape[1], self.look_origin)
         settled = np.zeros(ecef.shape[1], dtype=bool)
         for _ in range(_STEPS):
@@ -273,7 +200,7 @@ class Pushbroom(Frozen):
             det = rate[1] * slope[0] - rate[0] * slope[1]
             d_time = (slope[0] * miss[1] - slope[1] * miss[0]) / det
             d_col = (rate[0] * miss[1] - rate[1] * miss[0]) / det
-            time = np.clip(time + d_time, start - EXTRAPOLATION, stop + EXTRAPOLATION)
+            time = np.clip(time + d_time, start, stop)
             col = col + d_col
             settled = (
                 (np.abs(d_time) < _SETTLED * self.line_period) & (np.abs(d_col) < _SETTLED) & (depth > 0)
@@ -293,43 +220,13 @@ class Pushbroom(Frozen):
     def _by_ecef(self, ecef: Array, image: Array) -> Array:
         """d(col, row)/dX (N, 2, 3) [px/m] at ECEF points (3, N) seen at image points (2, N)."""
         time = self.time(image[1])
-        w, _ = self.attitude(time)
+        turn = Turn(self.attitude(time)[0])
         tangents, rate, depth = self._seen(ecef, time)
         slope = self._look(image[0])[1]
         zero, one = np.zeros(len(time)), np.ones(len(time))
-        by_x = self.mount @ _turn(w, np.stack([one, zero, -tangents[0]])) / depth  # d(tangent x)/dX
-        by_y = self.mount @ _turn(w, np.stack([zero, one, -tangents[1]])) / depth
+        by_x = self.mount @ turn.forth(np.stack([one, zero, -tangents[0]])) / depth  # d(tangent x)/dX
+        by_y = self.mount @ turn.forth(np.stack([zero, one, -tangents[1]])) / depth
         det = rate[1] * slope[0] - rate[0] * slope[1]
         row = (slope[1] * by_x - slope[0] * by_y) / det / self.line_period
         col = (rate[1] * by_x - rate[0] * by_y) / det
         return np.moveaxis(np.stack([col, row]), 2, 0)
-
-
-def _up(ground: Array) -> Array:
-    """Unit vectors (3, N) up at ground points (N, 3), ECEF."""
-    lon, lat = np.radians(ground[:, 0]), np.radians(ground[:, 1])
-    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-
-
-def _series(w: Array) -> tuple[Array, Array, Array]:
-    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of the angles a = |w| of rotation vectors (3, N)."""
-    angle2 = (w * w).sum(axis=0)
-    angle = np.sqrt(angle2)
-    sine = np.sinc(angle / np.pi)
-    cosine = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
-    with np.errstate(all="ignore"):
-        third = np.where(angle2 > 1e-4, (1.0 - sine) / angle2, 1.0 / 6 - angle2 / 120)
-    return sine, cosine, third
-
-
-def _turn(w: Array, v: Array) -> Array:
-    """exp([w]x) v for (3, N) vectors."""
-    sine, cosine, _ = _series(w)
-    bent = _cross(w, v)
-    return v + sine * bent + cosine * _cross(w, bent)
-
-
-def _turn_back(w: Array, v: Array, sine: Array, cosine: Array) -> Array:
-    """exp(-[w]x) v for (3, N) vectors, with the first two of `_series(w)`."""
-    bent = _cross(w, v)
-    return v - sine * bent + cosine * _cross(w, bent)

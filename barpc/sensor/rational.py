@@ -48,20 +48,7 @@ DERIVATIVE = _derivative_matrices()
 
 
 def monomials(normalized: Array, out: Array | None = None) -> Array:
-    """The twenty monomials of normalised ground points.
-
-    Parameters
-    ----------
-    normalized : (3, N)
-        Normalised longitude, latitude, altitude, one row each.
-    out : (20, N), optional
-        Where to put them.
-
-    Returns
-    -------
-    monomials : (20, N)
-        In RPC00B order (`MONOMIALS`).
-    """
+    """The twenty monomials (20, N), in RPC00B order, of normalised ground points (3, N)."""
     x, y, z = normalized
     if out is None:
         out = np.empty((20, x.shape[0]))
@@ -71,32 +58,20 @@ def monomials(normalized: Array, out: Array | None = None) -> Array:
     np.multiply(x, z, out=out[5])
     np.multiply(y, z, out=out[6])
     np.multiply(normalized, normalized, out=out[7:10])
-    xx, yy, zz = out[7:10]
     np.multiply(out[4], z, out=out[10])
-    np.multiply(xx, x, out=out[11])
-    np.multiply(yy, x, out=out[12])
-    np.multiply(zz, x, out=out[13])
-    np.multiply(xx, y, out=out[14])
-    np.multiply(yy, y, out=out[15])
-    np.multiply(zz, y, out=out[16])
-    np.multiply(xx, z, out=out[17])
-    np.multiply(yy, z, out=out[18])
-    np.multiply(zz, z, out=out[19])
+    for k, factor in enumerate((x, y, z)):  # of the squares: LLL LPP LHH, LLP PPP PHH, LLH PPH HHH
+        np.multiply(out[7:10], factor, out=out[11 + 3 * k : 14 + 3 * k])
     return out
 
 
 @dataclass(frozen=True, eq=False)
 class _Inverse:
-    """A cubic from (col, row, altitude) to (longitude, latitude), and how far one Newton step repairs it.
-
-    `center` and `scale` (3, 1) bring its arguments to -1..1; `safe_step` is the largest step after which
-    the error that is left stays below the accuracy asked for.
-    """
+    """A cubic from (col, row, altitude) to (longitude, latitude), and how far one Newton step repairs it."""
 
     coeffs: Array  # (2, 20)
-    center: Array
+    center: Array  # (3, 1), with `scale` brings its arguments to -1..1
     scale: Array
-    safe_step: float
+    safe_step: float  # the largest after which the error that is left stays below the accuracy asked for
 
 
 class Rational:
@@ -104,10 +79,8 @@ class Rational:
 
     Parameters
     ----------
-    coeffs : (4, 20)
-        Numerator and denominator of the first value, then of the second.
-    accuracy : (2,)
-        What `solve` may be off by in each value; rounding comes on top.
+    coeffs : (4, 20), numerator and denominator of the first value, then of the second
+    accuracy : (2,), what `solve` may be off by in each value; rounding comes on top
     """
 
     def __init__(self, coeffs: Array, accuracy: Array) -> None:
@@ -134,27 +107,12 @@ class Rational:
         return value, out
 
     def solve(self, target: Array, z: Array, work: Array | None = None) -> tuple[Array, BoolArray]:
-        """Points whose third variable is `z` and whose values are `target`: the inverse.
+        """The inverse: points (3, N) whose third variable is `z` (N,) and whose values are `target` (2, N).
 
         The cubic inverse and one Newton step; where the step is too long to prove that it was enough, one
         more; where that is too long or the point lies out of the box, damped Newton from the centre
-        and a check of the value, the sign of the denominators and the orientation.
-
-        Parameters
-        ----------
-        target : (2, N)
-            Values.
-        z : (N,)
-            Third variable.
-        work : (20, N), optional
-            Overwritten.
-
-        Returns
-        -------
-        x : (3, N)
-            Points; unusable where not `ok`.
-        ok : (N,)
-            Whether the point was found, on the sheet of the map that holds the centre.
+        and a check of the value, the sign of the denominators and the orientation. The second result (N,) says which
+        points were found, on the sheet of the map that holds the centre; `work` (20, N) is overwritten.
         """
         inverse = self._inverse
         x = np.empty((3, len(z)))
@@ -187,8 +145,7 @@ class Rational:
         dy = (a * value[1] - c * value[0]) * det
         x[0] += dx
         x[1] += dy
-        length: Array = np.maximum(np.abs(dx, out=dx), np.abs(dy, out=dy))
-        return length
+        return np.asarray(np.maximum(np.abs(dx, out=dx), np.abs(dy, out=dy)))
 
     @cached_property
     def _inverse(self) -> _Inverse | None:

@@ -1,16 +1,334 @@
-"""Known truth: `simulate_block` makes views, tie points and their exact geometry, for thousands of views."""
+"""Known truth: blocks of views with tie points and their exact geometry, without pixels, to try an adjustment on.
+
+The delivered camera of a view is an RPC P fitted to a pushbroom model; the exact camera is P behind a known
+correction, P(R (X - T - C) + C). So the corrections that an adjustment looks for exist to the last digit, for
+ten views or ten thousand. One RPC is fitted for every row of sites and every look; within a row the cameras
+are turned about the Earth's axis, under which an RPC only changes the offset of its longitude.
+"""
 
 from __future__ import annotations
 
-from barpc.simulate.block import Block, BlockOptions, BlockTruth, recentred, simulate_block
-from barpc.simulate.orbit import Look, fly
+from dataclasses import dataclass, replace
 
-__all__ = [
-    "Block",
-    "BlockOptions",
-    "BlockTruth",
-    "Look",
-    "fly",
-    "recentred",
-    "simulate_block",
-]
+import numpy as np
+import numpy.typing as npt
+
+from barpc.errors import InputError
+from barpc.fit import fit_rpc
+from barpc.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View
+from barpc.sensor import SensorModel
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.curve import rotation_matrix
+from barpc.sensor.geometry import triangulate
+from barpc.sensor.rpc import RPC
+from barpc.simulate.orbit import Look, fly, looks
+
+__all__ = ["Block", "BlockOptions", "BlockTruth", "Look", "fly", "recentred", "simulate_block"]
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """How a block is laid out and disturbed.
+
+    Parameters
+    ----------
+    per_site : int, views of every site
+    size : tuple of int, width, height of every image [px]
+    gsd : float, ground sampling distance at nadir [m]
+    overlap : float, part of an image's side that it shares with the next site, at most 0.5
+    alt_range : tuple of float, altitudes of the ground [m]
+    visible : float, probability that a view that covers a point shows it
+    attitude : float, standard deviation of each component of the attitude error [rad]
+    position : float, standard deviation of each component of the position error [m]
+    drift : float, standard deviation of each component of the attitude drift over an image's height [rad]
+    noise : float, standard deviation of each image coordinate [px]
+    outliers : float, part of the observations that are wrong
+    outlier_size : float, wrong observations are off by up to so much in each coordinate [px]
+    """
+
+    per_site: int = 3
+    size: tuple[int, int] = (20000, 20000)
+    gsd: float = 0.5
+    overlap: float = 0.2
+    alt_range: tuple[float, float] = (0.0, 600.0)
+    visible: float = 0.9
+    attitude: float = 15e-6
+    position: float = 1.0
+    drift: float = 0.0
+    noise: float = 0.1
+    outliers: float = 0.0
+    outlier_size: float = 30.0
+
+    def __post_init__(self) -> None:
+        if self.per_site < 1 or min(self.size) < 64 or not self.gsd > 0:
+            raise InputError("block: per_site, size and gsd must be positive")
+        parts = {"overlap": self.overlap, "visible": self.visible, "outliers": self.outliers}
+        for name, value in parts.items():
+            if not 0.0 <= value <= 1.0:
+                raise InputError(f"block: {name} {value} is not between 0 and 1")
+        if self.overlap > 0.5 or not self.alt_range[0] < self.alt_range[1]:
+            raise InputError("block: overlap must be at most 0.5 and the altitude range no point")
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Sites on a square grid, row by row: counts, centre and steps [deg]."""
+
+    columns: int
+    rows: int
+    lon: float
+    lat: float
+    step: tuple[float, float]
+
+    @classmethod
+    def square(cls, num_views: int, options: BlockOptions, lon: float, lat: float) -> _Grid:
+        """The grid that holds `num_views` views around a centre [deg]."""
+        sites = -(-num_views // options.per_site)
+        columns = int(np.ceil(np.sqrt(sites)))
+        rows = -(-sites // columns)
+        metres = (1.0 - options.overlap) * options.gsd * np.array(options.size, dtype=np.float64)
+        step = metres / metres_per_unit(np.array([lon, lat, 0.0]))[:2]
+        if abs(lat) + 0.5 * rows * step[1] > 85.0:
+            raise InputError("block: it would reach beyond 85 degrees of latitude")
+        return cls(columns, rows, lon, lat, (float(step[0]), float(step[1])))
+
+    def lonlat(self, row: npt.ArrayLike, column: npt.ArrayLike) -> tuple[Array, Array]:
+        """Longitude and latitude [deg] of (fractional) places on the grid."""
+        lon = self.lon + self.step[0] * (np.asarray(column) - 0.5 * (self.columns - 1))
+        lat = self.lat - self.step[1] * (np.asarray(row) - 0.5 * (self.rows - 1))
+        return wrap_longitude(lon), lat
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """Who sees what: ground points drawn over the block and projected by the exact cameras."""
+
+    cameras: tuple[Corrected, ...]
+    grid: _Grid
+    options: BlockOptions
+    rng: np.random.Generator
+
+    def observe(self, count: int, fewest: int, visible: float) -> tuple[Array, Tracks]:
+        """So many ground points (count, 3) that `fewest` views or more show, and their exact image points."""
+        grounds = [np.empty((0, 3))]
+        found = [(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 2)))]
+        have = 0
+        for _ in range(50):
+            if have >= count:
+                break
+            ground, view, point, xy = self._draw(max(64, int(1.2 * (count - have))), visible)
+            good = np.flatnonzero(np.bincount(point, minlength=len(ground)) >= fewest)
+            wanted = min(len(good), count - have)  # points are sorted by site: take evenly, not the first
+            good = good[np.arange(wanted) * len(good) // max(wanted, 1)]
+            index = np.full(len(ground), -1)
+            index[good] = have + np.arange(len(good))
+            keep = index[point] >= 0
+            grounds.append(ground[good])
+            found.append((view[keep], index[point[keep]], xy[keep]))
+            have += len(good)
+        if have < count:
+            raise InputError(f"block: only {have} of {count} points are seen by {fewest} views; more overlap")
+        view, point, xy = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.lexsort((view, point))
+        return np.concatenate(grounds), Tracks(view[order], point[order], xy[order], np.ones(len(order)))
+
+    def _draw(self, count: int, visible: float) -> tuple[Array, IntArray, IntArray, Array]:
+        """Random ground points and all of their observations: ground, view, point, xy."""
+        grid, per_site = self.grid, self.options.per_site
+        home = np.sort(self.rng.integers(0, -(-len(self.cameras) // per_site), count))
+        offset = self.rng.uniform(-0.5, 0.5, (2, count)) / (1.0 - self.options.overlap)
+        lon, lat = grid.lonlat(home // grid.columns + offset[0], home % grid.columns + offset[1])
+        ground = np.stack([lon, lat, self.rng.uniform(*self.options.alt_range, count)], axis=1)
+        size = np.array(self.options.size) - 1.0
+        shown: list[tuple[IntArray, IntArray, Array]] = []
+        for view, camera in enumerate(self.cameras):
+            near = self._near(view // per_site, home)
+            xy = camera.project(ground[near])
+            inside = ((xy >= 0) & (xy <= size)).all(axis=1) & (self.rng.random(len(near)) < visible)
+            shown.append((np.full(int(inside.sum()), view), near[inside], xy[inside]))
+        views, point, image = (np.concatenate(parts) for parts in zip(*shown, strict=True))
+        return ground, views, point, image
+
+    def _near(self, site: int, home: IntArray) -> IntArray:
+        """Indices of the points whose home is this site or one of its eight neighbours; `home` (N,) ascends."""
+        row, column = divmod(site, self.grid.columns)
+        rows = np.arange(max(0, row - 1), min(self.grid.rows, row + 2)) * self.grid.columns
+        first = np.searchsorted(home, rows + max(0, column - 1))
+        last = np.searchsorted(home, rows + min(self.grid.columns, column + 2))
+        return np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])
+
+
+@dataclass(frozen=True, eq=False)
+class BlockTruth:
+    """What a block was made from.
+
+    Parameters
+    ----------
+    corrections : tuple of Correction
+        The exact correction of every view: `Corrected(view.sensor, correction)` is the exact camera but for its drift.
+    drift : (V, 3)
+        The drift's rotation vector over the height of the image [rad]; it is zero in the middle row.
+    ground : (P, 3), the tracks' ground points; lon, lat [deg], alt [m]
+    outlier : (K,), which observations are wrong
+    check_ground : (Q, 3), held-out ground points; lon, lat [deg], alt [m]
+    check : Tracks, their exact image points in every view that sees them
+    """
+
+    corrections: tuple[Correction, ...]
+    drift: Array
+    ground: Array
+    outlier: BoolArray
+    check_ground: Array
+    check: Tracks
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Views, tie points and GCPs as an adjustment receives them, with the truth.
+
+    Parameters
+    ----------
+    views : tuple of View, without pixels; `sensor` is the delivered RPC
+    tracks : Tracks, observations with noise and outliers
+    gcps : GroundPoints, exact ground points with noisy observations; empty unless asked for
+    truth : BlockTruth, what is to be found
+    """
+
+    views: tuple[View, ...]
+    tracks: Tracks
+    gcps: GroundPoints
+    truth: BlockTruth
+
+    def held_out_rms(self, sensors: list[SensorModel]) -> float:
+        """Root mean square residual [px, per coordinate] of the held-out points in other cameras.
+
+        The points are triangulated anew from their exact image points: what no image can tell (a shift of
+        the whole scene) does not count.
+
+        Parameters
+        ----------
+        sensors : list of SensorModel, one a view: delivered, adjusted or refitted cameras
+        """
+        check = self.truth.check
+        found = triangulate(sensors, check.view, check.point, check.xy)
+        return float(np.sqrt(np.mean(found.residuals**2)))
+
+
+def recentred(correction: Correction, center: Array) -> Correction:
+    """The same correction about another camera centre (3,) [m, ECEF]: R stays, T takes up the difference."""
+    turn = rotation_matrix(correction.rotation)
+    shift = center - correction.center
+    return Correction(correction.rotation, correction.translation + turn.T @ shift - shift, center)
+
+
+def simulate_block(
+    num_views: int = 3,
+    num_tracks: int = 2000,
+    *,
+    seed: int = 0,
+    lon: float = 5.4,
+    lat: float = 43.3,
+    num_checks: int = 500,
+    num_gcps: int = 0,
+    **options: object,
+) -> Block:
+    """A block of views with tie points, GCPs and held-out points.
+
+    Views stand in groups of `per_site` over sites on a square grid; neighbouring sites overlap.
+
+    Parameters
+    ----------
+    num_views, num_tracks, num_checks, num_gcps : int
+        How many; a track or check point is seen by two views or more, a GCP by one or more.
+    seed : int
+        The same seed gives the same block.
+    lon, lat : float
+        Centre of the block [deg].
+    **options
+        Fields of `BlockOptions`.
+
+    Raises
+    ------
+    InputError
+        Options that contradict each other, or a layout whose views do not overlap.
+    """
+    if num_views < 1 or num_tracks < 0 or num_checks < 0 or num_gcps < 0:
+        raise InputError("block: at least one view, and no negative count")
+    chosen = BlockOptions(**options)  # type: ignore[arg-type]
+    rng = np.random.default_rng(seed)
+    grid = _Grid.square(num_views, chosen, lon, lat)
+    views, centers = _cameras(grid, num_views, chosen)
+    corrections = tuple(
+        Correction(rng.normal(0, chosen.attitude, 3), rng.normal(0, chosen.position, 3), center)
+        for center in centers
+    )
+    drift = rng.normal(0, chosen.drift, (num_views, 3)) if chosen.drift else np.zeros((num_views, 3))
+    rows = chosen.size[1]
+    exact = tuple(
+        Corrected(v.sensor, replace(c, drift=d[None], row_offset=rows / 2, row_scale=rows) if d.any() else c)
+        for v, c, d in zip(views, corrections, drift, strict=True)
+    )
+    scene = _Scene(exact, grid, chosen, rng)
+
+    ground, tracks = scene.observe(num_tracks, fewest=2, visible=chosen.visible)
+    noisy, outlier = _disturbed(tracks, chosen, rng)
+    check_ground, check = scene.observe(num_checks, fewest=2, visible=1.0)
+    gcps = _gcps(*scene.observe(num_gcps, fewest=1, visible=chosen.visible), chosen, rng)
+    truth = BlockTruth(corrections, drift, ground, outlier, check_ground, check)
+    return Block(views, noisy, gcps, truth)
+
+
+def _gcps(ground: Array, seen: Tracks, options: BlockOptions, rng: np.random.Generator) -> GroundPoints:
+    """GCPs at ground points (G, 3), where they are seen but for noise."""
+    noisy, _ = _disturbed(seen, replace(options, outliers=0.0), rng)
+    return GroundPoints(
+        names=tuple(f"gcp_{i:03d}" for i in range(len(ground))),
+        lonlatalt=ground,
+        sigma=np.full((len(ground), 3), 0.1),
+        point=noisy.point,
+        view=noisy.view,
+        xy=noisy.xy,
+        xy_sigma=noisy.sigma,
+    )
+
+
+def _cameras(grid: _Grid, num_views: int, options: BlockOptions) -> tuple[tuple[View, ...], list[Array]]:
+    """Views with delivered RPCs, and their camera centres (3,) [m, ECEF]; site by site."""
+    views: list[View] = []
+    centers: list[Array] = []
+    low, high = options.alt_range
+    margin = 0.1 * (high - low) + 50.0
+    alt_range = (low - margin, high + margin)
+    for row in range(grid.rows):
+        lon0, lat = grid.lonlat(row, 0)
+        target = np.array([lon0, lat, 0.5 * (low + high)])
+        flown = [fly(target, look, options.size, options.gsd) for look in looks(options.per_site, 0.17 * row)]
+        fitted = [fit_rpc(model, options.size, alt_range).rpc for model in flown]
+        places = [model.position(0.5 * (options.size[1] - 1)) for model in flown]
+        for column in range(grid.columns):
+            for rpc, place in zip(fitted, places, strict=True):
+                if len(views) == num_views:
+                    return tuple(views), centers
+                turn = column * grid.step[0]
+                name = f"view_{len(views):04d}"
+                views.append(View(name, "", options.size, _turned(rpc, turn), alt_range))
+                centers.append(rotation_matrix(np.array([0.0, 0.0, np.radians(turn)])) @ place)
+    return tuple(views), centers
+
+
+def _turned(rpc: RPC, degrees: float) -> RPC:
+    """The RPC of the same camera turned about the Earth's axis."""
+    offset = rpc.ground_offset + np.array([degrees, 0.0, 0.0])
+    offset[0] = wrap_longitude(offset[0])
+    return replace(rpc, ground_offset=offset)
+
+
+def _disturbed(tracks: Tracks, options: BlockOptions, rng: np.random.Generator) -> tuple[Tracks, BoolArray]:
+    """The observations with noise and outliers, and which are outliers (K,)."""
+    count = len(tracks)
+    xy = tracks.xy + (rng.normal(0, options.noise, (count, 2)) if options.noise else 0.0)
+    outlier = np.zeros(count, dtype=bool)
+    outlier[rng.permutation(count)[: round(options.outliers * count)]] = True
+    xy[outlier] += rng.uniform(-options.outlier_size, options.outlier_size, (int(outlier.sum()), 2))
+    return Tracks(tracks.view, tracks.point, xy, np.full(count, options.noise or 0.1)), outlier

@@ -17,8 +17,8 @@ from barpc.errors import InputError
 from barpc.fit import fit_rpc
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
-from barpc.sensor.corrected import Corrected, Correction, rotation_matrix
-from barpc.sensor.curve import Curve
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.curve import Curve, rotation_matrix
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.simulate.orbit import Look, fly, looks

@@ -10,9 +10,8 @@ import pytest
 
 from barpc.geodesy import ecef_from_ground
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.imagespace import ImageAffine, ImageCorrected
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.simulate.orbit import Look, fly

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from barpc.errors import RpcError
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
-from barpc.sensor.corrected import Corrected, Correction, rotation_left_jacobian, rotation_matrix
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.curve import rotation_left_jacobian, rotation_matrix
 
 from .conftest import make_rpc
 

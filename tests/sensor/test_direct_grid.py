@@ -50,6 +50,23 @@ def test_projection_inverts_localisation(grid, points):
     assert np.abs(grid.project(grid.localize(image, alt)) - image).max() < 5e-8
 
 
+@pytest.mark.parametrize("swing", [0.0, 20.0, 150.0])
+def test_a_grid_that_no_cubic_follows_is_inverted_as_well(points, swing):
+    """Waves of 4000 px: the slope of the image changes by up to a quarter within a thousand pixels."""
+    cols, rows, alts = np.linspace(0, 20000, 65), np.linspace(0, 20000, 65), np.linspace(-30.0, 4900.0, 3)
+    nodes = np.stack(np.meshgrid(cols, rows), axis=-1)
+    nodes = nodes + swing * np.sin(2 * np.pi * nodes[..., ::-1] / 4000)
+    waves = DirectGrid(cols, rows, alts, PHYSICAL.localize(nodes, alts[:, None, None])[..., :2])
+    image, alt = points
+    ground = waves.localize(image, alt)
+    assert np.abs(waves.project(ground) - image).max() < 5e-8
+    found, jacobian = waves.project_jacobian(ground[:100])
+    step = np.array([1e-6, 0.0, 0.0])
+    difference = (waves.project(ground[:100] + step) - waves.project(ground[:100] - step)) / 2e-6
+    assert np.abs(found - image[:100]).max() < 5e-8
+    assert np.nanmax(np.abs(difference - jacobian[..., 0])) < 1e-5 * np.abs(jacobian[..., 0]).max()
+
+
 def test_the_derivative_is_the_central_difference(grid, points):
     ground = grid.localize(*points)
     _, jacobian = grid.project_jacobian(ground)

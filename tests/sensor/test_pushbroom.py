@@ -149,6 +149,27 @@ def test_a_curve_of_pieces_is_continued_by_its_first_and_last_piece():
     assert np.allclose(rate, 2 * np.array([-0.5, 0.5, 1.0, 1.5, 2.5]))
 
 
+def test_a_curve_has_the_rate_and_acceleration_of_its_values_in_one_piece_and_in_many():
+    times = np.linspace(0.0, 60.0, 13)
+    values = np.stack([np.cos(0.05 * times), np.sin(0.05 * times), 1e-3 * times**2], axis=1)
+    whole = Curve.polynomial(np.polynomial.polynomial.polyfit(times, values, 7), 0.0, 60.0)
+    between, step = np.linspace(1.0, 59.0, 40), 1e-3
+    for curve in (whole, Curve.through(times, values)):
+        value, rate, acceleration = curve.states(between)
+        np.testing.assert_array_equal(np.stack(curve(between)), [value, rate])
+        (after, faster, _), (before, slower, _) = curve.states(between + step), curve.states(between - step)
+        np.testing.assert_allclose(rate, (after - before) / (2 * step), atol=1e-9)
+        np.testing.assert_allclose(acceleration, (faster - slower) / (2 * step), atol=1e-9)
+
+
+def test_orbit_and_attitude_must_share_some_time(sensor):
+    stop = sensor.orbit.knots[-1]
+    late = Curve.polynomial(sensor.orbit.coeffs[0], stop, stop + 10.0)
+    with pytest.raises(RpcError, match="share no time"):
+        replace(sensor, orbit=late)
+    assert replace(sensor, orbit=Curve.polynomial(sensor.orbit.coeffs[0], stop - 1e-6, stop)) != sensor
+
+
 def test_ecef_comes_back_from_a_localised_point(sensor):
     origin, direction = sensor.line_of_sight(np.array([10.0, 20.0]))
     ground = sensor.localize(np.array([10.0, 20.0]), np.array(1234.0))

@@ -27,6 +27,7 @@ from barpc.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
 from barpc.safexml import parse_xml
 from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.curve import Curve
 from barpc.sensor.sentinel1 import (
     RangeDoppler,
     burst_rows,
@@ -206,6 +207,13 @@ def test_whole_microseconds_of_the_state_vectors_do_not_raise_the_degree() -> No
     assert np.linalg.norm(off - late * along, axis=1).max() <= 1e-4
 
 
+def test_any_curve_may_be_the_orbit(model: RangeDoppler) -> None:
+    times = np.arange(-60.0, 91.0, 10.0)
+    splined = replace(model, orbit=Curve.through(times, model.orbit(times)[0].T))
+    ground = model.localize(*scatter(model, (0.0, 3000.0), 200))
+    assert np.abs(splined.project(ground) - model.project(ground)).max() <= 1e-4
+
+
 def test_the_order_and_repetition_of_state_vectors_do_not_matter() -> None:
     product = Product()
     times = -65.0 + 10.0 * np.arange(17)
@@ -288,6 +296,12 @@ def test_the_annotated_bistatic_correction_meets_the_lines_of_the_grid(iw1: Prod
         assert np.abs(difference).max() <= 1e-3
         plain = RangeDoppler.from_annotation(annotation).project(annotation.grid.ground)[:, 1] - row
         assert 0.04 <= np.abs(plain).max() <= 0.2
+
+
+def test_a_bistatic_correction_completes_that_of_the_processor_only(iw1: Product) -> None:
+    annotation = replace(read_annotation(iw1.xml()), bistatic_applied=False)
+    with pytest.raises(InputError, match="no bistatic correction by the processor"):
+        RangeDoppler.from_annotation(annotation, bistatic="annotated")
 
 
 def test_the_atmosphere_lengthens_the_path_by_its_zenith_delay_over_the_cosine(iw1: Product) -> None:

@@ -1,25 +1,29 @@
 """Sentinel-1: Range-Doppler models from the annotation XML alone.
 
-`open_product` makes the model of a product, `RangeDoppler.from_annotation` that of one file, `mosaic` that
-of several swaths. The rest says where bursts and swaths lie, and how the model agrees with the product's
-own geolocation grid.
+`open_product` makes the model of a product (folder, zip, annotation), `RangeDoppler.from_annotation` that of one
+file, `mosaic` that of several swaths. The rest says where bursts and swaths lie, and how the model agrees with the
+product's own geolocation grid.
 """
 
 from __future__ import annotations
 
-from barpc.sensor.sentinel1.annotation import Annotation, read_annotation
-from barpc.sensor.sentinel1.build import (
-    BurstRows,
-    burst_rows,
-    from_annotation,
-    grid_residuals,
-    mosaic,
-    mosaic_offsets,
-    open_product,
-)
-from barpc.sensor.sentinel1.frames import Delays, GroundFrame, SlantFrame
-from barpc.sensor.sentinel1.orbit import Orbit, fit_orbit
-from barpc.sensor.sentinel1.range_doppler import RangeDoppler
+import re
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TypeVar
+
+import numpy as np
+
+from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError
+from barpc.geodesy import Array
+from barpc.safexml import MAX_BYTES
+from barpc.sensor.curve import Orbit, fit_orbit
+from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation, seconds
+from barpc.sensor.sentinel1.frames import Bistatic, Delays, GroundFrame, SlantFrame
+from barpc.sensor.sentinel1.range_doppler import RangeDoppler, build, extent, grid_residuals
+from barpc.sidefile import PRODUCT, opened, read_head
 
 __all__ = [
     "Annotation",
@@ -31,10 +35,208 @@ __all__ = [
     "SlantFrame",
     "burst_rows",
     "fit_orbit",
-    "from_annotation",
     "grid_residuals",
     "mosaic",
     "mosaic_offsets",
     "open_product",
     "read_annotation",
 ]
+
+T = TypeVar("T")
+MOSAIC = "mosaic"
+"""The swath of all swaths."""
+_SAME = 1e-9  # relative: intervals and rates of the swaths of one mosaic
+_NAME = re.compile(r"s1[a-d]-(?P<swath>\w+)-(slc|grd)-(?P<pol>vv|hh|vh|hv)-.*\.xml", re.IGNORECASE)
+_POLARISATIONS = ("vv", "hh", "vh", "hv")
+
+
+def mosaic(
+    sources: Sequence[Path | Annotation],
+    *,
+    orbit: Path | None = None,
+    atmosphere: bool = False,
+    bistatic: Bistatic | None = None,
+) -> RangeDoppler:
+    """One model for the swaths of an SLC product, side by side.
+
+    Column 0 is pixel 0 of the nearest swath (IW1, EW1) and row 0 the earliest line 0; the other swaths
+    start at ``mosaic_offsets``.
+
+    Parameters
+    ----------
+    sources : sequence of Path or Annotation
+        Annotations of swaths of one product.
+    orbit, atmosphere, bistatic
+        As of `RangeDoppler.from_annotation`; no full bistatic correction, which jumps between swaths.
+
+    Raises
+    ------
+    InputError
+        A GRD, swaths that are not of one product, or the full bistatic correction.
+    """
+    swaths = [s if isinstance(s, Annotation) else read_annotation(s) for s in sources]
+    if bistatic == "full":
+        raise InputError("the full bistatic correction jumps between swaths: take one swath, or 'annotated'")
+    offsets = mosaic_offsets(swaths)
+    size = np.rint((offsets + [[a.samples, extent(a)[1]] for a in swaths]).max(axis=0))
+    epoch = min(a.first_line_time for a in swaths)
+    nearest_first = sorted(swaths, key=lambda a: a.slant_range_time)
+    return build(nearest_first, epoch, (int(size[0]), int(size[1])), orbit, atmosphere, bistatic)
+
+
+def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
+    """Where the stitched frames of the swaths of one SLC product begin in the frame of their mosaic.
+
+    Returns
+    -------
+    offsets : (S, 2), col, row [px]: whole numbers to within 1e-3 in products since 2016
+
+    Raises
+    ------
+    InputError
+        A GRD, or swaths that are not of one product.
+    """
+    if not swaths:
+        raise InputError("a mosaic of no swaths: give the annotations of IW1, IW2 and IW3")
+    first = swaths[0]
+    for other in swaths:
+        if other.product_type != "SLC" or not other.bursts:
+            raise InputError(f"{other.name}: a mosaic takes TOPS SLC swaths, this is {other.kind}")
+        apart = abs(seconds(other.first_line_time, first.first_line_time))
+        rates = (
+            other.azimuth_time_interval / first.azimuth_time_interval,
+            other.range_sampling_rate / first.range_sampling_rate,
+        )
+        late = apart > other.lines * other.azimuth_time_interval
+        if other.mission != first.mission or late or max(abs(rate - 1.0) for rate in rates) > _SAME:
+            raise InputError(f"{other.name}: not of the same product as {first.name}")
+    near = min(a.slant_range_time for a in swaths)
+    epoch = min(a.first_line_time for a in swaths)
+    cols = [(a.slant_range_time - near) * a.range_sampling_rate for a in swaths]
+    rows = [seconds(a.first_line_time, epoch) / a.azimuth_time_interval for a in swaths]
+    return np.column_stack([cols, rows])
+
+
+def open_product(
+    path: str | Path,
+    *,
+    swath: str | None = None,
+    polarisation: str | None = None,
+    orbit: str | Path | None = None,
+    burst: int | None = None,
+    atmosphere: bool = False,
+    bistatic: Bistatic | None = None,
+) -> RangeDoppler:
+    """The model of a Sentinel-1 product.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ``.SAFE`` folder, its ``manifest.safe``, a ``.zip`` of it, or one annotation XML.
+    swath : str, optional
+        "iw1", "s3", ..., or "mosaic" for all of them; may be left out where there is one.
+    polarisation : str, optional
+        "vv", "vh", "hh" or "hv"; the geometry is the same, the first one is taken if left out.
+    orbit, burst, atmosphere, bistatic
+        As of `RangeDoppler.from_annotation`.
+
+    Raises
+    ------
+    InputError
+        No such swath or polarisation, or a choice that does not go with the product; the message lists
+        what there is.
+    RpcFormatError
+        Not a Sentinel-1 product.
+    """
+    path, name = Path(path), None if swath is None else swath.lower()
+    precise = None if orbit is None else Path(orbit)
+    try:
+        found = _choose(path, polarisation)
+        if name == MOSAIC:
+            if burst is not None:
+                raise InputError(f"{path}: burst {burst} of the mosaic; choose one swath")
+            swaths = [file.read() for file in found.values()]
+            return mosaic(swaths, orbit=precise, atmosphere=atmosphere, bistatic=bistatic)
+        if name is None and len(found) == 1:
+            name = next(iter(found))
+        if name not in found:
+            wanted = "the product has several swaths" if name is None else f"no swath {name}"
+            choices = [*sorted(found), MOSAIC] if len(found) > 1 else sorted(found)
+            raise InputError(f"{path}: {wanted}; choose one of {', '.join(choices)}")
+        return RangeDoppler.from_annotation(
+            found[name].read(), burst=burst, orbit=precise, atmosphere=atmosphere, bistatic=bistatic
+        )
+    except RpcError as error:
+        guilty = precise or path
+        if guilty.name in str(error):
+            raise
+        raise type(error)(f"{guilty}: {error}") from error
+
+
+@dataclass(frozen=True, order=True)
+class _File:
+    """An annotation: its swath, its polarisation, and where it is."""
+
+    swath: str
+    polarisation: str
+    path: Path
+    member: str | None = None
+
+    def read(self) -> Annotation:
+        if self.member is None:
+            return read_annotation(self.path)
+        member, name = self.member, PurePosixPath(self.member).name
+        data = _from_zip(self.path, name, lambda archive: _content(archive, member))
+        return read_annotation(data, name=name)
+
+
+def _content(archive: zipfile.ZipFile, member: str) -> bytes:
+    with archive.open(member) as file:
+        return file.read(MAX_BYTES + 1)
+
+
+def _from_zip(path: Path, what: str, use: Callable[[zipfile.ZipFile], T]) -> T:
+    """What `use` gets out of a zip file."""
+    try:
+        with opened(path, PRODUCT) as file, zipfile.ZipFile(file) as archive:
+            return use(archive)
+    except BarpcError:
+        raise
+    except Exception as error:
+        raise RpcFormatError(f"{path}: {what} cannot be read ({error})") from error
+
+
+def _annotations(path: Path) -> list[_File]:
+    """The annotations of a product, in order of swath and polarisation."""
+    if path.name == "manifest.safe":
+        path = path.parent
+    if path.is_dir():
+        files = [_named(file, None) for file in path.glob("annotation/*.xml")]
+    elif read_head(path, PRODUCT, 4) in (b"PK\3\4", b"PK\5\6"):
+        names = _from_zip(path, "a zip file that", zipfile.ZipFile.namelist)
+        files = [_named(path, name) for name in names if PurePosixPath(name).parent.name == "annotation"]
+    else:
+        annotation = read_annotation(path)
+        files = [_File(annotation.swath.lower(), annotation.polarisation.lower(), path)]
+    return sorted(file for file in files if file is not None)
+
+
+def _named(path: Path, member: str | None) -> _File | None:
+    """The file, if its name is that of an annotation."""
+    match = _NAME.fullmatch(path.name if member is None else PurePosixPath(member).name)
+    return match and _File(match["swath"].lower(), match["pol"].lower(), path, member)
+
+
+def _choose(path: Path, polarisation: str | None) -> dict[str, _File]:
+    """Swath -> annotation, of one polarisation."""
+    files = _annotations(path)
+    if not files:
+        raise RpcFormatError(f"{path}: no Sentinel-1 annotation (annotation/s1?-*.xml) in it")
+    there = sorted({f.polarisation for f in files}, key=_POLARISATIONS.index)
+    wanted = polarisation.lower() if polarisation else there[0]
+    chosen = {f.swath: f for f in files if f.polarisation == wanted}
+    if not chosen:
+        raise InputError(f"{path}: no polarisation {wanted}; choose one of {', '.join(there)}")
+    if len(chosen) < sum(f.polarisation == wanted for f in files):
+        raise InputError(f"{path}: several images of one swath; give the annotation XML of one of them")
+    return chosen

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -19,6 +20,7 @@ import numpy.typing as npt
 from barpc.errors import RpcFormatError
 from barpc.geodesy import Array
 from barpc.safexml import parse_xml
+from barpc.sensor.curve import MARGIN
 
 TimeArray = npt.NDArray[np.datetime64]
 
@@ -35,12 +37,9 @@ class StateVectors:
 
     Parameters
     ----------
-    time : (N,)
-        datetime64[ns], UTC.
-    position, velocity : (N, 3)
-        ECEF [m, m/s].
-    source : str
-        Where they come from, for messages: "Auxiliary", "Downlink", or the orbit file.
+    time : (N,), datetime64[ns], UTC
+    position, velocity : (N, 3), ECEF [m, m/s]
+    source : str, where they come from, for messages: "Auxiliary", "Downlink", or the orbit file
     """
 
     time: TimeArray
@@ -55,15 +54,32 @@ class Burst:
 
     Parameters
     ----------
-    time : datetime64[ns]
-        Zero-Doppler time of the burst's first line (`azimuthTime`).
-    first_valid, last_valid : (L,)
-        First and last valid sample of every line; -1 where a line is not valid.
+    time : datetime64[ns], zero-Doppler time of the burst's first line (`azimuthTime`)
+    first_valid, last_valid : (L,), first and last valid sample of every line; -1 where a line is not valid
     """
 
     time: np.datetime64
     first_valid: npt.NDArray[np.int64]
     last_valid: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class BurstRows:
+    """Where a burst stands in the stitched frame.
+
+    Parameters
+    ----------
+    first_line : int, of the burst in the measurement file
+    first_row : int, frame row of that line
+    start, stop : int, frame rows [start, stop) that are taken from this burst
+    offset : float, what rounding the burst's time to a row left [rows]: 1e-3, up to 0.15 before 2016
+    """
+
+    first_line: int
+    first_row: int
+    start: int
+    stop: int
+    offset: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +88,13 @@ class GroundRange:
 
     Parameters
     ----------
-    time : (M,)
-        datetime64[ns].
-    slant_origin, ground_origin : (M,)
-        `sr0`, `gr0` [m].
-    ground_from_slant, slant_from_ground : (M, K)
-        Ascending powers of (slant - slant_origin), of (ground - ground_origin) [m].
+    time : (M,), datetime64[ns]
+    slant_origin : (M,), `sr0` [m]
+    ground_from_slant, slant_from_ground : (M, K), ascending powers of (slant - sr0), of (ground - gr0) [m]
     """
 
     time: TimeArray
     slant_origin: Array
-    ground_origin: Array
     ground_from_slant: Array
     slant_from_ground: Array
 
@@ -93,14 +105,10 @@ class GridPoints:
 
     Parameters
     ----------
-    time : (G,)
-        Azimuth time, datetime64[ns].
-    range_time : (G,)
-        Two-way slant range time [s].
-    image : (G, 2)
-        The annotation's (pixel, line).
-    ground : (G, 3)
-        lon, lat [deg], alt [m].
+    time : (G,), azimuth time, datetime64[ns]
+    range_time : (G,), two-way slant range time [s]
+    image : (G, 2), the annotation's (pixel, line)
+    ground : (G, 3), lon, lat [deg], alt [m]
     """
 
     time: TimeArray
@@ -115,34 +123,23 @@ class Annotation:
 
     Parameters
     ----------
-    name : str
-        The file, for messages.
+    name : str, the file, for messages
     mission, product_type, mode, swath, polarisation : str
         Upper case: S1A; SLC or GRD; IW, EW, S1 .. S6, WV; IW1, EW3, S4, IW (GRD); VV ...
     states : StateVectors
     first_line_time, last_line_time : datetime64[ns]
-    azimuth_time_interval : float
-        Between lines [s].
-    slant_range_time : float
-        Two-way, of the first sample [s].
-    range_sampling_rate : float
-        [Hz].
-    range_pixel_spacing : float
-        [m]; ground range in a GRD.
-    samples, lines : int
-        Size of the measurement file.
-    lines_per_burst : int
-        0 where there are no bursts.
+    azimuth_time_interval : float, between lines [s]
+    slant_range_time : float, two-way, of the first sample [s]
+    range_sampling_rate : float [Hz]
+    range_pixel_spacing : float [m]; ground range in a GRD
+    samples, lines : int, size of the measurement file
+    lines_per_burst : int, 0 where there are no bursts
     bursts : tuple of Burst
-    ground_range : GroundRange or None
-        Of a GRD.
+    ground_range : GroundRange or None, of a GRD
     grid : GridPoints
-    rank : int
-        Pulses on their way between sending and receiving.
-    pulse_interval : float
-        [s].
-    bistatic_applied : bool
-        Whether the processor corrected the bistatic delay, at mid range.
+    rank : int, pulses on their way between sending and receiving
+    pulse_interval : float [s]
+    bistatic_applied : bool, whether the processor corrected the bistatic delay, at mid range
     """
 
     name: str
@@ -168,6 +165,11 @@ class Annotation:
     pulse_interval: float
     bistatic_applied: bool
 
+    @property
+    def kind(self) -> str:
+        """What it is, for messages."""
+        return f"a {self.mode} {self.product_type} of {self.swath}"
+
     def line_time(self, line: Array) -> TimeArray:
         """Annotated times (...), datetime64[ns], of lines (...) of the measurement file."""
         start, rest = np.array([self.first_line_time]), np.asarray(line, dtype=np.float64)
@@ -181,19 +183,36 @@ class Annotation:
         return times
 
 
+def burst_rows(annotation: Annotation) -> list[BurstRows]:
+    """Where the bursts of a TOPS SLC swath stand in the stitched frame; overlaps are cut at their middle.
+
+    Raises
+    ------
+    RpcFormatError
+        Bursts out of order, or one without a valid line.
+    """
+    since = [seconds(b.time, annotation.first_line_time) for b in annotation.bursts]
+    exact = [float(time / annotation.azimuth_time_interval) for time in since]
+    first = [round(row) for row in exact]
+    valid = [np.flatnonzero(b.first_valid >= 0) for b in annotation.bursts]
+    if any(not len(v) for v in valid) or any(b <= a for a, b in pairwise(first)):
+        raise RpcFormatError(f"{annotation.name}: bursts out of order, or one without valid lines")
+    spans = [(row + int(v[0]), row + int(v[-1]) + 1) for row, v in zip(first, valid, strict=True)]
+    cuts = [(a[1] + b[0]) // 2 for a, b in pairwise(spans)]
+    starts, stops = [spans[0][0], *cuts], [*cuts, spans[-1][1]]
+    return [
+        BurstRows(k * annotation.lines_per_burst, first[k], starts[k], stops[k], exact[k] - first[k])
+        for k in range(len(first))
+    ]
+
+
 def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation:
     """Read a Sentinel-1 product annotation.
 
     Parameters
     ----------
-    source : bytes or Path
-        ``annotation/s1a-iw1-slc-vv-....xml`` of a product.
-    name : str, optional
-        What to call it in messages.
-
-    Returns
-    -------
-    annotation : Annotation
+    source : bytes or Path, ``annotation/s1a-iw1-slc-vv-....xml`` of a product
+    name : str, optional, what to call it in messages
 
     Raises
     ------
@@ -217,7 +236,7 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
         mode=values.text("adsHeader/mode").upper(),
         swath=values.text("adsHeader/swath").upper(),
         polarisation=values.text("adsHeader/polarisation").upper(),
-        states=_annotated_states(root, name),
+        states=_annotated_states(values),
         first_line_time=values.time(info + "productFirstLineUtcTime"),
         last_line_time=values.time(info + "productLastLineUtcTime"),
         azimuth_time_interval=values.positive(info + "azimuthTimeInterval", most=1.0),
@@ -227,42 +246,26 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
         samples=int(values.positive(info + "numberOfSamples")),
         lines=int(values.positive(info + "numberOfLines")),
         lines_per_burst=int(values.numbers(timing + "linesPerBurst")[0]),
-        bursts=tuple(_burst(b, name) for b in root.findall(timing + "burstList/burst")),
-        ground_range=_ground_range(root, name),
-        grid=_grid(root, name),
+        bursts=tuple(_burst(burst) for burst in values.all(timing + "burstList/burst")),
+        ground_range=_ground_range(values),
+        grid=_grid(values),
         rank=int(values.numbers(downlink + "rank")[0]),
         pulse_interval=values.positive(downlink + "pri"),
         bistatic_applied=root.findtext(processing + "bistaticDelayCorrectionApplied", "").strip() == "true",
     )
 
 
-def read_orbit_file(
-    path: Path, mission: str, window: tuple[np.datetime64, np.datetime64], margin: float
-) -> StateVectors:
-    """The state vectors of a precise or restituted orbit file (``.EOF``) around a time.
-
-    Parameters
-    ----------
-    path : Path
-        ``S1A_OPER_AUX_POEORB_....EOF``.
-    mission : str
-        Mission of the annotation, as "S1A".
-    window : (datetime64, datetime64)
-        First and last time of the image.
-    margin : float
-        Vectors so far beyond the window are returned too [s].
-
-    Returns
-    -------
-    states : StateVectors
+def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
+    """The state vectors of a precise or restituted orbit file (``S1A_OPER_AUX_POEORB_....EOF``) around an image.
 
     Raises
     ------
     RpcFormatError
         Not an orbit file, another satellite's, or no vector near that time.
     """
+    mission, start, stop = annotation.mission, annotation.first_line_time, annotation.last_line_time
     root = parse_xml(path, strip_namespaces=True)
-    vectors = root.findall("Data_Block/List_of_OSVs/OSV")
+    vectors = _Fields(root, str(path)).all("Data_Block/List_of_OSVs/OSV")
     if not vectors:
         raise RpcFormatError(f"{path}: not a Sentinel-1 orbit file (no List_of_OSVs)")
     owner = root.findtext("Earth_Explorer_Header/Fixed_Header/Mission", "").strip()
@@ -271,16 +274,15 @@ def read_orbit_file(
     frame = root.findtext("Earth_Explorer_Header/Variable_Header/Ref_Frame", "EARTH_FIXED").strip()
     if frame != "EARTH_FIXED":
         raise RpcFormatError(f"{path}: state vectors in {frame}, EARTH_FIXED is needed")
-    fields = [_Fields(vector, str(path)) for vector in vectors]
-    times = np.array([f.time("UTC") for f in fields], dtype="datetime64[ns]")
-    pad = np.timedelta64(int(margin * 1e9), "ns")
-    near = np.flatnonzero((times >= window[0] - pad) & (times <= window[1] + pad))
+    times = _times(vectors, "UTC")
+    pad = np.timedelta64(int(MARGIN * 1e9), "ns")
+    near = np.flatnonzero((times >= start - pad) & (times <= stop + pad))
     if not len(near):
         raise RpcFormatError(
-            f"{path}: covers {times.min()} to {times.max()}, the image is of {window[0]}; "
+            f"{path}: covers {times.min()} to {times.max()}, the image is of {start}; "
             "take the orbit file of that day"
         )
-    return _states([fields[i] for i in near], "UTC", "XYZ", ("V{}", "{}"), str(path))
+    return _states([vectors[i] for i in near], "UTC", ("X", "Y", "Z", "VX", "VY", "VZ"), str(path))
 
 
 def seconds(time: Any, epoch: np.datetime64) -> Any:
@@ -309,6 +311,9 @@ class _Fields:
             raise RpcFormatError(f"{self.name}: no {path} below <{self.element.tag}>; is the file complete?")
         return text.strip()
 
+    def all(self, path: str) -> list[_Fields]:
+        return [_Fields(element, self.name) for element in self.element.findall(path)]
+
     def time(self, path: str) -> np.datetime64:
         return parse_time(self.text(path), self.name)
 
@@ -328,53 +333,54 @@ class _Fields:
         return value
 
 
-def _states(
-    vectors: Sequence[_Fields], time: str, axes: str, tags: tuple[str, str], source: str
-) -> StateVectors:
-    """State vectors whose components are named by `tags` (velocity, position) with the axis filled in."""
-    position = [[v.numbers(tags[1].format(axis))[0] for axis in axes] for v in vectors]
-    velocity = [[v.numbers(tags[0].format(axis))[0] for axis in axes] for v in vectors]
-    times = np.array([v.time(time) for v in vectors], dtype="datetime64[ns]")
-    return StateVectors(times, np.reshape(position, (-1, 3)), np.reshape(velocity, (-1, 3)), source)
+def _times(rows: Sequence[_Fields], tag: str) -> TimeArray:
+    return np.array([row.time(tag) for row in rows], dtype="datetime64[ns]")
 
 
-def _annotated_states(root: Element, name: str) -> StateVectors:
-    vectors = [_Fields(v, name) for v in root.findall("generalAnnotation/orbitList/orbit")]
+def _states(vectors: Sequence[_Fields], time: str, tags: Sequence[str], source: str) -> StateVectors:
+    """State vectors whose time is named `time`, and x, y, z of position and of velocity by `tags`."""
+    table = np.reshape([[v.numbers(tag)[0] for tag in tags] for v in vectors], (-1, 6))
+    return StateVectors(_times(vectors, time), table[:, :3], table[:, 3:], source)
+
+
+def _annotated_states(root: _Fields) -> StateVectors:
+    vectors = root.all("generalAnnotation/orbitList/orbit")
     if any(v.text("frame") != "Earth Fixed" for v in vectors):
-        raise RpcFormatError(f"{name}: orbit state vectors are not Earth fixed; give an orbit file")
-    source = root.findtext("imageAnnotation/processingInformation/orbitSource", "annotation").strip()
-    return _states(vectors, "time", "xyz", ("velocity/{}", "position/{}"), source)
+        raise RpcFormatError(f"{root.name}: orbit state vectors are not Earth fixed; give an orbit file")
+    source = root.element.findtext("imageAnnotation/processingInformation/orbitSource", "annotation")
+    tags = [f"{part}/{axis}" for part in ("position", "velocity") for axis in "xyz"]
+    return _states(vectors, "time", tags, source.strip())
 
 
-def _burst(element: Element, name: str) -> Burst:
-    fields = _Fields(element, name)
-    first, last = (fields.numbers(tag).astype(np.int64) for tag in ("firstValidSample", "lastValidSample"))
+def _burst(burst: _Fields) -> Burst:
+    first, last = (burst.numbers(tag).astype(np.int64) for tag in ("firstValidSample", "lastValidSample"))
     if first.shape != last.shape:
-        raise RpcFormatError(f"{name}: a burst lists {len(first)} first and {len(last)} last valid samples")
-    return Burst(fields.time("azimuthTime"), first, last)
+        raise RpcFormatError(
+            f"{burst.name}: a burst lists {len(first)} first and {len(last)} last valid samples"
+        )
+    return Burst(burst.time("azimuthTime"), first, last)
 
 
-def _ground_range(root: Element, name: str) -> GroundRange | None:
-    rows = root.findall("coordinateConversion/coordinateConversionList/coordinateConversion")
-    fields = [_Fields(row, name) for row in rows]
-    if not fields:
+def _ground_range(root: _Fields) -> GroundRange | None:
+    rows = root.all("coordinateConversion/coordinateConversionList/coordinateConversion")
+    if not rows:
         return None
-    forward, backward = ([f.numbers(tag) for f in fields] for tag in ("srgrCoefficients", "grsrCoefficients"))
+    forward, backward = (
+        [row.numbers(tag) for row in rows] for tag in ("srgrCoefficients", "grsrCoefficients")
+    )
     if len({len(c) for c in forward}) > 1 or len({len(c) for c in backward}) > 1:
-        raise RpcFormatError(f"{name}: ground range polynomials of different lengths")
-    time = np.array([f.time("azimuthTime") for f in fields], dtype="datetime64[ns]")
-    if len(time) > 1 and not (np.diff(time) > np.timedelta64(0, "ns")).all():
-        raise RpcFormatError(f"{name}: the times of the ground range polynomials do not rise")
-    slant, ground = (np.array([f.numbers(tag)[0] for f in fields]) for tag in ("sr0", "gr0"))
-    return GroundRange(time, slant, ground, np.array(forward), np.array(backward))
+        raise RpcFormatError(f"{root.name}: ground range polynomials of different lengths")
+    time = _times(rows, "azimuthTime")
+    if not (np.diff(time) > np.timedelta64(0, "ns")).all():
+        raise RpcFormatError(f"{root.name}: the times of the ground range polynomials do not rise")
+    origin = np.array([row.numbers("sr0")[0] for row in rows])
+    return GroundRange(time, origin, np.array(forward), np.array(backward))
 
 
-def _grid(root: Element, name: str) -> GridPoints:
-    points = root.findall("geolocationGrid/geolocationGridPointList/geolocationGridPoint")
-    fields = [_Fields(point, name) for point in points]
-    if not fields:
-        raise RpcFormatError(f"{name}: no geolocation grid; is the file complete?")
+def _grid(root: _Fields) -> GridPoints:
+    points = root.all("geolocationGrid/geolocationGridPointList/geolocationGridPoint")
+    if not points:
+        raise RpcFormatError(f"{root.name}: no geolocation grid; is the file complete?")
     tags = ("slantRangeTime", "pixel", "line", "longitude", "latitude", "height")
-    table = np.array([[f.numbers(tag)[0] for tag in tags] for f in fields])
-    time = np.array([f.time("azimuthTime") for f in fields], dtype="datetime64[ns]")
-    return GridPoints(time, table[:, 0], table[:, 1:3], table[:, 3:6])
+    table = np.array([[point.numbers(tag)[0] for tag in tags] for point in points])
+    return GridPoints(_times(points, "azimuthTime"), table[:, 0], table[:, 1:3], table[:, 3:6])

@@ -1,7 +1,7 @@
 """Times and image points: the frames of an image, and smooth delays between the geometry and the annotated times.
 
-Both frames count rows by a constant interval of zero-Doppler time from the epoch, the time of row 0. Times
-and image points are (2, N) here: azimuth time [s] and two-way slant range time [s]; col and row [px]. Delays, added
+Both frames count rows by a constant interval of zero-Doppler time from the epoch, the time of row 0. Times are
+(2, N) here: azimuth time and two-way slant range time [s]; so are image points: col and row [px]. Delays, added
 to the geometric times of a ground point, give the times at which it is really found in the image; they are smooth
 over a swath, so that an RPC can hold them.
 """
@@ -15,7 +15,7 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.frozen import Frozen
-from barpc.geodesy import Array, enu_basis
+from barpc.geodesy import Array, enu_basis, up
 from barpc.sensor.sentinel1.annotation import Annotation, seconds
 
 SPEED_OF_LIGHT = 299792458.0
@@ -35,12 +35,9 @@ class SlantFrame(Frozen):
 
     Parameters
     ----------
-    first_range_time : float
-        Two-way slant range time of column 0 [s].
-    sampling_rate : float
-        Columns a second of two-way time [Hz].
-    interval : float
-        Azimuth time between rows [s].
+    first_range_time : float, two-way slant range time of column 0 [s]
+    sampling_rate : float, columns a second of two-way time [Hz]
+    interval : float, azimuth time between rows [s]
     """
 
     first_range_time: float
@@ -69,18 +66,12 @@ class GroundFrame(Frozen):
 
     Parameters
     ----------
-    interval : float
-        Azimuth time between rows [s].
-    spacing : float
-        Ground range between columns [m].
-    listed : (M,)
-        Times of the polynomials [s from the epoch], ascending.
-    origin : (M,)
-        Slant range origins [m].
-    coeffs : (M, K)
-        Ascending powers of (slant range - origin) [m].
-    slope : float
-        Slant range a ground range at mid swath, roughly: where the inversion starts.
+    interval : float, azimuth time between rows [s]
+    spacing : float, ground range between columns [m]
+    listed : (M,), times of the polynomials [s from the epoch], ascending
+    origin : (M,), slant range origins [m]
+    coeffs : (M, K), ascending powers of (slant range - origin) [m]
+    slope : float, slant range a ground range at mid swath, roughly: where the inversion starts
     """
 
     interval: float
@@ -116,7 +107,7 @@ class GroundFrame(Frozen):
         """Ground range (N,) [m] and its derivatives by slant range [m/m] and time [m/s]."""
         coeffs, rates, origin, drift = self._listed_at(time)
         u = slant - origin
-        value, by_slant, by_time = np.zeros_like(u), np.zeros_like(u), np.zeros_like(u)
+        value, by_slant, by_time = np.zeros((3, len(u)))
         for c, r in zip(coeffs[::-1], rates[::-1], strict=True):  # Horner, both derivatives alongside
             by_slant = by_slant * u + value
             value = value * u + c
@@ -126,8 +117,7 @@ class GroundFrame(Frozen):
     def _listed_at(self, time: Array) -> tuple[Array, Array, Array, Array]:
         """Coefficients (K, N) and their rates [1/s], origins (N,) [m] and theirs [m/s], at times (N,)."""
         if len(self.listed) == 1:
-            coeffs = np.broadcast_to(self.coeffs.T, (self.coeffs.shape[1], len(time)))
-            still = np.zeros(len(time))
+            coeffs, still = np.repeat(self.coeffs.T, len(time), axis=1), np.zeros(len(time))
             return coeffs, np.zeros_like(coeffs), still + self.origin[0], still
         k = np.clip(np.searchsorted(self.listed, time) - 1, 0, len(self.listed) - 2)
         span, since = self.listed[k + 1] - self.listed[k], time - self.listed[k]
@@ -161,48 +151,18 @@ class Delays:
         return self.atmosphere or self.bistatic is not None
 
     def shift(self, times: Array, ground: Array, sight: Array) -> Array:
-        """What is added to the times.
-
-        Parameters
-        ----------
-        times : (2, N)
-            Geometric azimuth time, slant range time [s].
-        ground : (N, 3)
-            lon, lat [deg], alt [m].
-        sight : (3, N)
-            Unit vectors from the ground point to the satellite.
-
-        Returns
-        -------
-        shift : (2, N)
-            [s].
-        """
+        """What is added to times (2, N), of points (N, 3) that see the satellite along unit vectors (3, N) [s]."""
         out = np.zeros_like(times)
         if self.bistatic is not None:
             out[0] = self.bistatic - 0.5 * times[1]
         if self.atmosphere:
-            up = enu_basis(ground)[:, 2, :].T
-            out[1] = _zenith(ground[:, 2])[0] / (up * sight).sum(axis=0) * (2.0 / SPEED_OF_LIGHT)
+            out[1] = _zenith(ground[:, 2])[0] / (up(ground) * sight).sum(axis=0) * (2.0 / SPEED_OF_LIGHT)
         return out
 
     def shift_jacobian(self, by_ground: Array, ground: Array, sight: Array, by_sight: Array) -> Array:
-        """Derivative of `shift`.
+        """Derivative of `shift` by (lon, lat, alt) (2, N, 3) [s/deg, s/deg, s/m].
 
-        Parameters
-        ----------
-        by_ground : (2, N, 3)
-            d(times)/d(lon, lat, alt) [s/deg, s/deg, s/m].
-        ground : (N, 3)
-            lon, lat [deg], alt [m].
-        sight : (3, N)
-            Unit vectors from the ground point to the satellite.
-        by_sight : (N, 3, 3)
-            d(sight)/d(lon, lat, alt).
-
-        Returns
-        -------
-        jacobian : (2, N, 3)
-            d(shift)/d(lon, lat, alt).
+        `by_ground` (2, N, 3) is that of the times, `by_sight` (N, 3, 3) that of the sight.
         """
         out = np.zeros_like(by_ground)
         if self.bistatic is not None:
@@ -221,7 +181,7 @@ class Delays:
 
 
 def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
-    """The constant b of the bistatic correction of azimuth time, b - tau/2.
+    """The constant b [s] of the bistatic correction of azimuth time, b - tau/2.
 
     The satellite flies on while the pulse is on its way. The processor allows for that at one range, the
     middle of the whole product (IW2, EW3), which shows in its geolocation grid: the time of a grid line
@@ -229,19 +189,13 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
 
     Parameters
     ----------
-    annotation : Annotation
-        One swath, or a GRD.
+    annotation : Annotation, one swath, or a GRD
     form : "annotated" or "full"
         "annotated": that constant, so that the model meets the lines of the product's own grid: 0.04 to
         0.14 line in an SLC, to 0.19 in a GRD (Schubert et al., "Sentinel-1A Product Geolocation Accuracy:
         Commissioning Phase Results", Remote Sensing 2015). "full": also the pulses on their way, rank
         times pulse interval, for one SLC swath: to 0.26 line (Gisinger et al., "Recent Findings on the
         Sentinel-1 Geolocation Accuracy Using the Australian Corner Reflector Array", IGARSS 2018).
-
-    Returns
-    -------
-    b : float
-        [s].
 
     Raises
     ------

@@ -7,6 +7,8 @@ into (col, row).
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,27 +16,43 @@ from typing import Literal
 
 import numpy as np
 
-from barpc.errors import RpcError
+from barpc.errors import BarpcWarning, InputError, RpcError, RpcFormatError
 from barpc.frozen import Frozen
 from barpc.geodesy import (
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
-    enu_basis,
     ground_from_ecef,
     pointwise,
+    up,
     wrap_longitude,
 )
-from barpc.sensor.sentinel1.annotation import Annotation
-from barpc.sensor.sentinel1.frames import SPEED_OF_LIGHT, Bistatic, Delays, Frame
-from barpc.sensor.sentinel1.orbit import Orbit
+from barpc.sensor.curve import Curve, Orbit, cross, fit_orbit
+from barpc.sensor.sentinel1.annotation import (
+    Annotation,
+    burst_rows,
+    read_annotation,
+    read_orbit_file,
+    seconds,
+)
+from barpc.sensor.sentinel1.frames import (
+    SPEED_OF_LIGHT,
+    Bistatic,
+    Delays,
+    Frame,
+    GroundFrame,
+    SlantFrame,
+    bistatic_constant,
+)
 
 CHUNK = 8192
 """Points worked on at a time."""
-
+RELIEF = (200.0, 500.0)
+"""How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
 NO_DELAYS = Delays()
 """Pure geometry."""
 
+_GRID_TOLERANCE = 5.0  # px and lines: a grid farther off does not belong to the orbit
 _STEPS = 12  # at most; three are enough near the image
 _SLACK = 10.0  # s: how far beyond the orbit the search for zero Doppler may wander
 _SETTLED = 1e-5  # s: quadratic convergence leaves less than 1e-12 s after a step so small
@@ -48,14 +66,13 @@ class RangeDoppler(Frozen):
 
     Parameters
     ----------
-    orbit : Orbit
-        Its time counts from `epoch`.
+    orbit : Curve
+        Position of the satellite [m], ECEF; its time counts from `epoch`.
     epoch : datetime64[ns]
         Zero-Doppler time (UTC) of row 0.
     frame : SlantFrame or GroundFrame
         (azimuth time, slant range time) to (col, row).
-    size : (width, height)
-        [px].
+    size : (width, height) [px]
     alt_range : (low, high)
         Altitudes that the image is used for [m above the ellipsoid].
     look : "right" or "left"
@@ -64,7 +81,7 @@ class RangeDoppler(Frozen):
         Smooth corrections between geometry and annotated times; none by default.
     """
 
-    orbit: Orbit
+    orbit: Curve
     epoch: np.datetime64
     frame: Frame
     size: tuple[int, int]
@@ -89,25 +106,48 @@ class RangeDoppler(Frozen):
         atmosphere: bool = False,
         bistatic: Bistatic | None = None,
     ) -> RangeDoppler:
-        """The model of one SLC swath, one of its bursts, or a GRD; see `build.from_annotation`."""
-        from barpc.sensor.sentinel1.build import from_annotation
+        """The model of one SLC swath (bursts stitched, or stripmap), one burst, or a GRD.
 
-        return from_annotation(source, burst=burst, orbit=orbit, atmosphere=atmosphere, bistatic=bistatic)
-
-    def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
-        """Times at which ground points are seen: pure geometry, without `delays`.
+        Column 0 is the annotation's pixel 0. Row 0 is its line 0; in a stitched swath rows go on by
+        zero-Doppler time, and `burst_rows` says where the lines of each burst lie.
 
         Parameters
         ----------
-        ground : (..., 3)
-            lon, lat [deg], alt [m above the WGS84 ellipsoid].
+        source : Path or Annotation
+            The annotation XML.
+        burst : int, optional
+            The model of this burst alone, from 0; row 0 is its first line.
+        orbit : Path, optional
+            Precise orbit file (``.EOF``) to use in place of the annotated state vectors.
+        atmosphere : bool
+            Add the path delay of the atmosphere (see `Delays`).
+        bistatic : "annotated" or "full", optional
+            Add a bistatic correction (see `bistatic_constant`).
+
+        Raises
+        ------
+        RpcError
+            Not a Sentinel-1 annotation (an `RpcFormatError`), or an orbit that cannot be used.
+        InputError
+            No such burst, or a correction that this product does not take.
+
+        Warns
+        -----
+        BarpcWarning
+            The geolocation grid does not belong to the orbit; it is not used but for its range of heights.
+        """
+        annotation = source if isinstance(source, Annotation) else read_annotation(source)
+        epoch, lines = extent(annotation, burst)
+        return build([annotation], epoch, (annotation.samples, lines), orbit, atmosphere, bistatic)
+
+    def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
+        """Times at which ground points (..., 3) are seen: pure geometry, without `delays`.
 
         Returns
         -------
         azimuth_time : (...)
             Zero-Doppler time [s from `epoch`]; NaN off the orbit's time span or on the other side.
-        range_time : (...)
-            Two-way slant range time [s].
+        range_time : (...), two-way slant range time [s]
         """
         azimuth_time, range_time = pointwise(
             lambda part: self._geometry(ecef_from_ground(part)).times, CHUNK, [(), ()], ground
@@ -115,74 +155,32 @@ class RangeDoppler(Frozen):
         return azimuth_time, range_time
 
     def incidence(self, ground: Array) -> Array:
-        """Incidence angles of the radar beam.
+        """Angles (...) [deg] between the ellipsoid's normal and the beam at ground points (..., 3).
 
-        Not that of `barpc.sensor.geometry.view_angles`, which follows the ground points of one pixel over
-        altitude: for a radar they lie on a circle about the track, at a right angle to the beam.
-
-        Parameters
-        ----------
-        ground : (..., 3)
-            lon, lat [deg], alt [m above the WGS84 ellipsoid].
-
-        Returns
-        -------
-        incidence : (...)
-            Angle between the ellipsoid's normal and the beam [deg]; NaN where `azimuth_range` is.
+        Not those of `barpc.sensor.geometry.view_angles`, which follows the ground points of one pixel over
+        altitude: for a radar they lie on a circle about the track, at a right angle to the beam. NaN where
+        `azimuth_range` is.
         """
         return pointwise(self._incidence, CHUNK, [()], ground)[0]
 
     def project(self, ground: Array) -> Array:
-        """Image points of ground points.
+        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m].
 
-        Parameters
-        ----------
-        ground : (..., 3)
-            lon, lat [deg], alt [m above the WGS84 ellipsoid].
-
-        Returns
-        -------
-        image : (..., 2)
-            col, row [px]; NaN off the orbit's time span or on the other side of the track.
+        NaN off the orbit's time span or on the other side of the track.
         """
         return pointwise(self._project, CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Image points of ground points, with the derivative.
-
-        Parameters
-        ----------
-        ground : (..., 3)
-            lon, lat [deg], alt [m].
-
-        Returns
-        -------
-        image : (..., 2)
-            col, row [px].
-        jacobian : (..., 2, 3)
-            d(col, row) / d(lon, lat, alt) [px/deg, px/deg, px/m].
-        """
+        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
         image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
-        """Ground points seen at image points, at known altitudes (the inverse of `project`).
+        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
 
-        On the circle of zero Doppler and given slant range, Newton on the look angle until the point has
-        the altitude.
-
-        Parameters
-        ----------
-        image : (..., 2)
-            col, row [px].
-        alt : (...)
-            Altitude above the WGS84 ellipsoid [m].
-
-        Returns
-        -------
-        ground : (..., 3)
-            lon, lat [deg], alt [m]; NaN off the orbit's time span or where the range does not reach.
-            Longitudes run on across the antimeridian.
+        On the circle of zero Doppler and given slant range, Newton on the look angle until the point has the
+        altitude. Longitudes run on across the antimeridian; NaN off the orbit's time span or where the range does
+        not reach.
         """
         ground = pointwise(lambda part, alt: [self._localize(part.T, alt)], CHUNK, [(3,)], image, alt)[0]
         with np.errstate(all="ignore"):
@@ -200,7 +198,7 @@ class RangeDoppler(Frozen):
         """Zero-Doppler geometry of ECEF points (N, 3)."""
         point = ecef.T
         low, high = self.orbit.span
-        time = np.where(np.isfinite(point[0]), self.orbit.center, np.nan)
+        time = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan)
         for _ in range(_STEPS):
             position, velocity, acceleration = self.orbit.states(time)
             sight = position - point
@@ -214,19 +212,20 @@ class RangeDoppler(Frozen):
         distance = np.sqrt(_dot(sight, sight))
         sight /= distance
         rate = -distance * _dot(acceleration, sight) - _dot(velocity, velocity)
-        side = self._sign() * _dot(np.cross(velocity, position, axis=0), sight)
+        side = _dot(self._aside(position, velocity), sight)
         time[~((time >= low) & (time <= high) & (side < 0) & (step <= _SETTLED))] = np.nan
         times = np.stack([time, distance * (2.0 / SPEED_OF_LIGHT)])
         return _Seen(times, sight, distance, velocity, -velocity / rate)
 
-    def _sign(self) -> float:
-        """Of velocity x position along the look: that vector points right of the track."""
-        return 1.0 if self.look == "right" else -1.0
+    def _aside(self, position: Array, velocity: Array) -> Array:
+        """Vectors (3, N) across the track, to the side that is looked at."""
+        right = cross(velocity, position)
+        return right if self.look == "right" else -right
 
     def _incidence(self, ground: Array) -> list[Array]:
         """`incidence` of points (N, 3)."""
         seen = self._geometry(ecef_from_ground(ground))
-        cosine = _dot(enu_basis(ground)[:, 2, :].T, seen.sight)
+        cosine = _dot(up(ground), seen.sight)
         return [np.where(np.isnan(seen.times[0]), np.nan, np.rad2deg(np.arccos(cosine)))]
 
     def _project(self, ground: Array) -> list[Array]:
@@ -258,8 +257,7 @@ class RangeDoppler(Frozen):
 
     def _localize(self, image: Array, alt: Array) -> Array:
         """`localize` of image points (2, N)."""
-        measured = self.frame.times(image)
-        times = measured
+        measured = times = self.frame.times(image)
         ground, sight = self._on_circle(times, alt)
         for _ in range(3 if self.delays else 0):  # delays change by 1e-5 of a step: three rounds are exact
             times = measured - self.delays.shift(times, ground, sight)
@@ -272,24 +270,27 @@ class RangeDoppler(Frozen):
         time = np.where((times[0] >= low) & (times[0] <= high), times[0], np.nan)
         position, velocity, _ = self.orbit.states(time)
         distance = 0.5 * SPEED_OF_LIGHT * times[1]
-        across = self._sign() * np.cross(velocity, position, axis=0)
+        across = self._aside(position, velocity)
         across /= np.sqrt(_dot(across, across))
-        up = self._sign() * np.cross(across, velocity, axis=0)
-        up /= np.sqrt(_dot(up, up))
+        above = position * _dot(velocity, velocity) - velocity * _dot(velocity, position)
+        above /= np.sqrt(_dot(above, above))
         height = ground_from_ecef(position.T)[:, 2]
         radius = np.sqrt(_dot(position, position)) - height + alt
-        cosine = (_dot(position, position) + distance**2 - radius**2) / (2 * distance * _dot(position, up))
-        angle = np.arccos(cosine)
+        cosine = _dot(position, position) + distance**2 - radius**2
+        angle = np.arccos(cosine / (2 * distance * _dot(position, above)))
+
+        def at(angle: Array) -> tuple[Array, Array]:
+            away = across * np.sin(angle) - above * np.cos(angle)
+            return away, ground_from_ecef((position + distance * away).T)
+
         for _ in range(_ANGLE_STEPS):
-            away = across * np.sin(angle) - up * np.cos(angle)
-            ground = ground_from_ecef((position + distance * away).T)
-            slope = distance * _dot(enu_basis(ground)[:, 2, :].T, across * np.cos(angle) + up * np.sin(angle))
-            step = (alt - ground[:, 2]) / slope
+            _, ground = at(angle)
+            turned = across * np.cos(angle) + above * np.sin(angle)
+            step = (alt - ground[:, 2]) / (distance * _dot(up(ground), turned))
             angle = angle + step
             if not (np.abs(step).max(initial=0.0, where=np.isfinite(step)) > _ANGLE_SETTLED):
                 break
-        away = across * np.sin(angle) - up * np.cos(angle)
-        ground = ground_from_ecef((position + distance * away).T)
+        away, ground = at(angle)
         ground[~(np.abs(ground[:, 2] - alt) <= 1e-6)] = np.nan
         ground[:, 2] = alt
         return ground, -away
@@ -307,13 +308,92 @@ class _Seen:
 
     def sight_by_ecef(self) -> Array:
         """(N, 3, 3): d(sight)/dX, the satellite moving along with the zero-Doppler time."""
-        moved: Array = np.einsum("in,jn->nij", self.velocity, self.time_by_ecef) - np.eye(3)
+        moved = np.einsum("in,jn->nij", self.velocity, self.time_by_ecef) - np.eye(3)
         moved += np.einsum("in,jn->nij", self.sight, self.sight)  # velocity has no part along the sight
-        moved /= self.distance[:, None, None]
-        return moved
+        return np.asarray(moved / self.distance[:, None, None])
 
 
 def _dot(a: Array, b: Array) -> Array:
     """Scalar products (N,) of vectors (3, N)."""
-    product: Array = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return product
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def extent(annotation: Annotation, burst: int | None = None) -> tuple[np.datetime64, int]:
+    """Time of row 0 and number of rows: of a burst, or of all there is, stitched."""
+    if burst is not None:
+        if not 0 <= burst < len(annotation.bursts):
+            raise InputError(f"{annotation.name}: no burst {burst}, it has {len(annotation.bursts)}")
+        return annotation.bursts[burst].time, annotation.lines_per_burst
+    if not annotation.bursts:
+        return annotation.first_line_time, annotation.lines
+    last = max(b.first_row for b in burst_rows(annotation))
+    return annotation.first_line_time, last + annotation.lines_per_burst
+
+
+def build(
+    swaths: Sequence[Annotation],
+    epoch: np.datetime64,
+    size: tuple[int, int],
+    orbit: Path | None,
+    atmosphere: bool,
+    bistatic: Bistatic | None,
+) -> RangeDoppler:
+    """The model of swaths side by side, the nearest first; row 0 at `epoch`."""
+    nearest = swaths[0]
+    alt = np.concatenate([a.grid.ground[:, 2] for a in swaths])
+    model = RangeDoppler(
+        orbit=_orbit(nearest, orbit, epoch),
+        epoch=epoch,
+        frame=_frame(nearest, epoch),
+        size=size,
+        alt_range=(float(np.floor(alt.min()) - RELIEF[0]), float(np.ceil(alt.max()) + RELIEF[1])),
+        delays=Delays(atmosphere, None if bistatic is None else bistatic_constant(nearest, bistatic)),
+    )
+    for annotation in swaths:
+        worst = np.abs(grid_residuals(annotation, model)).max(axis=0)
+        if not (worst <= _GRID_TOLERANCE).all():
+            warnings.warn(
+                f"{annotation.name}: the geolocation grid does not belong to the orbit (off by {worst[0]:.1f} "
+                f"samples, {worst[1]:.1f} lines); the model follows the orbit, the grid is not used",
+                BarpcWarning,
+                stacklevel=3,
+            )
+    return model
+
+
+def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
+    """The model against a product's own geolocation grid (of one swath of a mosaic).
+
+    Returns
+    -------
+    residuals : (G, 2), range [samples of `range_sampling_rate`], azimuth [lines]: model - grid, geometry only
+    """
+    grid = annotation.grid
+    azimuth_time, range_time = model.azimuth_range(grid.ground)
+    samples = (range_time - grid.range_time) * annotation.range_sampling_rate
+    lines = (azimuth_time - seconds(grid.time, model.epoch)) / annotation.azimuth_time_interval
+    return np.stack([samples, lines], axis=1)
+
+
+def _orbit(annotation: Annotation, file: Path | None, epoch: np.datetime64) -> Orbit:
+    """The orbit over the image, its times counted from `epoch`."""
+    states = annotation.states if file is None else read_orbit_file(file, annotation)
+    start, stop = (float(seconds(t, epoch)) for t in (annotation.first_line_time, annotation.last_line_time))
+    return fit_orbit(seconds(states.time, epoch), states.position, states.velocity, (start, stop))
+
+
+def _frame(annotation: Annotation, epoch: np.datetime64) -> Frame:
+    """The frame of an SLC, or of a GRD (which has ground range polynomials)."""
+    interval, convert = annotation.azimuth_time_interval, annotation.ground_range
+    if annotation.product_type == "SLC":
+        return SlantFrame(annotation.slant_range_time, annotation.range_sampling_rate, interval)
+    if annotation.product_type != "GRD" or convert is None:
+        raise RpcFormatError(f"{annotation.name}: {annotation.kind} has no geometry that is known here")
+    return GroundFrame(
+        interval,
+        annotation.range_pixel_spacing,
+        seconds(convert.time, epoch),
+        convert.slant_origin,
+        convert.ground_from_slant,
+        float(convert.slant_from_ground[:, 1].mean()),
+    )
