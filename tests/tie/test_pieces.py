@@ -494,6 +494,15 @@ def test_after_a_blind_pass_the_search_is_where_its_matches_lie(search) -> None:
         np.testing.assert_allclose(where.place(np.full(5, 3.0)), places + [3.0, -5.0], atol=1e-6)
 
 
+def test_the_correction_across_the_lines_is_one_by_the_place_in_the_first_view(search) -> None:
+    """Of a camera that is 300 px off along the lines, and across them by more the farther east."""
+    places = np.random.default_rng(1).uniform(0, 999, (200, 2))  # those of `Wrong`
+    along = np.random.default_rng(2).uniform(295, 305, 200)
+    found = search(Wrong(along, 0.004 * places[:, 0])).offset()
+    assert found is not None
+    np.testing.assert_allclose(found.at(places).across, places[:, 1] + 0.004 * places[:, 0], atol=0.05)
+
+
 @pytest.mark.parametrize(("noise", "width"), [(0.01, 0.6), (0.3, 1.2), (2.0, 3.0)])
 def test_the_local_band_is_four_standard_deviations_wide_within_its_bounds(search, noise, width) -> None:
     rng = np.random.default_rng(3)
