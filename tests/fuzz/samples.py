@@ -39,7 +39,7 @@ from barpc.rpcio.text import decode
 from barpc.scene import View
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.sentinel1 import open_product
-from barpc.tie.area import read_area
+from barpc.tie.pairs import read_area
 from barpc.workspace import Workspace
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
