@@ -32,11 +32,11 @@ class View(Frozen):
         Unique in a run: the file's stem, with its folder where stems repeat.
     path : str
         Absolute path of the raster; empty for a view without pixels.
-    size : tuple of int
+    size : (int, int)
         Width, height [px].
     sensor : SensorModel
         The camera as delivered.
-    alt_range : tuple of float
+    alt_range : (float, float)
         Lowest and highest altitude [m above the ellipsoid] that the camera is used for.
     """
 

@@ -17,8 +17,7 @@ from barpc.ba.blocks import CameraPrior, JointPrior
 from barpc.ba.solve import free_part
 from barpc.errors import InputError
 from barpc.geodesy import Array
-from barpc.record import load_npz
-from barpc.sidefile import ARRAYS
+from barpc.sidefile import ARRAYS, load_npz
 
 if TYPE_CHECKING:
     from barpc.ba.result import Adjustment
