@@ -1,18 +1,22 @@
-"""Values that never change, and how they are kept as plain named arrays without pickle."""
+"""Values that never change, how they are kept as plain named arrays without pickle, and archives of such arrays."""
 
 from __future__ import annotations
 
 import json
+import math
 import sys
+import zipfile
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib import format as npy
 
 from barpc.errors import BarpcError, InputError
-from barpc.sidefile import Arrays
+from barpc.sidefile import ARRAYS, Kind, opened
 
 
 class Frozen:
@@ -81,6 +85,9 @@ def _plain(value: object) -> object:
 
 # --- values as named arrays -------------------------------------------------------------------------------
 
+Arrays = dict[str, npt.NDArray[Any]]
+"""Named plain arrays: what an ``.npz`` file holds."""
+
 _FRAME = "frame"
 
 
@@ -147,3 +154,45 @@ def _decode(frame: Any, arrays: Mapping[str, npt.NDArray[Any]]) -> Any:
     if module.split(".")[0] != "barpc" or not (isinstance(kind, type) and is_dataclass(kind)):
         raise ValueError(f"{module}.{name} is not a record of barpc")
     return kind(**{k: _decode(v, arrays) for k, v in frame["fields"].items()})
+
+
+_DEFLATE = 1032  # bytes at most that one byte of a deflated stream stands for
+_HEADER = 1 << 12
+
+
+def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
+    """The arrays of an ``.npz`` file, unpacked of no more bytes than `kind` allows; errors are of its class.
+
+    What the archive claims is added up before anything is unpacked: a few kilobytes can hold gigabytes of zeros.
+    """
+    with opened(path, kind) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                members = archive.infolist()
+                kind.check(f"{path}, unpacked", sum(member.file_size for member in members))
+                return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+        except BarpcError:
+            raise
+        except Exception as error:
+            raise kind.error(
+                f"{path}: not {kind.words} (.npz) that can be read ({type(error).__name__}: {error})"
+            ) from error
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
+    """A member, after its header was found to claim as many bytes as the archive does."""
+    packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: _DEFLATE}.get(member.compress_type)
+    if packed is None or member.file_size > packed * member.compress_size + _HEADER:
+        raise ValueError(f"{member.filename} claims more bytes than it can hold")
+    with archive.open(member) as file:
+        version = npy.read_magic(file)
+        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
+        shape, _, dtype = read_header(file)
+        if dtype.hasobject:
+            raise ValueError(f"{member.filename} holds Python objects")
+        if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
+            raise ValueError(
+                f"{member.filename} holds another number of bytes than its shape {shape} asks for"
+            )
+    with archive.open(member) as file:
+        return np.asarray(npy.read_array(file, allow_pickle=False))

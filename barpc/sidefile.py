@@ -13,17 +13,12 @@ import math
 import os
 import stat
 import unicodedata
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, TextIO
 from xml.etree import ElementTree
-
-import numpy as np
-import numpy.typing as npt
-from numpy.lib import format as npy
 
 from barpc.errors import BarpcError, ImageError, InputError, RpcFormatError, visible
 
@@ -280,50 +275,3 @@ def parse_xml(
         for element in root.iter():
             element.tag = element.tag.rpartition("}")[2]
     return root
-
-
-# --- arrays -----------------------------------------------------------------------------------------------
-
-Arrays = dict[str, npt.NDArray[Any]]
-"""Named plain arrays: what an ``.npz`` file holds."""
-
-_DEFLATE = 1032  # bytes at most that one byte of a deflated stream stands for
-_HEADER = 1 << 12
-
-
-def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
-    """The arrays of an ``.npz`` file, unpacked of no more bytes than `kind` allows; errors are of its class.
-
-    What the archive claims is added up before anything is unpacked: a few kilobytes can hold gigabytes of zeros.
-    """
-    with opened(path, kind) as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                members = archive.infolist()
-                kind.check(f"{path}, unpacked", sum(member.file_size for member in members))
-                return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
-        except BarpcError:
-            raise
-        except Exception as error:
-            raise kind.error(
-                f"{path}: not {kind.words} (.npz) that can be read ({type(error).__name__}: {error})"
-            ) from error
-
-
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
-    """A member, after its header was found to claim as many bytes as the archive does."""
-    packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: _DEFLATE}.get(member.compress_type)
-    if packed is None or member.file_size > packed * member.compress_size + _HEADER:
-        raise ValueError(f"{member.filename} claims more bytes than it can hold")
-    with archive.open(member) as file:
-        version = npy.read_magic(file)
-        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
-        shape, _, dtype = read_header(file)
-        if dtype.hasobject:
-            raise ValueError(f"{member.filename} holds Python objects")
-        if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
-            raise ValueError(
-                f"{member.filename} holds another number of bytes than its shape {shape} asks for"
-            )
-    with archive.open(member) as file:
-        return np.asarray(npy.read_array(file, allow_pickle=False))

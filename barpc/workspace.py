@@ -38,7 +38,7 @@ import numpy.typing as npt
 from barpc import __version__
 from barpc.atomic import replacing
 from barpc.errors import BarpcError, OutputError
-from barpc.sidefile import Arrays, load_npz
+from barpc.frozen import Arrays, load_npz
 
 logger = logging.getLogger(__name__)
 

@@ -17,6 +17,7 @@ import pytest
 
 import barpc
 from barpc.errors import BarpcError, InputError
+from barpc.frozen import load_npz
 from barpc.rpcio import FORMATS
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import parse
@@ -24,7 +25,6 @@ from barpc.sidefile import (
     ARRAYS,
     NAMES,
     Kind,
-    load_npz,
     opened,
     parse_json,
     read_bytes,

@@ -27,8 +27,7 @@ from typing import Any
 import numpy as np
 
 from barpc.errors import AdjustError, BarpcError, InputError
-from barpc.frozen import from_arrays, to_arrays
-from barpc.sidefile import Arrays
+from barpc.frozen import Arrays, from_arrays, to_arrays
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)

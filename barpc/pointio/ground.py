@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from barpc.errors import InputError
+from barpc.frozen import load_npz
 from barpc.geodesy import Array
 from barpc.pointio.names import ViewNames
 from barpc.raster import driver_of, open_raster
 from barpc.scene import GroundPoints
-from barpc.sidefile import GEOJSON, TABLE, Kind, load_npz, read_head, read_json, read_text
+from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
 
 GROUND_SIGMA = 1.0
 """East, north, up standard deviation [m] of a GCP whose file states none."""

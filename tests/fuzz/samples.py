@@ -24,7 +24,7 @@ from barpc.cli.points import read_points
 from barpc.cli.tables import print_comparison
 from barpc.dem import Dem
 from barpc.errors import RpcError
-from barpc.frozen import from_arrays, to_arrays
+from barpc.frozen import from_arrays, load_npz, to_arrays
 from barpc.options import read_options
 from barpc.pipeline.inputs import read_pairs
 from barpc.pointio.ground import read_correspondences, read_gcps
@@ -38,7 +38,6 @@ from barpc.rpcio.text import decode
 from barpc.scene import View
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.sentinel1 import open_product
-from barpc.sidefile import load_npz
 from barpc.tie.area import read_area
 from barpc.workspace import Workspace
 from tests.report.conftest import run_of_block, written
