@@ -23,8 +23,7 @@ def replacing(
 ) -> Iterator[Path]:
     """A temporary path for `path`, renamed to it when the block ends without an error.
 
-    The temporary file has the target's own name, in a folder of its own: what a writer takes from a name
-    stays right, and a name as long as the system allows stays possible.
+    It has the target's own name, in a folder of its own: what a writer takes from a name stays right, however long.
 
     Parameters
     ----------

@@ -42,9 +42,8 @@ def pointwise(
         Points worked on at a time.
     shapes : sequence of tuple of int
         Of what a point gives.
-    points : (..., k)
-    alt : (...), optional
-        Broadcast with `points`.
+    points, alt : (..., k), (...)
+        Broadcast together; there may be no `alt`.
     rows : int
         Of memory that is kept for all pieces: fresh memory costs more than sums.
     """

@@ -239,25 +239,15 @@ class _Builder(ElementTree.TreeBuilder):
 def parse_xml(
     source: bytes | Path, *, name: str | None = None, max_bytes: int = MAX_XML, strip_namespaces: bool = False
 ) -> ElementTree.Element:
-    """The root element of an XML document: bytes, or the file that holds it.
+    """The root element of an XML document: bytes, or the file that holds it; messages call it `name`, or by its path.
 
-    No document type: an entity cannot be declared without one, so neither "billion laughs" nor a reference to
-    another file can be written.
-
-    Parameters
-    ----------
-    source : bytes or Path
-    name : str, optional
-        What to call it in messages; the path otherwise.
-    max_bytes : int
-        Larger documents are refused.
-    strip_namespaces : bool
-        Drop the ``{namespace}`` of every tag.
+    No document type: an entity cannot be declared without one, so neither "billion laughs" nor a reference to another
+    file can be written. `strip_namespaces` drops the ``{namespace}`` of every tag.
 
     Raises
     ------
     RpcFormatError
-        Not a readable file, too large, a DOCTYPE, or not well-formed XML. The message names the file.
+        Not a readable file, more than `max_bytes`, a DOCTYPE, or not well-formed XML. The message names the file.
     """
     name = name or (str(source) if isinstance(source, Path) else "XML document")
     data = read_bytes(source, replace(XML, most=max_bytes)) if isinstance(source, Path) else source

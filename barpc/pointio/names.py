@@ -1,7 +1,6 @@
 """What an image may be called, and which view a file means by a name.
 
-Views get their names here, before any work, so that every file that a run writes carries them and reads back to the
-same image.
+Views get their names before any work, so that every file of a run carries them and reads back to the same image.
 """
 
 from __future__ import annotations
