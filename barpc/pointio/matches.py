@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from barpc.errors import InputError
+from barpc.frozen import load_npz
 from barpc.geodesy import Array
 from barpc.pointio.names import ViewNames, cell, from_cell
-from barpc.frozen import load_npz
 from barpc.scene import IntArray, Tracks, connected_labels
 from barpc.sidefile import TABLE, opened_text, read_text
 
