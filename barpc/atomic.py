@@ -1,7 +1,6 @@
 """Files written whole or not at all: in a temporary folder beside the target, fsync, rename.
 
-A run that is killed, or a disk that is full, leaves the target as it was: never half a file. What a killed
-run does leave is its temporary folder, which holds nothing else and may be deleted.
+A run that is killed leaves its temporary folder, which holds nothing else and may be deleted.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ def replacing(
 ) -> Iterator[Path]:
     """A temporary path for `path`, renamed to it when the block ends without an error.
 
-    The temporary file has the target's own name, in a folder of its own: what a writer takes from a name
-    stays right, and a name as long as the system allows stays possible.
+    It has the target's own name, in a folder of its own: what a writer takes from a name stays right, however long.
 
     Parameters
     ----------
@@ -37,11 +35,6 @@ def replacing(
         Wait until the file is on the disk; not needed for what can be made again.
     room : Path, optional
         Where the temporary folder is made, on the same disk; None: beside `path`.
-
-    Yields
-    ------
-    partial : Path
-        Write here.
 
     Raises
     ------
@@ -57,11 +50,11 @@ def replacing(
         place.mkdir(parents=True)
         yield partial
         if durable:
-            sync(partial)
+            _sync(partial)
         _refuse_existing(path, overwrite)  # it may have come while the block was at work
         partial.replace(path)
         if durable:
-            sync(path.parent)
+            _sync(path.parent)
     except OSError as error:
         if isinstance(error, OutputError) or error.errno is None:
             raise
@@ -75,7 +68,7 @@ def _refuse_existing(path: Path, overwrite: bool) -> None:
         raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
 
 
-def sync(path: Path) -> None:
+def _sync(path: Path) -> None:
     """Ask the system to put a file, or a folder's entries, on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from barpc.errors import ImageError, InputError
-from barpc.pointio.tables import Correspondences, correspondence_kind, read_correspondences, read_grid
-from barpc.raster import open_raster
+from barpc.pointio.ground import Correspondences, correspondence_kind, read_correspondences, read_grid
+from barpc.raster import driver_of, open_raster
 from barpc.rpcio import read_rpc_source
 from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import DirectGrid
@@ -28,30 +28,19 @@ _HEAD = 4096
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A camera and where it came from.
-
-    Parameters
-    ----------
-    model : SensorModel
-        The camera itself.
-    path : Path
-        The file that holds it: what was given, or a file beside it.
-    format : str
-        What that file is: ``tag``, ``nitf``, a row of `barpc.rpcio.FORMATS`, or another row of `OPENERS`.
-    size : (int, int) or None
-        Width, height [px] of the image; None where nothing states them.
-    alt_range : (float, float)
-        The altitudes [m above the ellipsoid] that it is made for.
-    notes : tuple of str
-        What the user should know.
-    """
+    """A camera and where it came from."""
 
     model: SensorModel
     path: Path
+    """The file that holds it: what was given, or a file beside it."""
     format: str
+    """What that file is: ``tag``, ``nitf``, a row of `barpc.rpcio.FORMATS`, or another row of `OPENERS`."""
     size: tuple[int, int] | None
+    """Width, height [px] of the image; None where nothing states them."""
     alt_range: tuple[float, float]
+    """The altitudes [m above the ellipsoid] that it is made for."""
     notes: tuple[str, ...] = ()
+    """What the user should know."""
 
     @property
     def rpc(self) -> RPC:
@@ -82,21 +71,14 @@ Reader = Callable[[str], Any]
 
 @dataclass(frozen=True)
 class Opener:
-    """One kind of camera files.
-
-    Parameters
-    ----------
-    sniff : callable
-        (path, its first 4096 bytes - none of a folder -, choices) -> whether it is of this kind.
-    open : callable
-        (path, **choices) -> Camera.
-    choices : mapping of str to callable
-        What may be given behind the file, and how its text is read (ValueError: not so).
-    """
+    """One kind of camera files."""
 
     sniff: Callable[[Path, bytes, Mapping[str, Any]], bool]
+    """(path, its first 4096 bytes - none of a folder -, choices) -> whether it is of this kind."""
     open: Callable[..., Camera]
+    """(path, **choices) -> Camera."""
     choices: Mapping[str, Reader] = field(default_factory=dict)
+    """What may be given behind the file, and how its text is read (ValueError or KeyError: not so)."""
 
 
 def open_camera(spec: str | Path, **choices: Any) -> Camera:
@@ -113,10 +95,6 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
         the centre of the first pixel), ``band``. Sentinel-1: those of `sentinel1.open_product`. Localisation
         grid: ``altitudes`` of its layers.
 
-    Returns
-    -------
-    camera : Camera
-
     Raises
     ------
     InputError
@@ -125,10 +103,7 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
         No such file, none of the kinds, or a damaged one.
     """
     path, texts = split_spec(spec)
-    size, holder = (
-        choices.pop("size", texts.pop("size", None)),
-        choices.pop("camera", texts.pop("camera", None)),
-    )
+    size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
     file = path if holder is None else Path(holder)
     head = b"" if file.is_dir() else read_head(file, IMAGE, _HEAD)
     name, opener = next(
@@ -193,19 +168,9 @@ def _pixels(path: Path) -> tuple[int, int] | None:
         return None
 
 
-# --- RPC --------------------------------------------------------------------------------------------------
-
-
 def _open_rpc(path: Path, first_pixel: float | None = None, band: int = 1) -> Camera:
     source = read_rpc_source(path, first_pixel=first_pixel, band=band)
     return Camera(source.rpc, source.path, source.format, None, altitude_range(source.rpc), source.notes)
-
-
-def _convention(text: str) -> float | None:
-    return {"auto": None, "0": 0.0, "0.5": 0.5, "1": 1.0}[text]
-
-
-# --- Sentinel-1 -------------------------------------------------------------------------------------------
 
 
 def _is_sentinel1(path: Path, head: bytes, _choices: Mapping[str, Any]) -> bool:
@@ -220,21 +185,8 @@ def _open_sentinel1(path: Path, pol: str | None = None, **choices: Any) -> Camer
     return Camera(model, path, "sentinel-1", model.size, model.alt_range)
 
 
-def _bistatic(text: str) -> str:
-    return {"annotated": "annotated", "full": "full"}[text]
-
-
-def _yes(text: str) -> bool:
-    return {"yes": True, "no": False}[text]
-
-
-# --- localisation grid ------------------------------------------------------------------------------------
-
-
 def _is_grid(path: Path, head: bytes, choices: Mapping[str, Any]) -> bool:
-    if head[:2] not in (b"II", b"MM"):
-        return False
-    return "altitudes" in choices or correspondence_kind(path) == "grid"
+    return driver_of(head) == "GTiff" and ("altitudes" in choices or correspondence_kind(path) == "grid")
 
 
 def _open_grid(path: Path, altitudes: list[float] | None = None) -> Camera:
@@ -249,12 +201,21 @@ def _numbers(text: str) -> list[float]:
 
 
 OPENERS: dict[str, Opener] = {
-    "rpc": Opener(lambda _path, _head, _choices: True, _open_rpc, {"first_pixel": _convention, "band": int}),
+    "rpc": Opener(
+        lambda _path, _head, _choices: True,
+        _open_rpc,
+        {"first_pixel": {"auto": None, "0": 0.0, "0.5": 0.5, "1": 1.0}.__getitem__, "band": int},
+    ),
     "grid": Opener(_is_grid, _open_grid, {"altitudes": _numbers}),
     "sentinel-1": Opener(
         _is_sentinel1,
         _open_sentinel1,
-        {"swath": str, "pol": str, "burst": int, "orbit": str, "atmosphere": _yes, "bistatic": _bistatic},
+        {
+            **dict.fromkeys(("swath", "pol", "orbit"), str),
+            "burst": int,
+            "atmosphere": {"yes": True, "no": False}.__getitem__,
+            "bistatic": {"annotated": "annotated", "full": "full"}.__getitem__,
+        },
     ),
 }
 """Kind -> how it is told from others and opened. The last row that knows a file has it; the first takes any."""

@@ -1,8 +1,7 @@
 """Terrain heights from a DEM, always above the ellipsoid, and it is always said how they became so.
 
-DEM files are mostly orthometric: above a geoid, which lies up to 100 m from the ellipsoid. The vertical
-reference is read from the file; a geoid grid makes orthometric heights ellipsoidal. A reference that is not
-known, or heights that had to be taken as they are, raise a loud warning.
+DEM files are mostly orthometric: above a geoid, up to 100 m from the ellipsoid. A geoid grid makes them ellipsoidal;
+heights of unknown reference, or taken as they are, raise a loud warning.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from rasterio import Affine
 from rasterio._err import CPLE_BaseError
+from rasterio.crs import CRS
 from rasterio.errors import CRSError
 from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
@@ -36,60 +36,68 @@ _VERTICAL = re.compile(r'(?:VERTCRS|VERT_CS|VERTICALCRS)\s*\[\s*"([^"]+)"')
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
-    """Heights at the nodes of a regular grid, read when they are asked for.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    shape : (rows, cols)
-        Number of nodes.
-    read : callable
-        (row0, row1, col0, col1) -> heights (row1 - row0, col1 - col0) [m], NaN in voids.
-    locate : callable
-        lon, lat (N,) [deg] -> row, col (N,), fractional, node centres at integers.
-    reference : str
-        Vertical reference: ``"ellipsoid"``, the name of a geoid or datum, or ``"unknown"``.
-    period : float
-        Columns in a full turn of longitude where the grid goes around the Earth, else 0.
-    """
+class HeightGrid:
+    """Heights at the nodes of a regular grid, read when they are asked for."""
 
     path: Path
-    shape: tuple[int, int]
-    read: Callable[[int, int, int, int], Array]
-    locate: Callable[[Array, Array], tuple[Array, Array]]
-    reference: str
-    period: float = 0.0
+    driver: str | None
+    shape: tuple[int, int]  # number of nodes: rows, cols
+    crs: CRS
+    to_pixel: Affine  # from coordinates to col, row, (0, 0) at the corner of the first node's cell
+    west: float  # coordinate of the western edge
+    reference: str  # what heights count from: "ellipsoid", the name of a geoid or datum, or "unknown"
+    period: float  # columns in a full turn of longitude where the grid goes around the Earth, else 0
 
     @classmethod
-    def open(cls, path: Path | str) -> Grid:
-        """A grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS.
-
-        Raises
-        ------
-        InputError
-            The file is not what its name says, or has no CRS.
-        ImageError
-            The raster cannot be read.
-        """
+    def open(cls, path: Path | str) -> HeightGrid:
+        """A grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS; or InputError."""
         path = Path(path)
         read_head(path, GRID, 0)  # a regular file
-        if path.suffix.lower() not in HEIGHTS:
-            return _open(path)
-        driver, reference = HEIGHTS[path.suffix.lower()]
+        driver, reference = HEIGHTS.get(path.suffix.lower(), (None, None))
         try:
-            return _open(path, driver, reference)
+            with open_raster(path, driver) as dataset:
+                crs, shape, forward, extent = dataset.crs, dataset.shape, dataset.transform, dataset.bounds
+                if crs is None:
+                    raise InputError(f"{path}: a DEM or geoid grid needs a CRS, and this raster has none")
+                if driver == "GTX" and path.stat().st_size != 40 + 4 * shape[0] * shape[1]:
+                    raise ImageError(f"{path}: its header does not go with its size")
         except ImageError as error:
+            if driver is None:
+                raise
             raise InputError(
                 f"{error} (an SRTM tile is called as N44E005.hgt and has 1201 or 3601 nodes a side; a .gtx is as long "
                 "as its header says)"
             ) from error
+        to_pixel = _inverse(forward, path)
+        turn = 360.0 * abs(to_pixel.a) if crs.is_geographic else 0.0
+        around = turn > 0 and (extent.right - extent.left) * abs(to_pixel.a) >= turn - 0.5
+        reference = reference or _vertical_reference(crs.to_wkt())
+        period = float(round(turn)) if around else 0.0
+        return cls(path, driver, shape, crs, to_pixel, float(extent.left), reference, period)
+
+    def read(self, top: int, bottom: int, left: int, right: int) -> Array:
+        """Heights (bottom - top, right - left) [m] of a window, NaN in voids."""
+        with open_raster(self.path, self.driver) as dataset:
+            window = Window.from_slices((top, bottom), (left, right))
+            return np.asarray(dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan))
+
+    def locate(self, lon: Array, lat: Array) -> tuple[Array, Array]:
+        """Fractional row, col (N,) of lon, lat (N,) [deg], node centres at integers."""
+        if self.crs.is_geographic:
+            x, y = self.west + np.mod(lon - self.west, 360.0), lat
+        else:
+            try:
+                found = warp_points("EPSG:4326", self.crs, lon, lat)
+            except (CRSError, CPLE_BaseError) as error:
+                raise InputError(f"{self.path}: lon, lat cannot be brought into its CRS ({error})") from error
+            x, y = np.asarray(found[0]), np.asarray(found[1])
+        a, b, c, d, e, f = self.to_pixel[:6]
+        return _snapped(d * x + e * y + f - 0.5), _snapped(a * x + b * y + c - 0.5)
 
     def sample(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
         lon, lat = np.broadcast_arrays(np.asarray(lon, np.float64), np.asarray(lat, np.float64))
-        row, col = (_snapped(index) for index in self.locate(lon.ravel(), lat.ravel()))
+        row, col = self.locate(lon.ravel(), lat.ravel())
         if self.period:
             col = col % self.period
         height = np.full(lon.size, np.nan)
@@ -111,66 +119,28 @@ class Grid:
         bottom, right = int(r0.max()) + 2, int(c0.max()) + 2
         if (bottom - top) * (right - left) > _MAX_CELLS:
             raise InputError(f"{self.path}: the points spread over {(bottom - top) * (right - left)} cells")
-        cells = self._cells(top, bottom, left, right)
+        bottom, turn = min(bottom, self.shape[0]), int(self.period)
+        if turn and right > self.shape[1]:
+            parts = (left, min(turn, self.shape[1])), (0, right - turn)
+            cells = np.concatenate([self.read(top, bottom, *part) for part in parts], axis=1)
+        else:
+            cells = self.read(top, bottom, left, min(right, self.shape[1]))
         height = np.zeros(len(row))
         for i, row_weight in enumerate((r0 + 1 - row, row - r0)):
             for j, col_weight in enumerate((c0 + 1 - col, col - c0)):
                 weight = row_weight * col_weight
-                value = cells[np.minimum(r0 + i - top, len(cells) - 1), c0 + j - left]
-                height += np.where(weight > 0, weight * value, 0.0)
+                rows, cols = (
+                    (r0 + i - top).clip(max=len(cells) - 1),
+                    (c0 + j - left).clip(max=cells.shape[1] - 1),
+                )
+                height += np.where(weight > 0, weight * cells[rows, cols], 0.0)
         return height
-
-    def _cells(self, top: int, bottom: int, left: int, right: int) -> Array:
-        bottom, width = min(bottom, self.shape[0]), self.shape[1]
-        if right <= width:
-            return self.read(top, bottom, left, right)
-        if not self.period:
-            return np.pad(self.read(top, bottom, left, width), ((0, 0), (0, right - width)), mode="edge")
-        first = self.read(top, bottom, 0, right - int(self.period))
-        rest = self.read(top, bottom, left, min(int(self.period), width))
-        return np.concatenate([rest, first], axis=1)
 
 
 def _snapped(index: Array) -> Array:
     """Fractional indices, on the node where they are within a millionth of it: a void beyond has no weight."""
     node = np.rint(index)
     return np.where(np.abs(index - node) < 1e-6, node, index)
-
-
-def _open(path: Path, driver: str | None = None, reference: str | None = None) -> Grid:
-    with open_raster(path, driver) as dataset:
-        crs, shape, forward, extent = dataset.crs, dataset.shape, dataset.transform, dataset.bounds
-        if crs is None:
-            raise InputError(f"{path}: a DEM or geoid grid needs a CRS, and this raster has none")
-        if driver == "GTX" and path.stat().st_size != 40 + 4 * shape[0] * shape[1]:
-            raise ImageError(f"{path}: its header does not go with its size")
-    inverse = _inverse(forward, path)
-    around = 0.0
-    geographic = bool(crs.is_geographic)
-    if geographic and inverse.a and extent.right - extent.left >= 360.0 - abs(1.0 / inverse.a) / 2:
-        around = float(round(360.0 * abs(inverse.a)))
-
-    def read(top: int, bottom: int, left: int, right: int) -> Array:
-        with open_raster(path, driver) as dataset:
-            window = Window.from_slices((top, bottom), (left, right))
-            return np.asarray(dataset.read(1, window=window, masked=True).astype(np.float64).filled(np.nan))
-
-    def locate(lon: Array, lat: Array) -> tuple[Array, Array]:
-        if geographic:
-            x: Array = extent.left + np.mod(lon - extent.left, 360.0)
-            y = lat
-        else:
-            try:
-                found = warp_points("EPSG:4326", crs, lon, lat)
-            except (CRSError, CPLE_BaseError) as error:
-                raise InputError(f"{path}: lon, lat cannot be brought into its CRS ({error})") from error
-            x, y = np.asarray(found[0]), np.asarray(found[1])
-        return (
-            inverse.d * x + inverse.e * y + inverse.f - 0.5,
-            inverse.a * x + inverse.b * y + inverse.c - 0.5,
-        )
-
-    return Grid(path, shape, read, locate, reference or _vertical_reference(crs.to_wkt()), around)
 
 
 def _inverse(forward: Affine, path: Path) -> Affine:
@@ -193,58 +163,38 @@ def _vertical_reference(wkt: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Dem:
-    """Altitudes of the terrain above the WGS84 ellipsoid: call it with lon, lat.
+    """Altitudes of the terrain above the WGS84 ellipsoid: call it with lon, lat."""
 
-    Parameters
-    ----------
-    grid : Grid
-        The heights as the file gives them.
-    geoid : Grid or None
-        Height of the geoid above the ellipsoid, added to `grid`.
-    description : str
-        Which vertical reference was read and what was done with it.
-    """
-
-    grid: Grid
-    geoid: Grid | None
-    description: str
+    grid: HeightGrid  # the heights as the file gives them
+    geoid: HeightGrid | None  # height of the geoid above the ellipsoid, added to `grid`
+    description: str  # which vertical reference was read and what was done with it
 
     @classmethod
     def open(cls, path: Path | str, geoid: Path | str | None = None) -> Dem:
-        """Open a DEM, and the geoid grid that its heights need.
-
-        Parameters
-        ----------
-        path : path
-            ``.hgt``, or any raster with a CRS.
-        geoid : path, optional
-            ``.gtx`` or raster: height of the geoid above the ellipsoid.
+        """Open a DEM (``.hgt``, or any raster with a CRS), and the ``.gtx`` or raster with the height of its geoid.
 
         Raises
         ------
-        InputError
-            Not a DEM that is read, or a geoid for heights that are ellipsoidal already.
-
-        Warns
-        -----
-        BarpcWarning
-            The vertical reference is unknown, or orthometric heights are taken as they are.
+        InputError, ImageError
+            Not a DEM that is read, or a geoid for heights that are ellipsoidal already. A vertical reference that is
+            unknown, or orthometric heights that are taken as they are, raise a BarpcWarning.
         """
-        grid = Grid.open(path)
+        grid = HeightGrid.open(path)
         known = grid.reference
         if known == "ellipsoid" and geoid is not None:
             raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
+        done, advice = "ellipsoidal", ""
         if geoid is not None:
             done = f"made ellipsoidal with {Path(geoid).name}"
-        else:
-            done = "ellipsoidal" if known == "ellipsoid" else "TAKEN AS ELLIPSOIDAL"
-        description = f"{Path(path).name}: vertical reference {known}, {done}"
-        if known == "unknown" or (known != "ellipsoid" and geoid is None):
-            advice = (
-                "" if geoid is not None else "; give a geoid grid, or expect errors up to 100 m in height"
+        elif known != "ellipsoid":
+            done, advice = (
+                "TAKEN AS ELLIPSOIDAL",
+                "; give a geoid grid, or expect errors up to 100 m in height",
             )
+        description = f"{Path(path).name}: vertical reference {known}, {done}"
+        if advice or known == "unknown":
             warnings.warn(f"DEM {description}{advice}", BarpcWarning, stacklevel=2)
-        return cls(grid, None if geoid is None else Grid.open(geoid), description)
+        return cls(grid, None if geoid is None else HeightGrid.open(geoid), description)
 
     def __call__(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Altitude above the ellipsoid (...) [m] at lon, lat (...) [deg]; NaN in voids and outside."""
@@ -265,7 +215,6 @@ def localize_on_terrain(
     Parameters
     ----------
     sensor : SensorModel
-        The camera.
     image : (N, 2)
         col, row [px].
     terrain : callable

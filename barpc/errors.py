@@ -1,19 +1,5 @@
 """Every error that barpc raises on purpose.
 
-::
-
-    BarpcError
-      RpcError(ValueError)        a camera model cannot be used (not finite, zero scale, wrong shape)
-        RpcFormatError            a file is not an RPC file that barpc reads
-      ImageError(OSError)         a raster cannot be read, or has no RPC
-      TiePointError               too few tie points
-        DisconnectedError         the views fall into groups that share no tie point
-      AdjustError                 the adjustment has no usable solution
-      FitError                    a fitted RPC does not reach the tolerance
-      InputError(ValueError)      options or side files that contradict each other or do not parse
-      OutputError(OSError)        a result cannot be written
-    BarpcWarning(UserWarning)     a dropped view, extrapolation beyond the RPC's altitude range, ...
-
 A message is one line that says which file or view, what was found, and what to do.
 """
 
@@ -32,7 +18,7 @@ class BarpcError(Exception):
         text = super().__str__()
         if len(text) > _LONGEST:
             text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
-        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+        return visible(text).replace("\n", "\\n")
 
 
 class RpcError(BarpcError, ValueError):
@@ -83,3 +69,18 @@ class OutputError(BarpcError, OSError):
 
 class BarpcWarning(UserWarning):
     """Something the user should know that does not stop the run."""
+
+
+def visible(text: str) -> str:
+    r"""A text with everything that does not print escaped as in JSON; lines stay lines.
+
+    Examples
+    --------
+    >>> visible("a\x1b[31m\tb±")
+    'a\\u001b[31m\\u0009b±'
+    """
+    return "".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text)
+
+
+def _escaped(char: str) -> str:
+    return f"\\u{ord(char):04x}" if ord(char) < 0x10000 else f"\\U{ord(char):08x}"

@@ -1,14 +1,22 @@
-"""Values that never change: what frozen records with arrays share."""
+"""Values that never change, how they are kept as plain named arrays without pickle, and archives of such arrays."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+import json
+import math
+import sys
+import zipfile
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib import format as npy
 
 from barpc.errors import BarpcError, InputError
+from barpc.sidefile import ARRAYS, Kind, opened
 
 
 class Frozen:
@@ -73,3 +81,118 @@ def _plain(value: object) -> object:
     if not isinstance(value, np.ndarray):
         return value
     return value.shape, (value + 0.0 if value.dtype.kind == "f" else value).tobytes()
+
+
+# --- values as named arrays -------------------------------------------------------------------------------
+
+Arrays = dict[str, npt.NDArray[Any]]
+"""Named plain arrays: what an ``.npz`` file holds."""
+
+_FRAME = "frame"
+
+
+def to_arrays(value: Any) -> Arrays:
+    """Named arrays that hold a value: its arrays with their type and bits, and around them a text (JSON).
+
+    A value is None, bool, int, float, str, an array, tuple, list, mapping with string keys, or a dataclass of barpc
+    of such; TypeError where anything else is in it.
+
+    Examples
+    --------
+    >>> from_arrays(to_arrays({"xy": np.arange(3.0), "name": "a", "size": (2, None)}))
+    {'xy': array([0., 1., 2.]), 'name': 'a', 'size': (2, None)}
+    """
+    arrays: Arrays = {}
+    frame = _encode(value, arrays)
+    arrays[_FRAME] = np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8)
+    return arrays
+
+
+def from_arrays(arrays: Mapping[str, npt.NDArray[Any]]) -> Any:
+    """The value that `to_arrays` took apart; ValueError where it is damaged or names no loaded dataclass of barpc."""
+    try:
+        frame = json.loads(np.asarray(arrays[_FRAME], dtype=np.uint8).tobytes())
+        return _decode(frame, arrays)
+    except (KeyError, TypeError, AttributeError, IndexError, RecursionError, UnicodeDecodeError) as error:
+        raise ValueError(f"not a stage result: {error!r}") from error
+
+
+def _encode(value: Any, arrays: Arrays) -> Any:
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        if value.dtype.hasobject:
+            raise TypeError("an array of Python objects cannot be kept")
+        name = f"array{len(arrays)}"
+        arrays[name] = value
+        return {"array": name}
+    if isinstance(value, (tuple, list)):
+        return {type(value).__name__: [_encode(v, arrays) for v in value]}
+    if isinstance(value, Mapping):
+        return {"map": [[str(k), _encode(v, arrays)] for k, v in value.items()]}
+    if is_dataclass(value) and type(value).__module__.split(".")[0] == "barpc":
+        kept = {f.name: _encode(getattr(value, f.name), arrays) for f in fields(value) if f.init}
+        return {"class": [type(value).__module__, type(value).__qualname__], "fields": kept}
+    raise TypeError(f"a {type(value).__name__} cannot be kept")
+
+
+def _decode(frame: Any, arrays: Mapping[str, npt.NDArray[Any]]) -> Any:
+    if not isinstance(frame, dict):
+        return frame
+    if "array" in frame:
+        return arrays[frame["array"]]
+    if "tuple" in frame:
+        return tuple(_decode(v, arrays) for v in frame["tuple"])
+    if "list" in frame:
+        return [_decode(v, arrays) for v in frame["list"]]
+    if "map" in frame:
+        return {k: _decode(v, arrays) for k, v in frame["map"]}
+    module, name = frame["class"]
+    kind = getattr(sys.modules.get(module), name, None)
+    if module.split(".")[0] != "barpc" or not (isinstance(kind, type) and is_dataclass(kind)):
+        raise ValueError(f"{module}.{name} is not a record of barpc")
+    return kind(**{k: _decode(v, arrays) for k, v in frame["fields"].items()})
+
+
+_DEFLATE = 1032  # bytes at most that one byte of a deflated stream stands for
+_HEADER = 1 << 12
+
+
+def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
+    """The arrays of an ``.npz`` file, unpacked of no more bytes than `kind` allows; errors are of its class.
+
+    What the archive claims is added up before anything is unpacked: a few kilobytes can hold gigabytes of zeros.
+    """
+    with opened(path, kind) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                members = archive.infolist()
+                kind.check(f"{path}, unpacked", sum(member.file_size for member in members))
+                return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+        except BarpcError:
+            raise
+        except Exception as error:
+            raise kind.error(
+                f"{path}: not {kind.words} (.npz) that can be read ({type(error).__name__}: {error})"
+            ) from error
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
+    """A member, after its header was found to claim as many bytes as the archive does."""
+    packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: _DEFLATE}.get(member.compress_type)
+    if packed is None or member.file_size > packed * member.compress_size + _HEADER:
+        raise ValueError(f"{member.filename} claims more bytes than it can hold")
+    with archive.open(member) as file:
+        version = npy.read_magic(file)
+        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
+        shape, _, dtype = read_header(file)
+        if dtype.hasobject:
+            raise ValueError(f"{member.filename} holds Python objects")
+        if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
+            raise ValueError(
+                f"{member.filename} holds another number of bytes than its shape {shape} asks for"
+            )
+    with archive.open(member) as file:
+        return np.asarray(npy.read_array(file, allow_pickle=False))

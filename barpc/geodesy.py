@@ -7,21 +7,16 @@ last axis; leading axes broadcast. Nothing here raises for a point: what is not 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-WGS84_A = 6378137.0
-"""Semi-major axis [m]."""
-WGS84_F = 1.0 / 298.257223563
-"""Flattening."""
-WGS84_B = WGS84_A * (1.0 - WGS84_F)
-"""Semi-minor axis [m]."""
-WGS84_E2 = WGS84_F * (2.0 - WGS84_F)
-"""First eccentricity, squared."""
+WGS84_A = 6378137.0  # semi-major axis [m]
+WGS84_F = 1.0 / 298.257223563  # flattening
+WGS84_B = WGS84_A * (1.0 - WGS84_F)  # semi-minor axis [m]
+WGS84_E2 = WGS84_F * (2.0 - WGS84_F)  # first eccentricity, squared
 
 _EP2 = WGS84_E2 / (1.0 - WGS84_E2)  # second eccentricity, squared
 _CHUNK = 8192  # points worked on at a time, so that temporaries stay in cache
@@ -47,9 +42,8 @@ def pointwise(
         Points worked on at a time.
     shapes : sequence of tuple of int
         Of what a point gives.
-    points : (..., k)
-    alt : (...), optional
-        Broadcast with `points`.
+    points, alt : (..., k), (...)
+        Broadcast together; there may be no `alt`.
     rows : int
         Of memory that is kept for all pieces: fresh memory costs more than sums.
     """
@@ -75,18 +69,7 @@ def pointwise(
 
 
 def ecef_from_ground(ground: npt.ArrayLike) -> Array:
-    """ECEF coordinates of ground points.
-
-    Parameters
-    ----------
-    ground : (..., 3)
-        lon, lat [deg], alt [m above the WGS84 ellipsoid].
-
-    Returns
-    -------
-    ecef : (..., 3)
-        x, y, z [m].
-    """
+    """ECEF coordinates (..., 3) [m] of ground points (..., 3)."""
     ground = np.asarray(ground, dtype=np.float64)
     lon, lat, alt = ground[..., 0] * _RAD, ground[..., 1] * _RAD, ground[..., 2]
     sin_lat, cos_lat = np.sin(lat), np.cos(lat)
@@ -100,76 +83,46 @@ def ecef_from_ground(ground: npt.ArrayLike) -> Array:
 
 
 def ground_from_ecef(ecef: npt.ArrayLike) -> Array:
-    """Ground coordinates of ECEF points: the inverse of `ecef_from_ground`.
+    """Ground coordinates (..., 3), lon in -180 to 180, of ECEF points (..., 3): the inverse of `ecef_from_ground`.
 
     Within 5e-9 m from -10 km to 900 km of altitude, and to the rounding of the coordinates far beyond.
-
-    Parameters
-    ----------
-    ecef : (..., 3)
-        x, y, z [m].
-
-    Returns
-    -------
-    ground : (..., 3)
-        lon [deg, -180 to 180], lat [deg], alt [m above the WGS84 ellipsoid].
     """
-    return pointwise(lambda part: [_geodetic(*np.ascontiguousarray(part.T)).ground.T], _CHUNK, [(3,)], ecef)[
-        0
-    ]
+    (ground,) = pointwise(lambda part: [_geodetic(*np.ascontiguousarray(part.T))[0].T], _CHUNK, [(3,)], ecef)
+    return ground
 
 
 def ground_rows_from_ecef(ecef: Array) -> tuple[Array, Array]:
-    """Ground coordinates of ECEF points and their derivative, one row a coordinate.
+    """Ground coordinates (3, N) of ECEF points (3, N) and their derivative (3, 3, N), one row a coordinate.
 
-    `ground_from_ecef` and `ground_from_ecef_jacobian` in one, without the trigonometry of the second.
-
-    Parameters
-    ----------
-    ecef : (3, N)
-        x, y, z [m]; as many points as suit the cache.
-
-    Returns
-    -------
-    ground : (3, N)
-        lon [deg, -180 to 180], lat [deg], alt [m above the WGS84 ellipsoid].
-    jacobian : (3, 3, N)
-        d(lon, lat, alt) / d(x, y, z) [deg/m, deg/m, m/m]. Not finite for longitude at a pole.
+    `ground_from_ecef` and `ground_from_ecef_jacobian` in one, without the trigonometry of the second; as many points
+    as suit the cache. Not finite for longitude at a pole.
     """
     x, y, _ = ecef
-    point = _geodetic(*ecef)
+    ground, sin_lat, cos_lat, horizontal, root = _geodetic(*ecef)
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / point.horizontal
+        inverse = 1.0 / horizontal
         cos_lon, sin_lon = x * inverse, y * inverse
         inverse /= _RAD
-        meridian = (1.0 - WGS84_E2) * WGS84_A / (point.root * point.root * point.root)
-        north = (1.0 / _RAD) / (meridian + point.ground[2])
+        meridian = (1.0 - WGS84_E2) * WGS84_A / (root * root * root)
+        north = (1.0 / _RAD) / (meridian + ground[2])
     jacobian = np.empty((3, 3, x.size))
     np.multiply(-sin_lon, inverse, out=jacobian[0, 0])
     np.multiply(cos_lon, inverse, out=jacobian[0, 1])
     jacobian[0, 2] = 0.0
-    np.multiply(point.cos_lat, cos_lon, out=jacobian[2, 0])
-    np.multiply(point.cos_lat, sin_lon, out=jacobian[2, 1])
-    jacobian[2, 2] = point.sin_lat
-    south = point.sin_lat * -north
+    np.multiply(cos_lat, cos_lon, out=jacobian[2, 0])
+    np.multiply(cos_lat, sin_lon, out=jacobian[2, 1])
+    jacobian[2, 2] = sin_lat
+    south = sin_lat * -north
     np.multiply(south, cos_lon, out=jacobian[1, 0])
     np.multiply(south, sin_lon, out=jacobian[1, 1])
-    np.multiply(point.cos_lat, north, out=jacobian[1, 2])
-    return point.ground, jacobian
+    np.multiply(cos_lat, north, out=jacobian[1, 2])
+    return ground, jacobian
 
 
-class _Geodetic(NamedTuple):
-    """Ground coordinates (3, N) and what they were made of, (N,) each."""
+def _geodetic(x: Array, y: Array, z: Array) -> tuple[Array, ...]:
+    """Ground (3, N); sin, cos of latitude, distance from the axis [m], sqrt(1 - e^2 sin^2(lat)), (N,) each.
 
-    ground: Array
-    sin_lat: Array
-    cos_lat: Array
-    horizontal: Array  # distance from the axis [m]
-    root: Array  # sqrt(1 - e^2 sin^2(lat))
-
-
-def _geodetic(x: Array, y: Array, z: Array) -> _Geodetic:
-    """Latitude by two of Bowring's steps for the reduced latitude, from his start of 1985.
+    Latitude by two of Bowring's steps for the reduced latitude, from his start of 1985.
 
     Bowring, "Transformation from spatial to geographical coordinates", Survey Review 1976, and "The accuracy
     of geodetic latitude and height equations", Survey Review 1985. One step leaves 1e-6 m, two 4e-9 m.
@@ -195,22 +148,11 @@ def _geodetic(x: Array, y: Array, z: Array) -> _Geodetic:
     np.arctan2(s, c, out=ground[1])
     ground[:2] *= 1.0 / _RAD
     np.subtract(horizontal * c + z * s, WGS84_A * root, out=ground[2])
-    return _Geodetic(ground, s, c, horizontal, root)
+    return ground, s, c, horizontal, root
 
 
 def enu_basis(ground: npt.ArrayLike) -> Array:
-    """Local unit vectors: rows east, north, up, in ECEF.
-
-    Parameters
-    ----------
-    ground : (..., 3)
-        lon, lat [deg], alt [m].
-
-    Returns
-    -------
-    enu_from_ecef : (..., 3, 3)
-        Rotation that takes an ECEF vector into (east, north, up).
-    """
+    """The rotation (..., 3, 3) of ECEF vectors into (east, north, up) at ground points (..., 3); rows: unit vectors."""
     ground = np.asarray(ground, dtype=np.float64)
     lon, lat = ground[..., 0] * _RAD, ground[..., 1] * _RAD
     sin_lon, cos_lon, sin_lat, cos_lat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
@@ -229,17 +171,9 @@ def up(ground: Array) -> Array:
 
 
 def metres_per_unit(ground: npt.ArrayLike) -> Array:
-    """Metres east, north and up of one degree of longitude, one of latitude, one metre of altitude.
+    """Metres east, north and up (..., 3) of one degree of longitude, one of latitude, one metre of altitude.
 
-    Parameters
-    ----------
-    ground : (..., 3)
-        lon, lat [deg], alt [m].
-
-    Returns
-    -------
-    scale : (..., 3)
-        [m/deg, m/deg, 1]; the first is zero at a pole.
+    At ground points (..., 3); the first is zero at a pole.
     """
     ground = np.asarray(ground, dtype=np.float64)
     lat, alt = ground[..., 1] * _RAD, ground[..., 2]
@@ -253,55 +187,21 @@ def metres_per_unit(ground: npt.ArrayLike) -> Array:
 
 
 def ecef_from_ground_jacobian(ground: npt.ArrayLike) -> Array:
-    """Derivative of `ecef_from_ground`.
-
-    Parameters
-    ----------
-    ground : (..., 3)
-        lon, lat [deg], alt [m].
-
-    Returns
-    -------
-    jacobian : (..., 3, 3)
-        d(x, y, z) / d(lon, lat, alt) [m/deg, m/deg, m/m].
-    """
+    """d(x, y, z) / d(lon, lat, alt) (..., 3, 3) [m/deg, m/deg, m/m] at ground points (..., 3)."""
     return np.swapaxes(enu_basis(ground) * metres_per_unit(ground)[..., None], -1, -2)
 
 
 def ground_from_ecef_jacobian(ground: npt.ArrayLike) -> Array:
-    """Derivative of `ground_from_ecef`, given at the *ground* point.
+    """d(lon, lat, alt) / d(x, y, z) (..., 3, 3) [deg/m, deg/m, m/m] at *ground* points (..., 3).
 
-    Parameters
-    ----------
-    ground : (..., 3)
-        lon, lat [deg], alt [m].
-
-    Returns
-    -------
-    jacobian : (..., 3, 3)
-        d(lon, lat, alt) / d(x, y, z) [deg/m, deg/m, m/m]. Infinite for longitude at a pole.
+    Infinite for longitude at a pole.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         return enu_basis(ground) / metres_per_unit(ground)[..., None]
 
 
 def wrap_longitude(lon: npt.ArrayLike, center: npt.ArrayLike = 0.0) -> Array:
-    """Longitudes moved by whole turns to within 180 degrees of `center`.
-
-    Values that already lie there come back unchanged to the bit.
-
-    Parameters
-    ----------
-    lon : (...)
-        Longitudes [deg].
-    center : (...)
-        Longitude [deg] to be near to.
-
-    Returns
-    -------
-    lon : (...)
-        [deg], in [center - 180, center + 180].
-    """
+    """Longitudes (...) [deg] moved by whole turns to within 180 degrees of `center`; unchanged if they are there."""
     lon = np.asarray(lon, dtype=np.float64)
     turns = np.rint((lon - center) / 360.0)
     return lon - 360.0 * turns

@@ -28,12 +28,12 @@ from rasterio.transform import RPCTransformer
 
 from barpc.errors import OutputError
 from barpc.geodesy import Array, wrap_longitude
-from barpc.owned import own_files
 from barpc.raster import GDAL_OPTIONS
 from barpc.rpcio import Carrier, hidden_by, read_rpc, row_of, sidecars
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import image_grid
 from barpc.vrt import Vrt, read_vrt
+from barpc.workspace import own_files
 
 TOLERANCE = 1e-6
 """Largest difference [px] between a file and its model that passes."""

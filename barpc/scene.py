@@ -32,11 +32,11 @@ class View(Frozen):
         Unique in a run: the file's stem, with its folder where stems repeat.
     path : str
         Absolute path of the raster; empty for a view without pixels.
-    size : tuple of int
+    size : (int, int)
         Width, height [px].
     sensor : SensorModel
         The camera as delivered.
-    alt_range : tuple of float
+    alt_range : (float, float)
         Lowest and highest altitude [m above the ellipsoid] that the camera is used for.
     """
 
@@ -167,20 +167,7 @@ def connected_labels(num: int, links: npt.ArrayLike) -> IntArray:
 
 
 def connected_groups(num_views: int, pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
-    """Connected components of the views, the largest first (then by first view).
-
-    Parameters
-    ----------
-    num_views : int
-        Number of views.
-    pairs : sequence of (int, int)
-        Views that are tied to each other.
-
-    Returns
-    -------
-    groups : list of list of int
-        Every view in exactly one group, ascending.
-    """
+    """Connected components of the views, the largest first (then by first view); each ascending."""
     groups: dict[int, list[int]] = {}
     for view, label in enumerate(connected_labels(num_views, pairs).tolist() if num_views else []):
         groups.setdefault(label, []).append(view)

@@ -1,4 +1,4 @@
-"""Files from elsewhere, opened in one place: regular files only, of bounded size.
+"""Files from elsewhere, opened in one place: regular files only, of bounded size, and nothing in them is ever run.
 
 A pipe would wait for a writer that never comes and a device has no end, so what a path stands for is asked of
 the open file itself: nothing can be put in its place between the question and the reading.
@@ -12,49 +12,34 @@ import logging
 import math
 import os
 import stat
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, TextIO
+from xml.etree import ElementTree
 
-from barpc.errors import BarpcError, ImageError, InputError, RpcFormatError
+from barpc.errors import BarpcError, ImageError, InputError, RpcFormatError, visible
 
 logger = logging.getLogger(__name__)
 
 MB = 1 << 20
-_FLAGS = (
-    os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOCTTY", 0)
-    | getattr(os, "O_BINARY", 0)
-)  # fmt: skip
+MAX_XML = 32 * MB  # the largest in use, a day of precise orbits, has 5 MB
+_FLAGS = os.O_RDONLY
+for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # not every system has all
+    _FLAGS |= getattr(os, _flag, 0)
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
-_DIGITS = 18  # of a whole number: more do not fit 64 bits
 _LONG = 64 * MB  # what takes longer than two seconds to read and parse says so
-_LINE = 4 * 4096
-_LARGEST = 1e100  # no number of a side file comes near, and its square is finite
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file.
+    """A kind of file."""
 
-    Parameters
-    ----------
-    words : str
-        What a message calls it.
-    most : int or None
-        Larger files are refused [bytes]; None for images, which are never read whole.
-    error : type of BarpcError
-        What is raised.
-    """
-
-    words: str
-    most: int | None
+    words: str  # what a message calls it
+    most: int | None  # larger files are refused [bytes]; None for images, which are never read whole
     error: type[BarpcError] = InputError
-
-    def raising(self, error: type[BarpcError]) -> Kind:
-        """The same kind with another class of error."""
-        return replace(self, error=error)
 
     def check(self, path: Path | str, size: int) -> None:
         """Raise if a file of `size` bytes is too large."""
@@ -68,6 +53,7 @@ IMAGE = Kind("an image", None, ImageError)
 PRODUCT = Kind("a product", None, RpcFormatError)
 GRID = Kind("a height grid", None)
 RPC_FILE = Kind("an RPC file", 32 * MB, RpcFormatError)
+XML = Kind("an XML file", MAX_XML, RpcFormatError)
 TABLE = Kind("a table of points", 1024 * MB)
 ARRAYS = Kind("an archive of arrays", 1024 * MB)
 GEOJSON = Kind("a GeoJSON file", 256 * MB)
@@ -78,20 +64,10 @@ SUMMARY = Kind("a run's summary", 512 * MB)
 
 @contextmanager
 def opened(path: Path | str, kind: Kind) -> Iterator[BinaryIO]:
-    """A regular file, open for reading; what fails while it is read is told as one line.
+    """A regular file, open for reading; links are followed.
 
-    Parameters
-    ----------
-    path : Path or str
-        The file; links are followed.
-    kind : Kind
-        What it should be.
-
-    Raises
-    ------
-    BarpcError
-        Of the class of `kind`: there is no such file, it is a folder, pipe or device, it is too large or cannot
-        be read. The message names it.
+    What fails while it is read is one line that names it, of the class of `kind`: there is no such file, it is a
+    folder, pipe or device, it is too large or cannot be read.
     """
     try:
         with _regular(path, kind) as file:
@@ -126,11 +102,14 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
 @contextmanager
 def opened_text(path: Path | str, kind: Kind, newline: str | None = None) -> Iterator[TextIO]:
     """As `opened`, for UTF-8 text, with or without a byte order mark."""
+    with opened(path, kind) as file, _utf8(file, path, kind, newline) as text:
+        yield text
+
+
+@contextmanager
+def _utf8(file: BinaryIO, path: Path | str, kind: Kind, newline: str | None = None) -> Iterator[TextIO]:
     try:
-        with (
-            opened(path, kind) as file,
-            io.TextIOWrapper(file, encoding="utf-8-sig", newline=newline) as text,
-        ):
+        with io.TextIOWrapper(file, encoding="utf-8-sig", newline=newline) as text:
             yield text
     except UnicodeDecodeError as error:
         raise kind.error(f"{path}: not a UTF-8 text, so not {kind.words} ({error.reason})") from error
@@ -152,21 +131,48 @@ def read_head(path: Path | str, kind: Kind, size: int) -> bytes:
 
 def read_text(path: Path | str, kind: Kind) -> str:
     """All of a UTF-8 text, line ends of one kind (see `opened`)."""
-    data = io.BytesIO(read_bytes(path, kind))
-    try:
-        return io.TextIOWrapper(data, encoding="utf-8-sig").read()
-    except UnicodeDecodeError as error:
-        raise kind.error(f"{path}: not a UTF-8 text, so not {kind.words} ({error.reason})") from error
+    with _utf8(io.BytesIO(read_bytes(path, kind)), path, kind) as text:
+        return text.read()
+
+
+_LINE = 4 * 4096  # no line of names is longer than two paths can be
 
 
 def read_names(path: Path | str, words: str) -> list[str]:
-    """The lines of a list of names, called `words` (see `opened`); no line is longer than two paths can be."""
+    """The lines of a list of names, called `words` (see `opened`)."""
     kind = replace(NAMES, words=words)
     lines = read_text(path, kind).splitlines()
     for number, line in enumerate(lines, start=1):
         if len(line) > _LINE:
             raise kind.error(f"{path}, line {number}: {len(line)} characters, no name is so long")
     return lines
+
+
+_REFUSED = "\ufffe\uffff" + (
+    "\\" if os.sep == "/" else ""
+)  # no XML takes two, GDAL splits a name at the third
+
+
+def plain_path(path: str | os.PathLike[str]) -> Path:
+    """A path as it is, once every file that barpc writes can carry it.
+
+    InputError for a control character, an end of line, bytes that are no text, a backslash that separates no folders.
+    """
+    name = os.fspath(path)
+    for char in name:
+        if unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") or char in _REFUSED:
+            what = "bytes that are not UTF-8" if "\ud800" <= char <= "\udfff" else f"the character {char!a}"
+            raise InputError(
+                f"{visible(name)}: its path holds {what}, which not every file and tool takes;"
+                " rename it, or give a link to it"
+            )
+    return Path(name)
+
+
+# --- JSON -------------------------------------------------------------------------------------------------
+
+_DIGITS = 18  # of a whole number: more do not fit 64 bits
+_LARGEST = 1e100  # no number of a side file comes near, and its square is finite
 
 
 def read_json(path: Path | str, kind: Kind) -> Any:
@@ -179,13 +185,7 @@ def read_json(path: Path | str, kind: Kind) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What a JSON text holds: its numbers are finite, its whole numbers fit 64 bits.
-
-    Raises
-    ------
-    ValueError
-        Not JSON, a number beyond these bounds, or nested too deep.
-    """
+    """What a JSON text holds; ValueError for numbers that are not finite or beyond 64 bits, or nested too deep."""
     try:
         return json.loads(text, parse_constant=_refuse, parse_int=_whole, parse_float=_finite)
     except RecursionError:
@@ -207,3 +207,61 @@ def _finite(text: str) -> float:
     if not math.fabs(value) <= _LARGEST:
         raise ValueError(f"{text[:40]} is beyond {_LARGEST:g}")
     return value
+
+
+# --- XML --------------------------------------------------------------------------------------------------
+
+_MAX_DEPTH = 100
+_MAX_ELEMENTS = 2_000_000
+
+
+class _Builder(ElementTree.TreeBuilder):
+    """Refuses trees that are too large, and a document type that the encoding hides from a search of the bytes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._depth = self._count = 0
+
+    def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
+        self._depth, self._count = self._depth + 1, self._count + 1
+        if self._depth > _MAX_DEPTH or self._count > _MAX_ELEMENTS:
+            raise ElementTree.ParseError(f"{self._count} elements, {self._depth} deep: too many")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str) -> ElementTree.Element:
+        self._depth -= 1
+        return super().end(tag)
+
+    def doctype(self, name: str, _public: str | None, _system: str | None) -> None:
+        raise ElementTree.ParseError("it declares a DOCTYPE")
+
+
+def parse_xml(
+    source: bytes | Path, *, name: str | None = None, max_bytes: int = MAX_XML, strip_namespaces: bool = False
+) -> ElementTree.Element:
+    """The root element of an XML document: bytes, or the file that holds it; messages call it `name`, or by its path.
+
+    No document type: an entity cannot be declared without one, so neither "billion laughs" nor a reference to another
+    file can be written. `strip_namespaces` drops the ``{namespace}`` of every tag.
+
+    Raises
+    ------
+    RpcFormatError
+        Not a readable file, more than `max_bytes`, a DOCTYPE, or not well-formed XML. The message names the file.
+    """
+    name = name or (str(source) if isinstance(source, Path) else "XML document")
+    data = read_bytes(source, replace(XML, most=max_bytes)) if isinstance(source, Path) else source
+    if len(data) > max_bytes:
+        raise RpcFormatError(f"{name}: {len(data)} bytes of XML, at most {max_bytes} are read")
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise RpcFormatError(f"{name}: refused, it declares a DOCTYPE; remove the declaration")
+    parser = ElementTree.XMLParser(target=_Builder())  # noqa: S314 - no DOCTYPE, so no entities
+    try:
+        parser.feed(data)  # at once: expat before 2.6 looks at an unfinished token again with every part
+        root: ElementTree.Element = parser.close()
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise RpcFormatError(f"{name}: not an XML document that can be read ({error})") from error
+    if strip_namespaces:
+        for element in root.iter():
+            element.tag = element.tag.rpartition("}")[2]
+    return root

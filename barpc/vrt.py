@@ -1,43 +1,36 @@
 """Reading a VRT: a closed grammar of tags, attributes and text; what is not in it is refused.
 
 GDAL's own reader takes attributes for elements, tags in any case, and half-closed documents. So GDAL is never
-shown a VRT: what this module reads is all there is, and `barpc.mosaic` puts the pixels together.
+shown a VRT: what this module reads is all there is, and `barpc.raster` puts the pixels together.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from barpc.errors import ImageError, RpcFormatError
-from barpc.safexml import parse_xml
+from barpc.sidefile import parse_xml
 
+_INTEGERS = {f"{u}int{n}": f"{u.upper()}Int{n}" for n in (16, 32, 64) for u in ("u", "")}
+_COMPLEX = {"complex_int16": "CInt16", "complex64": "CFloat32", "complex128": "CFloat64"}
 GDAL_TYPES = {
     "uint8": "Byte",
     "int8": "Int8",
-    "uint16": "UInt16",
-    "int16": "Int16",
-    "uint32": "UInt32",
-    "int32": "Int32",
-    "uint64": "UInt64",
-    "int64": "Int64",
+    **_INTEGERS,
     "float32": "Float32",
     "float64": "Float64",
-    "complex_int16": "CInt16",
-    "complex64": "CFloat32",
-    "complex128": "CFloat64",
+    **_COMPLEX,
 }
 """rasterio's names of pixel types -> GDAL's."""
 MAGIC = b"<VRTDataset"
-MAX_BYTES = 1 << 20
-"""Larger files are no VRTs [bytes]; one that carries an RPC takes a few thousand."""
+_MAX_BYTES = 1 << 20  # larger files are no VRTs; one that carries an RPC takes a few thousand
 
-Rect = tuple[int, int, int, int]
-"""col, row of the first pixel, width, height [px]."""
+Rect = tuple[int, int, int, int]  # col, row of the first pixel, width, height [px]
 
 _ANY = r"(?s:.*)"
 _WHOLE = r"\d{1,9}"
@@ -47,7 +40,7 @@ _SWITCH = "0|1"
 _TYPE = "|".join(GDAL_TYPES.values())
 _RESAMPLING = "nearest|near|bilinear|cubic|cubicspline|lanczos|average|rms|mode|gauss"
 _SRS = r"(?s:[A-Z_]{4,20}\[.*\])|EPSG:\d{1,6}"
-_INDIRECT = re.compile(r"/vsi|[A-Za-z][A-Za-z0-9+._-]+:")
+INDIRECT = re.compile(r"/vsi|[A-Za-z][A-Za-z0-9+._-]+:")
 _SHIFT = 1e-3  # px; a rectangle that lies less beside whole pixels is meant to lie on them
 
 
@@ -59,63 +52,51 @@ class _Tag(NamedTuple):
     children: str = ""
 
 
-_RECT = _Tag(None, dict.fromkeys(("xOff", "yOff", "xSize", "ySize"), _NUMBER))
+_RECT = ("xOff", "yOff", "xSize", "ySize")
+_SIZES = ("RasterXSize", "RasterYSize", "BlockXSize", "BlockYSize")
 _SOURCE = "SourceFilename SourceBand SourceProperties SrcRect DstRect"
 _BAND = "ColorInterp NoDataValue HideNoDataValue SimpleSource ComplexSource"
 _FORGOTTEN = "Description UnitType Offset Scale Metadata CategoryNames ColorTable Histograms"
+_AXES = r"-?\d(,-?\d){0,3}"
 _GRAMMAR: dict[str, _Tag] = {
     "VRTDataset": _Tag(
         None,
         {"rasterXSize": _WHOLE, "rasterYSize": _WHOLE},
         "SRS GeoTransform GCPList Metadata BlockXSize BlockYSize OverviewList VRTRasterBand MaskBand",
     ),
-    "SRS": _Tag(_SRS, {"dataAxisToSRSAxisMapping": r"-?\d(,-?\d){0,3}", "coordinateEpoch": _NUMBER}),
+    "SRS": _Tag(_SRS, {"dataAxisToSRSAxisMapping": _AXES, "coordinateEpoch": _NUMBER}),
     "GeoTransform": _Tag(rf"{_NUMBER}(\s*,\s*{_NUMBER}){{5}}"),
-    "GCPList": _Tag(None, {"Projection": f"{_SRS}|", "dataAxisToSRSAxisMapping": r"-?\d(,-?\d){0,3}"}, "GCP"),
+    "GCPList": _Tag(None, {"Projection": f"{_SRS}|", "dataAxisToSRSAxisMapping": _AXES}, "GCP"),
     "GCP": _Tag(None, {"Id": _ANY, "Info": _ANY, **dict.fromkeys(("Pixel", "Line", "X", "Y", "Z"), _NUMBER)}),
     "Metadata": _Tag(None, {"domain": _ANY}, "MDI"),
     "MDI": _Tag(_ANY, {"key": _ANY}),
-    "BlockXSize": _Tag(_WHOLE),
-    "BlockYSize": _Tag(_WHOLE),
     "OverviewList": _Tag(r"[\d\s]*", {"resampling": r"\w+"}),
     "VRTRasterBand": _Tag(
         None,
-        {"dataType": _TYPE, "band": _WHOLE, "blockXSize": _WHOLE, "blockYSize": _WHOLE},
+        {"dataType": _TYPE, **dict.fromkeys(("band", "blockXSize", "blockYSize"), _WHOLE)},
         f"{_BAND} {_FORGOTTEN}",
     ),
     "MaskBand": _Tag(None, {}, "VRTRasterBand"),
     "ColorInterp": _Tag(r"[\w ]+"),
-    "NoDataValue": _Tag(_NODATA),
     "HideNoDataValue": _Tag(_SWITCH),
-    "Description": _Tag(_ANY),
-    "UnitType": _Tag(_ANY),
-    "Offset": _Tag(_NUMBER),
-    "Scale": _Tag(_NUMBER),
     "CategoryNames": _Tag(None, {}, "Category"),
-    "Category": _Tag(_ANY),
     "ColorTable": _Tag(None, {}, "Entry"),
     "Entry": _Tag(None, dict.fromkeys(("c1", "c2", "c3", "c4"), _WHOLE)),
     "Histograms": _Tag(None, {}, "HistItem"),
     "HistItem": _Tag(None, {}, "HistMin HistMax BucketCount IncludeOutOfRange Approximate HistCounts"),
-    **dict.fromkeys(("HistMin", "HistMax"), _Tag(_NODATA)),
-    **dict.fromkeys(("BucketCount", "IncludeOutOfRange", "Approximate"), _Tag(_WHOLE)),
     "HistCounts": _Tag(r"[\d|]*"),
     "SimpleSource": _Tag(None, {"resampling": _RESAMPLING}, _SOURCE),
     "ComplexSource": _Tag(None, {"resampling": _RESAMPLING}, f"{_SOURCE} NODATA ScaleOffset ScaleRatio"),
     "SourceFilename": _Tag(_ANY, {"relativeToVRT": _SWITCH, "shared": _SWITCH}),
     "SourceBand": _Tag(rf"{_WHOLE}|mask,{_WHOLE}"),
-    "SourceProperties": _Tag(
-        None,
-        {
-            **dict.fromkeys(("RasterXSize", "RasterYSize", "BlockXSize", "BlockYSize"), _WHOLE),
-            "DataType": r"\w+",
-        },
+    "SourceProperties": _Tag(None, {"DataType": r"\w+", **dict.fromkeys(_SIZES, _WHOLE)}),
+    **dict.fromkeys(("SrcRect", "DstRect"), _Tag(None, dict.fromkeys(_RECT, _NUMBER))),
+    **dict.fromkeys(
+        ("BlockXSize", "BlockYSize", "BucketCount", "IncludeOutOfRange", "Approximate"), _Tag(_WHOLE)
     ),
-    "SrcRect": _RECT,
-    "DstRect": _RECT,
-    "NODATA": _Tag(_NODATA),
-    "ScaleOffset": _Tag(_NUMBER),
-    "ScaleRatio": _Tag(_NUMBER),
+    **dict.fromkeys(("Description", "UnitType", "Category"), _Tag(_ANY)),
+    **dict.fromkeys(("Offset", "Scale", "ScaleOffset", "ScaleRatio"), _Tag(_NUMBER)),
+    **dict.fromkeys(("NoDataValue", "NODATA", "HistMin", "HistMax"), _Tag(_NODATA)),
 }
 _REPEATED = frozenset(
     [
@@ -134,34 +115,20 @@ _REPEATED = frozenset(
 
 @dataclass(frozen=True)
 class Source:
-    """A rectangle of a band of a raster, and where it goes.
-
-    Parameters
-    ----------
-    file : Path
-        The raster.
-    band : int
-        Band, from 1.
-    mask : bool
-        Its mask is meant, not its values.
-    src, dst : Rect or None
-        In the raster and in the VRT, of one size; None for the whole.
-    plain : bool
-        Values are handed on as they are.
-    nodata : float or None
-        Value that is not handed on.
-    scale : (ratio, offset)
-        Applied to the values.
-    """
+    """A rectangle of a band (from 1) of a raster, or of the band's mask, and where it goes."""
 
     file: Path
     band: int
     mask: bool = False
-    src: Rect | None = None
+    src: Rect | None = None  # in the raster, and in the VRT, of one size; None for the whole
     dst: Rect | None = None
-    plain: bool = True
-    nodata: float | None = None
-    scale: tuple[float, float] = (1.0, 0.0)
+    nodata: float | None = None  # not handed on
+    scale: tuple[float, float] = (1.0, 0.0)  # ratio and offset applied to the values
+
+    @property
+    def plain(self) -> bool:
+        """Whether values are handed on as they are."""
+        return self.nodata is None and self.scale == (1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -177,36 +144,16 @@ class Band:
 
 @dataclass(frozen=True)
 class Vrt:
-    """What a VRT says.
+    """What a VRT says."""
 
-    Parameters
-    ----------
-    size : (width, height)
-        [px].
-    bands : tuple of Band
-        In order.
-    mask : Band or None
-        Mask of the whole raster.
-    srs : str
-        WKT or EPSG code; empty where there is none.
-    transform : tuple of float or None
-        GDAL's six numbers.
-    metadata : dict
-        Domain -> key -> value.
-    gcp_srs : str
-        As `srs`, of the GCPs.
-    gcps : tuple of dict
-        Attributes of the GCPs, as they stand.
-    """
-
-    size: tuple[int, int]
+    size: tuple[int, int]  # width, height [px]
     bands: tuple[Band, ...]
-    mask: Band | None = None
-    srs: str = ""
-    transform: tuple[float, ...] | None = None
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    gcp_srs: str = ""
-    gcps: tuple[dict[str, str], ...] = ()
+    mask: Band | None  # of the whole raster
+    srs: str  # WKT or EPSG code; empty where there is none
+    transform: tuple[float, ...] | None  # GDAL's six numbers
+    metadata: dict[str, dict[str, str]]  # domain -> key -> value
+    gcp_srs: str
+    gcps: tuple[dict[str, str], ...]  # their attributes, as they stand
 
     @property
     def sources(self) -> list[Source]:
@@ -215,24 +162,14 @@ class Vrt:
 
 
 def read_vrt(path: Path, *, name: str | None = None) -> Vrt:
-    """Read a VRT; its sources are not looked at.
+    """Read a VRT; its sources are not looked at, and are relative to what `path` links to, as in GDAL.
 
-    Parameters
-    ----------
-    path : Path
-        An existing file; sources relative to it are beside what it links to, as in GDAL.
-    name : str, optional
-        What to call it in messages.
-
-    Raises
-    ------
-    ImageError
-        It does not parse, holds anything outside the grammar, or names a source by anything else than a
-        plain path. One line that names it.
+    ImageError where it does not parse, holds anything outside the grammar, or names a source by anything else than a
+    plain path.
     """
     name = name or str(path)
     try:
-        root = parse_xml(path, name=name, max_bytes=MAX_BYTES)
+        root = parse_xml(path, name=name, max_bytes=_MAX_BYTES)
     except RpcFormatError as error:
         raise ImageError(str(error)) from error
     return vrt_from_xml(root, path.resolve().parent, name)
@@ -333,22 +270,20 @@ class _Reader:
         src, dst = (self.rect(element.find(tag)) for tag in ("SrcRect", "DstRect"))
         if src and dst and src[2:] != dst[2:]:
             raise self.resampled()
-        scale = (float(element.findtext("ScaleRatio", "1")), float(element.findtext("ScaleOffset", "0")))
         return Source(
             file=self.file(element.find("SourceFilename")),
             band=int(number),
             mask=bool(kind),
             src=src,
             dst=dst,
-            plain=nodata is None and scale == (1.0, 0.0),
             nodata=None if nodata is None else float(nodata),
-            scale=scale,
+            scale=(float(element.findtext("ScaleRatio", "1")), float(element.findtext("ScaleOffset", "0"))),
         )
 
     def rect(self, element: Element | None) -> Rect | None:
         if element is None:
             return None
-        values = [float(element.get(key, "nan")) for key in ("xOff", "yOff", "xSize", "ySize")]
+        values = [float(element.get(key, "nan")) for key in _RECT]
         if not all(abs(v) < 2**31 and abs(v - round(v)) <= _SHIFT for v in values):
             raise self.resampled()
         x, y, width, height = (round(v) for v in values)
@@ -363,6 +298,6 @@ class _Reader:
     def file(self, element: Element | None) -> Path:
         text = "" if element is None else element.text or ""
         relative = element is not None and element.get("relativeToVRT", "0") == "1"
-        if not text or _INDIRECT.match(text) or not (relative or Path(text).is_absolute()):
+        if not text or INDIRECT.match(text) or not (relative or Path(text).is_absolute()):
             raise ImageError(f"{self.name}: the VRT points at {text[:200]!r}, which is no plain local file")
         return self.folder / text

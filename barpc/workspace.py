@@ -1,16 +1,18 @@
-"""The run folder: outputs that appear whole, stage results kept for resuming, one run at a time.
+"""The run folder: outputs that appear whole, stage results kept for resuming, one run at a time. Nothing is pickled.
 
 ::
 
     OUT/                     what the user asked for
     OUT/.barpc/state.json    status, stages with seconds and peak memory, the outputs with their sha256
-    OUT/.barpc/outputs.jsonl the same of the outputs of a run at work (see `barpc.owned`)
+    OUT/.barpc/outputs.jsonl the same of the outputs of a run at work
     OUT/.barpc/lock          held while a run is at work
     OUT/.barpc/partial/      files on their way; emptied at the next start
     OUT/.barpc/cache/<stage>/<key>.npz   results of tasks; a damaged one is made again
 
-The key of a stage is a hash of its inputs, its options and the code; resuming is running the same
-command again. Nothing is ever pickled.
+The key of a stage is a hash of its inputs, its options and the code; resuming is running the same command again.
+A run notes the sha256 of an output before the output takes its name: only a file with a noted content is ever replaced
+or taken away. The notes may be anybody's: a name counts only for a regular file inside the folder, reached through
+no symbolic link, and a folder below with a run of its own is that run's.
 """
 
 from __future__ import annotations
@@ -20,26 +22,31 @@ import json
 import logging
 import os
 import shutil
+import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
-from pathlib import Path
-from types import TracebackType
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import filelock
 import numpy as np
 import numpy.typing as npt
 
-from barpc import __version__, owned
+from barpc import __version__
 from barpc.atomic import replacing
 from barpc.errors import BarpcError, OutputError
-from barpc.owned import STATE
-from barpc.record import Record, load_npz
+from barpc.frozen import Arrays, load_npz
 
 logger = logging.getLogger(__name__)
+
+STATE = ".barpc"
+STATE_FILE, NOTES, LOCK, PARTIAL, CACHE = "state.json", "outputs.jsonl", "lock", "partial", "cache"
+_FILES = (STATE_FILE, NOTES, LOCK)
+_MAX_STATE = 32 << 20  # bytes: larger state files (some 300,000 outputs) count as missing
+_CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 KEEP_AFTER = 30.0
 """A run that is refused within so many seconds leaves nothing; after that its stages are kept."""
@@ -62,32 +69,24 @@ def code_version() -> str:
 def fingerprint(path: str | Path) -> str:
     """A hash of a file's content; of files above 64 MiB 64 samples, the size and the time of change."""
     path = Path(path)
-    stat = path.stat()
-    digest = hashlib.sha256(str(stat.st_size).encode())
+    found = path.stat()
+    digest = hashlib.sha256(str(found.st_size).encode())
     with path.open("rb") as file:
-        if stat.st_size <= _WHOLE_FILE:
+        if found.st_size <= _WHOLE_FILE:
             while block := file.read(_SAMPLE):
                 digest.update(block)
         else:
-            digest.update(str(stat.st_mtime_ns).encode())
-            for start in np.linspace(0, stat.st_size - _SAMPLE, 64).astype(np.int64):
+            digest.update(str(found.st_mtime_ns).encode())
+            for start in np.linspace(0, found.st_size - _SAMPLE, 64).astype(np.int64):
                 file.seek(int(start))
                 digest.update(file.read(_SAMPLE))
     return digest.hexdigest()
 
 
 def key_of(*parts: object) -> str:
-    """The key of a stage: a hash of its inputs and options, and of the code.
+    """The key of a stage, 32 hexadecimal digits: a hash of its inputs and options, and of the code.
 
-    Parameters
-    ----------
-    *parts : object
-        Strings, numbers, None, sequences, mappings, dataclasses, arrays, paths.
-
-    Returns
-    -------
-    key : str
-        32 hexadecimal digits.
+    Parts are strings, numbers, None, sequences, mappings, dataclasses, arrays, paths.
     """
     text = json.dumps([code_version(), *parts], default=_plain, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -123,23 +122,20 @@ class Workspace:
     Parameters
     ----------
     folder : str or Path
-        Where results go. A folder of an unfinished run is gone on with; any other that is not empty
-        needs `overwrite`.
+        Where results go. That of an unfinished run is gone on with; any other that is not empty needs `overwrite`.
     overwrite : bool
         Replace what an earlier run wrote here and nobody has changed since; never anything else.
-    keep : frozenset of Path
+    keep : iterable of Path
         Files that must never be written: the inputs.
     names : iterable of str
         The outputs to come, as far as they are known: what is in their way is refused before any work.
     adds : bool
-        Other things may be in the folder: what earlier runs wrote stays theirs, names that are free are
-        written.
+        Other things may be in the folder: what earlier runs wrote stays theirs, free names are written.
 
     Raises
     ------
     OutputError
-        The folder exists and is not empty, holds a file that is in the way, is in use by another run, or
-        cannot be written.
+        The folder is not empty, holds a file that is in the way, is in use by another run, or cannot be written.
     """
 
     def __init__(
@@ -152,17 +148,18 @@ class Workspace:
         adds: bool = False,
     ) -> None:
         self.folder = Path(folder).absolute()
+        own = self.folder / STATE
+        self.cache, self.partial = own / CACHE, own / PARTIAL
         self._keep = frozenset(path.resolve() for path in keep)
         self._adds = adds
         self.outputs: dict[str, str] = {}
         self.stages: list[dict[str, Any]] = []
         self._check_free(overwrite, names)
         self._start = time.perf_counter()
-        own = self.folder / STATE
         self._made = [p for p in (own, self.folder, *self.folder.parents) if not p.exists()]
         try:
             self.cache.mkdir(parents=True, exist_ok=True)
-            self._lock = filelock.FileLock(own / owned.LOCK, timeout=0)
+            self._lock = filelock.FileLock(own / LOCK, timeout=0)
             self._lock.acquire()
         except filelock.Timeout:
             raise OutputError(
@@ -171,7 +168,7 @@ class Workspace:
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         shutil.rmtree(self.partial, ignore_errors=True)  # of a run that was killed
-        self._earlier = owned.read_own(self.folder)  # again: another run may have ended in between
+        self._earlier = _read_own(self.folder)  # again: another run may have ended in between
         try:
             self._save_state("running")
         except BaseException:  # a full disk
@@ -182,15 +179,15 @@ class Workspace:
     def _check_free(self, overwrite: bool, names: Iterable[str]) -> None:
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder}: is a file; give -o a folder")
-        owned.refuse_odd(self.folder)
+        _refuse_odd(self.folder)
         present = {path.name for path in self.folder.iterdir()} if self.folder.is_dir() else set()
-        status = owned.read_state(self.folder).get("status")
+        status = _read_state(self.folder).get("status")
         # without a state: nothing but our own folder is left by a run that was killed in its first moment
         unfinished = status in ("running", "failed") or (status is None and present <= {STATE})
         self._may_replace = overwrite or unfinished
         if present and not self._adds and not self._may_replace:
             raise OutputError(f"{self.folder}: exists and is not empty; give --overwrite or another -o")
-        self._earlier = owned.read_own(self.folder)
+        self._earlier = _read_own(self.folder)
         for name in names:
             self._refuse_foreign(name)
 
@@ -214,19 +211,16 @@ class Workspace:
     def owns(self, name: str) -> bool:
         """Whether a run in this folder wrote this file, and nobody has changed it since."""
         known = self._earlier | self.outputs
-        return name in known and owned.owns(self.folder, name, known[name])
+        return name in known and _owns(self.folder, name, known[name])
 
     def __enter__(self) -> Workspace:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        refused = kind is not None and issubclass(kind, BarpcError)
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         try:
-            self._save_state("done" if kind is None else "failed")
+            self._save_state("done" if error is None else "failed")
         finally:
-            if refused and time.perf_counter() - self._start < KEEP_AFTER:
+            if isinstance(error, BarpcError) and time.perf_counter() - self._start < KEEP_AFTER:
                 self._discard()
             self._lock.release()
 
@@ -241,11 +235,9 @@ class Workspace:
             except OSError:
                 return
 
-    # -- stages ------------------------------------------------------------------------------------
-
-    def load(self, stage: str, key: str) -> Record | None:
+    def load(self, stage: str, key: str) -> Arrays | None:
         """A kept result, or None; one that is damaged is taken away and counts as missing."""
-        path = self._cache_path(stage, key)
+        path = self.cache / stage / f"{key}.npz"
         if path.is_symlink() or not path.is_file():
             return None
         try:
@@ -255,28 +247,15 @@ class Workspace:
             path.unlink(missing_ok=True)
             return None
 
-    def store(self, stage: str, key: str, record: Mapping[str, npt.NDArray[Any]]) -> None:
+    def store(self, stage: str, key: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         """Keep a result, under a temporary name until it is whole."""
-        path = self._cache_path(stage, key)
+        path = self.cache / stage / f"{key}.npz"
         with self.keeping(path) as partial, partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in record.items()})
-
-    @property
-    def cache(self) -> Path:
-        """Where results are kept."""
-        return self.folder / STATE / owned.CACHE
-
-    @property
-    def partial(self) -> Path:
-        """Where files are written before they take their names."""
-        return self.folder / STATE / owned.PARTIAL
+            np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
     def keeping(self, path: Path) -> AbstractContextManager[Path]:
         """A temporary path for a file among the caches, which can be made again."""
         return replacing(path, overwrite=True, durable=False, room=self.partial)
-
-    def _cache_path(self, stage: str, key: str) -> Path:
-        return self.cache / stage / f"{key}.npz"
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -294,29 +273,19 @@ class Workspace:
         logger.info("%s: %.2f s, peak memory %.0f MB", name, entry["seconds"], entry["peak_memory_mb"])
         self._save_state("running")
 
-    # -- outputs -----------------------------------------------------------------------------------
-
     @contextmanager
     def output(self, name: str) -> Iterator[Path]:
-        """A temporary path to write an output to; it takes its name when the block ends well.
+        """A temporary path for an output, called relative to the folder, that takes its name when the block ends well.
 
-        Parameters
-        ----------
-        name : str
-            Relative to the run folder.
-
-        Raises
-        ------
-        OutputError
-            It would replace an input or a file that is not barpc's own, or cannot be written.
+        OutputError where it would replace an input or a file that is not barpc's own, or cannot be written.
         """
         with replacing(self.folder / name, overwrite=True, room=self.partial) as partial:
             yield partial
             self._refuse_foreign(name)
-            sha = owned.digest(partial)
+            sha = _digest(partial)
             if sha is None:
                 raise OutputError(f"{self.folder / name}: cannot be written (its temporary file is gone)")
-            owned.note(self.folder, name, sha)
+            _note(self.folder, name, sha)
         self.outputs[name] = sha
 
     def write_text(self, name: str, text: str) -> Path:
@@ -331,13 +300,122 @@ class Workspace:
             if self.owns(name) and (self.folder / name).resolve() not in self._keep:
                 (self.folder / name).unlink()
 
-    # -- state -------------------------------------------------------------------------------------
-
     def _save_state(self, status: str) -> None:
         """Write state.json with all that is known of the outputs: the notes of single ones have done."""
         earlier = {} if status == "done" and not self._adds else self._earlier
         outputs = dict(sorted((earlier | self.outputs).items()))
         state = {"barpc": __version__, "status": status, "stages": self.stages, "outputs": outputs}
-        with replacing(self.folder / STATE / owned.STATE_FILE, overwrite=True, room=self.partial) as partial:
+        with replacing(self.folder / STATE / STATE_FILE, overwrite=True, room=self.partial) as partial:
             partial.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
-        (self.folder / STATE / owned.NOTES).unlink(missing_ok=True)
+        (self.folder / STATE / NOTES).unlink(missing_ok=True)
+
+
+# --- which files are barpc's own --------------------------------------------------------------------------
+
+
+def _digest(path: Path) -> str | None:
+    """The sha256 of a regular file; None for anything else. No link is followed, no FIFO waited for."""
+    try:
+        if not stat.S_ISREG(path.lstat().st_mode):
+            return None
+        with open(os.open(path, os.O_RDONLY | _CAREFUL), "rb") as file:  # noqa: PTH123  (no link)
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except (OSError, ValueError):
+        return None
+
+
+def _owns(folder: Path, name: str, sha: str) -> bool:
+    """Whether the file of this name has this content, and is this folder's own."""
+    parts = PurePosixPath(name)
+    if not parts.parts or parts.is_absolute() or ".." in parts.parts or str(parts) != name:
+        return False
+    if parts.parts[0].lower() == STATE:  # (disks that do not tell case apart)
+        return False
+    path = folder / name
+    try:
+        inside = path.parent.resolve() == folder.resolve() / parts.parent
+        below = [folder / parent for parent in parts.parents if str(parent) != "."]
+        return inside and not any((p / STATE).exists() for p in below) and _digest(path) == sha
+    except (OSError, ValueError):
+        return False
+
+
+def _read_state(folder: Path) -> dict[str, Any]:
+    """What state.json holds; nothing where it is missing, damaged, too large or no regular file."""
+    try:
+        state = json.loads(_text(folder / STATE / STATE_FILE))
+    except (ValueError, RecursionError):
+        return {}
+    return state if isinstance(state, dict) else {}
+
+
+def _read_own(folder: Path) -> dict[str, str]:
+    """The outputs of a folder's runs and their sha256; of two contents of one (a killed run's) that which is there."""
+    listed = _read_state(folder).get("outputs")
+    known: dict[str, dict[str, None]] = {}
+    pairs: list[Any] = list(listed.items()) if isinstance(listed, dict) else []
+    for line in _text(folder / STATE / NOTES).split("\n"):
+        with suppress(ValueError, RecursionError):  # the last line of a run that was killed
+            pairs.append(json.loads(line))
+    for pair in pairs:
+        if isinstance(pair, (list, tuple)) and [type(part) for part in pair] == [str, str]:
+            known.setdefault(pair[0], {})[pair[1]] = None
+    own = {}
+    for name, contents in known.items():
+        found = _digest(folder / name) if len(contents) > 1 else None
+        own[name] = found if found in contents else next(iter(contents))
+    return own
+
+
+def own_files(folder: Path) -> set[str]:
+    """The names of barpc's own files that are in a folder, as it wrote them."""
+    return {name for name, sha in _read_own(folder).items() if _owns(folder, name, sha)}
+
+
+def _note(folder: Path, name: str, sha: str) -> None:
+    path = folder / STATE / NOTES
+    line = "\n" + json.dumps([name, sha]) + "\n"  # on a line of its own, whatever a killed run left
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | _CAREFUL, 0o666)
+        with open(descriptor, "ab") as file:  # noqa: PTH123  (no link)
+            file.write(line.encode())
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def _refuse_odd(folder: Path) -> None:
+    """Raise where something else stands in the place of barpc's own files: a link, a FIFO, a user's file."""
+    own = folder / STATE
+    try:
+        stages = sorted((own / CACHE).iterdir())
+    except OSError:
+        stages = []
+    for path in (own, own / PARTIAL, own / CACHE, *stages, *(own / name for name in _FILES)):
+        try:
+            found = path.lstat()
+        except OSError:  # not there; where it cannot be reached, it cannot be written either
+            continue
+        if _is_odd(path, found):
+            raise OutputError(
+                f"{path}: cannot be written: it is not barpc's own; move {own} away, or give another -o"
+            )
+
+
+def _is_odd(path: Path, found: os.stat_result) -> bool:
+    if path.name not in _FILES:
+        return stat.S_ISLNK(found.st_mode) if path.parent.name == CACHE else not stat.S_ISDIR(found.st_mode)
+    # these are written to as they stand, and old releases of filelock empty what they open
+    shared = path.name in (LOCK, NOTES) and found.st_nlink > 1
+    return not stat.S_ISREG(found.st_mode) or shared or (path.name == LOCK and found.st_size > 0)
+
+
+def _text(path: Path) -> str:
+    try:
+        found = path.lstat()
+        if not stat.S_ISREG(found.st_mode) or found.st_size > _MAX_STATE:
+            return ""
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""

@@ -27,8 +27,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
-from barpc.fit.certificate import smallest_denominator
 from barpc.fit.points import check_points, control_points
+from barpc.fit.rpc import smallest_denominator
 from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor.rpc import RPC
@@ -181,7 +181,7 @@ def radar(data: Path, peer: Peer) -> None:
 
 
 def physical(data: Path) -> None:
-    from barpc.pointio.tables import read_correspondences
+    from barpc.pointio.ground import read_correspondences
 
     points = read_correspondences(data / "physical" / "GRID_P1BP--2017092838284574CP.tif")
     vendors = read_rpc(data / "physical" / "RPC_P1BP--2017092838284574CP.XML")

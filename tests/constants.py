@@ -17,7 +17,7 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
         "keypoints_per_cell": ("barpc.tie.features.PER_CELL",),
         "contrast": ("barpc.tie.features.CONTRAST",),
         "tolerance": ("barpc.tie.matching.TOLERANCE",),
-        "patch": ("barpc.tie.tracks.PATCH",),
+        "patch": ("barpc.tie.register.PATCH",),
     },
     AdjustOptions: {
         "sigma_shift": ("barpc.ba.priors.IMAGE_SIGMA",),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.dem import Dem, Grid, localize_on_terrain
+from barpc.dem import Dem, HeightGrid, localize_on_terrain
 from barpc.errors import BarpcWarning, InputError
 from barpc.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
@@ -107,7 +107,7 @@ def test_a_grid_that_goes_around_the_earth_has_no_seam(tmp_path):
     header = np.array([-90.0, -180.0, 10.0, 10.0], ">f8").tobytes() + np.array([19, 36], ">i4").tobytes()
     lon = np.radians(np.arange(-180, 180, 10.0))
     path.write_bytes(header + np.tile(np.cos(lon), (19, 1)).astype(">f4").tobytes())
-    grid = Grid.open(path)
+    grid = HeightGrid.open(path)
     expected = (-1.0 + np.cos(np.radians(170))) / 2
     np.testing.assert_allclose(grid.sample([175.0, -185.0, 535.0, -175.0], 0.0), expected, atol=1e-6)
     assert grid.sample(180.0, 90.0) == pytest.approx(-1.0)
@@ -132,7 +132,7 @@ HEADER = np.array([-90.0, -180.0, 10.0, 10.0], ">f8").tobytes() + np.array([19, 
 def test_a_file_that_is_not_what_its_name_says_is_refused(name, data, tmp_path):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(InputError, match=name.replace(".", r"\.")):
-        Grid.open(tmp_path / name)
+        HeightGrid.open(tmp_path / name)
 
 
 def test_a_tile_and_a_geoid_are_read_as_their_bytes_stand(tmp_path):
@@ -141,7 +141,7 @@ def test_a_tile_and_a_geoid_are_read_as_their_bytes_stand(tmp_path):
     tile = rng.integers(-100, 5000, (1201, 1201)).astype(">i2")
     tile[3, 5] = -32768
     (tmp_path / "S34W071.hgt").write_bytes(tile.tobytes())
-    grid = Grid.open(tmp_path / "S34W071.hgt")
+    grid = HeightGrid.open(tmp_path / "S34W071.hgt")
     expected = np.where(tile == -32768, np.nan, tile.astype(float))
     np.testing.assert_array_equal(grid.read(0, 1201, 0, 1201), expected)
     assert grid.reference == "EGM96 height"
@@ -150,7 +150,7 @@ def test_a_tile_and_a_geoid_are_read_as_their_bytes_stand(tmp_path):
     geoid = rng.normal(0, 30, (19, 36)).astype(">f4")
     geoid[2, 1] = -88.8888
     (tmp_path / "g.gtx").write_bytes(HEADER + geoid.tobytes())
-    grid = Grid.open(tmp_path / "g.gtx")
+    grid = HeightGrid.open(tmp_path / "g.gtx")
     heights = grid.sample(*np.meshgrid(np.arange(-180, 180, 10.0), np.arange(-90, 91, 10.0)))
     np.testing.assert_array_equal(
         heights, np.where(geoid == np.float32(-88.8888), np.nan, geoid.astype(float))
@@ -160,9 +160,9 @@ def test_a_tile_and_a_geoid_are_read_as_their_bytes_stand(tmp_path):
 
 def test_a_dem_without_crs_is_refused(tmp_path):
     with pytest.raises(InputError, match="needs a CRS"):
-        Grid.open(write_dem(tmp_path / "a.tif", None))
+        HeightGrid.open(write_dem(tmp_path / "a.tif", None))
     with pytest.raises(InputError, match="no such file"):
-        Grid.open(tmp_path / "b.tif")
+        HeightGrid.open(tmp_path / "b.tif")
 
 
 def test_srtm_over_mont_ventoux_is_what_gdal_reads_plus_the_geoid(shared_data):

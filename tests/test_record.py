@@ -7,16 +7,16 @@ import json
 import numpy as np
 import pytest
 
-from barpc.record import from_record, to_record
+from barpc.frozen import from_arrays, to_arrays
 from barpc.scene import Tracks
 
 from .sensor.conftest import make_rpc
 
 
 def through_a_file(value, path):
-    np.savez(path, **to_record(value))
+    np.savez(path, **to_arrays(value))
     with np.load(path, allow_pickle=False) as data:
-        return from_record({name: data[name] for name in data.files})
+        return from_arrays({name: data[name] for name in data.files})
 
 
 def test_values_come_back_to_the_bit(tmp_path):
@@ -45,7 +45,7 @@ def test_dataclasses_of_barpc_come_back(tmp_path):
 @pytest.mark.parametrize("value", [object(), {1, 2}, np.array([None]), 3j, Exception("x")])
 def test_anything_else_is_refused(value):
     with pytest.raises(TypeError):
-        to_record(value)
+        to_arrays(value)
 
 
 @pytest.mark.parametrize(
@@ -61,11 +61,11 @@ def test_anything_else_is_refused(value):
 )
 def test_a_forged_record_makes_nothing(frame):
     with pytest.raises(ValueError):
-        from_record({"frame": np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8)})
+        from_arrays({"frame": np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8)})
 
 
 def test_a_damaged_record_is_a_value_error():
     with pytest.raises(ValueError):
-        from_record({})
+        from_arrays({})
     with pytest.raises(ValueError):
-        from_record({"frame": np.frombuffer(b"{half", dtype=np.uint8)})
+        from_arrays({"frame": np.frombuffer(b"{half", dtype=np.uint8)})

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from barpc.errors import RpcFormatError
-from barpc.safexml import parse_xml
+from barpc.sidefile import parse_xml
 
 LAUGHS = b'<!DOCTYPE a [<!ENTITY x "lol"><!ENTITY y "&x;&x;&x;&x;">]><a>&y;</a>'
 

@@ -17,7 +17,7 @@ import pytest
 
 import barpc
 from barpc.errors import BarpcError, InputError
-from barpc.record import load_npz
+from barpc.frozen import load_npz
 from barpc.rpcio import FORMATS
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import parse
@@ -217,7 +217,6 @@ DIRECT = {
     "handoff.py": "reopens what barpc has just written, as its consumers do",
     "raster.py": "images, checked there",
     "workspace.py": "barpc's own source, images' fingerprints, the state",
-    "owned.py": "the state",
     "pipeline/executor.py": "arrays that the caller has put down for its workers",
     "cameras.py": "no file: a row of the table of openers",
     "report/load.py": "the schema, which is part of the package",
@@ -246,7 +245,7 @@ def _opens(call: ast.Call) -> bool:
     if name in ARRAYS_OF_A_PATH:
         return owner == "np"
     writes = bool(words & {"w", "wb", "r+b"})
-    members = owner in ("archive", "ZipFile", "Dem", "Grid")
+    members = owner in ("archive", "ZipFile", "Dem", "HeightGrid")
     return name in ("open", "read_text", "read_bytes") and not writes and not members
 
 

@@ -15,8 +15,8 @@ import scipy.linalg as la
 
 from barpc.ba.blocks import CameraPrior, JointPrior
 from barpc.errors import InputError
+from barpc.frozen import load_npz
 from barpc.geodesy import Array
-from barpc.record import load_npz
 from barpc.sidefile import ARRAYS
 
 if TYPE_CHECKING:

@@ -14,7 +14,6 @@ from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.terminal import as_json, echo, say, tell_gate
 from barpc.errors import InputError, OutputError
 from barpc.handoff import Reading, refuse_hiding, unverified, verify
-from barpc.plain import plain_path
 from barpc.raster import open_raster
 from barpc.rpcio import (
     CARRIERS,
@@ -30,6 +29,7 @@ from barpc.rpcio import (
 )
 from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import plain_path
 from barpc.workspace import Workspace
 
 Window = tuple[int, int, int, int]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import click
 
 from barpc.cli.terminal import THREADS
-from barpc.plain import visible
+from barpc.errors import visible
 
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from barpc.plain import visible
+from barpc.errors import visible
 
 EXIT_GATE = 3
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

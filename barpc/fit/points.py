@@ -45,25 +45,10 @@ def terrain_range(
     dem: Callable[[Array, Array], Array],
     margin: float,
 ) -> tuple[float, float]:
-    """Altitudes of a DEM over an image, with a margin.
+    """Lowest and highest altitude [m] of a DEM under an image of `size` (width, height), with a margin either side.
 
-    Parameters
-    ----------
-    model : SensorModel
-        The camera.
-    size : (width, height)
-        [px].
-    alt_range : (low, high)
-        Altitudes [m] that the footprint is looked for at.
-    dem : callable
-        (lon, lat) [deg] -> altitude [m above the ellipsoid], NaN where it has none.
-    margin : float
-        Added below and above [m]; the paper takes 500.
-
-    Raises
-    ------
-    FitError
-        The DEM has no altitude under the image.
+    `alt_range` [m] is where the footprint is looked for; `dem` takes lon, lat [deg] and gives altitudes [m above the
+    ellipsoid], NaN where it has none; the paper's `margin` [m] is 500.
     """
     (west, east), (south, north) = _ground_box(model, size, alt_range)
     lon, lat = np.meshgrid(np.linspace(west, east, _SAMPLES), np.linspace(south, north, _SAMPLES))
@@ -80,35 +65,18 @@ def terrain_range(
 def control_points(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions
 ) -> tuple[Array, Array]:
-    """Grid of control points.
+    """Grid of control points: ground (n_x, n_y, n_alt, 3) lon, lat [deg], alt [m], and image (n_x, n_y, n_alt, 2) [px].
 
-    Parameters
-    ----------
-    model : SensorModel
-        The camera to be sampled.
-    size : (width, height)
-        [px]; the grid spans the outer edges of the image.
-    alt_range : (low, high)
-        [m above the ellipsoid].
-    options : FitOptions
-        Its ``grid``, ``space`` and ``nodes``.
-
-    Returns
-    -------
-    ground : (n_x, n_y, n_alt, 3)
-        lon, lat [deg], alt [m]; longitudes run on across the antimeridian. NaN where the model fails.
-    image : (n_x, n_y, n_alt, 2)
-        col, row [px].
+    It spans the outer edges of the image and `alt_range` [m]; longitudes run on across the antimeridian. NaN where
+    the model fails.
     """
     if min(size) < 1:
         raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
-    n_x, n_y, n_alt = options.grid
-    alt = spaced(*alt_range, n_alt, options.nodes)
     if options.space == "ground":
         x, y = _ground_box(model, size, alt_range)
     else:
         x, y = (-0.5, size[0] - 0.5), (-0.5, size[1] - 0.5)
-    axes = spaced(*x, n_x, options.nodes), spaced(*y, n_y, options.nodes), alt
+    axes = (spaced(*ends, n, options.nodes) for ends, n in zip((x, y, alt_range), options.grid, strict=True))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     if options.space == "ground":
         return points, model.project(points)
@@ -133,17 +101,9 @@ def _ground_box(
 
 
 def check_points(ground: Array) -> Iterator[Array]:
-    """Middles of consecutive control points: strictly inside the box, never used by the fit.
+    """Middles (M, 3) of consecutive control points (n_x, n_y, n_alt, 3), the finite ones, some thousands at a time.
 
-    Parameters
-    ----------
-    ground : (n_x, n_y, n_alt, 3)
-        Control points; lon, lat [deg], alt [m].
-
-    Yields
-    ------
-    middle : (M, 3)
-        lon, lat [deg], alt [m]; the finite ones, some thousands at a time.
+    Strictly inside the box, and never used by the fit.
     """
     step = max(1, _SLAB // max(1, (ground.shape[1] - 1) * (ground.shape[2] - 1)))
     for start in range(0, ground.shape[0] - 1, step):
@@ -163,22 +123,7 @@ def extent(points: Array) -> tuple[Array, Array]:
 
 
 def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) -> tuple[Array, Array]:
-    """Correspondences fit to be fitted, longitudes made continuous.
-
-    Parameters
-    ----------
-    ground : (N, 3)
-        lon, lat [deg], alt [m].
-    image : (N, 2)
-        col, row [px].
-    allow_mirrored : bool
-        Do not suspect swapped columns behind a mirrored image.
-
-    Raises
-    ------
-    FitError
-        As for `numbers`; or columns that look swapped, points on a line, in a plane or mostly the same.
-    """
+    """As `numbers`; FitError too where columns look swapped (unless `allow_mirrored`) or points determine no RPC."""
     ground, image = numbers(ground, image)
     _check_geometry(ground, image, allow_mirrored)
     distinct = len(np.unique(ground, axis=0)) if len(ground) < 400 else len(ground)
@@ -188,15 +133,11 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
 
 
 def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
-    """Points (N, 3) and (N, 2) as finite arrays, longitudes made continuous.
+    """Points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made continuous.
 
-    Raises
-    ------
-    FitError
-        No points, a wrong shape, numbers that are not finite or out of range.
+    FitError: no points, a wrong shape, numbers that are not finite or out of range.
     """
-    ground = np.asarray(ground, dtype=np.float64)
-    image = np.asarray(image, dtype=np.float64)
+    ground, image = np.asarray(ground, dtype=np.float64), np.asarray(image, dtype=np.float64)
     if ground.ndim != 2 or ground.shape[1:] != (3,) or image.shape != (len(ground), 2):
         raise FitError(f"points: expected (N, 3) and (N, 2), found {ground.shape} and {image.shape}")
     if not len(ground):
@@ -204,16 +145,14 @@ def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
     bad = np.flatnonzero(~np.isfinite(ground.sum(axis=1) + image.sum(axis=1)))
     if len(bad):
         raise FitError(f"points: {len(bad)} of {len(ground)} are not finite (the first is point {bad[0]})")
-    for axis, (name, low, high) in enumerate(_RANGES):
-        value = ground[:, axis]
+    for value, (name, low, high) in zip(ground.T, _RANGES, strict=True):
         if value.min() < low or value.max() > high:
             wrong = value.min() if value.min() < low else value.max()
             raise FitError(
                 f"points: {wrong:g} is not a {name}: are the columns swapped? Give lon, lat [deg], alt [m]"
             )
     if np.ptp(ground[:, 0]) > 180.0:
-        ground = ground.copy()
-        ground[:, 0] = wrap_longitude(ground[:, 0], ground[0, 0])
+        ground = np.column_stack([wrap_longitude(ground[:, 0], ground[0, 0]), ground[:, 1:]])
     return ground, image
 
 
@@ -253,13 +192,7 @@ def _covariance(ground: Array, image: Array, center: Array, span: Array) -> Arra
 
 
 def _check_order(jacobian: Array) -> None:
-    """Refuse an image that is mirrored as given, and square and upright with two columns swapped.
-
-    Parameters
-    ----------
-    jacobian : (2, 2)
-        d(col, row) / d(east, north) [px/m].
-    """
+    """Refuse an image mirrored as given whose d(col, row) / d(east, north) [px/m] is square and upright."""
     a, b = np.linalg.norm(jacobian, axis=1)
     square = 0.5 < a / b < 2.0 and abs(jacobian[0] @ jacobian[1]) < 0.5 * a * b
     if np.linalg.det(jacobian) < 0 or not square:  # rows run down: a view from above is < 0

@@ -1,24 +1,144 @@
-"""Fit an RPC to any sensor model, or to given points, and certify it."""
+"""Fit an RPC to any sensor model, or to given points, and certify it on points that the fit has not seen."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
-from barpc.fit.certificate import Errors, RpcFit, coverage, roundtrip, smallest_denominator
 from barpc.fit.points import check_points, control_points, extent, numbers, screened, widened
 from barpc.fit.solve import Solution, solve
-from barpc.geodesy import Array
+from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
-from barpc.sensor.rpc import RPC
+from barpc.sensor.rpc import RPC, monomials
 
 _CHUNK = 8192
 _LOOPS = 4096  # round trips that a table of points is tried on, about
+_BEYOND = 1.25  # the box and 25 %
+
+
+@dataclass(frozen=True, eq=False)
+class RpcFit:
+    """A fitted RPC and its certificate.
+
+    Parameters
+    ----------
+    rpc : RPC
+        The result.
+    rmse_cnp, max_cnp : (2,)
+        Root mean square and largest error of col, row on the control points [px].
+    rmse_ckp, max_ckp : (2,)
+        The same on the check points, which the fit has not seen [px].
+    min_denominator : float
+        Smallest denominator over the ground box and 25 % around it, over that at its centre; near or below 0: a pole.
+    roundtrip : float
+        Largest distance of a check point from where its projection is localised [px]; infinite where that fails.
+    coverage : float
+        Share of the image inside the convex hull of the control points.
+    h : (2,)
+        Regularisation used for col, row.
+    iterations : int
+        Passes over the points.
+    num_cnp, num_ckp : int
+        Number of points.
+    method : str
+        The solver whose result this is.
+    """
+
+    rpc: RPC
+    rmse_cnp: Array
+    max_cnp: Array
+    rmse_ckp: Array
+    max_ckp: Array
+    min_denominator: float
+    roundtrip: float
+    coverage: float
+    h: Array
+    iterations: int
+    num_cnp: int
+    num_ckp: int
+    method: str
+
+    def summary(self) -> dict[str, Any]:
+        """The certificate as plain numbers and lists, col before row, lengths in px."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
+        return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
+
+    def verdict(self, tolerance: float) -> str:
+        """What is wrong with this fit at a tolerance [px], in words; empty if nothing is."""
+        worst = float(self.max_ckp.max())
+        if not worst <= tolerance:
+            return (
+                f"the RPC misses its check points by up to {worst:.3g} px (RMSE col {self.rmse_ckp[0]:.3g}, "
+                f"row {self.rmse_ckp[1]:.3g}), wanted {tolerance:g}: fit a smaller altitude range or a "
+                "smaller image, or raise the tolerance"
+            )
+        if not self.min_denominator > 0:
+            return "the RPC has a pole near the scene: use more control points or a stronger regularisation"
+        if not self.roundtrip <= max(tolerance, 1e-6):
+            return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
+        return ""
+
+
+@dataclass
+class Errors:
+    """Running root mean square and largest error of (N, 2) residuals [px]."""
+
+    count: int = 0
+    squares: Array = field(default_factory=lambda: np.zeros(2))
+    largest: Array = field(default_factory=lambda: np.zeros(2))
+
+    def add(self, residual: Array) -> None:
+        """Take in residuals (N, 2); one that is NaN makes the result NaN."""
+        if len(residual):
+            self.count += len(residual)
+            self.squares = self.squares + np.einsum("ij,ij->j", residual, residual)
+            self.largest = np.maximum(self.largest, np.abs(residual.T).max(axis=1))
+
+    @property
+    def rmse(self) -> Array:
+        """Root mean square (2,) [px]."""
+        return np.asarray(np.sqrt(self.squares / self.count)) if self.count else np.full(2, np.nan)
+
+
+def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
+    """Smallest denominator over a box `low`, `high` (3,) [deg, deg, m] and 25 % around it, over that at its centre."""
+    corner = rpc.normalize(np.stack([low, high]))
+    middle, half = corner.mean(axis=1), 0.5 * np.abs(corner[:, 1] - corner[:, 0])
+    t = np.linspace(-_BEYOND, _BEYOND, 11)
+    lattice = np.stack(np.meshgrid(t, t, t, indexing="ij")).reshape(3, -1)
+    value = rpc.coeffs[1::2] @ monomials(middle[:, None] + half[:, None] * lattice)
+    center = value[:, [lattice.shape[1] // 2]]
+    return float((value / center).min())
+
+
+def roundtrip(rpc: RPC, ground: Array) -> float:
+    """Largest distance [px] between ground points (N, 3) and where their projections are localised."""
+    image, jacobian = rpc.project_jacobian(ground)
+    back = rpc.localize(image, ground[:, 2])
+    miss = back - ground
+    miss[:, 0] = wrap_longitude(miss[:, 0])
+    distance = np.abs(np.einsum("nij,nj->ni", jacobian, miss))
+    return float(distance.max(initial=0.0)) if np.isfinite(distance).all() else float("inf")
+
+
+def coverage(image: Array, low: Array, high: Array) -> float:
+    """Share of the rectangle `low`, `high` (2,) [px] inside the convex hull of image points (N, 2) [px]."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    direction = np.column_stack([np.cos(angle), np.sin(angle)])  # outside is beyond all in one direction
+    reach = np.full(len(angle), -np.inf)
+    for start in range(0, len(image), _CHUNK):
+        part = (image[start : start + _CHUNK] - low) / (high - low)
+        reach = np.maximum(reach, (direction @ part.T).max(axis=1))
+    t = (np.arange(20) + 0.5) / 20
+    cells = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
+    return float((cells @ direction.T <= reach + 1e-9).all(axis=1).mean())
 
 
 def fit_rpc(
@@ -38,18 +158,11 @@ def fit_rpc(
     size : (width, height)
         Image that the RPC is for [px].
     alt_range : (low, high)
-        Altitudes that the RPC is for [m above the ellipsoid]; at least 100 m are taken around a flat
-        scene.
+        Altitudes that the RPC is for [m above the ellipsoid]; at least 100 m are taken around a flat scene.
     options : FitOptions, optional
         Grid, solver, tolerance.
     strict : bool
-        Raise where the RPC misses the tolerance; otherwise give the best one found, to be judged by its
-        `RpcFit.verdict`.
-
-    Returns
-    -------
-    RpcFit
-        The RPC and its certificate on check points.
+        Raise where the tolerance is missed; otherwise give the best fit found, to be judged by `RpcFit.verdict`.
 
     Raises
     ------
@@ -85,12 +198,9 @@ def _found(cnp: Array, image: Array, alt_range: tuple[float, float]) -> tuple[Ar
         )
     if ok.all():
         return cnp, image
-    warnings.warn(
-        f"{np.count_nonzero(~ok)} of {ok.size} control points have no ground point and are left out: the "
-        "RPC extrapolates there",
-        BarpcWarning,
-        stacklevel=3,
-    )
+    count = f"{np.count_nonzero(~ok)} of {ok.size} control points"
+    message = f"{count} have no ground point and are left out: the RPC extrapolates there"
+    warnings.warn(message, BarpcWarning, stacklevel=3)
     return cnp[ok], image[ok]
 
 
@@ -110,8 +220,7 @@ def fit_rpc_points(
     Parameters
     ----------
     ground : (N, 3)
-        lon, lat [deg], alt [m above the ellipsoid]. Points that all have one altitude give an RPC without
-        altitude terms, to be used at that altitude.
+        lon, lat [deg], alt [m above the ellipsoid]; all at one altitude give an RPC for that altitude only.
     image : (N, 2)
         col, row [px].
     sigma : (N,), optional
@@ -126,11 +235,6 @@ def fit_rpc_points(
         Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
     strict : bool
         As for `fit_rpc`.
-
-    Returns
-    -------
-    RpcFit
-        The RPC and its certificate.
 
     Raises
     ------
@@ -203,13 +307,7 @@ def _certified(
 def _first_accepted(
     attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool
 ) -> RpcFit:
-    """The fit by the method asked for; with ``auto``, the first that is accepted.
-
-    Raises
-    ------
-    FitError
-        None is, and `strict`; the message is about the best.
-    """
+    """The fit by the method asked for, with ``auto`` the first accepted; without one the best, or a FitError on it."""
     methods = [str(options.method)]
     if options.method == "auto":
         methods = ["ridge", "lcurve"] + (["vendor-denominators"] if vendor is not None else [])

@@ -1,4 +1,11 @@
-"""From points to the coefficients of an RPC: one function a method.
+"""From points to the coefficients of an RPC: the linearised system, and one function a method.
+
+One coordinate y = a(x) / b(x), b_0 = 1, is linear in its unknowns once it is multiplied by b:
+
+    w (m(x), -y m'(x)) (a, b') = w y,      w = 1 / b(x)  or 1                       (eq. 3 of the paper)
+
+m are the twenty monomials in RPC00B order, m' those without the constant one. Every method works on the triangular
+factor of (M | y), made chunk by chunk: no condition number is squared, whatever the number of points.
 
 ``ridge``, the default: least squares with a penalty scaled by the noise. Bayes' rule for coefficients of known size:
 with noise sigma in y and a coefficient expected within +- t, the penalty is (sigma / t)^2 x^2. Exact points have no
@@ -12,34 +19,164 @@ the compressed system, which has the same singular values.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtpqrt
 
 from barpc.errors import FitError
 from barpc.fit.points import extent
 from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
-from barpc.fit.system import Compressed, IntArray, Problem
-from barpc.geodesy import Array
+from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
-from barpc.sensor.rpc import MONOMIALS, RPC
+from barpc.sensor.rpc import MONOMIALS, RPC, monomials
 
+IntArray = npt.NDArray[np.int64]
+Rounding = Callable[[Array], Array]
+"""Coefficients (...) to the nearest ones that a file can hold."""
+Found = tuple[Array, list["Compressed"], Array, int]
+"""Coefficients (4, 20); final systems of col and row, penalties included; their regularisation h (2,); passes."""
+
+CHUNK = 1024
+"""Rows taken into the triangle at a time: what is worked on stays in cache."""
+_BLOCK = 8  # columns of a Householder block
+ALL = np.arange(20)
+_DEPENDENT = 1e-9  # rms of what a monomial adds to those of lower degree, on these points
 _DEGREE = np.array([0, *(len(monomial) for monomial in MONOMIALS[1:])])
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
 _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
 _SIGMA_STEPS = 2
-_EPS = float(np.finfo(np.float64).eps)
-MAX_PASSES = 20
 TAU = 0.003
 """Standard deviation that ``ridge`` expects of a denominator coefficient of degree one (no unit)."""
 WEIGHTED = 1
 """Further passes of ``ridge`` with the residuals weighted by 1 / denominator, where that varies."""
+_EPS = float(np.finfo(np.float64).eps)
+MAX_PASSES = 20
 TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _SAMPLES = 200  # of the L-curve
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Compressed:
+    """Triangle R (k + 1, k + 1) of the QR decomposition of (M | y) of one coordinate, M of `num_points` rows.
+
+    Its last column is Q' y, its last entry the norm of the part of y that no solution reaches.
+    """
+
+    triangle: Array
+    num_points: int
+
+    @property
+    def matrix(self) -> Array:
+        """(k, k): what stands for M."""
+        return self.triangle[:-1, :-1]
+
+    @property
+    def target(self) -> Array:
+        """(k,): what stands for y."""
+        return self.triangle[:-1, -1]
+
+    @property
+    def freedom(self) -> int:
+        """Points beyond the number of unknowns, at least one."""
+        return max(self.num_points - len(self.matrix), 1)
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the noise in y, from the residual of the free solution."""
+        return abs(float(self.triangle[-1, -1])) / float(np.sqrt(self.freedom))
+
+    def squares(self, solution: Array) -> float:
+        """Sum of squares of M x - y."""
+        rest = self.matrix @ solution - self.target
+        return float(rest @ rest + self.triangle[-1, -1] ** 2)
+
+    def penalized(self, penalty: Array, toward: Array | float = 0.0) -> Compressed:
+        """The system with the rows diag(`penalty`) x = `toward` below."""
+        rows = np.column_stack([np.diag(penalty), np.broadcast_to(toward, penalty.shape)])
+        return Compressed(_take_in(self.triangle, rows), self.num_points)
+
+
+def _take_in(triangle: Array, rows: Array) -> Array:
+    """Triangular factor of `triangle` on top of `rows`."""
+    block = min(_BLOCK, len(triangle))
+    factor: Array = dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0]
+    return factor
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Points, and the offsets and scales of the RPC that is to be fitted to them."""
+
+    ground: Array  # (N, 3) lon, lat [deg], alt [m]
+    image: Array  # (N, 2) [px]
+    norm: Normalization
+    active: IntArray = field(default_factory=lambda: ALL)  # monomials in use, the constant one first
+    weight: Array | None = None  # (N,)
+    first: Compressed | None = None  # of col without a denominator, where it is known already
+
+    def screened(self) -> Problem:
+        """The same problem without the monomials that its points do not tell from those of lower degree.
+
+        All twenty stay where altitudes abound; of points at one altitude those without H, of two altitudes those of
+        degree one in H. A dependent one would make a = b = 0 a solution.
+        """
+        first = self.compressed(0)
+        adds = np.abs(np.diag(first.matrix)[: len(self.active)]) > _DEPENDENT * np.sqrt(len(self.image))
+        return replace(self, first=first) if adds.all() else replace(self, active=self.active[adds])
+
+    def rows(
+        self, axis: int, denominator: Array | None = None, free: bool = True
+    ) -> Iterator[tuple[slice, Array]]:
+        """Rows (n, k + 1) of (M | y) of col (`axis` 0) or row (1), some hundred points at a time.
+
+        A denominator (20,) weights the rows by 1 / b; its coefficients are unknowns too where `free`.
+        """
+        m, norm = len(self.active), self.norm
+        k = 2 * m - 1 if free else m
+        for start in range(0, len(self.image), CHUNK):
+            part = slice(start, start + CHUNK)
+            lonlatalt = self.ground[part].T.copy()
+            lonlatalt[0] = wrap_longitude(lonlatalt[0], norm.ground_offset[0])
+            basis = monomials((lonlatalt - norm.ground_offset[:, None]) / norm.ground_scale[:, None])
+            y = (self.image[part, axis] - norm.image_offset[axis]) / norm.image_scale[axis]
+            used = basis if m == len(basis) else basis[self.active]
+            block = np.empty((k + 1, len(y)))
+            block[:m] = used
+            if free:
+                np.multiply(used[1:], -y, out=block[m:k])
+            block[k] = y
+            if denominator is not None:
+                block[: k + 1 if free else m] /= denominator @ basis
+            if self.weight is not None:
+                block *= self.weight[part]
+            yield part, block.T
+
+    def compressed(self, axis: int, denominator: Array | None = None, free: bool = True) -> Compressed:
+        """The system of the rows of the same parameters."""
+        if self.first is not None and axis == 0 and denominator is None and free:
+            return self.first
+        size = 2 * len(self.active) if free else len(self.active) + 1
+        triangle: Array = np.zeros((size, size), order="F")
+        for _, rows in self.rows(axis, denominator, free):
+            triangle = _take_in(triangle, rows)
+        return Compressed(np.triu(triangle), len(self.image))
+
+    def expanded(self, solution: Array, denominator: Array | None = None) -> Array:
+        """Numerator and denominator (2, 20) of a solution; monomials not in use are zero."""
+        m = len(self.active)
+        out = np.zeros((2, 20))
+        out[0, self.active] = solution[:m]
+        if denominator is not None:
+            out[1] = denominator
+        else:
+            out[1, 0], out[1, self.active[1:]] = 1.0, solution[m:]
+        return out
 
 
 def expected_size(active: IntArray) -> Array:
@@ -52,14 +189,6 @@ def expected_size(active: IntArray) -> Array:
     return np.concatenate([_NUMERATOR[degree], TAU * _DENOMINATOR[degree[1:]]])
 
 
-def penalized(system: Compressed, penalty: Array) -> Compressed:
-    """The system with the rows diag(`penalty`) x = 0 below."""
-    k = len(penalty)
-    rows = np.zeros((k, k + 1), order="F")
-    rows[np.arange(k), np.arange(k)] = penalty
-    return system.stacked(rows)
-
-
 def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float]:
     """The system with each unknown penalised by sigma / its expected size, and sigma.
 
@@ -67,25 +196,19 @@ def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float
     penalised one tells the noise better. Never quite singular: there is a floor at the rounding.
     """
     floor = 16 * _EPS * float(np.abs(system.matrix).max())
-    dof = max(system.num_points - len(expected), 1)
     sigma = system.sigma
     for _ in range(_SIGMA_STEPS):
         penalty = np.where(np.isfinite(expected), np.maximum(sigma / expected, floor), 0.0)
-        penalised = penalized(system, penalty)
-        sigma = float(np.sqrt(system.squares(solution(penalised)) / dof))
+        penalised = system.penalized(penalty)
+        sigma = float(np.sqrt(system.squares(solution(penalised)) / system.freedom))
     return penalised, sigma
 
 
-def solution(system: Compressed, quantize: Callable[[Array], Array] | None = None) -> Array:
+def solution(system: Compressed, quantize: Rounding | None = None) -> Array:
     """The least-squares solution (k,), by back substitution.
 
-    Parameters
-    ----------
-    system : Compressed
-        Penalties included.
-    quantize : callable, optional
-        Rounds a coefficient to what a file can hold. Each is rounded in turn, and the ones still to come
-        make up for its rounding (Babai's nearest plane).
+    Where quantized, each coefficient is rounded in turn and the ones still to come make up for it (Babai's nearest
+    plane).
     """
     matrix, target = system.matrix, system.target
     if quantize is None:
@@ -97,17 +220,16 @@ def solution(system: Compressed, quantize: Callable[[Array], Array] | None = Non
 
 
 def corner(systems: Sequence[Compressed]) -> float:
-    """Regularisation h at the corner of the L-curve of systems that share one h.
+    """Regularisation h at the corner of the L-curve of systems that share it: the largest curvature, by grids of h.
 
     The curve (log |M x - y|, log |x|) and its curvature have a closed form in the singular values (Hansen,
-    "Rank-deficient and discrete ill-posed problems", 1998); the largest curvature is searched on a
-    geometric range of h and around its best value.
+    "Rank-deficient and discrete ill-posed problems", 1998).
     """
     parts = [np.linalg.svd(system.matrix) for system in systems]
     s = np.concatenate([part.S for part in parts])
     beta = np.concatenate([part.U.T @ system.target for part, system in zip(parts, systems, strict=True)])
     rest = sum(float(system.triangle[-1, -1]) ** 2 for system in systems)
-    low = max(float(s.min()), float(s.max()) * 16 * float(np.finfo(np.float64).eps))
+    low = max(float(s.min()), float(s.max()) * 16 * _EPS)
     high = float(s.max())
     for _ in range(4):
         h = np.geomspace(low, high, _SAMPLES)
@@ -124,105 +246,61 @@ def _curvature(h: Array, s: Array, beta: Array, rest: float) -> Array:
     xi2, beta2 = (beta / s) ** 2, beta**2
     f = s**2 / (s**2 + h**2)
     g = 1.0 - f
-    f1 = -2.0 * f * g / h
-    f2 = -f1 * (3.0 - 4.0 * f) / h
+    # -h/2 df/dh: curvature takes neither the parameter's scale nor d2f/dh2, which is along the curve
+    slope = f * g
     eta2, rho2 = (f * f * xi2).sum(axis=1), (g * g * beta2).sum(axis=1) + rest
-    phi, psi = (f * f1 * xi2).sum(axis=1), (g * f1 * beta2).sum(axis=1)
-    dphi = ((f1 * f1 + f * f2) * xi2).sum(axis=1)
-    dpsi = ((g * f2 - f1 * f1) * beta2).sum(axis=1)
-    # derivatives of log(eta) and log(rho) with respect to h
-    eta1, rho1 = phi / eta2, -psi / rho2
-    eta22, rho22 = dphi / eta2 - 2.0 * eta1**2, -dpsi / rho2 - 2.0 * rho1**2
+    # derivatives of log(eta) and log(rho)
+    eta1, rho1 = -(f * slope * xi2).sum(axis=1) / eta2, (g * slope * beta2).sum(axis=1) / rho2
+    eta22 = (slope**2 * xi2).sum(axis=1) / eta2 - 2.0 * eta1**2
+    rho22 = (slope**2 * beta2).sum(axis=1) / rho2 - 2.0 * rho1**2
     return np.asarray((rho1 * eta22 - rho22 * eta1) / (rho1**2 + eta1**2) ** 1.5)
 
 
-@dataclass
-class _State:
-    """The best solution so far: coefficients, solved systems, RMSE [px]; and the last RMSE."""
-
-    coeffs: Array
-    solved: list[Compressed]
-    best: float
-    last: float
-
-
 def solve_lcurve(problem: Problem, axes: Sequence[int]) -> tuple[Array, list[Compressed], float, int]:
-    """Fit the coordinates `axes` (0 col, 1 row) with one h.
+    """Fit the coordinates `axes` (0 col, 1 row) with one h; both at once is the paper's joint problem of 78 unknowns.
 
-    Parameters
-    ----------
-    problem : Problem
-        The points.
-    axes : sequence of int
-        One coordinate, or both for the paper's joint problem of 78 unknowns.
-
-    Returns
-    -------
-    coeffs : (2 len(axes), 20)
-        Numerator and denominator of each coordinate.
-    solved : list of Compressed
-        Their final systems, penalties included.
-    h : float
-        Regularisation.
-    passes : int
-        Passes over the points.
+    Gives coefficients (2 len(axes), 20), the final systems with their penalties, h, and the passes over the points:
+    weighted ones until the RMSE stands still, then from the best such ones of the ICCV kind (eq. 6).
     """
     systems = [problem.compressed(axis) for axis in axes]
     h = corner(systems)
-    size = np.full(len(systems[0].target), h)
-    penalised = [penalized(system, size) for system in systems]
-    coeffs = np.concatenate([problem.expanded(solution(system)) for system in penalised])
-    state = _State(coeffs, penalised, np.inf, np.inf)
-    passes = 1 + _iterate(problem, axes, state, size, corrected=False)
-    passes += _iterate(problem, axes, state, np.ones_like(size), corrected=True)
-    return state.coeffs, state.solved, h, passes
+    ridge = np.full(len(systems[0].target), h)
+    solved, passes, least = [system.penalized(ridge) for system in systems], 1, np.inf
+    best = _coefficients(problem, solved), solved
+    for penalty, corrected in ((ridge, False), (np.ones_like(ridge), True)):
+        (coeffs, solved), last = best, np.inf
+        for _ in range(MAX_PASSES + 1):
+            passes += 1
+            rmse, following = _reweighted(problem, axes, coeffs, penalty, corrected)
+            if rmse < least:
+                least, best = rmse, (coeffs, solved)
+            if abs(last - rmse) < TOLERANCE:
+                break
+            coeffs, solved, last = _coefficients(problem, following), following, rmse
+    return *best, h, passes
 
 
-def _iterate(problem: Problem, axes: Sequence[int], state: _State, penalty: Array, corrected: bool) -> int:
-    """Weighted passes until the RMSE stands still; with `corrected`, of the ICCV kind (eq. 6)."""
-    coeffs, solved = state.coeffs, state.solved
-    for step in range(1, MAX_PASSES + 2):
-        squares, following = 0.0, []
-        for i, axis in enumerate(axes):
-            system = problem.compressed(axis, coeffs[2 * i + 1])
-            x = np.concatenate([coeffs[2 * i, problem.active], coeffs[2 * i + 1, problem.active[1:]]])
-            squares += system.squares(x) * float(problem.norm.image_scale[axis]) ** 2
-            if corrected:  # |M x - y|^2 + |x - x_previous|^2
-                rows = np.column_stack([np.diag(penalty), x])
-                following.append(system.stacked(rows))
-            else:
-                following.append(penalized(system, penalty))
-        rmse = float(np.sqrt(squares / (len(axes) * len(problem.image))))
-        if rmse < state.best:
-            state.coeffs, state.solved, state.best = coeffs, solved, rmse
-        settled, state.last = abs(state.last - rmse) < TOLERANCE, rmse
-        if settled or step > MAX_PASSES:
-            break
-        solved = following
-        coeffs = np.concatenate([problem.expanded(solution(system)) for system in following])
-    state.last = np.inf
-    return step
+def _coefficients(problem: Problem, systems: list[Compressed], quantize: Rounding | None = None) -> Array:
+    return np.concatenate([problem.expanded(solution(system, quantize)) for system in systems])
+
+
+def _reweighted(
+    problem: Problem, axes: Sequence[int], coeffs: Array, penalty: Array, corrected: bool
+) -> tuple[float, list[Compressed]]:
+    """RMSE [px] of coefficients, and the systems that their denominators weight."""
+    squares, following = 0.0, []
+    for i, axis in enumerate(axes):
+        system = problem.compressed(axis, coeffs[2 * i + 1])
+        x = np.concatenate([coeffs[2 * i, problem.active], coeffs[2 * i + 1, problem.active[1:]]])
+        squares += system.squares(x) * float(problem.norm.image_scale[axis]) ** 2
+        # corrected: |M x - y|^2 + |x - x_previous|^2
+        following.append(system.penalized(penalty, x if corrected else 0.0))
+    return float(np.sqrt(squares / (len(axes) * len(problem.image)))), following
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """An RPC and how it was found.
-
-    Parameters
-    ----------
-    rpc : RPC
-        The result.
-    problem : Problem
-        What was solved.
-    solved : list of Compressed
-        Final systems of col and row, penalties included.
-    h : (2,)
-        Regularisation of col, row.
-    iterations : int
-        Passes over the points.
-    method : str
-        The solver.
-    """
+    """An RPC and how it was found: what was solved, and the final systems of col and row with their penalties."""
 
     rpc: RPC
     problem: Problem
@@ -259,25 +337,16 @@ def tidy(values: Array) -> Array:
 def normalization(
     ground: Array, image: Array, options: FitOptions, vendor: RPC | None = None
 ) -> Normalization:
-    """Offsets and scales that take points into [-1, 1].
+    """Offsets and scales that take points into [-1, 1], rounded to the options' precision.
 
-    Parameters
-    ----------
-    ground : (N, 3)
-        lon (continuous), lat [deg], alt [m].
-    image : (N, 2)
-        col, row [px].
-    options : FitOptions
-        Its ``precision`` rounds what is found.
-    vendor : RPC, optional
-        Ground offsets and scales are taken from it.
+    Those of the ground are the vendor's where one is given.
     """
     (low, high), (left, right) = extent(ground), extent(image)
-    offset, scale = 0.5 * (low + high), 0.5 * (high - low)
     if vendor is not None:
         offset, scale = vendor.ground_offset, vendor.ground_scale
     else:
-        offset, scale = tidy(offset), tidy(np.maximum(scale, [1e-9, 1e-9, ALTITUDE_FLOOR]))
+        offset = tidy(0.5 * (low + high))
+        scale = tidy(np.maximum(0.5 * (high - low), [1e-9, 1e-9, ALTITUDE_FLOOR]))
     middle, half = tidy(0.5 * (left + right)), tidy(np.maximum(0.5 * (right - left), 1e-6))
     found = Normalization(offset, scale, middle, half)
     return found if options.precision is None else PRECISIONS[options.precision].normalization(found)
@@ -292,33 +361,14 @@ def solve(
     weight: Array | None = None,
     vendor: RPC | None = None,
 ) -> Solution:
-    """Fit the coefficients of an RPC to points.
+    """Fit the coefficients of an RPC to points (N, 3) lon (continuous), lat [deg], alt [m] and (N, 2) [px].
 
-    Parameters
-    ----------
-    ground : (N, 3)
-        lon (continuous), lat [deg], alt [m].
-    image : (N, 2)
-        col, row [px].
-    options : FitOptions
-        Parameters of the solvers.
-    method : {"ridge", "lcurve", "lcurve-joint", "vendor-denominators"}
-        The solver.
-    weight : (N,), optional
-        Weights of the points (1 / standard deviation).
-    vendor : RPC, optional
-        Whose denominators "vendor-denominators" keeps.
-
-    Raises
-    ------
-    FitError
-        Too few points, or points that do not determine the coefficients.
+    `method` is a row of `METHODS`, weights (N,) are 1 / standard deviation, `vendor` is whose denominators
+    "vendor-denominators" keeps. FitError: too few points, or points that do not determine the coefficients.
     """
     keeps = method == "vendor-denominators"
     if keeps and vendor is None:
-        raise FitError(
-            "vendor-denominators: the model is not built on an RPC whose denominators could be kept"
-        )
+        raise FitError(f"{method}: the model is not built on an RPC whose denominators could be kept")
     norm = normalization(ground, image, options, vendor if keeps else None)
     problem = Problem(ground, image, norm, weight=weight).screened()
     unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)
@@ -327,75 +377,54 @@ def solve(
             f"{len(ground)} points are too few: each coordinate has {unknowns} unknowns, "
             f"give {unknowns + 1} points or more"
         )
-    return _METHODS[method](problem, options, vendor)
-
-
-def _quantize(options: FitOptions) -> Callable[[Array], Array] | None:
-    return None if options.precision is None else PRECISIONS[options.precision].coeffs
-
-
-def _assembled(
-    problem: Problem, coeffs: Array, solved: list[Compressed], h: Array, passes: int, method: str
-) -> Solution:
-    norm = problem.norm
+    quantize = None if options.precision is None else PRECISIONS[options.precision].coeffs
+    coeffs, solved, h, passes = METHODS[method](problem, quantize, vendor)
     rpc = RPC(coeffs, norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
     return Solution(rpc, problem, solved, h, passes, method)
 
 
-def _ridge(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
+def _ridge(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     expected = expected_size(problem.active)
-    quantize = _quantize(options)
-    coeffs, solved, h, passes = np.zeros((4, 20)), [], np.zeros(2), 1
+    solved, h, passes = [], np.zeros(2), 1
     for axis in range(2):
         denominator = None
         for done in range(1 + WEIGHTED):
             system, sigma = noise_scaled(problem.compressed(axis, denominator), expected)
-            pair = problem.expanded(solution(system))
-            denominator = pair[1]
+            denominator = problem.expanded(solution(system))[1]
             passes = max(passes, 1 + done)
             if np.abs(denominator[1:]).sum() < _EVEN:
                 break
-        coeffs[2 * axis : 2 * axis + 2] = (
-            pair if quantize is None else problem.expanded(solution(system, quantize))
-        )
         solved.append(system)
         h[axis] = sigma / TAU
-    return _assembled(problem, coeffs, solved, h, passes, "ridge")
+    return _coefficients(problem, solved, quantize), solved, h, passes
 
 
-def _lcurve(problem: Problem, options: FitOptions, vendor: RPC | None, joint: bool = False) -> Solution:
-    groups = [[0, 1]] if joint else [[0], [1]]
-    results = [solve_lcurve(problem, axes) for axes in groups]
-    coeffs = np.concatenate([result[0] for result in results])
-    solved = [system for result in results for system in result[1]]
-    quantize = _quantize(options)
-    if quantize is not None:
-        pairs = [problem.expanded(solution(system, quantize)) for system in solved]
-        coeffs = np.concatenate(pairs)
-    h = np.broadcast_to([result[2] for result in results], 2).copy()
-    name, passes = "lcurve-joint" if joint else "lcurve", max(result[3] for result in results)
-    return _assembled(problem, coeffs, solved, h, passes, name)
+def _lcurve(problem: Problem, quantize: Rounding | None, vendor: RPC | None, joint: bool = False) -> Found:
+    results = [solve_lcurve(problem, axes) for axes in ([[0, 1]] if joint else [[0], [1]])]
+    parts, systems, sizes, passes = zip(*results, strict=True)
+    solved = [system for of_axes in systems for system in of_axes]
+    coeffs = np.concatenate(parts) if quantize is None else _coefficients(problem, solved, quantize)
+    return coeffs, solved, np.broadcast_to(sizes, 2).copy(), max(passes)
 
 
-def _vendor_denominators(problem: Problem, options: FitOptions, vendor: RPC | None) -> Solution:
-    quantize = _quantize(options)
-    coeffs, solved = np.zeros((4, 20)), []
-    for axis in range(2):
-        denominator = vendor.coeffs[2 * axis + 1] if vendor is not None else coeffs[1]
+def _vendor_denominators(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+    assert vendor is not None
+    parts, solved = [], []
+    for axis, denominator in enumerate(vendor.coeffs[1::2]):
         denominator = denominator / denominator[0]
         if quantize is not None:
             denominator = quantize(denominator)
         raw = problem.compressed(axis, denominator, free=False)
         system, _ = noise_scaled(raw, expected_size(problem.active)[: len(raw.matrix)])
-        x = solution(system, quantize)
-        coeffs[2 * axis : 2 * axis + 2] = problem.expanded(x, denominator)
+        parts.append(problem.expanded(solution(system, quantize), denominator))
         solved.append(system)
-    return _assembled(problem, coeffs, solved, np.zeros(2), 1, "vendor-denominators")
+    return np.concatenate(parts), solved, np.zeros(2), 1
 
 
-_METHODS: dict[str, Callable[[Problem, FitOptions, RPC | None], Solution]] = {
+METHODS: dict[str, Callable[[Problem, Rounding | None, RPC | None], Found]] = {
     "ridge": _ridge,
     "lcurve": _lcurve,
     "lcurve-joint": partial(_lcurve, joint=True),
     "vendor-denominators": _vendor_denominators,
 }
+"""Name -> solver of a problem; ``vendor-denominators`` keeps those of the vendor's RPC."""

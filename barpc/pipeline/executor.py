@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from barpc.errors import AdjustError, BarpcError, InputError
-from barpc.record import Record, from_record, to_record
+from barpc.frozen import Arrays, from_arrays, to_arrays
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
@@ -139,7 +139,7 @@ class CachingExecutor(Executor):
     def _spill(self, args: tuple[Any, ...]) -> tuple[Any, ...] | Spilled:
         """Arguments as they are, or without the large arrays among them, which a file of the run folder keeps."""
         try:
-            record = to_record(args)
+            record = to_arrays(args)
         except TypeError:  # something that is not kept as a record, such as a user's own sensor
             return args
         large = {}
@@ -228,7 +228,7 @@ class _Task(Future[Any]):
         self.args = ()
         try:
             if error is None and keep:
-                self._owner.workspace.store(self._stage, self._key, to_record(value))
+                self._owner.workspace.store(self._stage, self._key, to_arrays(value))
         except Exception as failed:  # noqa: BLE001  (a full disk: goes to whoever asks for the result)
             error = failed
         if error is None:
@@ -246,7 +246,7 @@ class _Task(Future[Any]):
         self._key = self._owner.key(self.fn, self.args)
         record = self._owner.workspace.load(self._stage, self._key)
         try:
-            return record is not None, None if record is None else from_record(record)
+            return record is not None, None if record is None else from_arrays(record)
         except ValueError as error:
             logger.warning("a kept result is made again: %s", error)
             return False, None
@@ -254,9 +254,9 @@ class _Task(Future[Any]):
 
 @dataclass(frozen=True)
 class Spilled:
-    """The arguments of a task whose large arrays lie in files: what `to_record` made of them, name -> file."""
+    """The arguments of a task whose large arrays lie in files: what `to_arrays` made of them, name -> file."""
 
-    small: Record
+    small: Arrays
     large: Mapping[str, str]
 
     def load(self) -> tuple[Any, ...]:
@@ -268,7 +268,7 @@ class Spilled:
                 f"{error.filename}: a worker cannot read it; images and run folder must be on a disk that all "
                 "workers see under the same path"
             ) from error
-        arguments: tuple[Any, ...] = from_record({**self.small, **arrays})
+        arguments: tuple[Any, ...] = from_arrays({**self.small, **arrays})
         return arguments
 
 

@@ -13,7 +13,7 @@ from barpc.ba import BlockPrior
 from barpc.dem import Dem
 from barpc.errors import InputError
 from barpc.options import RunOptions, declared
-from barpc.pointio.gcp import read_gcps
+from barpc.pointio.ground import read_gcps
 from barpc.pointio.names import ViewNames
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint

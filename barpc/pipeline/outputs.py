@@ -12,7 +12,6 @@ from barpc.errors import OutputError
 from barpc.fit import RpcFit
 from barpc.handoff import verify
 from barpc.options import RunOptions
-from barpc.owned import own_files
 from barpc.pipeline.inputs import PRIOR
 from barpc.report import Run, Summary
 from barpc.report.page import can_render, report_html
@@ -21,7 +20,7 @@ from barpc.report.tables import TABLES
 from barpc.rpcio import CARRIERS, WRITABLE, sidecars, write_camera
 from barpc.scene import View
 from barpc.sensor import SensorModel
-from barpc.workspace import Workspace
+from barpc.workspace import Workspace, own_files
 
 MATCHES = ("matches.csv", "matches.npz")
 

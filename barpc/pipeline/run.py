@@ -21,7 +21,6 @@ from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import Image, image_path, load_views
-from barpc.plain import plain_path
 from barpc.pointio.matches import asp_text, read_matches, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.report import Run, Summary, summarize
@@ -32,6 +31,7 @@ from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
 from barpc.tie.tasks import Progress
 from barpc.workspace import Workspace, fingerprint

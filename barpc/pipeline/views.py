@@ -17,11 +17,11 @@ from rasterio.windows import Window
 
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.errors import BarpcError, ImageError, InputError, RpcError
-from barpc.plain import plain_path
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
+from barpc.sidefile import plain_path
 
 logger = logging.getLogger(__name__)
 

@@ -1,6 +1,1 @@
-"""Files of points: correspondences, GCPs, tie points.
-
-Plain readers, one module a kind: `tables` (ground and image points that an RPC is fitted to).
-"""
-
-from __future__ import annotations
+"""Files of points: GCPs, tie points, correspondences of ground and image, and the names that they use for images."""

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from barpc.errors import InputError
+from barpc.frozen import load_npz
 from barpc.geodesy import Array
 from barpc.pointio.names import ViewNames, cell, from_cell
-from barpc.record import load_npz
 from barpc.scene import IntArray, Tracks, connected_labels
 from barpc.sidefile import TABLE, opened_text, read_text
 
@@ -27,7 +27,7 @@ _COLUMNS = ("image", "col", "row", "track")
 
 
 def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA) -> Tracks:
-    """Tie points of a file.
+    """Tie points of a file; tracks with fewer than two views, or with two observations in one, are left out.
 
     Parameters
     ----------
@@ -37,11 +37,6 @@ def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA
         The views, in order; observations in other images are left out.
     sigma : float
         Standard deviation of each coordinate [px] where the file states none.
-
-    Returns
-    -------
-    Tracks
-        Tracks with fewer than two views, or with two observations in one view, are left out.
 
     Raises
     ------
@@ -67,32 +62,13 @@ def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA
 
 
 def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> None:
-    """Write tie points as CSV or npz, by the ending; `read_matches` reads them back to the bit.
-
-    Parameters
-    ----------
-    path : path
-        Ends in `.csv` or `.npz`.
-    tracks : Tracks
-        Tie points.
-    names : sequence of str
-        The views.
-
-    Raises
-    ------
-    InputError
-        Another ending.
-    """
+    """Write tie points as ``.csv`` or ``.npz``; `read_matches` reads them back to the bit."""
     path = Path(path)
     if path.suffix.lower() == ".npz":
         with path.open("wb") as file:
+            view, track = tracks.view, tracks.point
             np.savez_compressed(
-                file,
-                names=np.array(names),
-                view=tracks.view,
-                track=tracks.point,
-                xy=tracks.xy,
-                sigma=tracks.sigma,
+                file, names=np.array(names), view=view, track=track, xy=tracks.xy, sigma=tracks.sigma
             )
         return
     if path.suffix.lower() != ".csv":
@@ -100,21 +76,16 @@ def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> Non
     with path.open("w", encoding="utf-8", newline="") as text:
         text.write(",".join([*_COLUMNS, "sigma"]) + "\r\n")
         cells = [cell(name) for name in names]
-        columns = (tracks.view.tolist(), tracks.point.tolist(), tracks.xy.tolist(), tracks.sigma.tolist())
-        for view, point, (col, row), sigma in zip(*columns, strict=True):
+        rows = (array.tolist() for array in (tracks.view, tracks.point, tracks.xy, tracks.sigma))
+        for view, point, (col, row), sigma in zip(*rows, strict=True):
             text.write(f"{cells[view]},{col!r},{row!r},{point},{sigma!r}\r\n")
 
 
 def asp_text(first: Array, second: Array) -> str:
     """The matches of a pair as an ASP text match file.
 
-    The counts on the first line, then one keypoint a line, those of the first image first: x, y, their whole
+    The counts on the first line, then one keypoint a line, those of the first image (M, 2) first: x, y, their whole
     pixels, orientation, scale, interest, polarity, octave, scale level and the length of the descriptor (0).
-
-    Parameters
-    ----------
-    first, second : (M, 2)
-        col, row [px] in the two images.
 
     Examples
     --------
@@ -138,8 +109,7 @@ def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
     with opened_text(path, TABLE, newline="") as text:
         lines = csv.reader(line for line in text if line.strip() and not line.startswith("#"))
         header = [word.strip().lower() for word in next(lines, [])]
-        missing = [name for name in _COLUMNS if name not in header]
-        if missing:
+        if missing := [name for name in _COLUMNS if name not in header]:
             raise InputError(
                 f"{path}: no column {', '.join(missing)}; found {', '.join(header) or 'nothing'}"
             )
@@ -166,22 +136,18 @@ def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
 
 
 def _read_npz(path: Path, views: ViewNames, sigma: float) -> Columns:
+    file = load_npz(path)
     try:
-        file = load_npz(path)
         own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
         index, point = (np.asarray(file[key], dtype=np.int64) for key in ("view", "track"))
         xy = np.asarray(file["xy"], dtype=np.float64)
-        spread = (
-            np.asarray(file["sigma"], dtype=np.float64) if "sigma" in file else np.full(len(index), sigma)
-        )
+        spread = np.asarray(file.get("sigma", np.full(len(index), sigma)), dtype=np.float64)
         if {(*index.shape, 2), (*point.shape, 2), (*spread.shape, 2), xy.shape} != {(len(xy), 2)}:
             raise ValueError(f"shapes {index.shape}, {point.shape}, {xy.shape}, {spread.shape}")
         if len(index) and not 0 <= index.min() <= index.max() < len(own):
             raise ValueError("a view that has no name")
         view = own[index]
     except (KeyError, ValueError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({error})") from error
     keep = view >= 0
     return view[keep], point[keep], xy[keep], spread[keep]

@@ -1,7 +1,6 @@
 """What an image may be called, and which view a file means by a name.
 
-Views get their names here, before any work, so that every file that a run writes carries them and reads back to the
-same image.
+Views get their names before any work, so that every file of a run carries them and reads back to the same image.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from barpc.errors import InputError
 MAX_NAME = 120
 """Bytes of a view's name: the file of a pair's matches carries two, and 255 are what a file system takes."""
 _FORMULA = frozenset("=+-@＝＋－＠\t\r")
-_LISTED = 10  # names in a message
 
 
 def unique_names(files: Sequence[Path]) -> list[str]:
@@ -79,13 +77,7 @@ def pair_name(first: str, second: str) -> str:
 
 
 def require_pair_names(names: Sequence[str]) -> None:
-    """Raise unless every `pair_name` of two of the views means these two alone.
-
-    Raises
-    ------
-    InputError
-        Names the views that are in each other's way.
-    """
+    """Raise InputError unless every `pair_name` of two of the views means these two alone."""
     known, ordered = set(names), sorted(names)
     for long in names:
         for size in range(1, len(long)):
@@ -130,15 +122,7 @@ def _computes(text: str) -> bool:
 
 
 class ViewNames:
-    """Views found by any of the names that files use for them.
-
-    Parameters
-    ----------
-    names : sequence of str
-        The views, in order.
-    source : str
-        The file that is read, for messages.
-    """
+    """Views found by any of the names that files use for them; `source` is the file that is read, for messages."""
 
     def __init__(self, names: Sequence[str], source: str) -> None:
         self.names, self.source = tuple(names), source
@@ -171,15 +155,9 @@ class ViewNames:
         return None
 
     def index(self, name: str) -> int:
-        """Index of the view that `name` means.
-
-        Raises
-        ------
-        InputError
-            There is none.
-        """
+        """Index of the view that `name` means; InputError where there is none."""
         found = self.find(name)
         if found is None:
-            listed = ", ".join(self.names[:_LISTED])
+            listed = ", ".join(self.names[:10])
             raise InputError(f"{self.source}: no view is named {name!r}; there are {listed}")
         return found

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.errors import BarpcError
-from barpc.plain import visible
+from barpc.errors import BarpcError, visible
 from barpc.report import charts
 from barpc.report.charts import MAX_ROWS, numbered
 from barpc.report.compare import flat_options

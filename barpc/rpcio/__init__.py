@@ -6,44 +6,30 @@ precedence. See ``docs/formats.md``.
 
 from __future__ import annotations
 
-from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import (
     CARRIERS,
     FORMATS,
     WRITABLE,
     Carrier,
-    Format,
     find_rpc,
     row_of,
     write_camera,
     write_rpc,
 )
-from barpc.rpcio.images import (
-    plain_source,
-    rpc_vrt,
-    write_crop,
-    write_rpc_copy,
-    write_rpc_nitf,
-    write_rpc_vrt,
-)
-from barpc.rpcio.sources import RpcSource, Sidecar, hidden_by, read_rpc, read_rpc_source, shadows, sidecars
+from barpc.rpcio.images import plain_source, write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.rpcio.sources import hidden_by, read_rpc, read_rpc_source, shadows, sidecars
 
 __all__ = [
     "CARRIERS",
     "FORMATS",
     "WRITABLE",
     "Carrier",
-    "Format",
-    "ReadOptions",
-    "RpcSource",
-    "Sidecar",
     "find_rpc",
     "hidden_by",
     "plain_source",
     "read_rpc",
     "read_rpc_source",
     "row_of",
-    "rpc_vrt",
     "shadows",
     "sidecars",
     "write_camera",

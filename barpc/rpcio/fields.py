@@ -1,7 +1,6 @@
 """The names that RPC files share, numbers as files print them, and the way between both and an `RPC`.
 
-Every reader gathers `Fields`: GDAL's names, ``LINE_OFF`` to ``SAMP_DEN_COEFF``. One function makes the RPC
-of them and checks that nothing is missing, so a format's module knows its syntax and nothing else.
+Every reader gathers `Fields`; one function makes the RPC of them and checks that nothing is missing.
 """
 
 from __future__ import annotations
@@ -20,44 +19,38 @@ OFFSETS = ("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF")
 SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")
 COEFFICIENTS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
 ERRORS = ("ERR_BIAS", "ERR_RAND")
+SINGLE = ERRORS + OFFSETS + SCALES
+KEYS = SINGLE + COEFFICIENTS
+"""GDAL's names of all fields, in the order of the GeoTIFF tag."""
+
+_MAXAR = (
+    "errBias errRand lineOffset sampOffset latOffset longOffset heightOffset lineScale sampScale latScale longScale "
+    "heightScale lineNumCoef lineDenCoef sampNumCoef sampDenCoef"
+)
+MAXAR = dict(zip(KEYS, _MAXAR.split(), strict=True))
+"""GDAL's name of a field -> Maxar's in an ``.RPB`` file; its XML has them in capitals."""
 
 Fields = dict[str, list[float]]
 """Field name -> its numbers: one, or twenty for the four lists of coefficients (RPC00B order)."""
 
+_INDEXED = re.compile(rf"({'|'.join(COEFFICIENTS)})_(\d+)")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What the reader of an RPC cannot know from the file.
-
-    Parameters
-    ----------
-    first_pixel : float or None
-        The coordinate that the file gives to the centre of the first pixel: 0, 0.5 or 1. None takes the
-        format's own rule (``docs/formats.md``).
-    band : int
-        Which band's RPC, from 1, where a file holds one for each.
-    """
+    """What the reader of an RPC cannot know from the file."""
 
     first_pixel: float | None = None
+    """The file's coordinate of the first pixel's centre: 0, 0.5 or 1; None: the format's rule (``docs/formats.md``)."""
     band: int = 1
+    """Which band's RPC, from 1, where a file holds one for each."""
 
 
 def number(text: str, name: str, key: str) -> float:
     """The number at the start of `text`; a unit may follow, and the exponent may be Fortran's D.
 
-    Parameters
-    ----------
-    text : str
-        Such as ``+005124.00 pixels``, ``-1.5D-03``.
-    name, key : str
-        File and field, for the message.
-
-    Raises
-    ------
-    RpcFormatError
-        No finite number.
+    File and field, `name` and `key`, are for the RpcFormatError if there is no finite number.
     """
     text = text.strip()
     match = _NUMBER.match(text)
@@ -77,76 +70,63 @@ def numbers(text: str, name: str, key: str) -> list[float]:
 
 def format_number(value: float) -> str:
     """The shortest text that reads back as the same double."""
-    text = repr(float(value))
-    return text.removesuffix(".0")
+    return repr(float(value)).removesuffix(".0")
 
 
 def collect_numbered(pairs: Iterable[tuple[str, float]], name: str, first: int = 1) -> Fields:
-    """Gather ``LINE_NUM_COEFF_1 .. _20`` into lists, in whatever order they come.
-
-    Parameters
-    ----------
-    pairs : iterable of (str, float)
-        Field names of this module, coefficients with ``_<index>`` behind.
-    name : str
-        The file, for messages.
-    first : int
-        Index of the first coefficient.
-    """
-    fields: Fields = {}
-    lists: dict[str, dict[int, float]] = {}
+    """Gather ``LINE_NUM_COEFF_1 .. _20`` (the first index is `first`) into lists, in whatever order they come."""
+    single: dict[str | int, float] = {}
+    lists: dict[str, dict[str | int, float]] = {}
     for key, value in pairs:
-        stem, _, index = key.rpartition("_")
-        target: dict[int, float] | None = None
-        if stem in COEFFICIENTS and index.isdecimal():
-            target, slot = lists.setdefault(stem, {}), int(index) - first
-            if slot in target and target[slot] != value:
-                raise RpcFormatError(f"{name}: {key} is given twice, {target[slot]} and {value}")
-            target[slot] = value
-        else:
-            if key in fields and fields[key] != [value]:
-                raise RpcFormatError(f"{name}: {key} is given twice, {fields[key][0]} and {value}")
-            fields[key] = [value]
-    for stem, slots in lists.items():
-        missing = sorted(set(range(20)) - set(slots))
-        if missing or len(slots) != 20:
-            raise RpcFormatError(f"{name}: {stem} has {len(slots)} coefficients, expected 20")
-        fields[stem] = [slots[i] for i in range(20)]
-    return fields
+        found = _INDEXED.fullmatch(key)
+        slot = int(found[2][:9]) - first if found else key
+        known = (lists.setdefault(found[1], {}) if found else single).setdefault(slot, value)
+        if known != value:
+            raise RpcFormatError(f"{name}: {key} is given twice, {known} and {value}")
+    for stem, values in lists.items():
+        if set(values) != set(range(20)):
+            raise RpcFormatError(f"{name}: {stem} has {len(values)} coefficients, expected 20")
+    one = {str(key): [value] for key, value in single.items()}
+    return one | {stem: [values[i] for i in range(20)] for stem, values in lists.items()}
 
 
-def rpc_from_fields(fields: Mapping[str, Sequence[float]], name: str, first_pixel: float = 0.0) -> RPC:
-    """The RPC of a file's fields.
+def rpc_from_fields(
+    fields: Mapping[str, Sequence[float]],
+    name: str,
+    options: ReadOptions | None = None,
+    first_pixel: float = 0.0,
+) -> RPC:
+    """The RPC of the fields of a file called `name`.
 
     Parameters
     ----------
     fields : mapping
         `Fields`; ERR_BIAS and ERR_RAND may be missing, and are unknown where they are not positive.
-    name : str
-        The file, for messages.
+    options : ReadOptions, optional
+        Its `first_pixel` goes before the format's.
     first_pixel : float
-        The file's coordinate of the centre of the first pixel, subtracted from the image offsets.
+        The format's coordinate of the centre of the first pixel, subtracted from the image offsets.
 
     Raises
     ------
     RpcFormatError
         A field is missing, has the wrong length, is not finite, or a scale is zero.
     """
+    if options is not None and options.first_pixel is not None:
+        first_pixel = options.first_pixel
     for key, count in [*((k, 1) for k in OFFSETS + SCALES), *((k, 20) for k in COEFFICIENTS)]:
         found = len(fields.get(key, ()))
         if found != count:
             what = "is missing" if not found else f"has {found} numbers, expected {count}"
             raise RpcFormatError(f"{name}: {key} {what}")
-    one = {key: fields[key][0] for key in OFFSETS + SCALES}
+    ground, image = ("LONG", "LAT", "HEIGHT"), ("SAMP", "LINE")
     try:
         return RPC(
-            coeffs=np.array(
-                [fields[f"{axis}_{part}_COEFF"] for axis in ("SAMP", "LINE") for part in ("NUM", "DEN")]
-            ),
-            ground_offset=np.array([one["LONG_OFF"], one["LAT_OFF"], one["HEIGHT_OFF"]]),
-            ground_scale=np.array([one["LONG_SCALE"], one["LAT_SCALE"], one["HEIGHT_SCALE"]]),
-            image_offset=np.array([one["SAMP_OFF"], one["LINE_OFF"]]) - first_pixel,
-            image_scale=np.array([one["SAMP_SCALE"], one["LINE_SCALE"]]),
+            coeffs=np.array([fields[f"{axis}_{part}_COEFF"] for axis in image for part in ("NUM", "DEN")]),
+            ground_offset=np.array([fields[f"{axis}_OFF"][0] for axis in ground]),
+            ground_scale=np.array([fields[f"{axis}_SCALE"][0] for axis in ground]),
+            image_offset=np.array([fields[f"{axis}_OFF"][0] for axis in image]) - first_pixel,
+            image_scale=np.array([fields[f"{axis}_SCALE"][0] for axis in image]),
             err_bias=_accuracy(fields.get("ERR_BIAS")),
             err_rand=_accuracy(fields.get("ERR_RAND")),
         )
@@ -165,12 +145,12 @@ def _accuracy(value: Sequence[float] | None) -> float | None:
 
 def fields_from_rpc(rpc: RPC) -> Fields:
     """The fields of an RPC, in the order that files give them; unknown accuracies are left out."""
-    (lon, lat, alt), (lon_scale, lat_scale, alt_scale) = rpc.ground_offset.tolist(), rpc.ground_scale.tolist()
-    (col, row), (col_scale, row_scale) = rpc.image_offset.tolist(), rpc.image_scale.tolist()
-    col_num, col_den, row_num, row_den = rpc.coeffs.tolist()
     fields = {key: [value] for key, value in zip(ERRORS, (rpc.err_bias, rpc.err_rand), strict=True) if value}
-    fields |= {key: [v] for key, v in zip(OFFSETS, (row, col, lat, lon, alt), strict=True)}
-    scales = (row_scale, col_scale, lat_scale, lon_scale, alt_scale)
-    fields |= {key: [v] for key, v in zip(SCALES, scales, strict=True)}
-    fields |= dict(zip(COEFFICIENTS, (row_num, row_den, col_num, col_den), strict=True))
-    return fields
+    for keys, image, ground in (
+        (OFFSETS, rpc.image_offset, rpc.ground_offset),
+        (SCALES, rpc.image_scale, rpc.ground_scale),
+    ):
+        (col, row), (lon, lat, alt) = image.tolist(), ground.tolist()
+        fields |= {key: [value] for key, value in zip(keys, (row, col, lat, lon, alt), strict=True)}
+    col_num, col_den, row_num, row_den = rpc.coeffs.tolist()
+    return fields | dict(zip(COEFFICIENTS, (row_num, row_den, col_num, col_den), strict=True))

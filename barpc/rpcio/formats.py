@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from barpc.atomic import write_text
 from barpc.errors import InputError, RpcFormatError
-from barpc.rpcio import fixed, structured, text, xml
+from barpc.rpcio import text, xml
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.images import rpc_vrt, write_rpc_copy, write_rpc_nitf
 from barpc.sensor.rpc import RPC
@@ -17,92 +18,81 @@ from barpc.sidefile import RPC_FILE
 
 @dataclass(frozen=True)
 class Format:
-    """One syntax of RPC files.
+    """One syntax of RPC files: how it is called, told from others, read, written and verified."""
 
-    Parameters
-    ----------
-    name : str
-        As ``--rpc-format`` and messages call it.
-    suffixes : tuple of str
-        Ends of the names of files to be written, the usual one first; reading goes by content.
-    sniff : callable
-        Whether a file's text is of this format.
-    read : callable
-        (text, file name for messages, options) -> RPC.
-    write : callable or None
-        RPC -> text.
-    beside : str
-        End of the name of the file that a run writes for an image, after the image's name.
-    consumers : tuple of str
-        Tools that read what is written (rows of `barpc.handoff.CONSUMERS`); barpc reads every one. A written file is
-        opened by each that is installed; where none is, that is said.
-    """
-
-    name: str
-    suffixes: tuple[str, ...]
-    sniff: Callable[[str], bool]
-    read: Callable[[str, str, ReadOptions], RPC]
+    name: str  # as --rpc-format and messages call it
+    suffixes: tuple[
+        str, ...
+    ]  # ends of the names of written files, the usual one first; reading goes by content
+    sniff: Callable[[str], bool]  # whether a file's text is of this format
+    read: Callable[[str, str, ReadOptions], RPC]  # of text, file name for messages, options
     write: Callable[[RPC], str] | None = None
-    beside: str = ""
-    consumers: tuple[str, ...] = ()
+    beside: str = ""  # end of the name of the file that a run writes for an image, after the image's name
+    consumers: tuple[
+        str, ...
+    ] = ()  # tools that read what is written (`barpc.handoff.CONSUMERS`), besides barpc
 
 
-FORMATS: dict[str, Format] = {
-    row.name: row
-    for row in (
-        Format(
-            "txt",
-            ("_RPC.TXT", "_rpc.txt", ".rpc", ".txt"),
-            text.sniff_txt,
-            text.read_txt,
-            text.write_txt,
-            "_RPC.TXT",
-            ("gdal, beside an image", "rpcm"),
-        ),
-        Format(
-            "rpb",
-            (".RPB", ".rpb"),
-            text.sniff_rpb,
-            text.read_rpb,
-            text.write_rpb,
-            ".RPB",
-            ("gdal, beside an image",),
-        ),
-        Format(
-            "geom",
-            (".geom",),
-            text.sniff_geom,
-            text.read_geom,
-            text.write_geom,
-            ".geom",
-            ("keywords", "shareloc"),
-        ),
-        Format(
-            "xml",
-            (".XML", ".xml"),
-            xml.sniff_maxar,
-            xml.read_maxar,
-            xml.write_maxar,
-            ".rpc.xml",
-            ("gdal, beside an image",),
-        ),
-        Format(
-            "json",
-            (".json",),
-            structured.sniff_json,
-            structured.read_json,
-            structured.write_json,
-            ".rpc.json",
-            ("rpcm",),
-        ),
-        Format("dimap", (), xml.sniff_dimap, xml.read_dimap),
-        Format("enmap", (), xml.sniff_enmap, xml.read_enmap),
-        Format("gdal", (), xml.sniff_gdal, xml.read_gdal),
-        Format("yaml", (), structured.sniff_yaml, structured.read_yaml),
-        Format("envi", (), text.sniff_envi, text.read_envi),
-        Format("alos", (), fixed.sniff_alos, fixed.read_alos),
-    )
-}
+def _has(*patterns: str) -> Callable[[str], bool]:
+    """Whether a text holds all of some patterns, searched in time in proportion to it."""
+    return lambda content: all(re.search(pattern, content) for pattern in patterns)
+
+
+_BESIDE = "gdal, beside an image"
+_ROWS = (
+    Format(
+        "txt",
+        ("_RPC.TXT", "_rpc.txt", ".rpc", ".txt"),
+        _has(r"(?im)^[ \t]*+LINE_NUM_COEFF_1[ \t]*+[:=]"),
+        text.read_txt,
+        text.write_txt,
+        "_RPC.TXT",
+        (_BESIDE, "rpcm"),
+    ),
+    Format(
+        "rpb",
+        (".RPB", ".rpb"),
+        _has(r"(?i)lineNumCoef\s*+="),
+        text.read_rpb,
+        text.write_rpb,
+        ".RPB",
+        (_BESIDE,),
+    ),
+    Format(
+        "geom",
+        (".geom",),
+        _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:"),
+        text.read_geom,
+        text.write_geom,
+        ".geom",
+        ("keywords", "shareloc"),
+    ),
+    Format(
+        "xml",
+        (".XML", ".xml"),
+        _has(r"<(\w+:)?LINENUMCOEF"),
+        xml.read_maxar,
+        xml.write_maxar,
+        ".rpc.xml",
+        (_BESIDE,),
+    ),
+    Format(
+        "json",
+        (".json",),
+        _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")'),
+        text.read_json,
+        text.write_json,
+        ".rpc.json",
+        ("rpcm",),
+    ),
+    Format("dimap", (), _has(r"<(\w+:)?Global_RFM"), xml.read_dimap),  # a Dimap_Document, or the model alone
+    Format("enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>"), xml.read_enmap),
+    Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"'), xml.read_gdal),
+    Format("yaml", (), _has(r"(?m)^[ \t]++line_num_coeff:"), text.read_yaml),
+    Format("envi", (), _has(r"(?im)^[ \t]*+rpc info\s*+=\s*+\{"), text.read_envi),
+    Format("alos", (), _has(r"\A[\d+\-. ]{66}[\d+\-. Ee]{960}"), text.read_alos),
+)
+FORMATS: dict[str, Format] = {row.name: row for row in _ROWS}
 """Name -> format. One row a syntax; readers are tried in this order."""
 
 WRITABLE: dict[str, Format] = {name: row for name, row in FORMATS.items() if row.write is not None}
@@ -111,21 +101,11 @@ WRITABLE: dict[str, Format] = {name: row for name, row in FORMATS.items() if row
 
 @dataclass(frozen=True)
 class Carrier:
-    """A raster that carries an RPC.
-
-    Parameters
-    ----------
-    suffixes : tuple of str
-        Ends of its names, the usual one first.
-    write : callable
-        (rpc, image, path, where the file will stand, overwrite): writes it.
-    consumers : tuple of str
-        As of `Format`.
-    """
+    """A raster that carries an RPC."""
 
     suffixes: tuple[str, ...]
-    write: Callable[[RPC, Path, Path, Path, bool], None]
-    consumers: tuple[str, ...]
+    write: Callable[[RPC, Path, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
+    consumers: tuple[str, ...] = ("gdal", "rpcm", "shareloc", "orthority")
 
 
 def _vrt(rpc: RPC, image: Path, path: Path, place: Path, overwrite: bool) -> None:
@@ -140,11 +120,10 @@ def _nitf(rpc: RPC, image: Path, path: Path, _place: Path, overwrite: bool) -> N
     write_rpc_nitf(rpc, image, path, overwrite=overwrite)
 
 
-_READ_BY = ("gdal", "rpcm", "shareloc", "orthority")
 CARRIERS: dict[str, Carrier] = {
-    "vrt": Carrier((".vrt",), _vrt, _READ_BY),
-    "copy": Carrier((".tif", ".tiff"), _copy, _READ_BY),
-    "nitf": Carrier((".ntf",), _nitf, _READ_BY),
+    "vrt": Carrier((".vrt",), _vrt),
+    "copy": Carrier((".tif", ".tiff"), _copy),
+    "nitf": Carrier((".ntf",), _nitf),
 }
 """Name -> raster that carries an RPC."""
 
@@ -156,34 +135,16 @@ def _rows() -> list[Format | Carrier]:
 def row_of(path: Path | str) -> Format | Carrier | None:
     """The row of a file to be written, by its name; None where no name ends so."""
     name = Path(path).name.lower()
-    for row in _rows():
-        if name.endswith(tuple(suffix.lower() for suffix in row.suffixes)):
-            return row
-    return None
+    return next((row for row in _rows() if name.endswith(tuple(end.lower() for end in row.suffixes))), None)
 
 
 def write_camera(
     rpc: RPC, path: Path | str, image: Path | str, *, place: Path | str | None = None, overwrite: bool = False
 ) -> None:
-    """Write an RPC into a file or a raster, as the name says.
+    """Write an RPC into a file, or into a raster with the pixels of `image`, as the name of `path` says.
 
-    Parameters
-    ----------
-    rpc : RPC
-        What to write.
-    path : Path or str
-        The file.
-    image : Path or str
-        The image that a raster carries.
-    place : Path or str, optional
-        Where the file will stand in the end, if not at `path`; its name decides.
-    overwrite : bool
-        Replace an existing file, never the image.
-
-    Raises
-    ------
-    RpcFormatError, ImageError, OutputError
-        No format by that name; the image or the file cannot be read or written.
+    `place` is where the file will stand in the end, if not at `path`: its name decides. An existing file is replaced
+    if `overwrite` is true, never the image.
     """
     place = Path(path if place is None else place)
     row = row_of(place)
@@ -193,15 +154,17 @@ def write_camera(
         write_text(path, _writer(place, None)(rpc), overwrite=overwrite)
 
 
-def find_rpc(folder: Path, image: Path) -> Path:
-    """The file in a folder that holds the RPC of an image of that name, in any format that is written.
+def files_of(folder: Path) -> dict[str, Path]:
+    """What is in a folder, by its name in lower case; nothing where it cannot be read."""
+    try:
+        return {entry.name.lower(): entry for entry in sorted(folder.iterdir())}
+    except OSError:
+        return {}
 
-    Raises
-    ------
-    InputError
-        There is none.
-    """
-    present = {entry.name.lower(): entry for entry in sorted(folder.iterdir())}
+
+def find_rpc(folder: Path, image: Path) -> Path:
+    """The file in a folder that holds the RPC of an image of that name, in a format that is written (or InputError)."""
+    present = files_of(folder)
     ends = [suffix for row in _rows() for suffix in row.suffixes]
     ends += [row.beside for row in WRITABLE.values()]
     for name in (image.name, *(image.stem + end for end in dict.fromkeys(ends))):
@@ -212,22 +175,7 @@ def find_rpc(folder: Path, image: Path) -> Path:
 
 
 def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[RPC, str]:
-    """The RPC in the bytes of a file, and the name of the format that was recognised.
-
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
-    name : str
-        The file, for messages.
-    options : ReadOptions, optional
-        Pixel convention and band.
-
-    Raises
-    ------
-    RpcFormatError
-        Empty, too large, of no known format, or of a known one and not valid.
-    """
+    """The RPC in all bytes of a file called `name`, and its format; RpcFormatError where there is no valid one."""
     if not data.strip():
         raise RpcFormatError(f"{name}: the file is empty, expected an RPC")
     RPC_FILE.check(name, len(data))
@@ -244,10 +192,9 @@ def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrit
     Parameters
     ----------
     rpc : RPC
-        What to write.
     path : Path or str
-        The file. Its name chooses the format: ``_RPC.TXT``, ``.RPB``, ``.geom``, ``.XML`` (Maxar), ``.json``
-        (rpcm). An RPC goes into a raster by `write_rpc_vrt` or `write_rpc_copy`, never into the input.
+        Its name chooses the format: ``_RPC.TXT``, ``.RPB``, ``.geom``, ``.XML`` (Maxar), ``.json`` (rpcm). An RPC
+        goes into a raster by `write_rpc_vrt` or `write_rpc_copy`, never into the input.
     format : str, optional
         A row of `FORMATS`, whatever the name.
     overwrite : bool
@@ -260,8 +207,7 @@ def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrit
     OutputError
         The file exists or cannot be written.
     """
-    path = Path(path)
-    write_text(path, _writer(path, format)(rpc), overwrite=overwrite)
+    write_text(path, _writer(Path(path), format)(rpc), overwrite=overwrite)
 
 
 def _writer(path: Path, name: str | None) -> Callable[[RPC], str]:

@@ -21,14 +21,12 @@ from rasterio.windows import Window
 
 from barpc.atomic import replacing, write_text
 from barpc.errors import ImageError, OutputError
-from barpc.mosaic import Mosaic
-from barpc.plain import plain_path
-from barpc.raster import identify, open_raster
-from barpc.rpcio.digits import printable
-from barpc.rpcio.fixed import nitf_record
-from barpc.rpcio.tiff import GEOREFERENCE_TAGS, put_tag
+from barpc.raster import Mosaic, identify, open_raster
+from barpc.rpcio.text import nitf_record
+from barpc.rpcio.tiff import printable, put_tag
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import plain_path
 from barpc.vrt import GDAL_TYPES
 
 _TIFF = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
@@ -41,25 +39,19 @@ def write_rpc_vrt(
     """Write a VRT that carries an RPC and takes its pixels from an image that stays as it is.
 
     A geotransform without CRS (the origin of a crop in its full image) is left out: the RPC written here is
-    the image's own. One with a CRS is kept.
+    the image's own. One with a CRS is kept. Every number of the RPC reads back to the bit.
 
     Parameters
     ----------
-    rpc : RPC
-        The camera of `image_path`, every number written with the digits that read back to the bit.
-    image_path, vrt_path : Path or str
-        The image, and the file to write.
+    rpc, image_path, vrt_path, overwrite
+        As of `write_rpc_copy`.
     relative : bool
         Point at the image relative to the VRT, so that both may move together; else by absolute path.
-    overwrite : bool
-        Replace an existing VRT.
 
     Raises
     ------
-    ImageError
-        The image cannot be read.
-    OutputError
-        The VRT exists or cannot be written.
+    ImageError, OutputError
+        The image cannot be read; the VRT exists or cannot be written.
     """
     write_text(vrt_path, rpc_vrt(rpc, image_path, vrt_path, relative=relative), overwrite=overwrite)
 
@@ -71,17 +63,46 @@ def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative:
     _refuse_same(source, target)
     name = os.path.relpath(source.resolve(), target.parent.resolve()) if relative else str(source)
     with open_raster(source) as dataset:
-        return _vrt(dataset, rpc, name, relative)
+        lines = [f'<VRTDataset rasterXSize="{dataset.width}" rasterYSize="{dataset.height}">']
+        if dataset.crs is not None:
+            numbers = ", ".join(repr(v) for v in dataset.transform.to_gdal())
+            lines.append(f"  <SRS>{escape(dataset.crs.to_wkt())}</SRS>")
+            lines.append(f"  <GeoTransform>{numbers}</GeoTransform>")
+        lines.append(rpc_domain(rpc))
+        for index in dataset.indexes:
+            lines += _vrt_band(dataset, index, _vrt_source(dataset, name, relative, str(index)))
+        if _has_mask(dataset):
+            mask = (f"  {line}" for line in _vrt_source(dataset, name, relative, "mask,1"))
+            band = ['    <VRTRasterBand dataType="Byte">', *mask, "    </VRTRasterBand>"]
+            lines += ["  <MaskBand>", *band, "  </MaskBand>"]
+    return "\n".join([*lines, "</VRTDataset>"]) + "\n"
+
+
+def _vrt_band(dataset: Any, index: int, source: list[str]) -> list[str]:
+    dtype, nodata = dataset.dtypes[index - 1], dataset.nodatavals[index - 1]
+    return [
+        f'  <VRTRasterBand dataType="{GDAL_TYPES.get(dtype, dtype.capitalize())}" band="{index}">',
+        *([] if nodata is None else [f"    <NoDataValue>{nodata!r}</NoDataValue>"]),
+        f"    <ColorInterp>{dataset.colorinterp[index - 1].name.capitalize()}</ColorInterp>",
+        *source,
+        "  </VRTRasterBand>",
+    ]
+
+
+def _vrt_source(dataset: Any, name: str, relative: bool, band: str) -> list[str]:
+    frame = f'xOff="0" yOff="0" xSize="{dataset.width}" ySize="{dataset.height}"'
+    return [
+        "    <SimpleSource>",
+        f'      <SourceFilename relativeToVRT="{int(relative)}">{escape(name)}</SourceFilename>',
+        f"      <SourceBand>{band}</SourceBand>",
+        f"      <SrcRect {frame} />",
+        f"      <DstRect {frame} />",
+        "    </SimpleSource>",
+    ]
 
 
 def plain_source(image_path: Path | str) -> Path:
-    """The file that holds an image's pixels: itself, or what a VRT written here points at.
-
-    Raises
-    ------
-    ImageError
-        The image cannot be read, or is a VRT that shows more, or less, than one whole image as it is.
-    """
+    """The file that holds an image's pixels: itself, or what a VRT written here points at (or ImageError)."""
     source, driver = identify(image_path)
     if driver != "VRT":
         return source
@@ -95,47 +116,11 @@ def plain_source(image_path: Path | str) -> Path:
     return found.resolve()
 
 
-def _vrt(dataset: Any, rpc: RPC, source: str, relative: bool) -> str:
-    width, height = dataset.width, dataset.height
-    lines = [f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">']
-    if dataset.crs is not None:
-        numbers = ", ".join(repr(v) for v in dataset.transform.to_gdal())
-        lines += [f"  <SRS>{escape(dataset.crs.to_wkt())}</SRS>", f"  <GeoTransform>{numbers}</GeoTransform>"]
-    lines.append(rpc_domain(rpc))
-    frame = f'xOff="0" yOff="0" xSize="{width}" ySize="{height}"'
-    for index in dataset.indexes:
-        kind = GDAL_TYPES.get(dataset.dtypes[index - 1], dataset.dtypes[index - 1].capitalize())
-        lines.append(f'  <VRTRasterBand dataType="{kind}" band="{index}">')
-        if (nodata := dataset.nodatavals[index - 1]) is not None:
-            lines.append(f"    <NoDataValue>{nodata!r}</NoDataValue>")
-        lines += [
-            f"    <ColorInterp>{dataset.colorinterp[index - 1].name.capitalize()}</ColorInterp>",
-            "    <SimpleSource>",
-            f'      <SourceFilename relativeToVRT="{int(relative)}">{escape(source)}</SourceFilename>',
-            f"      <SourceBand>{index}</SourceBand>",
-            f"      <SrcRect {frame} />",
-            f"      <DstRect {frame} />",
-            "    </SimpleSource>",
-            "  </VRTRasterBand>",
-        ]
-    if MaskFlags.per_dataset in dataset.mask_flag_enums[0] and not _has_alpha(dataset):
-        lines += [
-            "  <MaskBand>",
-            '    <VRTRasterBand dataType="Byte">',
-            "      <SimpleSource>",
-            f'        <SourceFilename relativeToVRT="{int(relative)}">{escape(source)}</SourceFilename>',
-            "        <SourceBand>mask,1</SourceBand>",
-            f"        <SrcRect {frame} />",
-            f"        <DstRect {frame} />",
-            "      </SimpleSource>",
-            "    </VRTRasterBand>",
-            "  </MaskBand>",
-        ]
-    return "\n".join([*lines, "</VRTDataset>"]) + "\n"
-
-
-def _has_alpha(dataset: Any) -> bool:
-    return ColorInterp.alpha in dataset.colorinterp
+def _has_mask(dataset: Any) -> bool:
+    """Whether a raster has a mask of its own, apart from an alpha band."""
+    return (
+        MaskFlags.per_dataset in dataset.mask_flag_enums[0] and ColorInterp.alpha not in dataset.colorinterp
+    )
 
 
 def write_rpc_copy(
@@ -158,53 +143,24 @@ def write_rpc_copy(
 
     Raises
     ------
-    ImageError
-        The image cannot be read.
-    OutputError
-        The copy exists, is the image itself, or cannot be written.
+    ImageError, OutputError
+        The image cannot be read; the copy exists, is the image itself, or cannot be written.
     """
-    source, driver = identify(image_path)
-    target = Path(copy_path).absolute()
-    _refuse_same(source, target)
-    with _copying(source) as dataset:
-        drop = () if dataset.crs is not None else GEOREFERENCE_TAGS
-        with replacing(target, overwrite=overwrite) as partial:
-            if driver == "GTiff":
-                shutil.copyfile(source, partial)
-            else:
-                with _gdal_writes(target):
-                    _convert(dataset, partial, **_TIFF)
-                _require_same(dataset, Window(0, 0, dataset.width, dataset.height), partial, target)
-            put_tag(partial, printable(rpc), drop)
-
-
-@contextmanager
-def _copying(source: Path) -> Iterator[Any]:
-    """An open raster whose copies leave no ``.aux.xml`` behind under a temporary name."""
-    with open_raster(source) as dataset, rasterio.Env(GDAL_PAM_ENABLED="NO"):
-        yield dataset
-
-
-def _convert(dataset: Any, target: Path, **options: str) -> None:
-    """A copy by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
-    if isinstance(dataset, Mosaic):
-        _copy_window(dataset, target, Window(0, 0, dataset.width, dataset.height), **options)
-    else:
-        raster_copy(dataset, str(target), **options)
+    with _copying(image_path, copy_path, overwrite) as (dataset, partial):
+        if not isinstance(dataset, Mosaic) and dataset.driver == "GTiff":
+            shutil.copyfile(image_path, partial)
+        else:
+            _convert(dataset, partial, Path(copy_path), **_TIFF)
+        put_tag(partial, printable(rpc), placed=dataset.crs is not None)
 
 
 def write_rpc_nitf(
     rpc: RPC, image_path: Path | str, nitf_path: Path | str, *, overwrite: bool = False
 ) -> None:
     """Write a NITF copy of an image with an RPC in its RPC00B extension (`nitf_record` says what it holds)."""
-    source, _ = identify(image_path)
-    target = Path(nitf_path).absolute()
-    _refuse_same(source, target)
     record = nitf_record(rpc)
-    with _copying(source) as dataset, replacing(target, overwrite=overwrite) as partial:
-        with _gdal_writes(target):
-            _convert(dataset, partial, driver="NITF", TRE=f"RPC00B={record}")
-        _require_same(dataset, Window(0, 0, dataset.width, dataset.height), partial, target)
+    with _copying(image_path, nitf_path, overwrite) as (dataset, partial):
+        _convert(dataset, partial, Path(nitf_path), driver="NITF", TRE=f"RPC00B={record}")
 
 
 def write_crop(
@@ -235,38 +191,49 @@ def write_crop(
 
     Raises
     ------
-    ImageError
-        The window does not lie inside the image, or the image cannot be read.
-    OutputError
-        The crop exists, is the image itself, or cannot be written.
+    ImageError, OutputError
+        The window is not inside the image, or that cannot be read; the crop exists or cannot be written.
     """
-    source, _ = identify(image_path)
-    target = Path(crop_path).absolute()
-    _refuse_same(source, target)
     col, row, width, height = window
     cropped = printable(rpc.crop(col, row))
-    with open_raster(source) as dataset:
+    with _copying(image_path, crop_path, overwrite) as (dataset, partial):
         if not (0 <= col < col + width <= dataset.width and 0 <= row < row + height <= dataset.height):
             raise ImageError(
                 f"{image_path}: window {window} is not inside the image of {dataset.width} x {dataset.height}"
             )
-        with replacing(target, overwrite=overwrite) as partial:
-            with _gdal_writes(target):
-                _copy_window(dataset, partial, Window(col, row, width, height), **_TIFF)
-            _require_same(dataset, Window(col, row, width, height), partial, target)
-            put_tag(partial, cropped, () if dataset.crs is not None else GEOREFERENCE_TAGS)
+        place = Window(col, row, width, height)
+        _copy_window(dataset, partial, place, **_TIFF)
+        _require_same(dataset, place, partial, Path(crop_path))
+        put_tag(partial, cropped, placed=dataset.crs is not None)
     return cropped
 
 
+@contextmanager
+def _copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iterator[tuple[Any, Path]]:
+    """An image and the temporary file of its copy; what GDAL says when it cannot write is told as one error."""
+    source, _ = identify(image_path)
+    target = Path(target).absolute()
+    _refuse_same(source, target)
+    with open_raster(source) as dataset, replacing(target, overwrite=overwrite) as partial:
+        try:
+            yield dataset, partial
+        except (RasterioError, CPLE_BaseError) as error:
+            raise _unwritten(target, str(error.__cause__ or error)) from error
+
+
+def _convert(dataset: Any, partial: Path, target: Path, **options: str) -> None:
+    """A copy by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
+    whole = Window(0, 0, dataset.width, dataset.height)
+    if isinstance(dataset, Mosaic):
+        _copy_window(dataset, partial, whole, **options)
+    else:
+        raster_copy(dataset, str(partial), **options)
+    _require_same(dataset, whole, partial, target)
+
+
 def _copy_window(dataset: Any, target: Path, window: Window, **options: str) -> None:
-    profile = {
-        "width": window.width,
-        "height": window.height,
-        "count": dataset.count,
-        "dtype": dataset.dtypes[0],
-        "nodata": dataset.nodata,
-        **options,
-    }
+    profile = {"width": window.width, "height": window.height, "count": dataset.count, **options}
+    profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
     if dataset.crs is not None:
         a, b, x, d, e, y = dataset.transform[:6]
         col, row = window.col_off, window.row_off
@@ -274,36 +241,27 @@ def _copy_window(dataset: Any, target: Path, window: Window, **options: str) -> 
         profile |= {"crs": dataset.crs, "transform": moved}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        masked = MaskFlags.per_dataset in dataset.mask_flag_enums[0] and not _has_alpha(dataset)
         with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(target, "w", **profile) as crop:
             crop.colorinterp = dataset.colorinterp
-            for _, block in crop.block_windows(1):
-                part = Window(
-                    window.col_off + block.col_off, window.row_off + block.row_off, block.width, block.height
-                )
+            for block, part in _blocks(crop, window):
                 crop.write(dataset.read(window=part), window=block)
-                if masked and options["driver"] == "GTiff":
+                if _has_mask(dataset) and options["driver"] == "GTiff":
                     crop.write_mask(dataset.read_masks(1, window=part), window=block)
 
 
-@contextmanager
-def _gdal_writes(target: Path) -> Iterator[None]:
-    """What GDAL says when it cannot write, which it does not always, as one error."""
-    try:
-        yield
-    except (RasterioError, CPLE_BaseError) as error:
-        raise _unwritten(target, str(error.__cause__ or error)) from error
+def _blocks(copy: Any, window: Window) -> Iterator[tuple[Window, Window]]:
+    """Blocks of a copy of a window, in the copy and in the image."""
+    for _, block in copy.block_windows(1):
+        col, row = window.col_off + block.col_off, window.row_off + block.row_off
+        yield block, Window(col, row, block.width, block.height)
 
 
 def _require_same(dataset: Any, window: Window, partial: Path, target: Path) -> None:
     """Raise unless a copy holds the pixels of a window: GDAL closes a file on a full disk without a word."""
     try:
         with open_raster(partial) as copy:
-            for _, block in copy.block_windows(1):
-                place = Window(
-                    window.col_off + block.col_off, window.row_off + block.row_off, block.width, block.height
-                )
-                if dataset.read(window=place).tobytes() != copy.read(window=block).tobytes():
+            for block, part in _blocks(copy, window):
+                if dataset.read(window=part).tobytes() != copy.read(window=block).tobytes():
                     raise _unwritten(target, "it holds other pixels than were written")
     except ImageError as error:
         raise _unwritten(target, "it cannot be read back") from error

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from barpc.errors import BarpcError, ImageError, RpcError, RpcFormatError
-from barpc.raster import identify, open_raster
+from barpc.raster import driver_of, identify, open_raster
 from barpc.rpcio.fields import ReadOptions
-from barpc.rpcio.fixed import is_nitf, read_nitf
-from barpc.rpcio.formats import FORMATS, parse
-from barpc.rpcio.text import decode
-from barpc.rpcio.tiff import is_tiff, read_tag
+from barpc.rpcio.formats import FORMATS, files_of, parse
+from barpc.rpcio.text import decode, read_nitf
+from barpc.rpcio.tiff import read_tag
 from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head
@@ -26,56 +25,30 @@ from barpc.vrt import MAGIC, read_vrt
 
 @dataclass(frozen=True)
 class RpcSource:
-    """An RPC and where it came from.
-
-    Parameters
-    ----------
-    rpc : RPC
-        The camera.
-    format : str
-        ``tag``, ``nitf``, or a row of `FORMATS`.
-    path : Path
-        The file that holds it: the image, or one beside it.
-    notes : tuple of str
-        What the user should know: a crop origin that was applied, files beside it that were passed over.
-    """
+    """An RPC and where it came from."""
 
     rpc: RPC
-    format: str
-    path: Path
-    notes: tuple[str, ...] = ()
+    format: str  # tag, nitf, or a row of FORMATS
+    path: Path  # the file that holds it: the image, or one beside it
+    notes: tuple[str, ...] = ()  # what the user should know: an origin that was applied, files passed over
 
 
 @dataclass(frozen=True)
 class Sidecar:
-    """A file beside an image that may hold an RPC.
+    """A file beside an image that may hold an RPC."""
 
-    Parameters
-    ----------
-    kind : str
-        ``rpb``, ``txt``, ``xml``, ``dimap``, ``alos``, ``pam`` or ``geom``.
-    path : Path
-        The file.
-    before_tag : bool
-        Whether GDAL and its users read it instead of the image's own RPC.
-    """
-
-    kind: str
+    kind: str  # rpb, txt, xml, dimap, alos, pam or geom
     path: Path
-    before_tag: bool
+    before_tag: bool  # whether GDAL and its users read it instead of the image's own RPC
 
 
 def sidecars(image: Path | str) -> list[Sidecar]:
     """The files beside an image that hold an RPC for some tool, in the order in which GDAL looks.
 
-    Names are compared without regard to case, as GDAL does. XML files count only where their content is
-    an RPC.
+    Names are compared without regard to case, as GDAL does. XML files count only where their content is an RPC.
     """
     image = Path(image)
-    try:
-        present = {entry.name.lower(): entry for entry in image.parent.iterdir()}
-    except OSError:
-        return []
+    present = files_of(image.parent)
     found: list[Sidecar] = []
     metadata_only = f"{image.stem}.imd".lower() in present  # with it GDAL takes the image for Maxar's
     for kind, name, before_tag in _names(image.name):
@@ -119,13 +92,6 @@ def shadows(image: Path | str) -> list[Sidecar]:
 
     A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and
     CARS are given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
-
-    Raises
-    ------
-    RpcFormatError
-        The image's own RPC does not parse.
-    ImageError
-        No such file.
     """
     image = Path(image)
     head = read_head(image, IMAGE, 64)
@@ -135,13 +101,7 @@ def shadows(image: Path | str) -> list[Sidecar]:
 
 
 def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
-    """Images whose RPC some tool would no longer see if these files were written.
-
-    Yields
-    ------
-    path, image, rpc : Path, Path, RPC
-        The file, an image beside which it would be read, and the RPC that the image has now.
-    """
+    """Images whose RPC some tool would no longer see if these files were written: file, image, the image's RPC."""
     wanted: dict[Path, dict[str, Path]] = {}
     for path in paths:
         wanted.setdefault(path.parent, {})[path.name.lower()] = path
@@ -177,15 +137,8 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     ----------
     path : Path or str
         An image or an RPC file.
-    first_pixel : float, optional
-        The coordinate that an RPC file gives to the centre of the first pixel (0, 0.5 or 1), where it is
-        not the one that its format prescribes.
-    band : int
-        Which band's RPC, from 1, where a file holds one for each.
-
-    Returns
-    -------
-    source : RpcSource
+    first_pixel, band
+        As of `ReadOptions`.
 
     Raises
     ------
@@ -197,7 +150,7 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     path = Path(path)
     options = ReadOptions(first_pixel, band)
     head = read_head(path, IMAGE, 64)
-    if is_tiff(head) or is_nitf(head) or _is_binary(head):
+    if b"\0" in head or driver_of(head) not in (None, "VRT"):  # no RPC text holds a zero byte near its start
         return _image_source(path, head, options)
     if _is_vrt(head):
         items = read_vrt(path).metadata.get("RPC")
@@ -208,86 +161,73 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     return RpcSource(rpc, name, path)
 
 
-def _is_binary(head: bytes) -> bool:
-    """No RPC text holds a zero byte near its start, unless it is UTF-16, which none is."""
-    return b"\0" in head or head[:3] == b"\xff\xd8\xff" or head[:4] == b"\x89PNG"
-
-
 def _is_vrt(head: bytes) -> bool:
     return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(MAGIC)
 
 
 def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:
     beside = sidecars(path)
+    first = next((sidecar for sidecar in beside if sidecar.before_tag), None)
     own: RPC | None = None
-    own_error: RpcError | None = None
     try:
         own = _own_rpc(path, head)
-    except RpcError as error:  # reported unless a file beside the image goes before
-        own_error = error
-    first = next((sidecar for sidecar in beside if sidecar.before_tag), None)
-    if first is None and own_error is not None:
-        raise own_error
+    except RpcError:
+        if first is None:
+            raise
     if first is None and own is None and beside:
         first = beside[0]
     ignored = [s.path.name for s in beside if s is not first]
-    if first is None:
-        if own is None:
-            raise ImageError(
-                f"{path}: no RPC in the image and none beside it (.RPB, _RPC.TXT, .XML, .geom and others)"
-            )
-        return RpcSource(own, "tag" if is_tiff(head) else "nitf", path, _passed_over(ignored))
-    if own is not None:
-        ignored.insert(0, "the image's own RPC")
-    source = _sidecar_source(path, first, options)
-    return RpcSource(source.rpc, source.format, source.path, source.notes + _passed_over(ignored))
+    if first is not None:
+        source = _sidecar_source(path, first, options)
+        ignored = ["the image's own RPC"] * (own is not None) + ignored
+    elif own is not None:
+        source = RpcSource(own, "tag" if driver_of(head) == "GTiff" else "nitf", path)
+    else:
+        raise ImageError(
+            f"{path}: no RPC in the image and none beside it (.RPB, _RPC.TXT, .XML, .geom and others)"
+        )
+    return replace(source, notes=source.notes + ((f"not used: {', '.join(ignored)}",) if ignored else ()))
 
 
 def _own_rpc(path: Path, head: bytes) -> RPC | None:
     """The RPC inside a TIFF or NITF."""
-    if is_tiff(head):
-        return read_tag(path)
-    return read_nitf(path) if is_nitf(head) else None
-
-
-def _passed_over(names: list[str]) -> tuple[str, ...]:
-    return (f"not used: {', '.join(names)}",) if names else ()
+    reader = {"GTiff": read_tag, "NITF": read_nitf}.get(driver_of(head) or "")
+    return reader(path) if reader else None
 
 
 def _sidecar_source(image: Path, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
     rpc, name = parse(read_bytes(sidecar.path, RPC_FILE), str(sidecar.path), options)
-    if sidecar.kind == "geom":
-        return _geom_source(image, sidecar.path, rpc)
-    if sidecar.kind == "dimap":
-        return _tile_source(image, sidecar.path, rpc)
-    return RpcSource(rpc, name, sidecar.path)
+    origin = {"geom": _crop_origin, "dimap": _tile_origin}.get(sidecar.kind)
+    window, note = origin(image, sidecar.path) if origin else (_WHOLE, "")
+    if window == _WHOLE:
+        return RpcSource(rpc, name, sidecar.path)
+    return RpcSource(rpc.window(*window), name, sidecar.path, (note,))
 
 
-def _geom_source(image: Path, path: Path, rpc: RPC) -> RpcSource:
+_Window = tuple[float, float, float, float]
+_WHOLE: _Window = (0.0, 0.0, 1.0, 1.0)  # corner, steps
+
+
+def _crop_origin(image: Path, _path: Path) -> tuple[_Window, str]:
     """A ``.geom`` speaks of the full image; a geotransform without CRS says where the crop is."""
     with open_raster(image) as dataset:
         step_x, _, x, _, step_y, y = dataset.transform[:6]
         has_crs = dataset.crs is not None
     if has_crs or (abs(step_x), abs(step_y), x, y) == (1.0, 1.0, 0.0, 0.0):
-        return RpcSource(rpc, "geom", path)
+        return _WHOLE, ""
     if step_x <= 0 or step_y == 0:
         raise RpcFormatError(f"{image}: a geotransform that is no crop origin (steps {step_x}, {step_y})")
     row = y if step_y > 0 else -y  # a negative row step: y = -row
-    cropped = rpc.window(x, row, step_x, abs(step_y))
-    return RpcSource(cropped, "geom", path, (f"crop origin ({x:g}, {row:g}) of the geotransform applied",))
+    return (x, row, step_x, abs(step_y)), f"crop origin ({x:g}, {row:g}) of the geotransform applied"
 
 
-_TILE = re.compile(r"_R(\d+)C(\d+)$")
-
-
-def _tile_source(image: Path, path: Path, rpc: RPC) -> RpcSource:
+def _tile_origin(image: Path, path: Path) -> tuple[_Window, str]:
     """A DIMAP product in tiles: the RPC is the whole image's, ``DIM_*.XML`` gives the size of a tile."""
-    tile = _TILE.search(image.stem.upper())
+    tile = re.search(r"_R(\d+)C(\d+)$", image.stem.upper())
     if tile is None or tile.groups() == ("1", "1"):
-        return RpcSource(rpc, "dimap", path)
+        return _WHOLE, ""
     product = path.name[4:]
-    names = {entry.name.lower(): entry for entry in image.parent.iterdir()}
-    dim = names.get(f"dim_{product}".lower())
+    dim = files_of(image.parent).get(f"dim_{product}".lower())
     text = decode(read_bytes(dim, RPC_FILE)) if dim else ""
     width, height = (
         re.search(rf"<NTILES_SIZE\b[^<>]*\b{key}=\"(\d{{1,9}})\"", text) for key in ("ncols", "nrows")
@@ -298,4 +238,4 @@ def _tile_source(image: Path, path: Path, rpc: RPC) -> RpcSource:
         )
     row, col = (int(index) - 1 for index in tile.groups())
     x, y = col * int(width.group(1)), row * int(height.group(1))
-    return RpcSource(rpc.crop(x, y), "dimap", path, (f"tile origin ({x}, {y}) applied",))
+    return (x, y, 1.0, 1.0), f"tile origin ({x}, {y}) applied"

@@ -1,48 +1,38 @@
 """The GeoTIFF RPCCoefficientTag (50844): read to the bit, and put into a copy whose pixels stay untouched.
 
-The tag is read from the file's directory itself: GDAL prints its numbers with 15 digits on the way. The
-copy is made of the source's bytes; only its first directory is written anew, behind the pixels, so that
-compression, tiles, overviews and masks stay as they are, in TIFF and BigTIFF alike.
+The tag is read from the file's directory itself: GDAL prints its numbers with 15 digits on the way. A copy is made
+of the source's bytes; only its first directory is written anew, behind the pixels, so that compression, tiles,
+overviews and masks stay as they are, in TIFF and BigTIFF alike.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+
 from barpc.errors import ImageError, RpcFormatError
-from barpc.rpcio.fields import COEFFICIENTS, ERRORS, OFFSETS, SCALES, fields_from_rpc, rpc_from_fields
+from barpc.geodesy import Array
+from barpc.rpcio.fields import COEFFICIENTS, SINGLE, fields_from_rpc, rpc_from_fields
+from barpc.sensor.rational import DERIVATIVE, MONOMIALS
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import IMAGE, opened
 
 RPC_TAG = 50844
-GEOREFERENCE_TAGS = (33550, 33922, 34264)
-"""ModelPixelScale, ModelTiepoint, ModelTransformation."""
-MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_GEOREFERENCE_TAGS = (33550, 33922, 34264)  # ModelPixelScale, ModelTiepoint, ModelTransformation
 
-_TYPE_SIZES = {
-    1: 1,
-    2: 1,
-    3: 2,
-    4: 4,
-    5: 8,
-    6: 1,
-    7: 1,
-    8: 2,
-    9: 4,
-    10: 8,
-    11: 4,
-    12: 8,
-    13: 4,
+_SIZES = dict(enumerate((1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4), 1)) | {
     16: 8,
     17: 8,
     18: 8,
-}
+}  # of a type [bytes]
 _DOUBLE = 12
 _MAX_ENTRIES = 4096
+_MAX_VALUES = 1 << 24  # bytes
 
 
 @dataclass(frozen=True)
@@ -69,52 +59,41 @@ class Directory:
         return next((entry for entry in self.entries if entry.tag == tag), None)
 
     @property
-    def offset_format(self) -> str:
-        """The format of an offset, for struct."""
-        return self.order + ("Q" if self.big else "I")
-
-
-def is_tiff(head: bytes) -> bool:
-    """Whether a file's first bytes are those of a TIFF or BigTIFF."""
-    return head[:4] in MAGICS
+    def formats(self) -> tuple[str, str, str]:
+        """Of an offset, of the number of entries and of an entry, for struct."""
+        offset, count, entry = ("Q", "Q", "HHQ8s") if self.big else ("I", "H", "HHI4s")
+        return self.order + offset, self.order + count, self.order + entry
 
 
 def read_directory(file: BinaryIO, name: str) -> Directory:
-    """The first directory of an open TIFF file.
-
-    Raises
-    ------
-    RpcFormatError
-        The file ends too early or the directory makes no sense.
-    """
+    """The first directory of an open TIFF file; RpcFormatError where it ends too early or makes no sense."""
     try:
         head = file.read(16)
-        order, big = ("<" if head[:2] == b"II" else ">"), head[2:4] in (b"+\0", b"\0+")
-        (start,) = struct.unpack(order + ("Q" if big else "I"), head[8:16] if big else head[4:8])
+        found = Directory("<" if head[:2] == b"II" else ">", head[2:4] in (b"+\0", b"\0+"), (), b"")
+        offset, number, layout = found.formats
+        (start,) = struct.unpack(offset, head[8:16] if found.big else head[4:8])
         file.seek(start)
-        (count,) = struct.unpack(order + ("Q" if big else "H"), file.read(8 if big else 2))
+        (count,) = struct.unpack(number, file.read(struct.calcsize(number)))
         if not 0 < count <= _MAX_ENTRIES:
             raise RpcFormatError(f"{name}: a TIFF directory of {count} entries")
-        layout = order + ("HHQ8s" if big else "HHI4s")
-        size = struct.calcsize(layout)
-        block = file.read(size * count)
-        entries = tuple(Entry(*struct.unpack_from(layout, block, size * i)) for i in range(count))
-        following = file.read(8 if big else 4)
-        if len(following) != (8 if big else 4):
+        block = file.read(struct.calcsize(layout) * count)
+        entries = tuple(Entry(*values) for values in struct.iter_unpack(layout, block))
+        following = file.read(struct.calcsize(offset))
+        if len(following) != struct.calcsize(offset):
             raise RpcFormatError(f"{name}: the TIFF directory is cut off")
     except (struct.error, OverflowError, OSError) as error:
         raise RpcFormatError(f"{name}: not a TIFF file that can be read ({error})") from error
-    return Directory(order, big, entries, following)
+    return replace(found, entries=entries, following=following)
 
 
 def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -> bytes:
     """The bytes of an entry's values, wherever they stand."""
-    size = _TYPE_SIZES.get(entry.kind, 1) * entry.count
-    if size > 1 << 24:
+    size = _SIZES.get(entry.kind, 1) * entry.count
+    if size > _MAX_VALUES:
         raise RpcFormatError(f"{name}: TIFF tag {entry.tag} claims {size} bytes")
     if size <= len(entry.value):
         return entry.value[:size]
-    (offset,) = struct.unpack(directory.offset_format, entry.value)
+    (offset,) = struct.unpack(directory.formats[0], entry.value)
     try:
         file.seek(offset)
         data = file.read(size)
@@ -126,13 +105,7 @@ def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -
 
 
 def read_tag(path: Path) -> RPC | None:
-    """The RPC in a TIFF's tag, or None where there is no such tag.
-
-    Raises
-    ------
-    RpcFormatError
-        The tag is there and does not hold 92 usable doubles.
-    """
+    """The RPC in a TIFF's tag, None without such a tag; RpcFormatError where it does not hold 92 usable doubles."""
     with opened(path, IMAGE) as file:
         directory = read_directory(file, str(path))
         entry = directory.find(RPC_TAG)
@@ -143,73 +116,97 @@ def read_tag(path: Path) -> RPC | None:
                 f"{path}: the RPC tag has {entry.count} values of type {entry.kind}, expected 92 doubles"
             )
         values = struct.unpack(f"{directory.order}92d", read_values(file, directory, entry, str(path)))
-    single = ERRORS + OFFSETS + SCALES
-    fields = {key: [value] for key, value in zip(single, values, strict=False)}
-    fields |= {key: list(values[12 + 20 * i : 32 + 20 * i]) for i, key in enumerate(COEFFICIENTS)}
     if not all(math.isfinite(value) for value in values[2:]):
         raise RpcFormatError(f"{path}: the RPC tag holds a number that is not finite")
+    fields = {key: [value] for key, value in zip(SINGLE, values, strict=False)}
+    fields |= {key: list(values[12 + 20 * i : 32 + 20 * i]) for i, key in enumerate(COEFFICIENTS)}
     return rpc_from_fields(fields, f"{path} (RPC tag)")
 
 
 def tag_values(rpc: RPC) -> list[float]:
     """The 92 doubles of the tag; an unknown accuracy is -1."""
     fields = fields_from_rpc(rpc)
-    single = [fields.get(key, [-1.0])[0] for key in ERRORS + OFFSETS + SCALES]
-    return single + [value for key in COEFFICIENTS for value in fields[key]]
+    return [value for key in SINGLE + COEFFICIENTS for value in fields.get(key, [-1.0])]
 
 
-def put_tag(path: Path, rpc: RPC, drop: tuple[int, ...] = ()) -> None:
+def put_tag(path: Path, rpc: RPC, placed: bool = True) -> None:
     """Give a TIFF an RPC tag, in place: for a fresh copy only, never for somebody's image.
 
-    Parameters
-    ----------
-    path : Path
-        The file that is changed: a new directory is written behind its end.
-    rpc : RPC
-        Goes into the tag, in place of the one that may be there.
-    drop : tuple of int
-        Tags to leave out of the new directory.
-
-    Raises
-    ------
-    RpcFormatError
-        No TIFF that can be read.
-    ImageError
-        The file would pass 4 GB, which only BigTIFF can hold.
+    A new directory, with its geotransform if `placed`, is written behind the end; ImageError if only BigTIFF holds it.
     """
     with opened(path, IMAGE) as file:
         directory = read_directory(file, str(path))
-    entries = [e for e in directory.entries if e.tag != RPC_TAG and e.tag not in drop]
     size = path.stat().st_size
     start = size + -size % 16
     if not directory.big and start + (1 << 16) > 0xFFFFFFFF:
         raise ImageError(
             f"{path}: a tag does not fit behind {size} bytes of classic TIFF; convert it to BigTIFF"
         )
-    order, big = directory.order, directory.big
-    values = struct.pack(f"{order}92d", *tag_values(rpc))
-    entries.append(Entry(RPC_TAG, _DOUBLE, 92, struct.pack(directory.offset_format, start)))
-    layout = order + ("HHQ8s" if big else "HHI4s")
-    table = struct.pack(order + ("Q" if big else "H"), len(entries))
+    offset, number, layout = directory.formats
+    values = struct.pack(f"{directory.order}92d", *tag_values(rpc))
+    drop = {RPC_TAG} if placed else {RPC_TAG, *_GEOREFERENCE_TAGS}
+    entries = [e for e in directory.entries if e.tag not in drop]
+    entries.append(Entry(RPC_TAG, _DOUBLE, 92, struct.pack(offset, start)))
+    table = struct.pack(number, len(entries))
     for entry in sorted(entries, key=lambda e: e.tag):
         table += struct.pack(layout, entry.tag, entry.kind, entry.count, entry.value)
     with path.open("r+b") as file:
         file.seek(start)
         file.write(values + table + directory.following)
         _unmark_cog(file)
-        file.seek(8 if big else 4)
-        file.write(struct.pack(directory.offset_format, start + len(values)))
+        file.seek(8 if directory.big else 4)
+        file.write(struct.pack(offset, start + len(values)))
 
 
 def _unmark_cog(file: BinaryIO) -> None:
-    """Say in a cloud-optimised GeoTIFF's header that its directory is no longer in front.
-
-    The header has a line for exactly this, of fixed width; readers then take the file as any tiled TIFF.
-    """
+    """Say in a cloud-optimised GeoTIFF's header, which has a line for it, that its directory is no longer in front."""
     file.seek(0)
-    head = file.read(1024)
-    mark = b"KNOWN_INCOMPATIBLE_EDITION=NO\n "
-    position = head.find(mark)
+    position = file.read(1024).find(b"KNOWN_INCOMPATIBLE_EDITION=NO\n ")
     if position >= 0:
         file.seek(position)
         file.write(b"KNOWN_INCOMPATIBLE_EDITION=YES\n")
+
+
+# --- fifteen digits ---------------------------------------------------------------------------------------
+
+_POWERS = np.array([[monomial.count(letter) for monomial in MONOMIALS] for letter in "LPH"], dtype=np.float64)
+
+
+def _fifteen(values: Array) -> Array:
+    return np.array([float(f"{value:.15g}") for value in values.tolist()])
+
+
+def survives(rpc: RPC) -> bool:
+    """Whether offsets and scales are the same after being printed with fifteen digits."""
+    arrays = (rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+    return all(np.array_equal(_fifteen(array), array) for array in arrays)
+
+
+def printable(rpc: RPC) -> RPC:
+    """The same camera with offsets and scales of at most fifteen digits, as which GDAL hands the tag's doubles on.
+
+    A longitude offset of 17 digits cut to 15 would move an image by up to 2e-8 px. The coefficients take up the
+    difference: a normalised coordinate x becomes a x + b with b and a - 1 of 1e-13, the polynomials change by
+    b dp/dx + (a - 1) x dp/dx, and what is left of second order is 1e-26.
+    """
+    if survives(rpc):
+        return rpc
+    ground_offset, ground_scale = _fifteen(rpc.ground_offset), _fifteen(rpc.ground_scale)
+    image_offset, image_scale = _fifteen(rpc.image_offset), _fifteen(rpc.image_scale)
+    shift = (ground_offset - rpc.ground_offset) / rpc.ground_scale
+    stretch = (ground_scale - rpc.ground_scale) / rpc.ground_scale
+    coeffs = np.array(rpc.coeffs)
+    change = coeffs * (stretch @ _POWERS)
+    change[:, :10] += np.einsum("k,kij,pi->pj", shift, DERIVATIVE, coeffs)
+    coeffs += change
+    numerator, denominator = coeffs[::2], coeffs[1::2]
+    offset = ((rpc.image_offset - image_offset) / image_scale)[:, None]
+    coeffs[::2] = numerator * (rpc.image_scale / image_scale)[:, None] + offset * denominator
+    return replace(
+        rpc,
+        coeffs=coeffs,
+        ground_offset=ground_offset,
+        ground_scale=ground_scale,
+        image_offset=image_offset,
+        image_scale=image_scale,
+    )

@@ -11,6 +11,8 @@ from barpc.errors import ImageError, RpcFormatError
 from barpc.rpcio.fields import (
     COEFFICIENTS,
     ERRORS,
+    KEYS,
+    MAXAR,
     OFFSETS,
     SCALES,
     Fields,
@@ -21,17 +23,16 @@ from barpc.rpcio.fields import (
     numbers,
     rpc_from_fields,
 )
-from barpc.safexml import parse_xml
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import parse_xml
 from barpc.vrt import vrt_from_xml
 
 
 def _root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
-    return parse_xml(
-        re.sub(r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1).encode(),
-        name=name,
-        strip_namespaces=strip_namespaces,
-    )
+    body = re.sub(
+        r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1
+    )  # the encoding it declares is no longer its own
+    return parse_xml(body.encode(), name=name, strip_namespaces=strip_namespaces)
 
 
 def _text(parent: Element, path: str, name: str) -> str:
@@ -50,33 +51,6 @@ def _element(parent: Element, paths: Iterable[str], name: str) -> Element:
     raise RpcFormatError(f"{name}: none of the elements {', '.join(paths)} is there")
 
 
-# --- Maxar ------------------------------------------------------------------------------------------------
-
-_MAXAR_NAMES = {
-    "ERRBIAS": "ERR_BIAS",
-    "ERRRAND": "ERR_RAND",
-    "LINEOFFSET": "LINE_OFF",
-    "SAMPOFFSET": "SAMP_OFF",
-    "LATOFFSET": "LAT_OFF",
-    "LONGOFFSET": "LONG_OFF",
-    "HEIGHTOFFSET": "HEIGHT_OFF",
-    "LINESCALE": "LINE_SCALE",
-    "SAMPSCALE": "SAMP_SCALE",
-    "LATSCALE": "LAT_SCALE",
-    "LONGSCALE": "LONG_SCALE",
-    "HEIGHTSCALE": "HEIGHT_SCALE",
-    "LINENUMCOEF": "LINE_NUM_COEFF",
-    "LINEDENCOEF": "LINE_DEN_COEFF",
-    "SAMPNUMCOEF": "SAMP_NUM_COEFF",
-    "SAMPDENCOEF": "SAMP_DEN_COEFF",
-}
-
-
-def sniff_maxar(text: str) -> bool:
-    """An ``<isd>`` with ``<RPB>`` in it, plain or in a namespace (``lv1b:``)."""
-    return re.search(r"<(\w+:)?LINENUMCOEF", text) is not None
-
-
 def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
     """Maxar's image support data: `<RPB><IMAGE>`, twenty numbers in one element a list."""
     root = _root(text, name)
@@ -86,47 +60,34 @@ def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
         raise RpcFormatError(f"{name}: coefficients in {spec} order, only RPC00B is read from this format")
     image = _element(rpb, ("IMAGE",), name)
     fields: Fields = {}
-    for key, field in _MAXAR_NAMES.items():
-        path = f"{key}List/{key}" if field in COEFFICIENTS else key
-        if field in ERRORS and image.find(path) is None:
-            continue
-        fields[field] = numbers(_text(image, path, name), name, key)
-    return rpc_from_fields(fields, name, options.first_pixel or 0.0)
+    for key, word in MAXAR.items():
+        tag = word.upper()
+        path = f"{tag}List/{tag}" if key in COEFFICIENTS else tag
+        if key not in ERRORS or image.find(path) is not None:
+            fields[key] = numbers(_text(image, path, name), name, tag)
+    return rpc_from_fields(fields, name, options)
 
 
 def write_maxar(rpc: RPC) -> str:
     """The `<RPB>` part of Maxar's image support data."""
-    fields = fields_from_rpc(rpc)
-    lines = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
-        "<isd>",
-        "\t<RPB>",
-        "\t\t<SPECID>RPC00B</SPECID>",
-        "\t\t<IMAGE>",
-    ]
-    for key, field in _MAXAR_NAMES.items():
-        if field in COEFFICIENTS:
-            values = " ".join(map(format_number, fields[field]))
-            lines += [f"\t\t\t<{key}List>", f"\t\t\t\t<{key}>{values}</{key}>", f"\t\t\t</{key}List>"]
-        elif field in fields:
-            lines.append(f"\t\t\t<{key}>{format_number(fields[field][0])}</{key}>")
-    return "\n".join([*lines, "\t\t</IMAGE>", "\t</RPB>", "</isd>"]) + "\n"
-
-
-# --- DIMAP ------------------------------------------------------------------------------------------------
-
-
-def sniff_dimap(text: str) -> bool:
-    """A ``Dimap_Document`` with a rational function model, or the model alone."""
-    return re.search(r"<(\w+:)?Global_RFM", text) is not None
+    lines = []
+    for key, values in fields_from_rpc(rpc).items():
+        tag = MAXAR[key].upper()
+        element = f"<{tag}>{' '.join(map(format_number, values))}</{tag}>"
+        if key in COEFFICIENTS:
+            lines += [f"\t\t\t<{tag}List>", f"\t\t\t\t{element}", f"\t\t\t</{tag}List>"]
+        else:
+            lines.append(f"\t\t\t{element}")
+    xml = '<?xml version="1.0" encoding="UTF-8"?>'
+    head = [xml, "<isd>", "\t<RPB>", "\t\t<SPECID>RPC00B</SPECID>", "\t\t<IMAGE>"]
+    return "\n".join([*head, *lines, "\t\t</IMAGE>", "\t</RPB>", "</isd>"]) + "\n"
 
 
 def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
-    """Airbus' DIMAP: Pleiades, SPOT 6/7, PeruSat (v1, v2) and Pleiades Neo (v3).
+    """Airbus' DIMAP: Pleiades, SPOT 6/7, PeruSat (v1, v2) and Pleiades Neo (v3); its inverse model, never the direct.
 
-    The inverse model (ground to image) is taken, never the direct one. The first pixel's centre is (1, 1)
-    in v1 and v2 and (0, 0) in v3, unless `options.first_pixel` says otherwise. ERR_BIAS_ROW and _COL are
-    the error of the vendor's own fit in pixels, no geolocation accuracy: they are left out.
+    The first pixel's centre is (1, 1) in v1 and v2 and (0, 0) in v3. ERR_BIAS_ROW and _COL are the error of the
+    vendor's own fit [px], no geolocation accuracy: they are left out.
     """
     root = _root(text, name)
     model = _element(root, ("Global_RFM",), name)
@@ -138,8 +99,7 @@ def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
     for key in COEFFICIENTS:
         indexed = [f"{key}_{i}" for i in range(1, 21)]
         fields[key] = [number(_text(inverse, k, name), name, k) for k in indexed]
-    default = 0.0 if inverse.tag == "GroundtoImage_Values" else 1.0
-    return rpc_from_fields(fields, name, default if options.first_pixel is None else options.first_pixel)
+    return rpc_from_fields(fields, name, options, 0.0 if inverse.tag == "GroundtoImage_Values" else 1.0)
 
 
 def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
@@ -156,20 +116,10 @@ def _read_dimap_v1(model: Element, name: str, options: ReadOptions) -> RPC:
         element = _element(validity, (axis,), name)
         fields[f"{field}_SCALE"] = [number(_text(element, "A", name), name, f"{axis}/A")]
         fields[f"{field}_OFF"] = [number(_text(element, "B", name), name, f"{axis}/B")]
-    return rpc_from_fields(fields, name, 1.0 if options.first_pixel is None else options.first_pixel)
+    return rpc_from_fields(fields, name, options, first_pixel=1.0)
 
-
-# --- EnMAP ------------------------------------------------------------------------------------------------
 
 _ENMAP_AXES = {"LINE": "ROW", "SAMP": "COL"}
-
-
-def sniff_enmap(text: str) -> bool:
-    """An RPC a band: ``<RPC><bandID number=...>`` with ``<ROW_NUM_1>``."""
-    return (
-        re.search(r"<bandID\s", text) is not None
-        and re.search(r"<ROW_NUM_0?1>", text, re.IGNORECASE) is not None
-    )
 
 
 def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
@@ -191,40 +141,29 @@ def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
         fields[key] = [
             values[k] for i in range(1, 21) for k in (f"{stem}{i}", f"{stem}{i:02d}") if k in values
         ][:20]
-    return rpc_from_fields(fields, name, options.first_pixel or 0.0)
-
-
-# --- GDAL -------------------------------------------------------------------------------------------------
-
-
-def sniff_gdal(text: str) -> bool:
-    """A VRT or a PAM ``.aux.xml`` with ``<Metadata domain="RPC">``."""
-    return re.search(r"<(VRTDataset|PAMDataset)\b", text) is not None and 'domain="RPC"' in text
+    return rpc_from_fields(fields, name, options)
 
 
 def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
     """GDAL's RPC metadata domain; a VRT is read by the grammar by which it is opened (`barpc.vrt`)."""
     root = _root(text, name, strip_namespaces=False)
+    found = root.find("Metadata[@domain='RPC']")
     if root.tag == "VRTDataset":
         try:
-            domains = vrt_from_xml(root, Path(), name).metadata
+            items = vrt_from_xml(root, Path(), name).metadata.get("RPC")
         except ImageError as error:
             raise RpcFormatError(str(error)) from error
     else:
-        found = root.find("Metadata[@domain='RPC']")
-        domains = (
-            {} if found is None else {"RPC": {e.get("key", ""): e.text or "" for e in found.iter("MDI")}}
-        )
-    if "RPC" not in domains:
+        items = None if found is None else {e.get("key", ""): e.text or "" for e in found.iter("MDI")}
+    if items is None:
         raise RpcFormatError(f'{name}: no <Metadata domain="RPC">')
-    return rpc_from_domain(domains["RPC"], name, options)
+    return rpc_from_domain(items, name, options)
 
 
 def rpc_from_domain(items: Mapping[str, str], name: str, options: ReadOptions) -> RPC:
     """The RPC in GDAL's metadata domain; other keys are passed over."""
-    known = {*OFFSETS, *SCALES, *ERRORS, *COEFFICIENTS}
-    fields = {key: numbers(value, name, key) for key, value in items.items() if key in known}
-    return rpc_from_fields(fields, name, options.first_pixel or 0.0)
+    fields = {key: numbers(value, name, key) for key, value in items.items() if key in KEYS}
+    return rpc_from_fields(fields, name, options)
 
 
 def rpc_domain(rpc: RPC) -> str:

@@ -4,13 +4,12 @@
 """
 
 from barpc.options import TieOptions
-from barpc.tie.area import Area, read_area
-from barpc.tie.features import Keypoints
-from barpc.tie.find import TieResult, detect, find_tracks, match, require_matches
+from barpc.tie.features import Keypoints, detect
 from barpc.tie.matcher import Matches
-from barpc.tie.matching import PairReport, match_pair
-from barpc.tie.pairs import Pair, select_pairs
-from barpc.tie.tracks import common_tracks, link, refine, thin
+from barpc.tie.matching import PairReport, match, match_pair
+from barpc.tie.pairs import Area, Pair, read_area, select_pairs
+from barpc.tie.register import refine
+from barpc.tie.tracks import TieResult, common_tracks, find_tracks, link, require_matches, thin
 
 __all__ = [
     "Area",

@@ -19,36 +19,19 @@ _WINDOW_POINTS = 60  # that a window needs for a fit of its own
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Points of image A in image B, in axes along and across the epipolar direction.
+    """Points of image A in image B, in axes along and across the epipolar direction; between two altitudes."""
 
-    Parameters
-    ----------
-    axis : (2,)
-        Unit vector in B along which a point moves when its altitude grows.
-    along : (N,)
-        Coordinate of the point along the axis at the middle altitude [px].
-    across : (N,)
-        Coordinate across it at the middle altitude [px].
-    slope : (N,)
-        d(across)/d(along).
-    before, after : (N,)
-        Where to look for the point along the axis, from (negative: backwards) and to [px]: as the cameras say,
-        from the lowest to the highest altitude.
-    linear : (2, 2)
-        d(image B)/d(image A) at constant altitude, in the middle of the points.
-    """
-
-    axis: Array
-    along: Array
+    axis: Array  # (2,) unit vector in B along which a point moves when its altitude grows
+    along: Array  # (N,) coordinates of the points at the middle altitude [px]
     across: Array
-    slope: Array
-    before: Array
-    after: Array
-    linear: Array
+    slope: Array  # (N,) d(across)/d(along)
+    before: Array  # (N,) where to look along the axis [px]: from the lowest altitude (negative: backwards)
+    after: Array  # to the highest
+    linear: Array  # (2, 2) d(image B)/d(image A) at constant altitude, in the middle of the points
 
     def turn(self, xy: Array) -> Array:
         """Coordinates along and across (..., 2) of points (..., 2) of image B [px]."""
-        turned: Array = xy @ np.array([[self.axis[0], -self.axis[1]], [self.axis[1], self.axis[0]]])
+        turned: Array = xy @ _rotation(self.axis)
         return turned
 
     def moved(self, across: Array | float) -> Frame:
@@ -58,7 +41,7 @@ class Frame:
     def place(self, along: Array) -> Array:
         """Points of B (N, 2) [px] on the epipolar lines, `along` (N,) [px] from the middle altitude's."""
         turned = np.stack([self.along + along, self.across + self.slope * along], axis=-1)
-        out: Array = turned @ np.array([[self.axis[0], self.axis[1]], [-self.axis[1], self.axis[0]]])
+        out: Array = turned @ _rotation(self.axis).T
         return out
 
     def errors(self, xy: Array) -> Array:
@@ -66,6 +49,10 @@ class Frame:
         u, w = self.turn(xy).T
         along = u - self.along
         return np.stack([along, w - self.across - self.slope * along], axis=-1)
+
+
+def _rotation(axis: Array) -> Array:
+    return np.array([[axis[0], -axis[1]], [axis[1], axis[0]]])
 
 
 def common_range(*views: View) -> tuple[float, float]:
@@ -88,44 +75,32 @@ def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> Fr
         length = float(np.hypot(*mean))
         axis = mean / length if length > 1e-3 else np.array([1.0, 0.0])
     middle = np.median(xy[usable], axis=0) if usable.any() else np.zeros(2)
-    none = np.empty(0)
-    result = Frame(axis, none, none, none, none, none, linear_map(first, second, middle))
-    (u0, w0), (u1, w1) = result.turn(low).T, result.turn(high).T
+    (u0, w0), (u1, w1) = (low @ _rotation(axis)).T, (high @ _rotation(axis)).T
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.where(np.abs(u1 - u0) > 1e-3, (w1 - w0) / (u1 - u0), 0.0)
     slope[~usable] = np.nan
-    reach = 0.5 * np.abs(u1 - u0)
-    along, across = 0.5 * (u0 + u1), 0.5 * (w0 + w1)
-    return replace(result, along=along, across=across, slope=slope, before=-reach, after=reach)
+    along, across, reach = 0.5 * (u0 + u1), 0.5 * (w0 + w1), 0.5 * np.abs(u1 - u0)
+    return Frame(axis, along, across, slope, -reach, reach, linear_map(first, second, middle))
 
 
 def linear_map(first: View, second: View, xy: Array) -> Array:
-    """Derivative (..., 2, 2) of the place in B by that in A (..., 2) [px], at the middle altitude.
-
-    The identity where a camera fails.
-    """
+    """Derivative (..., 2, 2) of the place in B by that in A (..., 2) [px] at mid altitude; identity if one fails."""
     alt = 0.5 * sum(common_range(first, second))
     ground = first.sensor.localize(xy, np.full(xy.shape[:-1], alt))
-    by_a = first.sensor.project_jacobian(ground)[1][..., :2]
-    by_b = second.sensor.project_jacobian(ground)[1][..., :2]
-    usable = np.isfinite(by_a).all(axis=(-2, -1)) & np.isfinite(by_b).all(axis=(-2, -1))
-    usable = np.asarray(usable)[..., None, None]
-    by_a, by_b = np.where(usable, by_a, np.eye(2)), np.where(usable, by_b, np.eye(2))
-    out: Array = by_b @ np.linalg.inv(by_a)
+    by_a, by_b = (view.sensor.project_jacobian(ground)[1][..., :2] for view in (first, second))
+    usable = np.isfinite(by_a + by_b).all(axis=(-2, -1), keepdims=True)
+    out: Array = np.where(usable, by_b, np.eye(2)) @ np.linalg.inv(np.where(usable, by_a, np.eye(2)))
     return out
 
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """A scalar [px] that varies affinely over an image: coefficients (3,) . (1, x, y), (x, y) = (xy - middle) / scale.
-
-    `spread` is the robust standard deviation of the values about it [px].
-    """
+    """A scalar [px] affine over an image: coefficients (3,) . (1, x, y), (x, y) = (xy - middle) / scale."""
 
     coefficients: Array
     middle: Array
     scale: Array
-    spread: float
+    spread: float  # robust standard deviation of the values about it [px]
 
     def __call__(self, xy: Array) -> Array:
         """Values (N,) at points (N, 2)."""
@@ -138,9 +113,9 @@ def _design(xy: Array, middle: Array, scale: Array) -> Array:
 
 
 def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
-    """Fit values (N,) [px] at positions (N, 2) [px] by an affine function, in spite of outliers.
+    """Fit values (N,) at positions (N, 2) [px] by an affine function, a constant for few points, despite outliers.
 
-    Tukey's biweight on a scale that follows the residuals' MAD; a constant for few points.
+    Tukey's biweight on a scale that follows the residuals' MAD.
     """
     middle, scale = np.median(xy, axis=0), np.maximum(np.ptp(xy, axis=0), 1.0)
     design = _design(xy, middle, scale)
@@ -170,10 +145,9 @@ def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
 
 
 def agreeing(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
-    """Which values (N,) [px] agree with an affine function of position (N, 2) [px], window by window.
+    """Which values (N,) [px] agree with an affine function of position (N, 2) [px], and their distances from it (N,).
 
-    Returns the mask (N,) of those within three robust standard deviations of their window's function, or within
-    `floor` [px], and the distances (N,) from it [px].
+    Each window has its own function; what lies within three robust standard deviations of it, or `floor` [px], agrees.
     """
     keep = np.zeros(len(values), dtype=bool)
     if not len(values):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
+from itertools import islice
 from typing import Any
 
 import cv2
@@ -12,39 +14,28 @@ import numpy.typing as npt
 
 from barpc.geodesy import Array
 from barpc.options import TieOptions
-from barpc.scene import BoolArray, IntArray
-from barpc.tie.raster import CELL, Box, ByteImage, Stretch, grow, read_pixels
+from barpc.scene import BoolArray, IntArray, View
+from barpc.tie.pairs import Area, Pair, shared_tiles
+from barpc.tie.raster import CELL, Box, ByteImage, Stretch, grow, read_pixels, sample_stretch, tiles
+from barpc.tie.tasks import Progress, ordered
 
 PER_CELL = 40
 """Strongest keypoints kept in a cell."""
 CONTRAST = 0.01
 """SIFT's contrast threshold."""
+_DEFAULTS = TieOptions()
 _MARGIN = 48  # px read around a tile, so that keypoints at its border are those of the whole image
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Points of an image that can be found again in another one.
+    """Points of an image that can be found again in another one."""
 
-    Parameters
-    ----------
-    xy : (N, 2)
-        col, row [full-resolution px].
-    scale : (N,)
-        Diameter of the neighbourhood described [px].
-    angle : (N,)
-        Orientation, from the column axis towards the row axis [rad].
-    response : (N,)
-        Strength, comparable within an image.
-    descriptors : (N, D) uint8
-        Unit vectors times 255 (RootSIFT: square roots of SIFT's).
-    """
-
-    xy: Array
-    scale: Array
-    angle: Array
-    response: Array
-    descriptors: npt.NDArray[np.uint8]
+    xy: Array  # (N, 2) col, row [full-resolution px]
+    scale: Array  # (N,) diameter of the neighbourhood described [px]
+    angle: Array  # (N,) orientation, from the column axis towards the row axis [rad]
+    response: Array  # (N,) strength, comparable within an image
+    descriptors: npt.NDArray[np.uint8]  # (N, D) unit vectors times 255 (RootSIFT: square roots of SIFT's)
 
     def __len__(self) -> int:
         """Number of keypoints N."""
@@ -57,12 +48,10 @@ class Keypoints:
 
 def join(parts: Sequence[Keypoints]) -> Keypoints:
     """Keypoints of several tiles as one set; an empty set of none."""
-    if not parts:
-        none = np.empty(0)
-        return Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))
-    return Keypoints(
-        *(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Keypoints))
-    )
+    none = np.empty(0)
+    parts = parts or [Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))]
+    columns = (np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Keypoints))
+    return Keypoints(*columns)
 
 
 class Sift:
@@ -74,8 +63,6 @@ class Sift:
     def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
         """Keypoints for which `keep(xy, scale, response)` is true; only those are described."""
         found = self._sift.detect(picture, None)
-        if not found:
-            return join([])
         kept = np.flatnonzero(keep(*_table(found)))
         described, raw = self._sift.compute(picture, [found[i] for i in kept])
         if raw is None:
@@ -94,9 +81,9 @@ def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
 def detect_tile(
     path: str, size: tuple[int, int], box: Box, stretch: Stretch, options: TieOptions
 ) -> Keypoints:
-    """Keypoints of one tile of an image of `size` (width, height), at most a quota a cell.
+    """Keypoints of one tile of an image of `size` (width, height), at most a quota a cell, sorted by row and column.
 
-    In the coordinates of the whole image, sorted by row and column; `stretch` is that of the whole image.
+    Coordinates and `stretch` are those of the whole image.
     """
     cv2.setNumThreads(1)
     window = grow(box, _MARGIN, size)
@@ -108,14 +95,12 @@ def detect_tile(
 
     def keep(xy: Array, scale: Array, response: Array) -> BoolArray:
         col, row = np.rint(xy).astype(int).T
-        inside = (
-            (xy + origin >= box[:2] - 0.5 * np.ones(2)) & (xy + origin < np.add(box[:2], box[2:]) - 0.5)
-        ).all(1)
+        place = xy + origin
+        inside = ((place >= np.array(box[:2]) - 0.5) & (place < np.add(box[:2], box[2:]) - 0.5)).all(axis=1)
         inside &= distance[row.clip(0, window[3] - 1), col.clip(0, window[2] - 1)] > np.maximum(3.0, scale)
-        chosen = np.zeros(len(xy), dtype=bool)
         index = np.flatnonzero(inside)
-        chosen[index[quota(xy[index] + origin, response[index], CELL, PER_CELL)]] = True
-        return chosen
+        strongest = quota(place[index], response[index], CELL, PER_CELL)
+        return np.isin(np.arange(len(xy)), index[strongest])
 
     found = Sift().detect(stretch.apply(pixels, valid), keep)
     found = found.select(np.lexsort((found.angle, found.xy[:, 0], found.xy[:, 1])))
@@ -146,3 +131,29 @@ def bounded(keypoints: Keypoints, options: TieOptions) -> Keypoints:
         strongest = np.argsort(-keypoints.response, kind="stable")[: options.keypoints_per_image]
         keypoints = keypoints.select(np.sort(strongest))
     return keypoints
+
+
+def detect(
+    views: Sequence[View],
+    options: TieOptions = _DEFAULTS,
+    *,
+    pairs: Sequence[Pair] | None = None,
+    area: Area | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> list[Keypoints]:
+    """Keypoints of every view; none in an image in which nothing varies.
+
+    With `pairs`, tiles that no partner may see are not read, nor those outside `area`; the rest as for `find_tracks`.
+    """
+    stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
+    boxes = [tiles(view.size, options) for view in views]
+    if pairs is not None:
+        boxes = shared_tiles(views, pairs, options, area)
+    boxes = [of_view if stretch else [] for of_view, stretch in zip(boxes, stretches, strict=True)]
+    each = zip(views, stretches, boxes, strict=True)
+    tasks = [
+        (view.path, view.size, box, stretch, options) for view, stretch, of_view in each for box in of_view
+    ]
+    found = iter(ordered(executor, detect_tile, tasks, "detect", progress))
+    return [bounded(join(list(islice(found, len(of_view)))), options) for of_view in boxes]

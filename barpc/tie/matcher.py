@@ -25,28 +25,14 @@ from barpc.tie.raster import Box
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Where points of A may lie in B.
+    """Where points of A may lie in B."""
 
-    Parameters
-    ----------
-    where : callable
-        Points of A (N, 2) [px] -> their `Frame`; its axis is the same for all predictions of a pair.
-    half_width : float
-        How far across the epipolar lines to look [px].
-    windows : callable
-        () -> the windows of A that B may see, as far as the cameras may be wrong.
-    probes : int, optional
-        So many points of A are enough, spread evenly, and only clear matches count: the cameras' error is looked
-        for. None: all points.
-    aside : float
-        How far the bands are moved across the epipolar lines [px].
-    """
-
-    where: Callable[[Array], Frame]
-    half_width: float
-    windows: Callable[[], Sequence[Box]]
+    where: Callable[[Array], Frame]  # of points of A (N, 2) [px]; one axis for all predictions of a pair
+    half_width: float  # how far across the epipolar lines to look [px]
+    windows: Callable[[], Sequence[Box]]  # those of A that B may see, as far as the cameras may be wrong
     probes: int | None = None
-    aside: float = 0.0
+    """So many points, spread evenly, are enough and only clear matches count: the cameras' error is looked for."""
+    aside: float = 0.0  # how far the bands are moved across the epipolar lines [px]
 
     def at(self, xy: Array) -> Frame:
         """The frame of points of A (N, 2) [px]; NaN: nowhere."""
@@ -56,7 +42,7 @@ class Prediction:
         """Indices of the points that are wanted of `count`, ascending."""
         return np.linspace(0, count - 1, min(count, self.probes or count)).astype(np.int64)
 
-    def holds(self, xy: Array) -> BoolArray:
+    def contains(self, xy: Array) -> BoolArray:
         """Which matches (M, 2, 2) lie in the bands: for a matcher that looks everywhere."""
         where = self.at(xy[:, 0])
         along, across = where.errors(xy[:, 1]).T
@@ -67,25 +53,13 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Points of two views that show the same ground.
+    """Points of two views that show the same ground."""
 
-    Parameters
-    ----------
-    xy : (M, 2, 2)
-        col, row in the first and in the second view [px].
-    score : (M,)
-        How unlike the two places look: 0 or more, comparable among all calls for a pair.
-    index : (M, 2)
-        Number of the point in the first and in the second view. Matches of two pairs that give a point of their
-        common view the same number belong to one track.
-    sigma : float
-        Standard deviation of each coordinate [px], measured once the matches are verified.
-    """
-
-    xy: Array
-    score: Array
+    xy: Array  # (M, 2, 2) col, row in the first and in the second view [px]
+    score: Array  # (M,) how unlike the two places look: 0 or more, comparable among all calls for a pair
     index: IntArray
-    sigma: float = float("nan")
+    """(M, 2) number of the point in either view: points of a view that two pairs number alike belong to one track."""
+    sigma: float = float("nan")  # standard deviation of each coordinate [px], measured once they are verified
 
     def __len__(self) -> int:
         """Number of matches M."""

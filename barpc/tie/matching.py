@@ -1,17 +1,18 @@
 """Matching two views along the epipolar segments that their cameras predict, with any matcher.
 
-A blind pass finds how wrong the cameras are relative to each other; a tight pass searches a narrow band
-about the corrected segments; a local pass looks again where the neighbours' altitudes are; a robust affine
-fit, window by window, throws out what does not lie on the lines. The same searches in bands that are
-shifted aside find only false matches: they say how unlike two places may look for a wanted share of them.
+A blind pass finds how wrong the cameras are relative to each other; a tight pass searches a narrow band about the
+corrected segments; a local pass looks again at the altitudes of the neighbours; a robust affine fit, window by window,
+throws out what does not lie on the lines. The same searches in bands that are shifted aside find only false matches:
+they say how unlike two places may look for a wanted share of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,14 +25,14 @@ from barpc.tie.features import Keypoints
 from barpc.tie.guided import Guided
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
 from barpc.tie.pairs import Pair, shared_tiles
-
-T = TypeVar("T")
+from barpc.tie.tasks import Progress, ordered
 
 MATCHERS: dict[str, type[Matcher]] = {"guided": Guided}
 """Name -> matcher."""
 
 TOLERANCE = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
+_DEFAULTS = TieOptions()
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
 _PEAK = 4.0  # px, width of the window in which true matches of a blind pass fall
@@ -44,71 +45,28 @@ _NEIGHBOURS = 12
 
 @dataclass(frozen=True)
 class PairReport:
-    """What became of a pair of views.
-
-    Parameters
-    ----------
-    names : tuple of str
-        The views.
-    status : str
-        "ok", or what went wrong.
-    keypoints : tuple of int
-        Keypoints of the two views; 0 for a matcher that wants none.
-    matches, verified : int
-        After the tight pass; after the verification.
-    inlier_share : float
-        verified / matches.
-    control_share : float
-        Share of the verified matches that chance alone would give.
-    offset : tuple of float
-        Median distance of the matches from the prediction at the middle altitude, along and across the
-        epipolar direction [px].
-    spread : float
-        Robust standard deviation across the epipolar line after the affine fit [px].
-    angle : float
-        Convergence angle [deg].
-    overlap : float
-        Common area over that of the smaller footprint.
-    """
+    """What became of a pair of views."""
 
     names: tuple[str, str]
-    status: str
-    keypoints: tuple[int, int]
-    matches: int = 0
-    verified: int = 0
-    inlier_share: float = 0.0
-    control_share: float = 0.0
+    status: str  # "ok", or what went wrong
+    keypoints: tuple[int, int]  # of the two views; 0 for a matcher that wants none
+    matches: int = 0  # after the tight pass
+    verified: int = 0  # of them, after the verification
+    inlier_share: float = 0.0  # verified / matches
+    control_share: float = 0.0  # of the verified matches: what chance alone would give
     offset: tuple[float, float] = (float("nan"), float("nan"))
-    spread: float = float("nan")
-    angle: float = float("nan")
-    overlap: float = float("nan")
+    """Median distance along and across the epipolar line from the prediction at the middle altitude [px]."""
+    spread: float = float("nan")  # robust, across the epipolar line after the affine fit [px]
+    angle: float = float("nan")  # of convergence [deg]
+    overlap: float = float("nan")  # common area over that of the smaller footprint
 
 
 def match_pair(
     views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions
 ) -> tuple[Matches, PairReport]:
-    """Match two views.
-
-    Parameters
-    ----------
-    views : two View
-        The views.
-    keypoints : two Keypoints
-        Their keypoints; empty for a matcher that wants none.
-    pair : Pair
-        As `select_pairs` gave it.
-    options : TieOptions
-        Matcher, search distances, share of false matches, smallest number of matches.
-
-    Returns
-    -------
-    matches : Matches
-        None where the pair failed: the report says why.
-    report : PairReport
-        Counts and measures.
-    """
-    counts = (len(keypoints[0]), len(keypoints[1]))
-    report = PairReport((views[0].name, views[1].name), "ok", counts, angle=pair.angle, overlap=pair.overlap)
+    """Match two views; keypoints are empty for a matcher that wants none. No matches: the report says why."""
+    names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
+    report = PairReport(names, "ok", counts, angle=pair.angle, overlap=pair.overlap)
     kind = MATCHERS[options.matcher]
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
@@ -126,37 +84,45 @@ def match_pair(
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
     if report.verified < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches on common epipolar lines")
-    spread = robust_spread(residual[keep])
-    report = replace(
-        report,
-        inlier_share=report.verified / len(found),
-        offset=(float(np.median(errors[keep, 0])), float(np.median(errors[keep, 1]))),
-        spread=spread,
-    )
+    spread, share = robust_spread(residual[keep]), report.verified / len(found)
+    along, across = np.median(errors[keep], axis=0).tolist()
+    report = replace(report, inlier_share=share, offset=(along, across), spread=spread)
     return replace(found.select(keep), sigma=max(spread, 0.05)), report
 
 
-def _latest(function: Callable[[Array], T]) -> Callable[[Array], T]:
-    """A function of points that remembers its last value: a matcher asks about the same array again."""
-    known: list[tuple[Array, T]] = []
+def match(
+    views: Sequence[View],
+    keypoints: Sequence[Keypoints],
+    pairs: Sequence[Pair],
+    options: TieOptions = _DEFAULTS,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> list[tuple[Matches, PairReport]]:
+    """Matches of every pair, each with its report: `match_pair` over all pairs."""
+    ends = [(pair, *pair.views) for pair in pairs]
+    tasks = [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
+    return ordered(executor, match_pair, tasks, "match", progress)
 
-    def remembered(xy: Array) -> T:
+
+def _latest(where: Callable[[Array], Frame]) -> Callable[[Array], Frame]:
+    """A function of points that remembers its last value: a matcher asks about the same array again."""
+    known: list[tuple[Array, Frame]] = []
+
+    def remembered(xy: Array) -> Frame:
         if not known or known[0][0] is not xy:
-            known[:] = [(xy, function(xy))]
+            known[:] = [(xy, where(xy))]
         return known[0][1]
 
     return remembered
 
 
-@dataclass(frozen=True, eq=False)
-class _Peak:
-    """What a blind pass finds: where to search next, the part of the matches in the peak, and how many standard
-    deviations these are beyond chance.
-    """
+class _Peak(NamedTuple):
+    """What a blind pass finds."""
 
-    prediction: Prediction
-    share: float
-    significance: float
+    prediction: Prediction  # where to search next
+    share: float  # of the matches that stand in the peak
+    significance: float  # in standard deviations beyond chance
 
 
 class _Search:
@@ -193,23 +159,21 @@ class _Search:
     def trusted(self, prediction: Prediction, false_share: float) -> tuple[Matches, float]:
         """Matches among which at most a share is false, and that share as estimated.
 
-        Bands shifted to either side hold no true match; their matches tell how many false ones come with a
-        score. (The "decoys" of peptide identification: Elias and Gygi 2007.)
+        Bands shifted to either side hold no true match: theirs tell how many false ones come with a score. (The
+        "decoys" of peptide identification: Elias and Gygi 2007.)
         """
         found, aside = self._distinct(prediction), 2.0 * prediction.half_width + 6.0
         decoys = [self._distinct(replace(prediction, aside=side * aside)).score for side in (-1.0, 1.0)]
         false = 0.5 * np.searchsorted(np.sort(np.concatenate(decoys)), found.score, side="right")
         share = false / np.arange(1, len(found) + 1)
         good = np.flatnonzero(share <= false_share)
-        if not len(good):
-            return found.select(good), 0.0
-        return found.select(np.arange(good[-1] + 1)), float(share[good[-1]])
+        count = good[-1] + 1 if len(good) else 0
+        return found.select(np.arange(count)), float(share[count - 1]) if count else 0.0
 
     def offset(self) -> Prediction | None:
         """Where to search in view of the cameras' error, from blind passes of growing width.
 
-        The first pass in whose peak most matches stand decides; without one, the pass with the most
-        significant peak; None where none finds a clear one.
+        The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
         best: _Peak | None = None
         for width, probes in _PASSES:

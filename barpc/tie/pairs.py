@@ -1,23 +1,27 @@
-"""Which views to match: footprints that overlap under a useful angle, and a connected graph of them."""
+"""Which views to match: footprints that overlap under a useful angle, in an area, and a connected graph of them."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import compress
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
+from shapely import affinity
 
-from barpc.errors import DisconnectedError, TiePointError
+from barpc.errors import DisconnectedError, InputError, TiePointError
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.options import TieOptions
-from barpc.scene import View, connected_groups
+from barpc.scene import BoolArray, View, connected_groups
 from barpc.sensor.geometry import convergence_angle, footprint
-from barpc.tie.area import Area
+from barpc.sidefile import GEOJSON, read_json
 from barpc.tie.epipolar import common_range
 from barpc.tie.raster import Box, tiles
 
@@ -25,25 +29,98 @@ logger = logging.getLogger(__name__)
 
 _BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined
 _ANGLE_DECAY = 15.0  # deg
+_MALFORMED = (
+    ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, shapely.GEOSException,
+)  # fmt: skip
+_WGS84 = ("CRS84", "4326", "4979")
+_WRAPPED = {"Feature": "geometry", "FeatureCollection": "features", "GeometryCollection": "geometries"}
+
+
+@dataclass(frozen=True, eq=False)
+class Area:
+    """Part of the ground, at any altitude: polygons in lon, lat [deg], all of them three times, a whole turn apart."""
+
+    outline: shapely.Geometry
+
+    def plane(self, origin: Array, scale: Array) -> shapely.Geometry:
+        """The area in a plane [m]: (lon, lat) minus `origin` (2,) [deg], times `scale` (2,) [m/deg]."""
+        near = np.array([float(wrap_longitude(origin[0])), origin[1]])
+        return shapely.transform(self.outline, lambda lonlat: (lonlat - near) * scale)
+
+    def contains(self, lonlat: Array) -> BoolArray:
+        """Which points (N, 2), lon, lat [deg], lie inside; NaN does not."""
+        shapely.prepare(self.outline)
+        inside: BoolArray = shapely.contains_xy(self.outline, wrap_longitude(lonlat[:, 0]), lonlat[:, 1])
+        return inside
+
+
+def read_area(path: str | os.PathLike[str]) -> Area:
+    """The polygons of a GeoJSON file as one area.
+
+    Parameters
+    ----------
+    path : path
+        Polygons, or features and collections of them; lon, lat [deg] on WGS84. An outline may cross the antimeridian
+        with or without a jump of its longitudes, or be cut there (RFC 7946).
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or holds no polygon in degrees; the message names it.
+    """
+    data = read_json(Path(path), GEOJSON)
+    try:
+        crs = data.get("crs")  # before 2016 GeoJSON could name another reference system
+        if crs is not None and not str(crs["properties"]["name"]).endswith(_WGS84):
+            raise ValueError(f"its coordinates are in {crs['properties']['name']}")
+        polygons = [shapely.make_valid(polygon) for polygon in _polygons(data)]
+    except _MALFORMED as error:
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"{path}: not an area of interest, GeoJSON polygons in degrees ({said})") from error
+    turns = [affinity.translate(polygon, turn) for polygon in polygons for turn in (-360.0, 0.0, 360.0)]
+    outline = shapely.union_all(turns)
+    if not outline.area > 0:
+        raise InputError(f"{path}: the area of interest holds no polygon of any extent")
+    return Area(outline)
+
+
+def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
+    """All polygons of a GeoJSON object, whatever they are wrapped in."""
+    kind = data["type"]
+    if kind in _WRAPPED:
+        inner = data[_WRAPPED[kind]]
+        for part in [inner] if kind == "Feature" else inner:
+            yield from _polygons(part)
+    elif kind in ("Polygon", "MultiPolygon"):
+        parts = data["coordinates"] if kind == "MultiPolygon" else [data["coordinates"]]
+        for part in parts:
+            rings = [_ring(ring) for ring in part]
+            for hole in rings[1:]:
+                hole[:, 0] += 360.0 * np.rint((rings[0][0, 0] - hole[0, 0]) / 360.0)
+            yield shapely.Polygon(rings[0], rings[1:])
+    else:
+        raise ValueError(f"a {kind} is no polygon")
+
+
+def _ring(positions: list[list[float]]) -> Array:
+    """Vertices (N, 2) of an outline, the first between -180 and 180, its longitudes without jumps."""
+    ring = np.array([position[:2] for position in positions], dtype=np.float64).reshape(-1, 2)
+    if not (np.isfinite(ring).all() and (np.abs(ring) <= [540.0, 90.0]).all()):
+        raise ValueError("a position is not a longitude and a latitude")
+    step = np.diff(ring[:, 0])
+    # a full turn is no jump, but an edge along a parallel
+    ring[1:, 0] -= 360.0 * np.cumsum(np.where(np.abs(step) < 360.0, np.rint(step / 360.0), 0.0))
+    ring[:, 0] += wrap_longitude(ring[:1, 0]) - ring[0, 0]
+    return ring
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two views to be matched.
+    """Two views to be matched."""
 
-    Parameters
-    ----------
-    views : tuple of int
-        Their indices, ascending.
-    overlap : float
-        Common area over that of the smaller footprint.
-    angle : float
-        Convergence angle in the middle of the common area [deg].
-    """
-
-    views: tuple[int, int]
-    overlap: float
-    angle: float
+    views: tuple[int, int]  # their indices, ascending
+    overlap: float  # common area over that of the smaller footprint
+    angle: float  # of convergence in the middle of the common area [deg]
 
     @property
     def score(self) -> float:
@@ -54,8 +131,7 @@ class Pair:
 class Footprints:
     """Outlines of views at one altitude [m], as far as they lie in an area, in a common plane [m east, north].
 
-    They grow by as much as the cameras may be wrong (`reach` [px]), and the area does; an outline is empty where
-    the camera sees no ground at that altitude.
+    They grow, as the area does, by as much as the cameras may be wrong (`reach` [px]); empty where no ground is seen.
     """
 
     def __init__(
@@ -69,15 +145,12 @@ class Footprints:
         wanted = None if area is None else area.plane(self._origin, self._scale)
         self.outlines: list[shapely.Geometry] = []
         for view, ring in zip(views, usable, strict=True):
-            ring = self.plane(ring) if len(ring) > 3 else ring[:0]
-            outline = shapely.make_valid(shapely.Polygon(ring))
+            outline = shapely.make_valid(shapely.Polygon(self.plane(ring) if len(ring) > 3 else ring[:0]))
             more = reach * float(np.sqrt(outline.area / (view.size[0] * view.size[1])))
-            if reach:
-                outline = shapely.buffer(outline, more)
-            if wanted is not None:
-                near = shapely.buffer(wanted, more) if reach else wanted
-                outline = shapely.intersection(outline, near)
-            self.outlines.append(outline)
+            near = wanted
+            if reach:  # None stays None
+                outline, near = shapely.buffer([outline, wanted], more)
+            self.outlines.append(outline if near is None else shapely.intersection(outline, near))
 
     def plane(self, lonlat: Array) -> Array:
         """East and north (..., 2) [m] of longitudes and latitudes (..., 2) [deg]."""
@@ -132,9 +205,7 @@ def select_pairs(
     only: Sequence[tuple[int, int]] = (),
     area: Area | None = None,
 ) -> list[Pair]:
-    """The pairs of views to match.
-
-    For every view its best partners by `Pair.score`, and whatever else is needed to connect all views.
+    """The pairs of views to match, ascending: the best partners of every view, and what else connects them all.
 
     Parameters
     ----------
@@ -146,11 +217,6 @@ def select_pairs(
         These pairs, all that overlap, and no others.
     area : Area, optional
         Where the overlap counts; None: everywhere.
-
-    Returns
-    -------
-    pairs : list of Pair
-        Ascending.
 
     Raises
     ------
@@ -200,19 +266,16 @@ def _candidates(
 
 
 def _best(pairs: Sequence[Pair], num_views: int, neighbours: int) -> list[Pair]:
-    """The best partners of every view, and what connects all views, ascending."""
-    taken = [0] * num_views
+    """The best partners of every view, and the best tree that connects all views, ascending."""
     ranked = sorted(pairs, key=lambda pair: (-pair.score, pair.views))
-    first, second = np.array([pair.views for pair in ranked], dtype=np.int64).reshape(-1, 2).T
-    rank = np.arange(1.0, len(ranked) + 1)  # the graph's weights; no two alike, so the tree is one
-    tree = minimum_spanning_tree(coo_array((rank, (first, second)), shape=(num_views, num_views)))
-    chosen = []
-    for pair, joins in zip(ranked, np.isin(rank, tree.data).tolist(), strict=True):
-        i, j = pair.views
-        if joins or min(taken[i], taken[j]) < neighbours:
+    ends = tuple(np.array([pair.views for pair in ranked]).T)
+    rank = np.arange(1, len(ranked) + 1)
+    tree = minimum_spanning_tree(coo_array((rank, ends), shape=(num_views, num_views))).data
+    chosen, taken = [], np.zeros(num_views, dtype=int)
+    for pair, connects in zip(ranked, np.isin(rank, tree), strict=True):
+        if connects or taken[list(pair.views)].min() < neighbours:
             chosen.append(pair)
-            taken[i] += 1
-            taken[j] += 1
+            taken[list(pair.views)] += 1
     return sorted(chosen, key=lambda pair: pair.views)
 
 
@@ -222,20 +285,15 @@ def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], w
     if len(groups) < 2:
         return
     names = [[views[i].name for i in group] for group in groups]
-    listed = "; ".join(
-        ", ".join(group[:5]) + (f" and {len(group) - 5} more" if len(group) > 5 else "")
-        for group in names[:6]
-    )
+    more = [f" and {len(group) - 5} more" if len(group) > 5 else "" for group in names]
+    listed = "; ".join(", ".join(group[:5]) + rest for group, rest in zip(names[:6], more[:6], strict=True))
     raise DisconnectedError(f"the images fall into {len(groups)} groups ({listed}): {why}", names)
 
 
 def shared_tiles(
     views: Sequence[View], pairs: Sequence[Pair], options: TieOptions, area: Area | None = None
 ) -> list[list[Box]]:
-    """The tiles of every view that a partner in `pairs` may see at some altitude: only those are worth reading.
-
-    The cameras may be wrong by `options.search`; what lies outside the area is not worth reading either.
-    """
+    """The tiles of every view that a partner may see in the area, though cameras be wrong by `options.search`."""
     boxes = [tiles(view.size, options) for view in views]
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]

@@ -62,16 +62,13 @@ def _levelled(pixels: Pixels, low: float, high: float, levels: float) -> FloatIm
 def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
     """Pixels of a window in float32, as they are or (from float64) on a scale of the window's own.
 
-    Registration does not see offset and scale. In float32 an offset of 2e9 would swallow the picture, and the
-    squares of 1e30 overflow.
+    Registration does not see offset and scale; float32 would lose the picture beside 2e9, and overflow squaring 1e30.
     """
     if pixels.dtype == np.float32:
         return pixels.astype(np.float32, copy=False)
     known = pixels[valid]
-    if not len(known):
-        return np.zeros(pixels.shape, np.float32)
-    low, high = np.percentile(known[:: 1 + len(known) // 100_000], [0.5, 99.5])
-    if not high > low:
+    low, high = np.percentile(known[:: 1 + len(known) // 100_000], [0.5, 99.5]) if len(known) else (0.0, 0.0)
+    if len(known) and not high > low:
         low, high = known.min(), known.max()
     if not high > low:
         return np.zeros(pixels.shape, np.float32)
@@ -81,16 +78,15 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
 def read_pixels(path: str | os.PathLike[str], box: Box, band: int = 1) -> tuple[Pixels, BoolArray]:
     """Pixels (height, width) of a window as stored, 0 where invalid, and which of them mean something.
 
-    They do not at nodata, masked, non-finite and saturated pixels, and in undeclared zero borders. ImageError where the
-    file cannot be read, has no such band (from 1), or holds complex numbers.
+    Those at nodata, masked, non-finite, saturated or in undeclared zero borders do not. ImageError: the file cannot
+    be read, has no such band (from 1), or holds complex numbers.
     """
     with open_raster(path) as dataset:
-        check_band(dataset, path, band)
+        _check_band(dataset, path, band)
         return _read(dataset, box, band)
 
 
-def check_band(dataset: Any, path: str | os.PathLike[str], band: int) -> None:
-    """Raise ImageError unless `band` exists and holds real numbers."""
+def _check_band(dataset: Any, path: str | os.PathLike[str], band: int) -> None:
     if not 1 <= band <= dataset.count:
         raise ImageError(f"{os.fspath(path)}: there is no band {band}, only {dataset.count}")
     if dataset.dtypes[band - 1].startswith("complex"):
@@ -100,9 +96,8 @@ def check_band(dataset: Any, path: str | os.PathLike[str], band: int) -> None:
 def _read(dataset: Any, box: Box, band: int) -> tuple[Pixels, BoolArray]:
     window = Window(*box)
     raw = dataset.read(band, window=window)
-    pixels: Pixels = raw.astype(
-        np.float32 if np.can_cast(raw.dtype, np.float32) and raw.dtype.kind != "f" else np.float64
-    )
+    single = raw.dtype.kind != "f" and np.can_cast(raw.dtype, np.float32)
+    pixels: Pixels = raw.astype(np.float32 if single else np.float64)
     valid: BoolArray = dataset.read_masks(band, window=window) != 0
     valid &= np.isfinite(pixels)
     if np.issubdtype(raw.dtype, np.integer):
@@ -115,10 +110,10 @@ def _read(dataset: Any, box: Box, band: int) -> tuple[Pixels, BoolArray]:
 
 
 def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | None:
-    """The stretch of a raster, the 0.5 and 99.5 percentiles of blocks spread over it; None where nothing varies."""
+    """0.5 and 99.5 percentile of blocks spread over a raster; None where nothing varies."""
     found: list[Array] = []
     with open_raster(path) as dataset:
-        check_band(dataset, path, band)
+        _check_band(dataset, path, band)
         kind = np.dtype(dataset.dtypes[band - 1])
         side_x, side_y = (min(_SAMPLE_SIDE, n) for n in (dataset.width, dataset.height))
         for row in np.linspace(0, dataset.height - side_y, _SAMPLES).astype(int):
@@ -126,9 +121,7 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | Non
                 pixels, valid = _read(dataset, (int(col), int(row), side_x, side_y), band)
                 found.append(pixels[valid][::7].astype(np.float64))
     values = np.concatenate(found)
-    if not len(values):
-        return None
-    low, high = np.percentile(values, [0.5, 99.5])
+    low, high = np.percentile(values, [0.5, 99.5]) if len(values) else (0.0, 0.0)
     step = np.finfo(kind).eps if kind.kind == "f" else 0.0
     if not high / 2 - low / 2 > _NEGLIGIBLE * step * max(abs(low), abs(high)) / 2:
         return None
@@ -136,11 +129,11 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | Non
 
 
 def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
-    """A box with a margin on every side, cut at an image of `size` (width, height)."""
+    """A box with a margin on every side, cut at an image of `size` (width, height); a pixel at least."""
     col, row, width, height = box
-    left, top = max(0, col - margin), max(0, row - margin)
-    right, bottom = min(size[0], col + width + margin), min(size[1], row + height + margin)
-    return left, top, max(0, right - left), max(0, bottom - top)
+    low = np.clip(np.array([col, row]) - margin, 0, np.array(size) - 1)
+    high = np.clip(np.array([col + width, row + height]) + margin, low + 1, size)
+    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
 def tiles(size: tuple[int, int], options: TieOptions) -> list[Box]:

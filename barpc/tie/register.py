@@ -1,26 +1,30 @@
-"""Sub-pixel registration: every observation of a track is registered to ONE reference patch.
+"""Sub-pixel registration: every observation of a track is registered to ONE reference patch, and verified.
 
-The reference is the patch around the keypoint in the track's most central view, at a whole pixel, so that
-it needs no interpolation and defines the point exactly: errors do not chain from view to view. The patch
-of another view is pre-warped by the cameras' local derivative and registered by least squares with an
-affine distortion, gain and bias (Gruen 1985), in the inverse compositional form (Baker and Matthews 2004):
-the derivative is that of the reference, so one small pseudo-inverse a match serves all iterations.
+The reference is the patch around the keypoint in the view most like the others, at a whole pixel, so that it needs no
+interpolation and defines the point exactly: errors do not chain from view to view. The patch of another view is
+pre-warped by the cameras' local derivative and registered by least squares with an affine distortion, gain and bias
+(Gruen 1985), in the inverse compositional form (Baker and Matthews 2004): the derivative is that of the reference, so
+one small pseudo-inverse a match serves all iterations.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from barpc.geodesy import Array
-from barpc.scene import BoolArray, IntArray
-from barpc.tie.raster import Box, FloatImage, levelled, read_pixels
+from barpc.options import TieOptions
+from barpc.scene import BoolArray, IntArray, Tracks, View
+from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, robust_spread
+from barpc.tie.raster import FloatImage, grow, levelled, read_pixels
+from barpc.tie.tasks import Progress, ordered
 
-FloatArray = npt.NDArray[np.float32]
-
+PATCH = 21
+"""Side of the patches that are registered [px], odd."""
 _CHUNK = 256  # patches worked on at a time: they stay in cache
 _STEPS = 12
 _SETTLED = 0.003  # px; a step below it is the last
@@ -31,31 +35,37 @@ _GRID = 1.0 / (32 * _FINE)  # px; positions that the sampler tells apart
 _REACH = 1.5  # px; a patch that moves farther has left its point
 _WEIGHT = 0.7  # standard deviation of the patch's Gaussian weight, in half sides
 _MIN_DETAIL = 1e-12  # relative variance below which a patch is flat
-_LEAST_SIGMA = 1e-3  # px
+_LEAST_SIGMA = 1e-3  # px, of a registration
 _TAPS = 6  # samples on either side in the interpolation
 _RIDGE = 1e-6
+_FLOOR = 0.1  # px across the epipolar line that are always tolerated
+_DISTORTED = 2.0  # times the median sigma: the patch lies across a step of the ground
+_LEAST_END_SIGMA = 0.02  # px, of an observation
+_LEAST_REACH = 5.0  # px of half a segment, below which altitudes are not compared
+_FEW = 20  # observations of a pair of views below which their sigmas are not scaled by their errors
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Where the reference patches were found.
+    """Where the reference patches were found in the other image."""
 
-    Parameters
-    ----------
-    xy : (N, 2)
-        col, row in the other image [px].
-    correlation : (N,)
-        Of the patches after registration.
-    sigma : (N,)
-        Standard deviation of a coordinate [px], from the residual noise and the patch's detail.
-    ok : (N,)
-        Settled, near its start, on valid pixels.
-    """
+    xy: Array  # (N, 2) [px]
+    correlation: Array  # (N,) of the patches after registration
+    sigma: (
+        Array  # (N,) standard deviation of a coordinate [px], from the residual noise and the patch's detail
+    )
+    ok: BoolArray  # (N,) settled, near its start, on valid pixels
 
-    xy: Array
-    correlation: Array
-    sigma: Array
-    ok: BoolArray
+    @staticmethod
+    def none(start: Array) -> Registration:
+        """Nothing found yet of points (N, 2)."""
+        zero = np.zeros(len(start))
+        return Registration(start.copy(), zero, zero + np.inf, zero > 0)
+
+    def put(self, rows: IntArray, found: Registration) -> None:
+        """Take in what was found of some rows."""
+        for field in fields(self):
+            getattr(self, field.name)[rows] = getattr(found, field.name)
 
 
 def register_places(
@@ -71,7 +81,8 @@ def register_places(
     margin = patch + _TAPS + int(_REACH)
     images, valid, origins = [], [], []
     for (path, size), xy in zip(files, (reference, start), strict=True):
-        box = _around(xy, margin, size)
+        low, high = np.floor(xy.min(axis=0)).astype(int), np.ceil(xy.max(axis=0)).astype(int)
+        box = grow((low[0], low[1], *(high - low + 1)), margin, size)
         pixels, usable = read_pixels(path, box, band)
         images.append(levelled(pixels, usable))
         valid.append(usable)
@@ -81,17 +92,10 @@ def register_places(
     return replace(found, xy=found.xy + origins[1])
 
 
-def _around(xy: Array, margin: int, size: tuple[int, int]) -> Box:
-    low = np.clip(np.floor(xy.min(axis=0)).astype(int) - margin, 0, np.array(size) - 1)
-    high = np.clip(np.ceil(xy.max(axis=0)).astype(int) + margin + 1, low + 1, size)
-    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
-
-
 def _usable(valid: BoolArray, patch: int) -> BoolArray:
     """Pixels about which a whole patch is valid and inside."""
-    kernel = np.ones((patch, patch), np.uint8)
-    eroded = cv2.erode(valid.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    usable: BoolArray = eroded > 0
+    whole, kernel = valid.astype(np.uint8), np.ones((patch, patch), np.uint8)
+    usable: BoolArray = cv2.erode(whole, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
     return usable
 
 
@@ -103,26 +107,13 @@ def register(
     linear: Array,
     patch: int,
 ) -> Registration:
-    """Register patches of the second image to patches of the first.
+    """Register patches of the second image to patches of the first; a patch, `patch` [px] a side (odd), is all valid.
 
-    What fails (at a border, on a steep slope) is tried again with a smaller patch; what succeeds must be
-    confirmed by it.
-
-    Parameters
-    ----------
-    images, valid : two (height, width) arrays
-        Reference and other image, and the pixels that mean something: a patch holds no others.
-    reference, start : (N, 2)
-        Centres in the reference image, whole pixels; where they are about in the other one [px].
-    linear : (N, 2, 2)
-        First guess of d(other)/d(reference).
-    patch : int
-        Side of the patches [px], odd.
+    They are centred at `reference` (N, 2), whole pixels, and at about `start` (N, 2) [px] in the second image, with
+    `linear` (N, 2, 2) a first guess of d(second)/d(first). What fails (at a border, on a steep slope) is tried again
+    with a smaller patch; what succeeds must be confirmed by it.
     """
-    fine = _upsampled(images[1])
-    best = Registration(
-        np.array(start), np.zeros(len(start)), np.full(len(start), np.inf), np.zeros(len(start), dtype=bool)
-    )
+    fine, best = _upsampled(images[1]), Registration.none(start)
     smaller = int(_SMALLER * patch) | 1
     for side in (patch, smaller):
         template = _Template(images[0], side)
@@ -130,8 +121,7 @@ def register(
         possible = np.flatnonzero(~best.ok & _at(usable[0], reference) & _at(usable[1], start))
         for rows in _chunks(possible):
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
-            best.xy[rows], best.correlation[rows], best.sigma[rows] = found.xy, found.correlation, found.sigma
-            best.ok[rows] = found.ok & _at(usable[1], found.xy)
+            best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
         inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows])
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
@@ -165,7 +155,7 @@ def _upsampled(image: FloatImage) -> FloatImage:
     return out
 
 
-def _kernels() -> list[FloatArray]:
+def _kernels() -> list[FloatImage]:
     """Weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel."""
     kernels = []
     for phase in range(_FINE):
@@ -192,7 +182,7 @@ class _Template:
         self._effective = float(weight.sum() ** 2 / (weight**2).sum())  # pixels that count
         self._weight = (weight / weight.sum()).astype(np.float32)
 
-    def _normalized(self, patches: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _normalized(self, patches: FloatImage) -> tuple[FloatImage, FloatImage]:
         """Patches of weighted mean 0 and variance 1, and their standard deviations (N, 1)."""
         mean = (patches @ self._weight)[:, None]
         centred = patches - mean
@@ -224,7 +214,7 @@ class _Template:
         return Registration(xy[0], correlation, sigma, ok)
 
     def _iterate(
-        self, fine: FloatImage, solver: FloatArray, centre: Array, linear: Array
+        self, fine: FloatImage, solver: FloatImage, centre: Array, linear: Array
     ) -> tuple[tuple[Array, Array], Array]:
         """Centres and distortions after the iterations, and the length of each one's last step [px]."""
         length = np.full(len(centre), np.inf)
@@ -245,11 +235,170 @@ class _Template:
                 break
         return (centre, linear), length
 
-    def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatArray:
+    def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatImage:
         """Patches (N, P) of the other image about centres (N, 2) under distortions (N, 2, 2)."""
         offsets = np.stack([self._col, self._row]).astype(np.float32)
         where = _FINE * (linear.astype(np.float32) @ offsets + centre.astype(np.float32)[:, :, None])
-        return np.asarray(
-            cv2.remap(fine, where[:, 0], where[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101),
-            np.float32,
-        )
+        border = cv2.BORDER_REFLECT_101
+        patches = cv2.remap(fine, where[:, 0], where[:, 1], cv2.INTER_LINEAR, borderMode=border)
+        return np.asarray(patches, np.float32)
+
+
+def refine(
+    views: Sequence[View],
+    tracks: Tracks,
+    spreads: Mapping[tuple[int, int], float],
+    options: TieOptions,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Tracks:
+    """Register every observation to its track's reference patch, and verify the result.
+
+    `spreads`, `PairReport.spread` of the pairs of views, tell which view of a track makes the best reference. Its
+    observation is given at a whole pixel, the others as registered, without what did not correlate or left its
+    epipolar line. Each observation carries half the variance of its registration.
+    """
+    if not len(tracks):
+        return tracks
+    of_track = references(tracks, spreads, len(views))
+    other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
+    links = _Links(views, tracks, of_track[tracks.point[other]], other)
+    found = links.register(options, executor, progress)
+    good = links.verified(found, found.ok & (found.correlation >= options.min_correlation))
+    sigma = links.scaled(found, good)
+    return _shared(tracks, of_track, other[good], found.xy[good], sigma[good])
+
+
+@dataclass(frozen=True, eq=False)
+class _Links:
+    """Observations that are registered (`other`), each with the reference of its track; rows of `tracks`."""
+
+    views: Sequence[View]
+    tracks: Tracks
+    reference: IntArray
+    other: IntArray
+
+    def __len__(self) -> int:
+        return len(self.other)
+
+    @property
+    def origin(self) -> Array:
+        """Whole pixels at which the reference patches stand."""
+        return np.rint(self.tracks.xy[self.reference])
+
+    def of(self, part: IntArray) -> tuple[View, View]:
+        """The two views of links that have them in common."""
+        ends = self.reference[part[0]], self.other[part[0]]
+        return self.views[self.tracks.view[ends[0]]], self.views[self.tracks.view[ends[1]]]
+
+    def groups(self, *more: IntArray) -> list[IntArray]:
+        """Indices of the links between the same two views, and of equal values of `more`."""
+        return grouped(self.tracks.view[self.reference], self.tracks.view[self.other], *more)
+
+    def register(
+        self, options: TieOptions, executor: Executor | None, progress: Progress | None
+    ) -> Registration:
+        """Register all, tile by tile of the reference view."""
+        origin = self.origin
+        linear = np.empty((len(self), 2, 2))
+        for group in self.groups():
+            linear[group] = linear_map(*self.of(group), origin[group])
+        rounding = (origin - self.tracks.xy[self.reference])[:, :, None]
+        start = self.tracks.xy[self.other] + (linear @ rounding)[:, :, 0]
+        parts = self.groups(*np.floor(origin[:, ::-1] / options.tile).astype(np.int64).T)
+        tasks = []
+        for part in parts:
+            first, second = self.of(part)
+            images = ((first.path, first.size), (second.path, second.size))
+            tasks.append((images, options.band, origin[part], start[part], linear[part], PATCH))
+        done: list[Registration] = ordered(executor, register_places, tasks, "refine", progress)
+        found = Registration.none(start)
+        for part, one in zip(parts, done, strict=True):
+            found.put(part, one)
+        return found
+
+    def errors(self, found: Registration, group: IntArray) -> tuple[Array, Array]:
+        """Along and across the epipolar lines (M, 2) [px] between two views; half the segments' length (M,)."""
+        where = frame(*self.of(group), self.origin[group])
+        return where.errors(found.xy[group]), where.after
+
+    def verified(self, found: Registration, good: BoolArray) -> BoolArray:
+        """Those near their epipolar line, no less certain than others, at one altitude with their track."""
+        verified = np.zeros(len(self), dtype=bool)
+        altitude, reach = np.zeros((2, len(self)))  # from the middle of the range, in its halves
+        for group in self.groups():
+            group = group[good[group]]
+            if len(group):
+                group = group[found.sigma[group] <= _DISTORTED * np.median(found.sigma[group])]
+                errors, reach[group] = self.errors(found, group)
+                verified[group] = agreeing(self.origin[group], errors[:, 1], _FLOOR)[0]
+                altitude[group] = errors[:, 0] / np.maximum(reach[group], 1e-9)
+        return verified & ~self._torn(verified, altitude, reach)
+
+    def _torn(self, good: BoolArray, altitude: Array, reach: Array) -> BoolArray:
+        """Links that disagree in altitude with all their neighbours in the track, up to an affine function."""
+        rows = np.flatnonzero(good & (reach >= _LEAST_REACH))
+        first, second = rows[:-1], rows[1:]
+        same = self.reference[first] == self.reference[second]
+        first, second = first[same], second[same]
+        apart = (altitude[first] - altitude[second]) * np.minimum(reach[first], reach[second])
+        compared, agreed = np.zeros((2, len(self)), dtype=bool)
+        views = self.tracks.view
+        three = views[self.reference[first]], views[self.other[first]], views[self.other[second]]
+        for group in grouped(*three):
+            agree = agreeing(self.origin[first[group]], apart[group], 2 * _FLOOR)[0]
+            for end in (first[group], second[group]):
+                compared[end] = True
+                agreed[end[agree]] = True
+        torn: BoolArray = compared & ~agreed
+        return torn
+
+    def scaled(self, found: Registration, good: BoolArray) -> Array:
+        """Sigmas [px] made larger where the distances from the epipolar lines are."""
+        sigma = found.sigma.copy()
+        for group in self.groups():
+            group = group[good[group]]
+            if len(group) >= _FEW:
+                across = self.errors(found, group)[0][:, 1]
+                residual = agreeing(self.origin[group], across, _FLOOR)[1]
+                sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
+        return sigma
+
+
+def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma: Array) -> Tracks:
+    """Registered rows and their references; the variance of a registration is shared by both its ends."""
+    points = tracks.point[rows]
+    count = np.bincount(points, minlength=tracks.num_points)
+    variance = np.zeros(len(tracks))
+    variance[rows] = 0.5 * sigma**2
+    variance[of_track] = np.bincount(points, weights=variance[rows], minlength=tracks.num_points)
+    variance[of_track] /= np.maximum(count, 1)
+    placed, keep = np.rint(tracks.xy), np.zeros(len(tracks), dtype=bool)
+    placed[rows], keep[rows] = xy, True
+    keep[of_track] = count > 0
+    return Tracks(tracks.view, tracks.point, placed, np.sqrt(variance).clip(_LEAST_END_SIGMA)).select(keep)
+
+
+def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_views: int) -> IntArray:
+    """Row of the reference observation of every track (P,): the view that is most like the others.
+
+    That is where the pairs' spread across the epipolar line [px] is least: it grows with the angle between two views
+    and with all else that makes them look different.
+    """
+    key = np.array([min(pair) * num_views + max(pair) for pair in spreads] or [-1], dtype=np.int64)
+    spread = np.array(list(spreads.values()) or [0.0])[np.argsort(key)]
+    key = np.sort(key)
+    starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
+    length = np.diff(starts)[tracks.point]
+    left = np.repeat(np.arange(len(tracks)), length)
+    step = np.arange(len(left)) - np.repeat(np.cumsum(length) - length, length)
+    right = starts[tracks.point[left]] + step
+    low = np.minimum(tracks.view[left], tracks.view[right])
+    wanted = low * num_views + np.maximum(tracks.view[left], tracks.view[right])
+    place = np.searchsorted(key, wanted).clip(0, len(key) - 1)
+    unlike = np.where(key[place] == wanted, spread[place], np.where(left == right, 0.0, 2.0 * spread.max()))
+    cost = np.bincount(left, weights=unlike, minlength=len(tracks))
+    order = np.lexsort((cost, tracks.point))
+    first: IntArray = order[starts[:-1]]
+    return first

@@ -12,7 +12,6 @@ import pytest
 from barpc.errors import FitError, InputError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import rpc as fit_module
-from barpc.fit.certificate import Errors, coverage, roundtrip, smallest_denominator
 from barpc.fit.points import (
     _check_order,
     check_points,
@@ -22,9 +21,15 @@ from barpc.fit.points import (
     terrain_range,
     widened,
 )
-from barpc.fit.rpc import relative_weight, underlying_rpc
-from barpc.fit.solve import _curvature, expected_size, noise_scaled, solution, solve_lcurve
-from barpc.fit.system import ALL, Problem
+from barpc.fit.rpc import (
+    Errors,
+    coverage,
+    relative_weight,
+    roundtrip,
+    smallest_denominator,
+    underlying_rpc,
+)
+from barpc.fit.solve import ALL, Problem, _curvature, expected_size, noise_scaled, solution, solve_lcurve
 from barpc.sensor.rpc import RPC
 from tests.constants import CONSTANTS, chosen
 from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
@@ -118,6 +123,23 @@ def test_weighted_passes_are_made_where_the_denominator_varies(camera: Camera) -
     assert flat.iterations == 1  # within 5 %
 
 
+@pytest.mark.parametrize("sides", ["lon", "lat", "alt"])
+def test_a_denominator_that_varies_along_any_axis_weights_a_second_pass(camera: Camera, sides: str) -> None:
+    for slope, passes in ((0.4, 2), (0.04, 1)):
+        rpc = _with_denominator(0, slope, sides)
+        ground = camera.model.localize(*_image_points(camera, 600))
+        fit = fit_rpc_points(ground, rpc.project(ground), options=FitOptions(method="ridge", tolerance=1.0))
+        assert fit.iterations == passes
+
+
+def test_the_regularisation_is_the_noise_over_the_size_expected(camera: Camera) -> None:
+    """Both in units of an image coordinate over its scale; a denominator is expected within 0.003 of 1."""
+    ground, image = random_points(camera, 2500, np.random.default_rng(7))
+    noisy = image + np.random.default_rng(8).normal(0, 1, image.shape) * [0.2, 0.6]
+    fit = fit_rpc_points(ground, noisy, options=FitOptions(method="ridge", tolerance=5.0))
+    assert fit.h * fit.rpc.image_scale * 0.003 == pytest.approx([0.2, 0.6], rel=0.1)
+
+
 def _image_points(camera: Camera, count: int) -> tuple[Any, Any]:
     rng = np.random.default_rng(6)
     return rng.uniform(0, 1, (count, 2)) * camera.size, rng.uniform(*camera.alt_range, count)
@@ -183,6 +205,23 @@ def test_mirrored_points_are_taken_where_allowed(camera: Camera) -> None:
         screened(ground, mirrored, False)
     screened(ground, mirrored, True)
     screened(ground, image, False)
+    ground, image = random_points(camera, 2000, np.random.default_rng(0))
+    strip = image[:, 1] < 0.15 * camera.size[1]  # its pixels are as square as those of the whole
+    screened(ground[strip], image[strip], False)
+    with pytest.raises(FitError, match="mirrored"):
+        screened(ground[strip], (image * [-1.0, 1.0])[strip], False)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-3, 1e-6])
+def test_a_scene_of_any_size_is_one_in_space(camera: Camera, size: float) -> None:
+    """Shrunk in longitude and latitude, to a hand's width at last: not flat for that; its diagonal plane still is."""
+    ground, image = random_points(camera, 300, np.random.default_rng(0))
+    middle = ground.mean(axis=0)
+    small = middle + (ground - middle) * [size, size, 1.0]
+    screened(small, image, False)
+    small[:, 1] = middle[1] + (small[:, 0] - middle[0])
+    with pytest.raises(FitError, match="in a plane"):
+        screened(small, image, True)
 
 
 @pytest.mark.parametrize(
@@ -340,6 +379,15 @@ def test_coverage_is_the_share_of_the_image_inside_the_hull() -> None:
     assert coverage(corners[:3], low, high) == pytest.approx(0.5, abs=0.06)
     many = np.random.default_rng(0).uniform(low, low + 0.5 * (high - low), (3000, 2))
     assert coverage(many, low, high) == pytest.approx(0.25, abs=0.03)
+
+
+@pytest.mark.parametrize("step", [1, 3, 8])
+def test_a_narrow_strip_covers_its_own_share(step: int) -> None:
+    """A strip of a tenth of the image's side, across it askew: its hull is no wider for being thin."""
+    angle = 2 * np.pi * step / 64
+    along, across = np.array([-np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), np.sin(angle)])
+    ends = [0.5 + a * along + b * across for a in (-0.4, 0.4) for b in (-0.05, 0.05)]
+    assert coverage(np.array(ends), np.zeros(2), np.ones(2)) == pytest.approx(0.08, abs=0.012)
 
 
 # --- grid --------------------------------------------------------------------------------------------------

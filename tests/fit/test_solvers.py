@@ -7,8 +7,16 @@ import pytest
 
 from barpc.fit import Normalization
 from barpc.fit.precision import PRECISIONS
-from barpc.fit.solve import corner, expected_size, noise_scaled, penalized, solution
-from barpc.fit.system import ALL, Problem
+from barpc.fit.solve import (
+    ALL,
+    Compressed,
+    Problem,
+    _reweighted,
+    corner,
+    expected_size,
+    noise_scaled,
+    solution,
+)
 from barpc.geodesy import Array
 from tests.fit.cameras import Camera, random_points
 
@@ -53,7 +61,7 @@ def test_the_penalised_solution_is_that_of_the_normal_equations(problem: Problem
     penalty = np.r_[np.zeros(4), np.linspace(0.1, 3, 35)]
     matrix = whole[:, :-1]
     expected = np.linalg.solve(matrix.T @ matrix + np.diag(penalty**2), matrix.T @ whole[:, -1])
-    assert solution(penalized(problem.compressed(0), penalty)) == pytest.approx(expected, abs=1e-9)
+    assert solution(problem.compressed(0).penalized(penalty)) == pytest.approx(expected, abs=1e-9)
 
 
 def test_the_penalty_follows_the_noise(camera: Camera, problem: Problem) -> None:
@@ -81,6 +89,49 @@ def test_the_corner_of_the_l_curve_has_the_largest_curvature(problem: Problem) -
     rho2, eta2 = np.gradient(rho, np.log(grid)), np.gradient(eta, np.log(grid))
     curvature = (rho * eta2 - rho2 * eta) / (rho**2 + eta**2) ** 1.5
     assert abs(np.log(grid[5 + np.argmax(curvature[5:-5])] / h)) <= 0.02
+
+
+def test_a_corner_that_is_not_sharp_is_one() -> None:
+    """Singular values from 1 to 0.001, of a curve whose curvature is at most 0.47: against the sampled curve."""
+    s = np.geomspace(1.0, 1e-3, 5)
+    triangle = np.zeros((6, 6))
+    triangle[:5], triangle[5, 5] = np.column_stack([np.diag(s), s]), 1.0
+    t = np.linspace(np.log(1e-3), 0.0, 20001)
+    f = s**2 / (s**2 + np.exp(2 * t)[:, None])
+    rho, eta = 0.5 * np.log((((1 - f) * s) ** 2).sum(axis=1) + 1.0), 0.5 * np.log((f**2).sum(axis=1))
+    rho1, eta1 = np.gradient(rho, t), np.gradient(eta, t)
+    rho2, eta2 = np.gradient(rho1, t), np.gradient(eta1, t)
+    curvature = (rho1 * eta2 - rho2 * eta1) / (rho1**2 + eta1**2) ** 1.5
+    best = 10 + int(np.argmax(curvature[10:-10]))
+    assert curvature[best] == pytest.approx(0.47, abs=0.01)
+    assert corner([Compressed(triangle, 10)]) == pytest.approx(np.exp(t[best]), rel=0.01)
+
+
+def test_without_a_corner_the_regularisation_is_the_least() -> None:
+    """Of exact points whose L-curve is concave from the smallest singular value to the largest."""
+    s, beta = np.array([0.4, 0.1]), np.array([0.05, 0.9])
+    triangle = np.zeros((3, 3))
+    triangle[:2] = np.column_stack([np.diag(s), beta])
+    assert corner([Compressed(triangle, 10)]) == pytest.approx(0.1)
+
+
+def test_one_point_more_than_unknowns_tells_the_noise(problem: Problem) -> None:
+    """The residual of 40 points and 39 unknowns has one degree of freedom, as that of fewer is taken to have."""
+    few = Problem(problem.ground[:40], problem.image[:40], problem.norm)
+    whole = dense(few, 0)
+    residual = np.linalg.lstsq(whole[:, :-1], whole[:, -1], rcond=None)[1]
+    assert few.compressed(0).sigma == pytest.approx(float(np.sqrt(residual[0])), rel=1e-3)
+
+
+@pytest.mark.parametrize("axes", [[0], [1], [0, 1]])
+def test_weighted_by_its_own_denominator_the_residual_is_that_of_the_image(
+    camera: Camera, problem: Problem, axes: list[int]
+) -> None:
+    rpc = camera.rpc
+    coeffs = np.concatenate([rpc.coeffs[2 * axis : 2 * axis + 2] for axis in axes])
+    rmse, _ = _reweighted(problem, axes, coeffs, np.ones(39), False)
+    residual = (rpc.project(problem.ground) - problem.image)[:, axes]
+    assert rmse == pytest.approx(np.sqrt((residual**2).mean()))
 
 
 def test_coefficients_rounded_in_turn_make_up_for_each_other(problem: Problem) -> None:

@@ -24,12 +24,11 @@ from barpc.cli.points import read_points
 from barpc.cli.tables import print_comparison
 from barpc.dem import Dem
 from barpc.errors import RpcError
+from barpc.frozen import from_arrays, load_npz, to_arrays
 from barpc.options import read_options
 from barpc.pipeline.inputs import read_pairs
-from barpc.pointio.gcp import read_gcps
+from barpc.pointio.ground import read_correspondences, read_gcps
 from barpc.pointio.matches import read_matches
-from barpc.pointio.tables import read_correspondences
-from barpc.record import from_record, load_npz, to_record
 from barpc.report.compare import compare_runs
 from barpc.report.load import read_summary
 from barpc.report.page import report_html
@@ -39,7 +38,7 @@ from barpc.rpcio.text import decode
 from barpc.scene import View
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.sentinel1 import open_product
-from barpc.tie.area import read_area
+from barpc.tie.pairs import read_area
 from barpc.workspace import Workspace
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
@@ -145,7 +144,7 @@ def _tiff() -> bytes:
 
 def _nitf() -> bytes:
     from barpc.fit import FitOptions, fit_rpc
-    from barpc.rpcio.fixed import nitf_record
+    from barpc.rpcio.text import nitf_record
 
     fitted = fit_rpc(
         make_rpc(), (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf"), strict=False
@@ -253,7 +252,7 @@ def _use_prior(path: Path) -> object:
 def _use_record(path: Path) -> object:
     record = load_npz(path)
     try:
-        return from_record(record)
+        return from_arrays(record)
     except ValueError:  # its documented class: the kept result is made again
         return None
 
@@ -433,7 +432,7 @@ SAMPLES: dict[str, Sample] = {
     "record": Sample(
         "kept.npz",
         _use_record,
-        lambda: _npz(**to_record((make_rpc(), {"a": [1.5, None]}, np.arange(3)))),
+        lambda: _npz(**to_arrays((make_rpc(), {"a": [1.5, None]}, np.arange(3)))),
         (mutate_npz,),
     ),
     "summary": _run_sample("summary.json", _report, mutate_json, mutate_values, mutate_values, share=0.6),

@@ -10,7 +10,7 @@ import rasterio
 from rasterio.control import GroundControlPoint
 
 from barpc.errors import InputError
-from barpc.pointio.gcp import GROUND_SIGMA, IMAGE_SIGMA, read_gcps
+from barpc.pointio.ground import GROUND_SIGMA, IMAGE_SIGMA, read_gcps
 
 NAMES = ["left", "right"]
 
@@ -41,6 +41,12 @@ def test_sigmas_can_be_given_instead_of_the_files(tmp_path):
     assert (found.xy_sigma == 0.7).all()
 
 
+def test_a_text_whose_first_letters_are_those_of_a_tiff_is_a_text(tmp_path):
+    path = tmp_path / "a.gcp"
+    path.write_text("II-7 43.26 5.45 130 1 1 1 left.tif 300 400 1 1\n")
+    assert read_gcps(path, NAMES).names == ("II-7",)
+
+
 def _feature(**properties):
     base = {"ji": [10.5, 20.5], "filename": "left.tif", "id": "a", "info": "x"}
     return {
@@ -60,6 +66,17 @@ def test_a_point_of_geojson_seen_in_two_images_is_one_point(tmp_path):
     np.testing.assert_array_equal(found.xy, [[10.5, 20.5], [1, 2]])
     assert (found.sigma == GROUND_SIGMA).all()
     assert (found.xy_sigma == IMAGE_SIGMA).all()
+
+
+def test_geojson_may_give_col_and_row(tmp_path):
+    point = {"type": "Point", "coordinates": [5.4, 43.2, 120]}
+    properties = {"col": 10.5, "row": 20.5, "filename": "left.tif"}
+    feature = {"type": "Feature", "geometry": point, "properties": properties}
+    path = tmp_path / "a.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    found = read_gcps(path, NAMES)
+    assert found.names == ("gcp_1",)
+    np.testing.assert_array_equal(found.xy, [[10.5, 20.5]])
 
 
 def test_tags_of_an_image_belong_to_that_image(tmp_path):

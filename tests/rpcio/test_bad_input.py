@@ -100,6 +100,8 @@ def test_nineteen_and_twenty_one_coefficients_are_refused():
     text = SAMPLES["txt"]
     assert "expected 20" in outcome(text.replace("LINE_NUM_COEFF_20", "LINE_NUM_COEFF_21").encode())
     assert "expected 20" in outcome((text + "LINE_NUM_COEFF_21: 1\n").encode())
+    assert "expected 20" in outcome((text + f"LINE_NUM_COEFF_{'1' * 5000}: 1\n").encode())
+    assert "given twice" in outcome((text + "LINE_NUM_COEFF_01: 3\n").encode())
     assert "19 numbers" in outcome(
         re.sub(r"lineNumCoef = \(\n[^\n]*\n", "lineNumCoef = (\n", SAMPLES["rpb"]).encode()
     )

@@ -11,9 +11,8 @@ import pytest
 from barpc.errors import OutputError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
 from barpc.rpcio.fields import number
-from barpc.rpcio.fixed import nitf_record
 from barpc.rpcio.formats import parse
-from barpc.rpcio.text import write_rpb, write_txt
+from barpc.rpcio.text import nitf_record, write_rpb, write_txt
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
 
 WRITABLE = [row for row in FORMATS.values() if row.write is not None]

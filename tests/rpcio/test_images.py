@@ -16,8 +16,7 @@ from barpc.errors import ImageError, OutputError, RpcFormatError
 from barpc.handoff import CONSUMERS
 from barpc.raster import open_raster
 from barpc.rpcio import read_rpc, read_rpc_source, write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
-from barpc.rpcio.digits import survives
-from barpc.rpcio.tiff import read_tag
+from barpc.rpcio.tiff import read_tag, survives
 from tests.rpcio.conftest import grid, make_rpc, write_image
 
 

@@ -249,7 +249,7 @@ def test_the_monomials_are_those_of_rpc00b():
 @vendors
 def test_rpcm_and_the_localisation_agree(file: str, shared_data: Path):
     rpcm = pytest.importorskip("rpcm.rpc_model")
-    from barpc.rpcio.structured import write_json
+    from barpc.rpcio.text import write_json
 
     rpc = read_rpc(shared_data / file)
     import json

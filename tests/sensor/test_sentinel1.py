@@ -25,7 +25,6 @@ from barpc.errors import BarpcError, BarpcWarning, FitError, InputError, RpcErro
 from barpc.fit import FitOptions, fit_rpc
 from barpc.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
-from barpc.safexml import parse_xml
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve
 from barpc.sensor.sentinel1 import (
@@ -39,6 +38,7 @@ from barpc.sensor.sentinel1 import (
     read_annotation,
 )
 from barpc.sensor.sentinel1.annotation import parse_time, seconds
+from barpc.sidefile import parse_xml
 from tests.sensor.s1_product import GRD, INTERVAL, IW, SAMPLING, START, STRIPMAP, Product
 
 AUXILIARY = ["20210216t151207", "20220104t170558", "20211223t051122"]

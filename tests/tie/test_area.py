@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from barpc.errors import DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.sensor.geometry import triangulate
-from barpc.tie import TieOptions, find, find_tracks, read_area, select_pairs
+from barpc.tie import TieOptions, features, find_tracks, read_area, select_pairs
 from barpc.tie.pairs import Footprints, shared_tiles
 from barpc.tie.raster import tiles
 from tests.constants import chosen
@@ -116,6 +116,8 @@ def test_the_whole_world_is_an_area(tmp_path) -> None:
         ({"type": "Polygon", "coordinates": [[[1], [2], [3], [1]]]}, "not an area of interest"),
         ({"type": "Polygon", "coordinates": []}, "not an area of interest"),
         (box(500000, 4800000, 501000, 4801000), "not a longitude and a latitude"),
+        (box(5, 89, 6, 90.5), "not a longitude and a latitude"),
+        (box(539, 43, 540.5, 44), "not a longitude and a latitude"),
         ('{"type": "Polygon", "coordinates": [[[5, NaN], [6, 44], [5, 44], [5, 43]]]}', "NaN is no finite number"),
         (box(5, 43, 5, 44), "of any extent"),
         (wrapped({"type": "MultiPolygon", "coordinates": []}), "of any extent"),
@@ -240,9 +242,9 @@ def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(
     scene = render(views=2)
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.4)))
     read: list[tuple[str, tuple[int, ...]]] = []
-    original = find.detect_tile
+    original = features.detect_tile
     monkeypatch.setattr(
-        find,
+        features,
         "detect_tile",
         lambda path, size, box, *rest: read.append((path, box)) or original(path, size, box, *rest),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -91,6 +93,29 @@ def test_long_and_accurate_tracks_are_kept_first() -> None:
     )
     tracks = thin(joined, [(1001, 1001)] * 3, 600)
     assert (np.bincount(tracks.point) == 3).sum() > 250
+
+
+def test_accuracies_within_a_hundredth_of_a_pixel_are_alike() -> None:
+    """Else the images' part that is better by nothing would be filled first."""
+    alike = many(3000)
+    graded = replace(alike, sigma=0.096 + 0.008 * alike.xy[:, 0] / 1001)
+    kept = [thin(tracks, [(1001, 1001)] * 2, 500).xy for tracks in (alike, graded)]
+    np.testing.assert_array_equal(*kept)
+    better = replace(alike, sigma=np.where(alike.xy[:, 0] < 500, 0.1, 0.12))
+    assert len(thin(better, [(1001, 1001)] * 2, 500).xy) != 0
+    assert not np.array_equal(thin(better, [(1001, 1001)] * 2, 500).xy, kept[0])
+
+
+def test_among_equals_no_direction_is_preferred() -> None:
+    """Tracks numbered from west to east: those kept lie anywhere in their cells."""
+    tracks = many(20_000)
+    order = np.argsort(tracks.xy[::2, 0])
+    ranked = replace(tracks, xy=tracks.xy.reshape(-1, 2, 2)[order].reshape(-1, 2))
+    kept = thin(ranked, [(1001, 1001)] * 2, 1000)
+    side = np.sqrt(4 * 1001**2 / 1000)
+    place = ((kept.xy[kept.view == 0, 0] + 0.5) / side) % 1.0
+    assert 0.45 < place.mean() < 0.55
+    assert place.std() == pytest.approx(np.sqrt(1 / 12), abs=0.02)
 
 
 def test_few_tracks_are_not_thinned() -> None:

@@ -56,7 +56,7 @@ class Correlated:
             found.append((left + col, top + row))
             score.append(1.0 - likeness[row, col])
         xy = np.stack([points, np.array(found, dtype=np.float64)], axis=1)
-        good = np.flatnonzero((np.array(score) < 0.3) & prediction.holds(xy))
+        good = np.flatnonzero((np.array(score) < 0.3) & prediction.contains(xy))
         return Matches.of_places(xy[good], np.array(score)[good])
 
 
@@ -66,7 +66,7 @@ class Everywhere(Correlated):
     def match(self, a, b, prediction: Prediction) -> Matches:
         if not hasattr(self, "found"):
             self.found = super().match(a, b, replace(prediction, probes=None, half_width=90.0))
-        return self.found.select(prediction.holds(self.found.xy))
+        return self.found.select(prediction.contains(self.found.xy))
 
 
 class Guessing(Correlated):

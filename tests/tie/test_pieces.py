@@ -14,7 +14,6 @@ from barpc.errors import InputError
 from barpc.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import TieOptions, TieResult, find_tracks, select_pairs
-from barpc.tie import find as find_module
 from barpc.tie.epipolar import (
     Affine,
     Frame,
@@ -28,10 +27,11 @@ from barpc.tie.epipolar import (
 )
 from barpc.tie.features import detect_tile, join
 from barpc.tie.matcher import Matches, Prediction
-from barpc.tie.matching import MATCHERS, _Search
+from barpc.tie.matching import MATCHERS, PairReport, _Search
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import sample_stretch, tiles
-from barpc.tie.tracks import _shared, references, thin
+from barpc.tie.register import Registration, _Links, _shared, references
+from barpc.tie.tracks import require_tracks, thin
 from tests.constants import CONSTANTS, chosen
 from tests.tie.conftest import Rendered, write_image
 from tests.tie.test_pairs import METRE, camera, views
@@ -313,6 +313,18 @@ def test_an_affine_function_is_found_among_outliers_with_its_spread() -> None:
     assert (robust_affine(xy[:30], truth[:30]).coefficients[1:] != 0).all()
 
 
+def test_an_affine_function_is_that_of_its_own_weights() -> None:
+    """Tukey's biweight at the end of the iteration: the weighted residuals are orthogonal to 1, x and y."""
+    rng = np.random.default_rng(6)
+    xy = rng.uniform(0, 5000, (400, 2))
+    values = 1e-3 * xy[:, 0] + rng.normal(0, 0.2, 400)
+    values[:120] += rng.uniform(1, 10, 120)
+    residual = values - robust_affine(xy, values)(xy)
+    weight = np.maximum(0.0, 1.0 - (residual / (4.685 * robust_spread(residual))) ** 2) ** 2
+    design = np.column_stack([np.ones(400), (xy - 2500) / 5000])
+    assert np.abs(design.T @ (weight * residual)).max() < 1e-3 * np.abs(design.T @ np.abs(residual)).max()
+
+
 def test_the_mad_is_a_standard_deviation_about_zero() -> None:
     assert robust_spread(np.array([-2.0, 1.0, 3.0])) == pytest.approx(1.4826 * 2.0)
     assert robust_spread(np.empty(0)) == 0.0
@@ -374,6 +386,23 @@ def test_the_variance_of_a_registration_is_shared_by_both_ends() -> None:
     np.testing.assert_array_equal(found.xy[[0, 3]], np.rint(tracks.xy[[0, 3]]))
 
 
+@pytest.mark.parametrize(
+    ("count", "noise", "scaled"), [(200, 0.3, 0.3), (200, 0.02, 0.1), (19, 0.3, 0.1), (20, 0.3, 0.3)]
+)
+def test_sigmas_are_those_of_the_epipolar_lines_where_these_say_more(count, noise, scaled) -> None:
+    two = views(camera(0.0, lean=0.0), camera(0.0, lean=0.2))
+    rng = np.random.default_rng(4)
+    places = rng.integers(100, 900, (count, 2)).astype(float)
+    xy = np.stack([places, frame(*two, places).place(np.zeros(count))], axis=1).reshape(-1, 2)
+    tracks = Tracks(np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy, np.full(2 * count, 0.1))
+    links = _Links(two, tracks, np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2))
+    across = rng.normal(0, noise, count)
+    found = Registration.none(xy[1::2] + np.column_stack([rng.uniform(-5, 5, count), across]))
+    found.sigma[:] = 0.1
+    sigma = links.scaled(found, np.ones(count, dtype=bool))
+    np.testing.assert_allclose(sigma, scaled, rtol=0.3 if scaled > 0.1 else 1e-12)
+
+
 def test_rows_aregrouped_by_equal_keys() -> None:
     a, b = np.array([1, 0, 1, 1, 0]), np.array([2, 5, 2, 1, 5])
     groups = grouped(a, b)
@@ -384,11 +413,11 @@ def test_rows_aregrouped_by_equal_keys() -> None:
 def test_tracks_must_tie_every_pair_after_registration() -> None:
     two = views(camera(0.0), camera(100 * METRE))
     pairs = select_pairs(two, TieOptions())
-    reports = [find_module.PairReport(("v0", "v1"), "ok", (50, 50), 30, 20)]
+    reports = [PairReport(("v0", "v1"), "ok", (50, 50), 30, 20)]
     tracks = _tracks(*[(v, p) for p in range(12) for v in (0, 1)])
-    find_module.require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=12))
+    require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=12))
     with pytest.raises(Exception, match="only 12 tracks after registration"):
-        find_module.require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=13))
+        require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=13))
 
 
 # --- matching ----------------------------------------------------------------------------------------------
@@ -442,6 +471,54 @@ def test_as_many_matches_are_trusted_as_the_bands_aside_allow(search, aside, sha
     assert len(found) == count
     assert control == pytest.approx(stated)
     assert matcher.asked == [0.0, -12.0, 12.0]  # twice the band's half width and six pixels more
+
+
+class Wrong:
+    """A matcher of two like cameras, the second of which is wrong by given amounts along and across the rows."""
+
+    detects = True
+
+    def __init__(self, along: np.ndarray, across: np.ndarray) -> None:
+        places = np.random.default_rng(1).uniform(0, 999, (len(along), 2))
+        xy = np.stack([places, places + np.column_stack([along, across])], axis=1)
+        self.found = Matches.of_places(xy, np.linspace(0, 1, len(along)))
+
+    def match(self, a: Any, b: Any, prediction: Prediction) -> Matches:
+        return self.found.select(prediction.contains(self.found.xy))
+
+
+def test_after_a_blind_pass_the_search_is_where_its_matches_lie(search) -> None:
+    """Half their spread and ten pixels more either side along the lines; on the line itself across them."""
+    rng = np.random.default_rng(2)
+    for spread in (4.0, 12.0):
+        along = rng.uniform(3 - spread, 3 + spread, 200)
+        found = search(Wrong(along, np.full(200, -5.0))).offset()
+        assert found is not None
+        places = rng.uniform(0, 999, (5, 2))
+        where = found.at(places)
+        low, high = np.percentile(along, [2, 98])
+        np.testing.assert_allclose(where.before, low - 0.5 * (high - low) - 10.0)
+        np.testing.assert_allclose(where.after, high + 0.5 * (high - low) + 10.0)
+        np.testing.assert_allclose(where.place(np.full(5, 3.0)), places + [3.0, -5.0], atol=1e-6)
+
+
+def test_the_correction_across_the_lines_is_one_by_the_place_in_the_first_view(search) -> None:
+    """Of a camera that is 300 px off along the lines, and across them by more the farther east."""
+    places = np.random.default_rng(1).uniform(0, 999, (200, 2))  # those of `Wrong`
+    along = np.random.default_rng(2).uniform(295, 305, 200)
+    found = search(Wrong(along, 0.004 * places[:, 0])).offset()
+    assert found is not None
+    np.testing.assert_allclose(found.at(places).across, places[:, 1] + 0.004 * places[:, 0], atol=0.05)
+
+
+@pytest.mark.parametrize(("noise", "width"), [(0.01, 0.6), (0.3, 1.2), (2.0, 3.0)])
+def test_the_local_band_is_four_standard_deviations_wide_within_its_bounds(search, noise, width) -> None:
+    rng = np.random.default_rng(3)
+    wrong = Wrong(np.full(400, 7.0), rng.normal(0, noise, 400))
+    found = search(wrong).local(wrong.found)
+    assert found.half_width == pytest.approx(width, rel=0.15)
+    where = found.at(np.array([[500.0, 500.0]]))
+    np.testing.assert_allclose([where.before, where.after], [[3.0], [11.0]], atol=1e-6)
 
 
 def test_the_best_come_first_and_each_place_once(search) -> None:

@@ -116,3 +116,10 @@ def test_an_image_of_one_pixel_has_no_stretch(tmp_path) -> None:
 
 def test_a_box_grows_up_to_the_border_of_the_image() -> None:
     assert grow((0, 10, 20, 20), 5, (100, 32)) == (0, 5, 25, 27)
+
+
+def test_a_window_of_one_value_is_level() -> None:
+    for value in (0.0, 2e9, -1e30):
+        pixels = np.full((8, 8), value)
+        for valid in (np.ones((8, 8), bool), np.eye(8, dtype=bool), np.zeros((8, 8), bool)):
+            np.testing.assert_array_equal(levelled(pixels, valid), np.zeros((8, 8), np.float32))

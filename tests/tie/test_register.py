@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.tie.register import _Template, _upsampled, register
+from barpc.tie.register import _Template, _upsampled, register, register_places
+from tests.tie.conftest import write_image
 
 SIZE = 400
 
@@ -60,6 +61,27 @@ def test_a_known_affine_map_is_found_to_a_hundredth_of_a_pixel(texture, referenc
     assert np.abs(error.mean(axis=0)).max() < 0.001
 
 
+@pytest.mark.parametrize("zoom", [1.0, 1.3])
+def test_enough_is_read_about_a_place_for_the_patch_and_its_interpolation(texture, tmp_path, zoom) -> None:
+    """One place at a time, from files, is registered as in the whole images."""
+    first = np.rint(texture)
+    second = np.rint(warped(first, zoom * np.eye(2), np.array([0.4, -0.3])))
+    files = []
+    for name, image in (("a.tif", first), ("b.tif", second)):
+        write_image(tmp_path / name, image.astype(np.uint16))
+        files.append((str(tmp_path / name), (SIZE, SIZE)))
+    places = np.random.default_rng(5).integers(120, SIZE - 120, (20, 2)).astype(np.float64)
+    start = (places - SIZE / 2) * zoom + SIZE / 2 + [0.9, -0.8]
+    many = np.broadcast_to(zoom * np.eye(2), (20, 2, 2))
+    whole = run(first, second, places, start, zoom * np.eye(2))
+    assert whole.ok.mean() > 0.8
+    for k in range(20):
+        alone = register_places(tuple(files), 1, places[k : k + 1], start[k : k + 1], many[k : k + 1], 21)
+        assert alone.ok[0] == whole.ok[k]
+        np.testing.assert_allclose(alone.xy[0], whole.xy[k], atol=2e-4)
+        np.testing.assert_allclose(alone.correlation[0], whole.correlation[k], atol=1e-5)
+
+
 def test_gain_and_offset_between_the_images_do_not_matter(texture, reference) -> None:
     found = run(texture, 0.37 * texture + 210, reference, reference + 0.4, np.eye(2))
     assert found.ok.all()
@@ -107,12 +129,14 @@ def test_no_patches_at_all_is_no_error(texture) -> None:
     assert len(run(texture, texture, np.empty((0, 2)), np.empty((0, 2)), np.eye(2)).ok) == 0
 
 
-def test_upsampling_keeps_the_pixels_and_a_wave_between_them() -> None:
-    wave = np.tile(np.cos(2 * np.pi * np.arange(200.0) / 5.0), (50, 1)).astype(np.float32)
+@pytest.mark.parametrize(("period", "error"), [(3, 0.01), (4, 0.003), (5, 0.004), (8, 0.002)])
+def test_upsampling_keeps_the_pixels_and_a_wave_between_them(period: int, error: float) -> None:
+    wave = np.tile(np.cos(2 * np.pi * np.arange(240.0) / period), (50, 1)).astype(np.float32)
     fine = _upsampled(wave)
     np.testing.assert_allclose(fine[::4, ::4], wave, atol=1e-6)
-    expected = np.cos(2 * np.pi * np.arange(800) / 20.0)
-    np.testing.assert_allclose(fine[80, 80:-80], expected[80:-80], atol=0.01)
+    expected = np.cos(2 * np.pi * np.arange(960) / (4 * period))
+    np.testing.assert_allclose(fine[80, 80:-80], expected[80:-80], atol=error)
+    np.testing.assert_allclose(_upsampled(wave.T.copy()), fine.T, atol=1e-6)
 
 
 def test_the_result_does_not_depend_on_opencv_threads(texture, reference) -> None:
@@ -162,3 +186,16 @@ def test_the_derivative_of_a_ramp_is_its_slope() -> None:
     assert template._weight.sum() == pytest.approx(1.0, rel=1e-5)
     middle, edge = template._weight[220], template._weight[210]
     assert edge / middle == pytest.approx(np.exp(-0.5 / 0.7**2), rel=1e-5)
+
+
+@pytest.mark.parametrize(("detail", "flat"), [(0.0005, True), (0.003, False)])
+def test_a_patch_is_flat_below_a_millionth_of_its_level(detail: float, flat: bool) -> None:
+    """Of level 1000 a millionth is 0.001, some steps of float32."""
+    template = _Template(np.zeros((60, 60), np.float32), 21)
+    noise = np.random.default_rng(9).normal(0, detail, (1, 21 * 21))
+    patch, deviation = template._normalized((1000.0 + noise).astype(np.float32))
+    assert (patch == 0).all() == flat
+    assert np.isinf(deviation).all() == flat
+    if not flat:
+        assert deviation[0, 0] == pytest.approx(detail, rel=0.2)
+        assert (patch**2 @ template._weight)[0] == pytest.approx(1.0, rel=1e-3)

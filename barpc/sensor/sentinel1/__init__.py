@@ -18,12 +18,11 @@ import numpy as np
 
 from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError
 from barpc.geodesy import Array
-from barpc.safexml import MAX_BYTES
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation, seconds
 from barpc.sensor.sentinel1.frames import Bistatic, Delays, GroundFrame, SlantFrame
 from barpc.sensor.sentinel1.range_doppler import RangeDoppler, build, extent, grid_residuals
-from barpc.sidefile import PRODUCT, opened, read_head
+from barpc.sidefile import MAX_XML, PRODUCT, opened, read_head
 
 __all__ = [
     "Annotation",
@@ -192,7 +191,7 @@ class _File:
 
 def _content(archive: zipfile.ZipFile, member: str) -> bytes:
     with archive.open(member) as file:
-        return file.read(MAX_BYTES + 1)
+        return file.read(MAX_XML + 1)
 
 
 def _from_zip(path: Path, what: str, use: Callable[[zipfile.ZipFile], T]) -> T:

@@ -19,8 +19,8 @@ import numpy.typing as npt
 
 from barpc.errors import RpcFormatError
 from barpc.geodesy import Array
-from barpc.safexml import parse_xml
 from barpc.sensor.curve import MARGIN
+from barpc.sidefile import parse_xml
 
 TimeArray = npt.NDArray[np.datetime64]
 

@@ -1,0 +1,364 @@
+"""Ground points and where images show them: the GCPs of a run, and the correspondences that an RPC is fitted to.
+
+Image coordinates have (0, 0) at the centre of the top-left pixel. Those of GCPs are taken as they stand, as ASP and
+orthority mean them; GDAL leaves the meaning of its tags to the application. Altitudes are ellipsoidal.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barpc.errors import InputError
+from barpc.frozen import load_npz
+from barpc.geodesy import Array
+from barpc.pointio.names import ViewNames
+from barpc.raster import driver_of, open_raster
+from barpc.scene import GroundPoints
+from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
+
+GROUND_SIGMA = 1.0
+"""East, north, up standard deviation [m] of a GCP whose file states none."""
+IMAGE_SIGMA = 0.5
+"""Standard deviation of each image coordinate [px] where the file states none."""
+
+
+@dataclass(frozen=True)
+class _Point:
+    """One GCP in one image: the files repeat the ground point for each of its images."""
+
+    name: str
+    lonlatalt: tuple[float, float, float]
+    sigma: tuple[float, float, float]
+    view: int
+    xy: tuple[float, float]
+    xy_sigma: float
+
+
+def read_gcps(
+    path: Path | str, names: Sequence[str], *, sigma: float | None = None, image_sigma: float | None = None
+) -> GroundPoints:
+    """GCPs and where they are seen.
+
+    Parameters
+    ----------
+    path : path
+        A `.gcp` file, a GeoJSON file, or an image with GCP tags.
+    names : sequence of str
+        The views; observations in other images are left out, and these named in `strangers`.
+    sigma : float or None
+        East, north, up standard deviation [m] instead of the file's.
+    image_sigma : float or None
+        Standard deviation of image coordinates [px] instead of the file's.
+
+    Raises
+    ------
+    InputError
+        The file does not parse, or holds no point of these views.
+    """
+    path = Path(path)
+    head = read_head(path, TABLE, 4096)
+    views = ViewNames(names, str(path))
+    if head.lstrip().startswith(b"{"):
+        found = list(_read_geojson(path, views))
+    elif driver_of(head) is not None or b"\0" in head:
+        found = list(_read_tags(path, views))
+    else:
+        found = list(_read_asp(path, views))
+    if not found:
+        raise InputError(f"{path}: no GCP of {', '.join(names[:10])}")
+    try:
+        return replace(_assembled(found, sigma, image_sigma), strangers=tuple(views.strangers))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
+    """Lines `id lat lon alt sigma_x sigma_y sigma_z image col row sigma_col sigma_row [image ...]`."""
+    for number, raw in enumerate(read_text(path, TABLE).split("\n"), start=1):
+        words = re.split(r"(?:^|\s)#", raw, maxsplit=1)[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            lat, lon, alt, *sigma = (float(word) for word in words[1:7])
+            images = [words[i : i + 5] for i in range(7, len(words), 5)]
+            east, north, up = sigma
+            if not images:
+                raise ValueError("no image")
+            for image, *numbers in images:
+                col, row, sigma_col, sigma_row = (float(word) for word in numbers)
+                view = views.find(image)
+                if view is not None:
+                    spread = max(sigma_col, sigma_row)
+                    yield _Point(words[0], (lon, lat, alt), (east, north, up), view, (col, row), spread)
+        except ValueError as error:
+            raise InputError(
+                f"{path}, line {number}: expected 'id lat lon alt sx sy sz image col row scol srow ...' ({error})"
+            ) from error
+
+
+def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
+    """Features with a 3-D point and the properties `ji` (col, row), `filename` and, perhaps, `id`."""
+    for n, ((lon, lat, alt, col, row), properties) in enumerate(geojson_points(path, "filename"), 1):
+        view = views.find(str(properties["filename"]))
+        if view is not None:
+            name = str(properties.get("id") or f"gcp_{n}")
+            yield _Point(name, (lon, lat, alt), (GROUND_SIGMA,) * 3, view, (col, row), IMAGE_SIGMA)
+
+
+def _read_tags(path: Path, views: ViewNames) -> Iterator[_Point]:
+    """The GCP tags of an image: they are seen in that image alone."""
+    view = views.index(str(path))
+    with open_raster(path) as dataset:
+        gcps, crs = dataset.gcps
+    if gcps and crs is not None and not crs.is_geographic:
+        raise InputError(f"{path}: its GCPs are in {crs}; longitude and latitude on WGS84 are needed")
+    for n, gcp in enumerate(gcps, 1):
+        if gcp.z is None:
+            raise InputError(f"{path}: GCP {gcp.id or n} has no altitude")
+        place, xy = (float(gcp.x), float(gcp.y), float(gcp.z)), (float(gcp.col), float(gcp.row))
+        yield _Point(str(gcp.id or n), place, (GROUND_SIGMA,) * 3, view, xy, IMAGE_SIGMA)
+
+
+def _assembled(found: list[_Point], sigma: float | None, image_sigma: float | None) -> GroundPoints:
+    """Observations of points of the same name and place belong to one point."""
+    first: dict[tuple[str, tuple[float, float, float]], _Point] = {}
+    for point in found:
+        first.setdefault((point.name, point.lonlatalt), point)
+    index = {key: i for i, key in enumerate(first)}
+    points = list(first.values())
+    numbers = np.array([point.lonlatalt for point in points])
+    wrong = ~(np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, 1]) <= 90.0))
+    if wrong.any():
+        raise InputError(
+            f"GCP {points[int(wrong.argmax())].name}: a coordinate is not finite, or its latitude beyond 90 degrees"
+        )
+    return GroundPoints(
+        names=tuple(point.name for point in points),
+        lonlatalt=numbers,
+        sigma=np.array([point.sigma if sigma is None else (sigma,) * 3 for point in points]),
+        point=np.array([index[point.name, point.lonlatalt] for point in found]),
+        view=np.array([point.view for point in found]),
+        xy=np.array([point.xy for point in found]),
+        xy_sigma=np.array([point.xy_sigma if image_sigma is None else image_sigma for point in found]),
+    )
+
+
+# --- correspondences --------------------------------------------------------------------------------------
+
+_FAR = 1e9  # px and m: no node comes near
+
+_COLUMNS = {
+    "lon": ("lon", "long", "longitude", "lng"),
+    "lat": ("lat", "latitude"),
+    "alt": ("alt", "altitude", "height", "h", "z", "elevation", "height_above_datum"),
+    "col": ("col", "column", "samp", "sample", "pixel", "x"),
+    "row": ("row", "line", "y"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Ground points and where an image shows them."""
+
+    ground: Array  # (N, 3): lon, lat [deg], alt [m above the ellipsoid]
+    image: Array  # (N, 2): col, row [px]
+    sigma: Array | None = None  # (N,): standard deviation of the image points [px]
+
+
+def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None = None) -> Correspondences:
+    """Read a table of points or a direct-localisation grid, whichever the file is.
+
+    Parameters
+    ----------
+    path : Path or str
+        CSV (a header of names, or the columns lon, lat, alt, col, row), npz (arrays ``ground`` and ``image``
+        or one a column), GeoJSON (GCPs with ``ji`` = [col, row]), or a GeoTIFF whose bands are longitude and
+        latitude of one altitude layer after the other, on a regular grid of image points.
+    altitudes : sequence of float, optional
+        Altitudes of the layers of a grid that does not state them [m].
+
+    Raises
+    ------
+    InputError
+        No such file, not one of these, columns that are missing or do not parse.
+    """
+    path = Path(path)
+    kind = correspondence_kind(path, altitudes)
+    if kind is None:
+        raise InputError(f"{path}: neither a table of points (CSV, npz, GeoJSON) nor a localisation grid")
+    if kind == "grid":
+        return read_grid(path, altitudes)
+    return {"csv": _read_table, "npz": _read_npz, "geojson": _read_features}[kind](path)
+
+
+def correspondence_kind(path: Path, altitudes: Sequence[float] | None = None) -> str | None:
+    """What a file is: "csv", "npz", "geojson", "grid", or None for neither (an image or an RPC file)."""
+    head = read_head(path, TABLE, 65536)
+    if driver_of(head) == "GTiff":
+        with open_raster(path) as dataset:
+            return "grid" if altitudes is not None or "ALTITUDE_B0" in dataset.tags() else None
+    if head[:2] == b"PK":
+        return "npz"
+    if head.lstrip()[:1] == b"{":
+        return "geojson" if b'"FeatureCollection"' in head else None
+    return "csv" if _is_table(head) else None
+
+
+def _is_table(head: bytes) -> bool:
+    """Whether a text begins with a header that names columns, or with a line of five numbers."""
+    try:
+        lines = head.decode("utf-8-sig", errors="strict" if len(head) < 65536 else "ignore").splitlines()
+    except UnicodeDecodeError:
+        return False
+    first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
+    words = _split(first)
+    return (_numbers(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(_header(words))
+
+
+def _split(line: str) -> list[str]:
+    return [word.strip().strip('"') for word in re.split(r"[,;\t]|\s+", line.strip()) if word.strip()]
+
+
+def _numbers(words: Sequence[str]) -> list[float] | None:
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return None
+
+
+def _header(words: Sequence[str]) -> dict[str, int]:
+    """Column of each quantity that a header names."""
+    lower = [re.sub(r"[\[(].*", "", word.lower()).strip() for word in words]
+    names = {**_COLUMNS, "sigma": ("sigma", "sigma_px")}
+    found = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
+    return {key: hits[0] for key, hits in found.items() if hits}
+
+
+def _read_table(path: Path) -> Correspondences:
+    """A text table: separated by commas, semicolons, tabs or blanks; ``#`` begins a comment."""
+    rows: list[list[float]] = []
+    columns: dict[str, int] = {}
+    for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
+        words = _split(raw.split("#", 1)[0])
+        values = _numbers(words)
+        if not columns and words:
+            columns = dict(zip(_COLUMNS, range(5), strict=True)) if values else _header(words)
+            if missing := [name for name in _COLUMNS if name not in columns]:
+                raise InputError(f"{path}: no column {', '.join(missing)}; found {', '.join(words)}")
+        elif words and values is None:
+            raise InputError(f"{path}, line {number}: expected numbers, found {words[0][:40]!r}")
+        if values:
+            if len(values) <= max(columns.values()):
+                raise InputError(f"{path}, line {number}: expected {max(columns.values()) + 1} columns")
+            rows.append([values[i] for i in columns.values()])
+    if not rows:
+        raise InputError(f"{path}: no points in it")
+    return _correspondences(path, dict(zip(columns, np.array(rows).T, strict=True)))
+
+
+def _read_npz(path: Path) -> Correspondences:
+    """Arrays ``ground`` (N, 3) and ``image`` (N, 2), or one array a column; ``sigma`` (N,) if known."""
+    found = load_npz(path)
+    try:
+        arrays = {name: np.asarray(value, dtype=np.float64) for name, value in found.items()}
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: not an npz of numbers ({error})") from error
+    if "ground" in arrays and "image" in arrays:
+        return _checked(path, arrays["ground"], arrays["image"], arrays.get("sigma"))
+    columns = {key: arrays[list(arrays)[i]] for key, i in _header(list(arrays)).items()}
+    if missing := [name for name in _COLUMNS if name not in columns]:
+        raise InputError(
+            f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}"
+        )
+    return _correspondences(path, columns)
+
+
+def _correspondences(path: Path, columns: dict[str, Array]) -> Correspondences:
+    if len({column.shape for column in columns.values()}) > 1:
+        raise InputError(f"{path}: columns of different lengths")
+    ground = np.stack([columns[name] for name in ("lon", "lat", "alt")], axis=-1)
+    return _checked(path, ground, np.stack([columns["col"], columns["row"]], axis=-1), columns.get("sigma"))
+
+
+def _checked(path: Path, ground: Array, image: Array, sigma: Array | None) -> Correspondences:
+    """The points, whose arrays must have one length."""
+    shapes = [array.shape for array in (ground, image, sigma) if array is not None]
+    n = len(ground) if ground.ndim else 0
+    if shapes != [(n, 3), (n, 2), (n,)][: len(shapes)]:
+        raise InputError(f"{path}: arrays of shapes {shapes}, not (N, 3), (N, 2), (N,)")
+    return Correspondences(ground, image, sigma)
+
+
+def _read_features(path: Path) -> Correspondences:
+    """GCPs (see `geojson_points`)."""
+    table = np.array([numbers for numbers, _ in geojson_points(path)])
+    if not len(table):
+        raise InputError(f"{path}: no points in it")
+    return Correspondences(table[:, :3], table[:, 3:])
+
+
+def geojson_points(path: Path, *needed: str) -> list[tuple[list[float], dict[str, Any]]]:
+    """Points of a GeoJSON: lon, lat, alt, col, row (of the property ``ji``, or ``col``, ``row``); properties.
+
+    InputError where it is no such file, or has not all properties that are `needed`.
+    """
+    document = read_json(path, GEOJSON)
+    try:
+        return [_feature(feature, needed) for feature in document["features"]]
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        words = ", ".join(("ji", *needed))
+        raise InputError(f"{path}: not a GeoJSON of 3-D points with {words} ({error!r})") from error
+
+
+def _feature(feature: dict[str, Any], needed: Sequence[str]) -> tuple[list[float], dict[str, Any]]:
+    lon, lat, alt = feature["geometry"]["coordinates"]
+    properties = feature["properties"]
+    col, row = properties["ji"] if "ji" in properties else (properties["col"], properties["row"])
+    if missing := [key for key in needed if key not in properties]:
+        raise KeyError(missing[0])
+    return [float(value) for value in (lon, lat, alt, col, row)], properties
+
+
+def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspondences:
+    """A direct-localisation grid: bands lon, lat of each altitude layer, nodes by the geotransform.
+
+    The geotransform counts from the corner of the first pixel, as GDAL does; half a pixel is taken off.
+
+    Parameters
+    ----------
+    path : Path
+        GeoTIFF.
+    altitudes : sequence of float, optional
+        Of the layers [m]; by default from the tags ``ALTITUDE_B0``, ``ALTITUDE_B2``, ...
+    """
+    with open_raster(path) as dataset:
+        Kind("a localisation grid", TABLE.most).check(
+            f"{path}, read", 8 * dataset.count * dataset.width * dataset.height
+        )
+        bands = np.real(dataset.read()).astype(np.float64)
+        to_image, tags = dataset.transform, dataset.tags()
+    layers = len(bands) // 2
+    if altitudes is None:
+        stated = [_numbers([tags.get(f"ALTITUDE_B{2 * i}", "nan")]) for i in range(layers)]
+        altitudes = [np.nan if value is None else value[0] for value in stated]
+    if len(bands) % 2 or len(altitudes) != layers or not np.isfinite(altitudes).all():
+        raise InputError(
+            f"{path}: {len(bands)} bands are {layers} layers of lon and lat, but {len(altitudes)} altitudes "
+            "are known; give one altitude a layer"
+        )
+    row, col = np.indices(bands.shape[1:], dtype=np.float64)
+    a, b, c, d, e, f = to_image[:6]
+    nodes = np.stack([a * col + b * row + c, d * col + e * row + f], axis=-1) - 0.5
+    image = np.broadcast_to(nodes, (layers, *nodes.shape)).reshape(-1, 2)
+    alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
+    ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)
+    ok = np.isfinite(ground).all(axis=1)
+    if (np.abs(ground[ok]) > (540.0, 90.0, _FAR)).any() or not (np.abs(image) <= _FAR).all():
+        raise InputError(f"{path}: a node of it is no longitude, latitude and altitude, or no image point")
+    return Correspondences(ground[ok], image[ok])
