@@ -170,8 +170,8 @@ class ViewEntry(Record):
         "fitted": Column("covered [%]", lambda view: _percent(value_of(view, "fit.coverage")), ".0f"),
     }
     PAGE: ClassVar = (
-        "name verdict num_observations rejected covered rmse_before rmse_after held_out_px correction.center_shift_px gsd_m "
-        "incidence_deg rpc_source.format"
+        "name verdict num_observations rejected covered rmse_before rmse_after held_out_px correction.center_shift_px "
+        "gsd_m incidence_deg rpc_source.format"
     )
     TERMINAL: ClassVar = (
         "name verdict num_observations rmse_before rmse_after correction.center_shift_px about"
@@ -202,13 +202,6 @@ class ViewEntry(Record):
     rmse_after: Number = said(
         "The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True
     )
-    held_out_px: Number = said(
-        "RMS reprojection error of tie points that took no part in the adjustment, by their median",
-        "px",
-        "not used",
-        ".3f",
-        default=None,
-    )
     smooth_px: Number = said("RMS of what is smooth in the residuals left, less noise", "px")
     prior_scale: Number = said("By how much the camera's stated standard deviations were widened")
     correction: CorrectionEntry | None = said("The correction; null for a check")
@@ -222,6 +215,13 @@ class ViewEntry(Record):
         "Verdict on the image"
     )
     advice: str = said("What to do; empty when all is well")
+    held_out_px: Number = said(
+        "RMS reprojection error of tie points that took no part in the adjustment, by their median",
+        "px",
+        "not used",
+        ".3f",
+        default=None,
+    )
 
 
 class OffsetEntry(Record):
@@ -319,13 +319,6 @@ class SceneEntry(Record):
     )
     weakest_modes: tuple[ModeEntry, ...] = said("What the images cannot tell, the weakest first")
     noise: Number = said("Observed over stated standard deviation of the observations")
-    num_held_out: Count = said("Observations that took no part, to be measured on", default=0)
-    model: str = said("Unknowns of each view that were solved for", default="")
-    in_space_px: Number = said(
-        "Where an affine in the image was chosen: what a rotation and translation leave of the same tie points",
-        "px",
-        default=None,
-    )
     drift_degree: Count = said("Degree of the rotation in the row")
     drift_sigma_m: tuple[float, ...] = said(
         "Standard deviation of the drift at the first and last row, by degree", "m"
@@ -335,6 +328,13 @@ class SceneEntry(Record):
     num_held_in_height: Count = said("Tie points seen under too small an angle, held in height")
     gcp_residuals_enu_m: tuple[Vector, ...] = said("Adjusted GCPs minus their given place", "m")
     solver: str = said("What the solver did")
+    num_held_out: Count = said("Observations that took no part, to be measured on", default=0)
+    model: str = said("Unknowns of each view that were solved for", default="")
+    in_space_px: Number = said(
+        "Where an affine in the image was chosen: what a rotation and translation leave of the same tie points",
+        "px",
+        default=None,
+    )
 
 
 class KnownPoint(Record):

@@ -126,8 +126,8 @@ def _left(name: str, adjustment: Adjustment) -> str:
     if not noise > NOISE_LIMIT:
         return ""
     return (
-        f"tie points that took no part are left with {error:.2f} px, {noise:.1f} times what the matcher states: look for "
-        "wrong matches, moving things, or errors that these unknowns cannot follow"
+        f"tie points that took no part are left with {error:.2f} px, {noise:.1f} times what the matcher states: "
+        "look for wrong matches, moving things, or errors that these unknowns cannot follow"
     )
 
 
@@ -146,9 +146,9 @@ def _block_reasons(run: Run) -> list[str]:
     if (in_space := run.adjustment.in_space_rms) is not None:
         tilts = ", ".join(metres(s) for s in run.adjustment.gauge.motion_sigma[3:5])
         out.append(
-            f"Rotations and translations leave {in_space:.2f} px of tie points that took no part; an affine in each image "
-            f"leaves {_median(run.adjustment.held_out_rms):.2f} px and was taken: images that were turned, resampled or "
-            "cropped otherwise than their RPCs say, or RPCs of other images. The scene's tilts are known to "
+            f"Rotations and translations leave {in_space:.2f} px of tie points that took no part; an affine in each "
+            f"image leaves {_median(run.adjustment.held_out_rms):.2f} px and was taken: images that were turned, "
+            "resampled or cropped otherwise than their RPCs say, or RPCs of other images. Its tilts are known to "
             f"{tilts} (east, north) only."
         )
     names = run.adjustment.names
@@ -157,8 +157,8 @@ def _block_reasons(run: Run) -> list[str]:
         if not (_oddity(names[i], run.adjustment) or _oddity(names[j], run.adjustment)):
             out.append(
                 f"Tie points of {names[i]} and {names[j]} fall into two groups, {100 * group.share:.0f} % lying "
-                f"{group.apart:.2f} px from the others: there are two solutions, and this is the one between them. Look "
-                "for a moving cloud or a repeated pattern, or add an image."
+                f"{group.apart:.2f} px from the others: there are two solutions, and this is the one between them. "
+                "Look for a moving cloud or a repeated pattern, or add an image."
             )
     if noise > NOISE_LIMIT:
         out.append(
