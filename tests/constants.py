@@ -18,6 +18,7 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
         "contrast": ("barpc.tie.features.CONTRAST",),
         "tolerance": ("barpc.tie.matching.TOLERANCE",),
         "patch": ("barpc.tie.register.PATCH",),
+        "min_correlation": ("barpc.tie.register.MIN_CORRELATION",),
     },
     AdjustOptions: {
         "sigma_shift": ("barpc.ba.priors.IMAGE_SIGMA",),

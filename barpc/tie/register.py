@@ -23,6 +23,8 @@ from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, robust_spre
 from barpc.tie.raster import FloatImage, grow, levelled, read_pixels
 from barpc.tie.tasks import Progress, ordered
 
+MIN_CORRELATION = 0.8
+"""Of two registered patches, or the match is left out."""
 PATCH = 21
 """Side of the patches that are registered [px], odd."""
 _CHUNK = 256  # patches worked on at a time: they stay in cache
@@ -265,7 +267,7 @@ def refine(
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Links(views, tracks, of_track[tracks.point[other]], other)
     found = links.register(options, executor, progress)
-    good = links.verified(found, found.ok & (found.correlation >= options.min_correlation))
+    good = links.verified(found, found.ok & (found.correlation >= MIN_CORRELATION))
     sigma = links.scaled(found, good)
     return _shared(tracks, of_track, other[good], found.xy[good], sigma[good])
 

@@ -221,7 +221,7 @@ def test_a_pair_needs_as_many_matches_as_asked_for(scene: Rendered) -> None:
     "wrong",
     [
         {"tile": 127}, {"min_matches": 3}, {"min_overlap": 1.01},
-        {"ratio": 1.01}, {"min_correlation": 1.0}, {"angles": (-0.1, 9.0)}, {"angles": (9.0, 8.0)},
+        {"ratio": 1.01}, {"angles": (-0.1, 9.0)}, {"angles": (9.0, 8.0)},
         {"search": 0.0}, {"band": 0},
     ],
 )  # fmt: skip
@@ -233,7 +233,7 @@ def test_options_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
 def test_options_at_the_end_of_their_range_are_taken() -> None:
     low = TieOptions(tile=128, min_matches=4, min_overlap=0.0, angles=(0.0, 0.0), ratio=1.0)
     assert (low.tile, low.ratio) == (128, 1.0)
-    assert TieOptions(min_overlap=1.0, min_correlation=0.99, band=1).min_overlap == 1.0
+    assert TieOptions(min_overlap=1.0, band=1).min_overlap == 1.0
 
 
 # --- pairs -------------------------------------------------------------------------------------------------
