@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from barpc.ba.consensus import TwoGroups
 from barpc.report.summary import STATUS_WORDS, measure
 from barpc.report.verdict import GOOD, block_verdict
 from tests.report.conftest import summarize
@@ -67,10 +68,70 @@ def test_ground_points_with_a_reservation_need_a_look(change, word, block_run):
     assert word in summary["reasons"][0]
 
 
+def in_the_image(adjustment):
+    return replace(adjustment, in_space_rms=0.95)
+
+
+def between_two_groups(adjustment):
+    return replace(adjustment, two_groups=(TwoGroups((1, 4), 0.31, 0.42),))
+
+
+def scattered(adjustment):
+    return replace(adjustment, noise=2.6)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (in_the_image, ("leave 0.95 px", "affine", "turned, resampled or cropped", "tilts")),
+        (between_two_groups, ("{1} and {4} fall into two groups", "31 %", "0.42 px", "two solutions")),
+        (scattered, ("scatter 2.6 times",)),
+    ],
+)
+def test_what_the_adjustment_says_of_the_block_needs_a_look(change, words, block_run):
+    run = block_run.run
+    summary = summarize(replace(run, adjustment=change(run.adjustment)))
+    assert summary["status"] == "look"
+    assert summary["headline"] == "All 9 images are adjusted; the block needs a look."
+    (reason,) = summary["reasons"]
+    for word in words:
+        assert word.format(*run.adjustment.names) in reason
+
+
+@pytest.mark.parametrize(("noise", "said"), [(2.4, False), (2.6, True), (float("nan"), False)])
+def test_an_image_is_judged_by_tie_points_that_took_no_part(noise, said, block_run):
+    run = block_run.run
+    of_views, rms = run.adjustment.held_out_noise.copy(), run.adjustment.held_out_rms.copy()
+    of_views[3], rms[3] = noise, 0.31
+    summary = summarize(
+        replace(run, adjustment=replace(run.adjustment, held_out_noise=of_views, held_out_rms=rms))
+    )
+    view = summary["views"][3]
+    assert view["held_out_px"] == 0.31
+    assert (view["status"] == "doubtful") == said
+    if said:
+        assert "took no part are left with 0.31 px, 2.6 times" in view["advice"]
+        assert not summary["passed"]
+
+
+def test_what_takes_no_part_is_counted_apart(block_run):
+    run, summary = block_run.run, block_run.summary
+    adjustment = run.adjustment
+    assert adjustment.held_out.any()
+    assert summary["scene"]["num_held_out"] == adjustment.held_out.sum()
+    for i, view in enumerate(summary["views"]):
+        of_view = run.tracks.view == i
+        assert view["num_observations"] == (adjustment.inlier & of_view).sum()
+        assert view["num_rejected"] == (~(adjustment.inlier | adjustment.held_out) & of_view).sum()
+        if view["held_out_px"] is not None:
+            assert 0.3 * view["rmse_after"] < view["held_out_px"] < 2.0 * view["rmse_after"]
+
+
 def test_images_held_by_control_points_alone_are_not_weak(block_run):
     run = block_run.run
     tracks = run.tracks.select(np.zeros(len(run.tracks), dtype=bool))
-    adjustment = replace(run.adjustment, inlier=np.zeros(0, dtype=bool), view=np.zeros(0, dtype=np.int64))
+    none = np.zeros(0, dtype=bool)
+    adjustment = replace(run.adjustment, inlier=none, held_out=none, view=np.zeros(0, dtype=np.int64))
     summary = summarize(replace(run, tracks=tracks, adjustment=adjustment))
     assert {view["status"] for view in summary["views"] if view["num_gcps"] >= 3} == {"adjusted"}
     assert {view["status"] for view in summary["views"] if view["num_gcps"] < 3} <= {"weak"}
