@@ -28,7 +28,7 @@ _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
 NOMINAL_ALTITUDE = 650e3
 """Orbit altitude [m] assumed where a model does not tell its own."""
-PLAUSIBLE_ALTITUDE = (250e3, 1000e3)
+PLAUSIBLE_ALTITUDE = (380e3, 1000e3)
 """A camera centre regressed outside this range [m] is not believed."""
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pyproj
 import pytest
 
+from barpc.cameras import open_camera
 from barpc.errors import RpcError
 from barpc.sensor.geometry import NOMINAL_ALTITUDE, PLAUSIBLE_ALTITUDE, camera_center
 from tests.sensor.conftest import make_rpc
@@ -85,3 +86,21 @@ def test_a_flat_altitude_range_still_gives_a_projective_centre() -> None:
 def test_parallel_rays_have_a_nominal_centre_at_the_nominal_altitude() -> None:
     found = camera_center(make_rpc(), (20000, 19000), (0.0, 1000.0))
     assert found.altitude == pytest.approx(NOMINAL_ALTITUDE, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high", "method"),
+    [
+        ("rpc_IKONOS.txt", 500, 700, "nominal"),  # flown at 681 km; the rows of this product meet at 293 km
+        ("rpc_PLEIADES.xml", 690, 715, "line"),
+        ("rpc_SPOT6.xml", 690, 715, "line"),
+        ("qb-1.geom", 440, 465, "line"),
+        ("wv3_20.NTF", 610, 635, "line"),
+        ("rpc_PLANET_L1A.txt", 470, 540, "line"),
+    ],
+)
+def test_centres_of_real_cameras_are_where_their_satellites_fly(shared_data, name, low, high, method) -> None:
+    camera = open_camera(shared_data / "rpc_formats" / name)
+    found = camera_center(camera.model, camera.extent, camera.alt_range)
+    assert found.method == method
+    assert low * 1e3 < found.altitude < high * 1e3
