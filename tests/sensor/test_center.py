@@ -101,6 +101,7 @@ def test_parallel_rays_have_a_nominal_centre_at_the_nominal_altitude() -> None:
 )
 def test_centres_of_real_cameras_are_where_their_satellites_fly(shared_data, name, low, high, method) -> None:
     camera = open_camera(shared_data / "rpc_formats" / name)
-    found = camera_center(camera.model, camera.extent, camera.alt_range)
+    width, height = (2 * camera.rpc.image_scale).astype(int).tolist()
+    found = camera_center(camera.rpc, (width, height), camera.alt_range)
     assert found.method == method
     assert low * 1e3 < found.altitude < high * 1e3
