@@ -38,6 +38,7 @@ _MUCH_LOST = 0.85  # of a view's observations are to be left
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
 _MANY_KEPT = 0.99  # of the observations: the others do not tell in a mean
 _BETTER = 0.8  # of the noise
+_CLEARLY_BETTER = 0.9  # the same, where the drift that was learnt is no drift
 _MUCH_BETTER = (
     0.7  # of the error on tracks that took no part: another model is worth what it may do to heights
 )
@@ -108,7 +109,7 @@ def adjust_tracks(
         skew = found.is_skew
         if skew or found.has_trend:
             in_image = _solve(inner, outer, replace(options, model="affine"), gcps, dem, None, None)
-            if in_image.after.error < (1.0 if skew else _MUCH_BETTER) * found.after.error:
+            if in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error:
                 in_space, found = found.after.whole_rms, in_image
     return _adjustment(found, inner, outer, gcps, options, in_space, start)
 

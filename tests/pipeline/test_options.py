@@ -165,7 +165,7 @@ def _height(found: AdjustResult) -> float:
 
 
 def dem(run: Run, out: Path, scene: Path) -> None:
-    tight = AdjustOptions(dem_for_all=True, dem_sigma=0.01)
+    tight = AdjustOptions(dem_for_all=True, dem_sigma=0.01, dem_bias_sigma=0.01)
     geoid = str(scene / "dem/g.gtx")
     free = run("a", adjust=tight)
     held = run("b", adjust=tight, dem=str(scene / "dem/a.tif"), geoid=geoid)
@@ -176,7 +176,7 @@ def dem(run: Run, out: Path, scene: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
 def geoid(run: Run, out: Path, scene: Path) -> None:
-    tight = AdjustOptions(dem_for_all=True, dem_sigma=0.01)
+    tight = AdjustOptions(dem_for_all=True, dem_sigma=0.01, dem_bias_sigma=0.01)
     dem = str(scene / "dem/a.tif")
     with_geoid = run("a", adjust=tight, dem=dem, geoid=str(scene / "dem/g.gtx"))
     with pytest.warns(BarpcWarning, match="geoid"):

@@ -15,7 +15,7 @@ import pytest
 import rasterio
 
 from barpc.errors import BarpcWarning, InputError
-from barpc.pipeline import AdjustResult, RunOptions, adjust, load_views, twins
+from barpc.pipeline import AdjustResult, RunOptions, adjust, load_views, views
 from barpc.pipeline.views import unique_names
 from barpc.rpcio import read_rpc, write_rpc_vrt
 from tests.scenes import ImageOptions, write_scene
@@ -191,8 +191,8 @@ def test_cameras_of_one_image_may_be_compared_with_others(scene, tmp_path):
 def test_images_that_are_nearly_empty_are_no_twins(scene, tmp_path, monkeypatch):
     """None is read whole, however many there are; a copy among them is found."""
     reads = []
-    whole = twins._whole
-    monkeypatch.setattr(twins, "_whole", lambda image, band: reads.append(image.name) or whole(image, band))
+    whole = views._whole
+    monkeypatch.setattr(views, "_whole", lambda image, band: reads.append(image.name) or whole(image, band))
     images = []
     for number in range(8):
 
