@@ -115,31 +115,15 @@ def adjust_tracks(
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """A block solved with one model.
+    """A block solved with one model."""
 
-    Parameters
-    ----------
-    problem : Problem
-        As it was solved last.
-    state : State
-        Where it started: delivered cameras, points triangulated with them.
-    before : (2, K)
-        Residuals there [px].
-    heights : Heights
-        What holds points.
-    outcome : Outcome
-        Of the rounds.
-    start, after : HeldOut
-        What the tracks that took no part say before and after.
-    """
-
-    problem: Problem
-    state: State
-    before: Array
-    heights: Heights
-    outcome: Outcome
-    start: HeldOut
-    after: HeldOut
+    problem: Problem  # as it was solved last
+    state: State  # where it started: delivered cameras, points triangulated with them
+    before: Array  # (2, K) residuals there [px]
+    heights: Heights  # what holds points
+    outcome: Outcome  # of the rounds
+    start: HeldOut  # what the tracks that took no part say before
+    after: HeldOut  # and after
 
     @property
     def final(self) -> State:

@@ -25,39 +25,19 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 @dataclass(frozen=True)
 class Block:
-    """Observations of tracks and of GCPs together, sorted by view.
+    """Observations of tracks and of GCPs together, sorted by view."""
 
-    Parameters
-    ----------
-    views : tuple of View
-        N views.
-    view, point : (K,)
-        Indices; points from `num_tracks` on are GCPs.
-    xy : (2, K)
-        Observed col, row [px].
-    sigma : (K,)
-        [px], view weights applied.
-    order : (K,)
-        Row of each observation in the tracks, then in the GCPs, as given.
-    use : (K,)
-        False for observations in views that are left out.
-    num_tracks, num_points, num_rows : int
-        Tracks; tracks and GCPs; rows given.
-    left_out : tuple of str
-        Views outside the largest group.
-    """
-
-    views: tuple[View, ...]
-    view: IntArray
-    point: IntArray
-    xy: Array
-    sigma: Array
-    order: IntArray
-    use: BoolArray
+    views: tuple[View, ...]  # N views
+    view: IntArray  # (K,)
+    point: IntArray  # (K,) those from `num_tracks` on are GCPs
+    xy: Array  # (2, K) observed col, row [px]
+    sigma: Array  # (K,) [px], view weights applied
+    order: IntArray  # (K,) row of each observation in the tracks, then in the GCPs, as given
+    use: BoolArray  # (K,) false for observations in views that are left out
     num_tracks: int
-    num_points: int
-    num_rows: int
-    left_out: tuple[str, ...]
+    num_points: int  # tracks and GCPs
+    num_rows: int  # given, used or not
+    left_out: tuple[str, ...]  # views outside the largest group
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -111,24 +91,7 @@ def join(
     options: AdjustOptions,
     keep_largest: bool = False,
 ) -> Block:
-    """The block of tracks and GCPs.
-
-    Parameters
-    ----------
-    views : tuple of View
-        N views.
-    tracks, gcps, options, keep_largest
-        As in `barpc.ba.adjust_tracks`.
-
-    Returns
-    -------
-    Block
-
-    Raises
-    ------
-    TiePointError, DisconnectedError, InputError
-        See `barpc.ba.adjust_tracks`.
-    """
+    """The block of tracks and GCPs; arguments and errors as in `barpc.ba.adjust_tracks`."""
     names = [view.name for view in views]
     _check_names(names, options)
     extra_view = gcps.view if gcps is not None else np.zeros(0, dtype=np.int64)

@@ -21,16 +21,10 @@ _SLOPE_STEP = 15.0  # m: terrain slopes are taken over twice this distance
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """Independent priors: (p - mean) / sigma.
+    """Independent priors: (p - mean) / sigma."""
 
-    Parameters
-    ----------
-    mean, sigma : (N, q)
-        Of every view's unknowns.
-    """
-
-    mean: Array
-    sigma: Array
+    mean: Array  # (N, q) of every view's unknowns
+    sigma: Array  # (N, q)
 
     def residual(self, params: Array) -> Array:
         """Whitened residuals (N, q) of unknowns (N, q)."""
@@ -44,21 +38,11 @@ class CameraPrior:
 
 @dataclass(frozen=True)
 class JointPrior:
-    """A prior on several views together, with all of their correlations: root (p - mean).
+    """A prior on several views together, with all of their correlations: root (p - mean)."""
 
-    Parameters
-    ----------
-    index : (n,)
-        Places of the unknowns in the raveled (N, q) array.
-    mean : (n,)
-        Their prior mean.
-    root : (n, n)
-        Upper triangular factor of the information matrix.
-    """
-
-    index: IntArray
-    mean: Array
-    root: Array
+    index: IntArray  # (n,) places of the unknowns in the raveled (N, q) array
+    mean: Array  # (n,) their prior mean
+    root: Array  # (n, n) upper triangular factor of the information matrix
 
     def residual(self, params: Array) -> Array:
         """Whitened residuals (n,) of unknowns (N, q)."""
@@ -75,22 +59,12 @@ class PointPrior:
     """Priors on points with errors in common: rows (X - mean) - common b, and b itself is standard normal.
 
     b is never a state of its own: residuals are those that the best b for the points leaves.
-
-    Parameters
-    ----------
-    index : (Q,)
-        Which points; none twice.
-    mean : (Q, 3)
-        ECEF [m].
-    rows : (Q, 3, 3)
-        Whitening rows [1/m]; rows of zeros say nothing.
-    common : (Q, 3, m)
-        What one standard deviation of each of m common errors adds to the whitened residuals.
     """
 
-    index: IntArray
-    mean: Array
-    rows: Array
+    index: IntArray  # (Q,) which points; none twice
+    mean: Array  # (Q, 3) ECEF [m]
+    rows: Array  # (Q, 3, 3) whitening rows [1/m]; rows of zeros say nothing
+    # (Q, 3, m) what one standard deviation of each of m common errors adds to the whitened residuals
     common: Array
 
     def offset(self, points: Array) -> Array:
@@ -148,24 +122,10 @@ def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
 def terrain_heights(
     points: Array, index: IntArray, terrain: Terrain, sigma: float, common_sigma: float
 ) -> PointPrior:
-    """Points `index` held to a terrain: the height above its tangent plane at the points' present place.
+    """Points `index` (Q,) of (P, 3) held to a terrain: the height above its tangent plane where they stand now.
 
-    Parameters
-    ----------
-    points : (P, 3)
-        ECEF [m].
-    index : (Q,)
-        Which points; those where the terrain is unknown are left out.
-    terrain : Terrain
-        Altitudes; the slope is taken over 30 m.
-    sigma : float
-        Standard deviation of single altitudes [m].
-    common_sigma : float
-        Of what all of them are wrong by, and at the scene's edges of a slope to the east and to the north [m].
-
-    Returns
-    -------
-    PointPrior
+    Single altitudes are known to `sigma` [m]; all of them may be wrong by `common_sigma` [m], and by a slope that
+    is as much at the scene's edges. Points where the terrain is unknown are left out.
     """
     ground = ground_from_ecef(points[index])
     step = _SLOPE_STEP / metres_per_unit(ground)[:, :2]

@@ -30,21 +30,11 @@ Wanted = Literal["image", "points", "unknowns"]
 
 @dataclass(frozen=True)
 class Projected:
-    """Image points of K observations and their derivatives, sorted by view.
+    """Image points of K observations and their derivatives, sorted by view."""
 
-    Parameters
-    ----------
-    image : (2, K)
-        col, row [px].
-    by_point : (2, 3, K)
-        d(image) / d(ECEF point) [px/m].
-    by_unknown : (2, q, K)
-        d(image) / d(unknowns of the observing view) [px per unit].
-    """
-
-    image: Array
-    by_point: Array
-    by_unknown: Array
+    image: Array  # (2, K) col, row [px]
+    by_point: Array  # (2, 3, K) d(image) / d(ECEF point) [px/m]
+    by_unknown: Array  # (2, q, K) d(image) / d(unknowns of the observing view) [px per unit]
 
 
 class Cameras:
@@ -81,25 +71,11 @@ class Cameras:
         wanted: Wanted = "unknowns",
         out: Projected | None = None,
     ) -> Projected:
-        """Corrected image points with derivatives.
+        """Corrected image points with derivatives, put into `out` where it is given.
 
-        Parameters
-        ----------
-        params : (N, q)
-            Unknowns of every view.
-        ecef : (3, K)
-            The point of every observation [m], sorted by view.
-        bounds : (N + 1,)
-            Observations of view v are bounds[v] : bounds[v + 1].
-        wanted : str
-            "image": no derivatives; "points": by the points; "unknowns": by the unknowns too. What is not
-            wanted has no rows.
-        out : Projected or None
-            Where to put them.
-
-        Returns
-        -------
-        Projected
+        Of unknowns (N, q) and every observation's point (3, K) [m]; observations of view v are bounds[v] :
+        bounds[v + 1]. `wanted` are no derivatives ("image"), those by the "points", or by the "unknowns" too; what
+        is not wanted has no rows.
         """
         found = self.room(ecef.shape[1], wanted) if out is None else out
         image, by_point, by_unknown = found.image, found.by_point, found.by_unknown

@@ -95,22 +95,9 @@ def _mixture(z: Array) -> tuple[float, float, float]:
 def agreeing(
     structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray
 ) -> BoolArray:
-    """Observations (K,) that are left once those are put aside which most of their partners contradict.
+    """Observations (K,) of those to use that are left once those are put aside which most of their partners contradict.
 
-    Parameters
-    ----------
-    structure : Structure
-        Who sees what.
-    xy : (2, K)
-        Observed col, row [px].
-    residual : (2, K)
-        Projected - observed [px], points anywhere near.
-    projected : Projected
-        With derivatives by the points.
-    sigma : (K,)
-        Standard deviations [px].
-    use : (K,)
-        Observations to look at.
+    Of observed col, row `xy` (2, K), residuals (2, K) with points anywhere near and `sigma` (K,), all [px].
     """
     first, second = structure.first, structure.second
     offset = _across(residual, projected.by_point, first, second)

@@ -67,21 +67,7 @@ class GaugeReport:
 
 
 def gauge_report(covariance: Covariance, points: Array, before: Array, use: BoolArray) -> GaugeReport:
-    """The report for an adjustment.
-
-    Parameters
-    ----------
-    covariance : Covariance
-        Of the adjustment.
-    points, before : (P, 3)
-        ECEF [m], after and before.
-    use : (P,)
-        Points that count.
-
-    Returns
-    -------
-    GaugeReport
-    """
+    """The report for points (P, 3), ECEF [m], after and before an adjustment; those that count in `use` (P,)."""
     shift_of_all = (points[use] - before[use]).mean(axis=0)
     index = np.flatnonzero(use)
     use = np.zeros_like(use)

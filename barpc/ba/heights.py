@@ -41,30 +41,14 @@ def convergence_angles(structure: Structure, projected: Projected, points: Array
 
 @dataclass(frozen=True)
 class Heights:
-    """The priors on points: GCPs, and heights for tracks that need (or are given) them.
+    """The priors on points: GCPs, and heights for tracks that need (or are given) them."""
 
-    Parameters
-    ----------
-    control : tuple of PointPrior
-        GCPs.
-    weak : (P,)
-        Points whose rays meet under too small an angle.
-    tracks : (T,)
-        Points that are tracks (GCPs are held already).
-    alt_range : tuple of float
-        Altitudes [m] to expect where no other track tells.
-    options : AdjustOptions
-        `dem_sigma`, `dem_for_all`.
-    dem : Terrain or None
-        None: weak tracks are held to the altitude of the others, within their spread.
-    """
-
-    control: tuple[PointPrior, ...]
-    weak: BoolArray
-    tracks: IntArray
-    alt_range: tuple[float, float]
-    options: AdjustOptions
-    dem: Terrain | None
+    control: tuple[PointPrior, ...]  # GCPs
+    weak: BoolArray  # (P,) points whose rays meet under too small an angle
+    tracks: IntArray  # (T,) points that are tracks (GCPs are held already)
+    alt_range: tuple[float, float]  # altitudes [m] to expect where no other track tells
+    options: AdjustOptions  # `dem_sigma`, `dem_for_all`
+    dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
 
     def hold(self, problem: Problem, points: Array) -> Problem:
         """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""

@@ -29,25 +29,13 @@ _FEW = 20  # observations of a view that tell nothing by themselves
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What the tracks that were kept out say.
+    """What the tracks that were kept out say."""
 
-    Parameters
-    ----------
-    residual : (2, H)
-        Projected - observed [px], points triangulated by the cameras.
-    index, points : (Q,), (Q, 3)
-        Their points, ECEF [m].
-    noise : (N,)
-        Observed over stated standard deviation of every view's; NaN with too few.
-    rms : (N,)
-        The same as a root mean square of residuals [px].
-    """
-
-    residual: Array
-    index: IntArray
-    points: Array
-    noise: Array
-    rms: Array
+    residual: Array  # (2, H) projected - observed [px], points triangulated by the cameras
+    index: IntArray  # (Q,) their points
+    points: Array  # (Q, 3) where these are, ECEF [m]
+    noise: Array  # (N,) observed over stated standard deviation of every view's; NaN with too few
+    rms: Array  # (N,) the same as a root mean square of residuals [px]
 
     @property
     def error(self) -> float:

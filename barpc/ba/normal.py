@@ -33,27 +33,13 @@ TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
 
 @dataclass(frozen=True)
 class Common:
-    """Errors that points have in common, eliminated after the points.
+    """Errors that points have in common, eliminated after the points."""
 
-    Parameters
-    ----------
-    index : (Q,)
-        The points.
-    cross : (Q, 3, m)
-        L^-1 times the points' second derivative with the errors.
-    upper : (m, m)
-        U of their matrix U^T U once the points are eliminated.
-    by_camera : (m, N q)
-        U^-T times their second derivative with the cameras.
-    half : (m,)
-        U^-T times their gradient.
-    """
-
-    index: IntArray
-    cross: Array
-    upper: Array
-    by_camera: Array
-    half: Array
+    index: IntArray  # (Q,) the points
+    cross: Array  # (Q, 3, m) L^-1 times the points' second derivative with the errors
+    upper: Array  # (m, m) U of their matrix U^T U once the points are eliminated
+    by_camera: Array  # (m, N q) U^-T times their second derivative with the cameras
+    half: Array  # (m,) U^-T times their gradient
 
     def step(self, step: Array) -> Array:
         """The move of the errors (m,) that goes with a step (N q,) of the camera unknowns."""
@@ -63,37 +49,18 @@ class Common:
 
 @dataclass(frozen=True)
 class Reduced:
-    """The linearised problem with its points eliminated.
-
-    Parameters
-    ----------
-    matrix : (N q, N q) array or sparse
-        S; where it is sparse, without what the common errors take off it.
-    gradient : (N q,)
-        g: derivative of half the cost by the camera unknowns, points at their (linear) optimum.
-    cost : float
-        Sum of squared whitened residuals.
-    gain : float
-        What moving the points (and common errors) alone would take off the cost: sum |h|^2.
-    lower : (6, P)
-        L: its elements 00, 10, 20, 11, 21, 22.
-    half : (P, 3)
-        h.
-    cross : (K, 3, q)
-        Y.
-    common : Common or None
-        Errors that the points have in common.
-    """
+    """The linearised problem with its points eliminated."""
 
     structure: Structure
-    matrix: Matrix
+    matrix: Matrix  # (N q, N q) S; where it is sparse, without what the common errors take off it
+    # (N q,) g: derivative of half the cost by the camera unknowns, points at their (linear) optimum
     gradient: Array
-    cost: float
-    gain: float
-    lower: Array
-    half: Array
-    cross: Array
-    common: Common | None = None
+    cost: float  # sum of squared whitened residuals
+    gain: float  # what moving the points (and common errors) alone would take off the cost: sum |h|^2
+    lower: Array  # (6, P) L: its elements 00, 10, 20, 11, 21, 22
+    half: Array  # (P, 3) h
+    cross: Array  # (K, 3, q) Y
+    common: Common | None = None  # errors that the points have in common
 
     def plain(self, free: BoolArray) -> Array:
         """S (n, n) as an array, of the unknowns that are free (N q,)."""
@@ -137,27 +104,11 @@ def reduce_normal(
     camera_gradient: Array,
     point_prior: PointPrior | None = None,
 ) -> Reduced:
-    """Eliminate the points of a linearised problem.
+    """Eliminate the points of a linearised problem; the cost is without the priors' part.
 
-    Parameters
-    ----------
-    structure : Structure
-        Who sees what.
-    residual : (2, K)
-        Whitened residuals.
-    by_point, by_unknown : (2, 3, K), (2, q, K)
-        Their derivatives.
-    point_matrix, point_gradient : (6, P), (3, P)
-        What priors add to V (elements as in `Reduced.lower`) and to the points' gradient.
-    camera_diagonal, camera_gradient : (N, q)
-        What priors add to the diagonal of S and to g.
-    point_prior : PointPrior or None
-        Whose common errors are to be eliminated, too.
-
-    Returns
-    -------
-    Reduced
-        `cost` without the priors' part.
+    Of whitened residuals (2, K) and their derivatives (2, 3, K) and (2, q, K). Priors add `point_matrix` (6, P,
+    elements as in `Reduced.lower`) to V, `point_gradient` (3, P) to the points' gradient, `camera_diagonal` and
+    `camera_gradient` (N, q) to the diagonal of S and to g; the common errors of `point_prior` are eliminated too.
     """
     q = by_unknown.shape[1]
     sums = structure.sum_points(point_products(by_point, residual))

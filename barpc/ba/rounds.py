@@ -45,36 +45,16 @@ _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, whi
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the rounds end with.
+    """What the rounds end with."""
 
-    Parameters
-    ----------
-    problem : Problem
-        With the priors on points as they ended.
-    minimum : Minimum
-        Unknowns, points, the last linearisation.
-    residual : (2, K)
-        Projected - observed [px].
-    inlier : (K,)
-        Observations in the final solve.
-    noise : float
-        Observed over stated standard deviation.
-    passes : int
-        Rounds of cutting.
-    prior : PriorTest
-        How the corrections compare with the priors given, and what the priors became.
-    smooth : SmoothTest
-        What is smooth in the residuals that are left.
-    """
-
-    problem: Problem
-    minimum: Minimum
-    residual: Array
-    inlier: BoolArray
-    noise: float
-    passes: int
-    prior: PriorTest
-    smooth: SmoothTest
+    problem: Problem  # with the priors on points as they ended
+    minimum: Minimum  # unknowns, points, the last linearisation
+    residual: Array  # (2, K) projected - observed [px]
+    inlier: BoolArray  # (K,) observations in the final solve
+    noise: float  # observed over stated standard deviation
+    passes: int  # rounds of cutting
+    prior: PriorTest  # how the corrections compare with the priors given, and what the priors became
+    smooth: SmoothTest  # what is smooth in the residuals that are left
 
 
 class Observations:

@@ -43,24 +43,12 @@ _LOST = 1e-6
 
 @dataclass(frozen=True)
 class State:
-    """Where the iteration stands.
+    """Where the iteration stands."""
 
-    Parameters
-    ----------
-    params : (N, q)
-        Unknowns of the views.
-    points : (P, 3)
-        ECEF [m].
-    cost : float
-        Sum of squared whitened residuals.
-    history : tuple of float
-        The cost at every linearisation, and at the end of every pass, so far.
-    """
-
-    params: Array
-    points: Array
-    cost: float = np.inf
-    history: tuple[float, ...] = ()
+    params: Array  # (N, q) unknowns of the views
+    points: Array  # (P, 3) ECEF [m]
+    cost: float = np.inf  # sum of squared whitened residuals
+    history: tuple[float, ...] = ()  # the cost at every linearisation, and at the end of every pass, so far
 
     def moved(self, step: Array, reduced: Reduced, cost: float) -> State:
         """The state after a step (N, q) of the cameras and the points' step that goes with it."""
@@ -71,24 +59,12 @@ class State:
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where a minimisation ended.
+    """Where a minimisation ended."""
 
-    Parameters
-    ----------
-    state : State
-        The minimum.
-    reduced : Reduced
-        The last linearisation: at the minimum (scipy), or one small step before it.
-    factor : Factor or None
-        Of its matrix, free unknowns only, where it was factorised.
-    status : str
-        Which solver ran, and why it stopped.
-    """
-
-    state: State
-    reduced: Reduced
-    factor: Factor | None = None
-    status: str = ""
+    state: State  # the minimum
+    reduced: Reduced  # the last linearisation: at the minimum (scipy), or one small step before it
+    factor: Factor | None = None  # of its matrix, free unknowns only, where it was factorised
+    status: str = ""  # which solver ran, and why it stopped
 
     def covariance(self, free: BoolArray) -> Covariance:
         """The posterior covariance, by the last linearisation."""
@@ -112,27 +88,11 @@ def minimise(
     tolerance: float = TOLERANCE,
     projected: Projected | None = None,
 ) -> Minimum:
-    """Minimise at fixed weights from a state near the minimum.
+    """Minimise at fixed weights (K,) [1/px] from a state near the minimum.
 
-    Parameters
-    ----------
-    problem : Problem
-        What is minimised.
-    state : State
-        Where it starts.
-    weight : (K,)
-        1 / sigma of every observation [1/px], 0 for one that does not count.
-    solver : str
-        "scipy", "sparse" or "auto".
-    tolerance : float
-        The step that is expected to gain less than this fraction of the cost is taken and is the last, and
-        so is one that is expected to leave a thousandth of it (see `_settled`).
-    projected : Projected or None
-        `Problem.linearise` of the state, which is used up.
-
-    Returns
-    -------
-    Minimum
+    The step that is expected to gain less than `tolerance` of the cost is taken and is the last, and so is one
+    that is expected to leave a thousandth of it (see `_settled`). `projected` is `Problem.linearise` of the state,
+    and is used up.
 
     Raises
     ------

@@ -13,39 +13,20 @@ from barpc.scene import IntArray
 
 @dataclass(frozen=True)
 class Structure:
-    """Index arrays of K observations of P points in N views; observations sorted by view.
-
-    Parameters
-    ----------
-    num_views, num_points : int
-        N and P.
-    view, point : (K,)
-        Indices of every observation.
-    bounds : (N + 1,)
-        Observations of view v are bounds[v] : bounds[v + 1].
-    by_point : (K,)
-        Observations sorted by point.
-    point_bounds : (P + 1,)
-        Observations of point p are by_point[point_bounds[p] : point_bounds[p + 1]].
-    first, second : (Q,)
-        Pairs of observations of one point, sorted by their pair of views.
-    pair_view : (M, 2)
-        Pairs of views i < j that share a point.
-    pair_bounds : (M + 1,)
-        Observation pairs of view pair m are pair_bounds[m] : pair_bounds[m + 1].
-    """
+    """Index arrays of K observations of P points in N views; observations sorted by view."""
 
     num_views: int
     num_points: int
-    view: IntArray
-    point: IntArray
-    bounds: IntArray
-    by_point: IntArray
+    view: IntArray  # (K,)
+    point: IntArray  # (K,)
+    bounds: IntArray  # (N + 1,) observations of view v are bounds[v] : bounds[v + 1]
+    by_point: IntArray  # (K,) observations sorted by point
+    # (P + 1,) observations of point p are by_point[point_bounds[p] : point_bounds[p + 1]]
     point_bounds: IntArray
-    first: IntArray
-    second: IntArray
-    pair_view: IntArray
-    pair_bounds: IntArray
+    first: IntArray  # (Q,) pairs of observations of one point, sorted by their pair of views
+    second: IntArray  # (Q,)
+    pair_view: IntArray  # (M, 2) pairs of views i < j that share a point
+    pair_bounds: IntArray  # (M + 1,) observation pairs of view pair m are pair_bounds[m] : pair_bounds[m + 1]
 
     def sum_points(self, rows: Array) -> Array:
         """Sums (m, P) over every point's observations of rows (m, K)."""
@@ -67,19 +48,7 @@ class Structure:
 
 
 def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: int) -> Structure:
-    """The structure of observations that are already sorted by view.
-
-    Parameters
-    ----------
-    view, point : (K,)
-        Indices of every observation, views ascending.
-    num_views, num_points : int
-        N and P.
-
-    Returns
-    -------
-    Structure
-    """
+    """The structure of observations (K,) that are already sorted by view."""
     bounds = np.searchsorted(view, np.arange(num_views + 1))
     by_point, point_bounds = counting_sort(point, num_points)
     first, second = _pairs(by_point, point_bounds)

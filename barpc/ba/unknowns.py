@@ -23,30 +23,16 @@ _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Layout of the unknowns of N views.
+    """Layout of the unknowns of N views."""
 
-    Parameters
-    ----------
-    model : str
-        A name of `AdjustOptions.model`.
-    drift : int
-        Degree of the rotation in the image row.
-    center : (N, 3)
-        Camera centres [m], ECEF.
-    distance : (N,)
-        From the centre to the scene [m]: a rotation unknown is angle x distance.
-    col_offset, col_scale, row_offset, row_scale : (N,)
-        Middle and half width or height of every image [px].
-    """
-
-    model: str
-    drift: int
-    center: Array
-    distance: Array
-    col_offset: Array
-    col_scale: Array
-    row_offset: Array
-    row_scale: Array
+    model: str  # A name of `AdjustOptions.model`
+    drift: int  # degree of the rotation in the image row
+    center: Array  # (N, 3) camera centres [m], ECEF
+    distance: Array  # (N,) from the centre to the scene [m]: a rotation unknown is angle x distance
+    col_offset: Array  # (N,) middle of every image [px]
+    col_scale: Array  # (N,) its half width [px]
+    row_offset: Array  # (N,)
+    row_scale: Array  # (N,)
 
     @property
     def geometric(self) -> bool:
@@ -180,21 +166,7 @@ class Unknowns:
 def make_unknowns(
     views: Sequence[View], model: str, drift: int = 0, centers: Array | None = None
 ) -> Unknowns:
-    """The layout for a block of views.
-
-    Parameters
-    ----------
-    views : sequence of View
-        N views.
-    model, drift : str, int
-        As in `barpc.options.AdjustOptions`.
-    centers : (N, 3) or None
-        Camera centres [m], ECEF; None: `barpc.sensor.geometry.camera_center` of the sensors.
-
-    Returns
-    -------
-    Unknowns
-    """
+    """The layout for N views; `centers` (N, 3), ECEF [m], are regressed from the sensors where None."""
     size = np.array([view.size for view in views], dtype=np.float64).reshape(-1, 2)
     middle = (size - 1.0) / 2.0
     if model in _IMAGE_TERMS:

@@ -102,21 +102,11 @@ class _Around:
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """The priors of a block and what may be learnt about them.
+    """The priors of a block and what may be learnt about them."""
 
-    Parameters
-    ----------
-    given : CameraPrior
-        With the standard deviations as they were given.
-    unknowns : Unknowns
-        Which unknown is what.
-    learn_constant, learn_drift : bool
-        Whether the constants' and the drift's standard deviations may change.
-    """
-
-    given: CameraPrior
-    unknowns: Unknowns
-    learn_constant: bool
+    given: CameraPrior  # with the standard deviations as they were given
+    unknowns: Unknowns  # which unknown is what
+    learn_constant: bool  # whether the constants' standard deviations may change
     learn_drift: bool
 
     @classmethod
@@ -135,15 +125,7 @@ class Variances:
         return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, _SEARCH))
 
     def learnt(self, problem: Problem, minimum: Minimum) -> tuple[CameraPrior, PriorTest]:
-        """The priors that the block supports, in its linearisation at a minimum.
-
-        Parameters
-        ----------
-        problem : Problem
-            With the priors of the minimum.
-        minimum : Minimum
-            What `minimise` found.
-        """
+        """The priors that the block supports, in its linearisation at a minimum."""
         try:
             return self._learnt(problem, minimum)
         except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
