@@ -9,22 +9,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.block import Block, join
-from barpc.ba.blocks import CameraPrior, Terrain, ground_control
 from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import agreeing, two_groups
 from barpc.ba.gauge import gauge_report
-from barpc.ba.heights import Heights, convergence_angles
+from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control
 from barpc.ba.heldout import HeldOut, keep_out, measure
 from barpc.ba.incremental import BlockPrior, apply_prior
-from barpc.ba.priors import DRIFT_SIGMA, prior_sigmas
+from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
-from barpc.ba.rounds import Observations, Outcome, revived, run_rounds
-from barpc.ba.smooth import Smooth
+from barpc.ba.rounds import Outcome, revived, run_rounds
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
-from barpc.ba.variances import Variances
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.options import AUTO, AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
@@ -163,7 +160,7 @@ class _Solution:
         problem = self.problem
         by_point = problem.project_points(self.final.params, self.final.points).by_point
         pixels = float(np.nanmedian(np.linalg.norm(by_point[1], axis=0)))  # a metre
-        return learnt[0] > _SKEW * float(np.median(problem.cameras.unknowns.row_scale)) / pixels
+        return learnt[0] > _SKEW * float(np.median(problem.cameras.unknowns.half[1])) / pixels
 
 
 def _solve(
@@ -183,11 +180,11 @@ def _solve(
     state, heights = _start(problem, block, options, gcps, dem)
     before = problem.residuals(state.params, state.points)
     start = measure(problem, state.params, outer)
-    outcome = _rounds(problem, block, state, options, heights, block.use)
+    outcome = run_rounds(problem, block, state, options, heights, block.use)
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
         agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
-        again = _rounds(problem, block, state, options, heights, agree)
+        again = run_rounds(problem, block, state, options, heights, agree)
         if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
     drift = problem.cameras.unknowns.drift
@@ -197,7 +194,7 @@ def _solve(
             problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
         )
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
-        problem, outcome = bent, _rounds(bent, block, there, options, heights, outcome.inlier, outcome.noise)
+        problem, outcome = bent, run_rounds(bent, block, there, options, heights, outcome.inlier)
     after = measure(problem, outcome.minimum.state.params, outer)
     return _Solution(problem, state, before, heights, outcome, start, after)
 
@@ -271,27 +268,6 @@ def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
     """Whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
     had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
     return outcome.noise > _MUCH_NOISE or bool((kept < _MUCH_LOST * had).any())
-
-
-def _rounds(
-    problem: Problem,
-    block: Block,
-    state: State,
-    options: AdjustOptions,
-    heights: Heights,
-    use: BoolArray,
-    known_noise: float | None = None,
-) -> Outcome:
-    """Robust rounds and cuts from a state, with the observations in use (K,) to start with."""
-    unknowns = problem.cameras.unknowns
-    observations = Observations(
-        heights.hold(problem, state.points), block.sigma, options.noise_floor, block.point < block.num_tracks
-    )
-    middle = np.column_stack([unknowns.col_offset, unknowns.row_offset])
-    half = np.column_stack([unknowns.col_scale, unknowns.row_scale])
-    smooth = Smooth(problem.structure, problem.xy, middle, half)
-    variances = Variances.of(problem.camera_prior, unknowns, options)
-    return run_rounds(problem, observations, state, options, block.use, use, heights.hold, variances, smooth)
 
 
 def make_problem(

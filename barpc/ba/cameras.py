@@ -122,7 +122,7 @@ class Cameras:
         drift = None
         if unknowns.drift:
             assert row is not None
-            row = unknowns.normalized_row(row, index)
+            row = (row - unknowns.middle[1, index]) / unknowns.half[1, index]
             drift = unknowns.drift_rotation(params, index, row)
         of_views = params[views]
         motion = Motion(

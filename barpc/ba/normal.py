@@ -15,8 +15,8 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from barpc.ba.blocks import PointPrior
 from barpc.ba.linear import Factor, Matrix, factorize
+from barpc.ba.priors import PointPrior
 from barpc.ba.structure import Structure
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray

@@ -1,12 +1,18 @@
-"""What is expected of the cameras' corrections before any is known."""
+"""What is expected of cameras and points before any is known, as whitened residual blocks.
+
+Every block gives residuals and their derivative, divided by sigma. All of them are linear in the unknowns; the tie
+observations, which are not, are in `problem`.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
-from barpc.scene import View
+from barpc.scene import IntArray, View
 from barpc.sensor.rpc import RPC
 
 DEFAULT_ACCURACY = 5.0
@@ -20,6 +26,85 @@ USABLE_ACCURACY = 0.1
 
 IMAGE_SIGMA = 20.0
 """Models in the image: prior standard deviation of every coefficient, at the edge of the image [px]."""
+
+
+@dataclass(frozen=True)
+class CameraPrior:
+    """Independent priors: (p - mean) / sigma."""
+
+    mean: Array  # (N, q) of every view's unknowns
+    sigma: Array  # (N, q)
+
+    def residual(self, params: Array) -> Array:
+        """Whitened residuals (N, q) of unknowns (N, q)."""
+        whitened: Array = (params - self.mean) / self.sigma
+        return whitened
+
+    def jacobian(self) -> Array:
+        """Diagonal of the derivative (N, q)."""
+        return 1.0 / self.sigma
+
+
+@dataclass(frozen=True)
+class JointPrior:
+    """A prior on several views together, with all of their correlations: root (p - mean)."""
+
+    index: IntArray  # (n,) places of the unknowns in the raveled (N, q) array
+    mean: Array  # (n,) their prior mean
+    root: Array  # (n, n) upper triangular factor of the information matrix
+
+    def residual(self, params: Array) -> Array:
+        """Whitened residuals (n,) of unknowns (N, q)."""
+        whitened: Array = self.root @ (params.ravel()[self.index] - self.mean)
+        return whitened
+
+    def jacobian(self) -> Array:
+        """Derivative (n, n) by the unknowns `index`."""
+        return self.root
+
+
+@dataclass(frozen=True)
+class PointPrior:
+    """Priors on points with errors in common: rows (X - mean) - common b, and b itself is standard normal.
+
+    b is never a state of its own: residuals are those that the best b for the points leaves.
+    """
+
+    index: IntArray  # (Q,) which points; none twice
+    mean: Array  # (Q, 3) ECEF [m]
+    rows: Array  # (Q, 3, 3) whitening rows [1/m]; rows of zeros say nothing
+    # (Q, 3, m) what one standard deviation of each of m common errors adds to the whitened residuals
+    common: Array
+
+    def offset(self, points: Array) -> Array:
+        """The common errors (m,) that points (P, 3) [m] show, in their standard deviations."""
+        whitened = self.apart(points)
+        offset: Array = np.linalg.solve(self.information(), np.einsum("qim,qi->m", self.common, whitened))
+        return offset
+
+    def residual(self, points: Array) -> Array:
+        """Whitened residuals (Q, 3) of points (P, 3) [m], the common errors taken away."""
+        residual: Array = self.apart(points) - self.common @ self.offset(points)
+        return residual
+
+    def cost(self, points: Array) -> float:
+        """Sum of the squared residuals, with the common errors' own."""
+        return float((self.residual(points) ** 2).sum() + (self.offset(points) ** 2).sum())
+
+    def information(self) -> Array:
+        """Information (m, m) on the common errors where the points are known."""
+        information: Array = np.einsum("qim,qin->mn", self.common, self.common)
+        information += np.eye(len(information))
+        return information
+
+    def apart(self, points: Array) -> Array:
+        """Whitened offsets (Q, 3) of points (P, 3) [m], the common errors still in them."""
+        whitened: Array = (self.rows @ (points[self.index] - self.mean)[..., None])[..., 0]
+        return whitened
+
+    def jacobian(self) -> Array:
+        """Derivatives (Q, 3, 3) by the points `index` [1/m]."""
+        return self.rows
 
 
 def stated_accuracy(view: View) -> float:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.sparse as sp
 
-from barpc.ba.blocks import CameraPrior, JointPrior, PointPrior
 from barpc.ba.cameras import Cameras, Projected
 from barpc.ba.normal import (
     TRIANGLE,
@@ -18,6 +17,7 @@ from barpc.ba.normal import (
     solve_lower,
     solve_transposed,
 )
+from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.structure import Structure
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
@@ -35,14 +35,6 @@ class Problem:
     joint_prior: JointPrior | None = None  # on several views together
     point_prior: PointPrior | None = None  # GCPs and heights
     _room: list[Projected] = field(default_factory=list, repr=False)
-
-    def with_point_prior(self, prior: PointPrior | None) -> Problem:
-        """The same problem with other priors on its points."""
-        return replace(self, point_prior=prior)
-
-    def with_camera_prior(self, prior: CameraPrior) -> Problem:
-        """The same problem with other priors on its cameras."""
-        return replace(self, camera_prior=prior)
 
     def residuals(self, params: Array, points: Array) -> Array:
         """Projected - observed (2, K) [px], sorted by view."""

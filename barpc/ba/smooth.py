@@ -14,6 +14,7 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from barpc.ba.structure import Structure
+from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
@@ -57,21 +58,11 @@ class SmoothTest:
 
 
 class Smooth:
-    """The smooth model of a block's views.
+    """The smooth model of a block's views, of observations at `xy` (2, K) [px]."""
 
-    Parameters
-    ----------
-    structure : Structure
-        Observations sorted by view.
-    xy : (2, K)
-        col, row [px].
-    middle, half : (N, 2)
-        Middle and half size of every image, col and row [px].
-    """
-
-    def __init__(self, structure: Structure, xy: Array, middle: Array, half: Array) -> None:
+    def __init__(self, structure: Structure, xy: Array, unknowns: Unknowns) -> None:
         self.structure = structure
-        col, row = ((xy - middle.T[:, structure.view]) / half.T[:, structure.view]).clip(-1.0, 1.0)
+        col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
         self._place = xy
         self._basis = np.empty((_TERMS, xy.shape[1]))
         self._basis[:SPLINES] = _bsplines(row)

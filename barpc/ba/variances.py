@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from barpc.ba.blocks import CameraPrior
 from barpc.ba.covariance import Covariance
 from barpc.ba.linear import factorize
+from barpc.ba.priors import CameraPrior
 from barpc.ba.problem import Problem
 from barpc.ba.solve import Minimum
 from barpc.ba.unknowns import Unknowns
