@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,19 +25,17 @@ _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DE
 _TOGETHER = 0.25  # of it: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
 
 
-def join_point_priors(priors: list[PointPrior]) -> PointPrior | None:
+def _join(priors: Sequence[PointPrior | None]) -> PointPrior | None:
     """One block of several that speak of different points, and share their errors; None where all are empty."""
-    priors = [prior for prior in priors if len(prior.index)]
-    if not priors:
+    given = [prior for prior in priors if prior is not None and len(prior.index)]
+    if not given:
         return None
-    most = max(prior.common.shape[2] for prior in priors)
-    common = [np.pad(p.common, ((0, 0), (0, 0), (0, most - p.common.shape[2]))) for p in priors]
-    return PointPrior(
-        np.concatenate([prior.index for prior in priors]),
-        np.concatenate([prior.mean for prior in priors]),
-        np.concatenate([prior.rows for prior in priors]),
-        np.concatenate(common),
+    most = max(prior.common.shape[2] for prior in given)
+    common = [np.pad(p.common, ((0, 0), (0, 0), (0, most - p.common.shape[2]))) for p in given]
+    index, mean, rows = (
+        np.concatenate([getattr(p, name) for p in given]) for name in ("index", "mean", "rows")
     )
+    return PointPrior(index, mean, rows, np.concatenate(common))
 
 
 def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
@@ -117,17 +115,16 @@ class Heights:
 
     def hold(self, problem: Problem, points: Array) -> Problem:
         """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
-        held = self._held(points)
-        return replace(problem, point_prior=join_point_priors([*self.control, *held]))
+        return replace(problem, point_prior=_join([*self.control, self._held(points)]))
 
-    def _held(self, points: Array) -> list[PointPrior]:
+    def _held(self, points: Array) -> PointPrior | None:
         dem, options = self.dem, self.options
         weak = self.weak[self.tracks]
         index = self.tracks if dem is not None and options.dem_for_all else self.tracks[weak]
         if not len(index):
-            return []
+            return None
         if dem is not None:
-            return [terrain_heights(points, index, dem, options.dem_sigma, options.dem_bias_sigma)]
+            return terrain_heights(points, index, dem, options.dem_sigma, options.dem_bias_sigma)
         others = self.tracks[~weak]
         if len(others) >= 10:
             low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
@@ -135,7 +132,7 @@ class Heights:
             low, high = self.alt_range
             middle = 0.5 * (low + high)
         sigma = max(float(high - low) * (1.0 if len(others) >= 10 else 0.5), _FLAT_SIGMA)
-        return [flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)]
+        return flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)
 
     def warn(self) -> None:
         """Say that tracks are held in height without a DEM."""

@@ -8,7 +8,6 @@ points: they couple all cameras, so that what they take off S stays apart from i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,7 @@ import scipy.sparse as sp
 
 from barpc.ba.linear import Factor, Matrix, factorize
 from barpc.ba.priors import PointPrior
-from barpc.ba.structure import Structure
+from barpc.ba.structure import Structure, parts
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
@@ -67,11 +66,9 @@ class Reduced:
         if isinstance(self.matrix, np.ndarray):
             return self.matrix if free.all() else self.matrix[np.ix_(free, free)]
         matrix: Array = self.matrix.tocsr()[free][:, free].toarray()
-        return (
-            matrix
-            if self.common is None
-            else matrix - self.common.by_camera[:, free].T @ self.common.by_camera[:, free]
-        )
+        if self.common is not None:
+            matrix -= self.common.by_camera[:, free].T @ self.common.by_camera[:, free]
+        return matrix
 
     def factor(self, free: BoolArray, damping: float = 0.0) -> Factor:
         """The factorised S, of the unknowns that are free (N q,)."""
@@ -163,18 +160,12 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
 def point_products(by_point: Array, residual: Array) -> Array:
     """(9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
     products = np.empty((9, residual.shape[1]))
-    for part in parts(residual.shape[1]):
+    for part in parts(residual.shape[1], CHUNK):
         (a, b), r = by_point[..., part], residual[:, part]
         for n, (i, j) in enumerate(TRIANGLE):
             np.add(a[i] * a[j], b[i] * b[j], out=products[n, part])
         np.add(a * r[0], b * r[1], out=products[6:, part])
     return products
-
-
-def parts(count: int) -> Iterator[slice]:
-    """Pieces of `count` observations that stay in cache."""
-    for start in range(0, count, CHUNK):
-        yield slice(start, min(start + CHUNK, count))
 
 
 def cholesky3(matrix: Array) -> Array:
@@ -216,7 +207,7 @@ def _eliminate(
     """Y (K, 3, q), and what every observation adds to the gradient, B^T r - Y^T h, (q, K)."""
     q, count = by_unknown.shape[1:]
     cross, slope = np.empty((count, 3, q)), np.empty((q, count))
-    for part in parts(count):
+    for part in parts(count, CHUNK):
         point = structure.point[part]
         whitened = _whiten(by_point[..., part], lower.take(point, axis=1, mode="clip"))
         unknown, r = by_unknown[..., part], residual[:, part]

@@ -146,11 +146,7 @@ def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tup
 
 
 def _levenberg_marquardt(
-    problem: Problem,
-    state: State,
-    weight: Array,
-    tolerance: float,
-    projected: Projected | None,
+    problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
 ) -> Minimum:
     """Gauss-Newton steps, damped only when one fails."""
     damping, before = 0.0, np.inf
@@ -164,12 +160,8 @@ def _levenberg_marquardt(
             continue
         ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
         if _settled(gain, before, state.cost, tolerance):
-            return Minimum(
-                ahead,
-                reduced,
-                factor if not damping else None,
-                _status(state, "the next step gains too little"),
-            )
+            status = _status(state, "the next step gains too little")
+            return Minimum(ahead, reduced, None if damping else factor, status)
         trial = problem.reduce(ahead.params, ahead.points, weight)
         if trial.cost <= state.cost * (1.0 + 1e-12):
             state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
@@ -201,40 +193,30 @@ class _Compressed:
         cost = _finite(self.reduced.cost)
         self.state = replace(state, cost=cost, history=(*state.history, cost))
         self.start = state.params
-        self.upper0 = self._cholesky()
+        self.upper0 = la.cholesky(self.reduced.plain(self.problem.free), check_finite=False)
         self.key = np.zeros(len(self.upper0)).tobytes()
-        self._compress()
+        self._compress(self.upper0)
 
-    def _cholesky(self) -> Array:
-        upper: Array = la.cholesky(self.reduced.plain(self.problem.free), check_finite=False)
-        return upper
-
-    def _compress(self) -> None:
-        upper = self._cholesky()
+    def _compress(self, upper: Array) -> None:
         gradient = self.reduced.gradient[self.problem.free]
         self.whitened = la.solve_triangular(upper, gradient, trans="T", check_finite=False)
-        self.rest = np.sqrt(
-            max(self.reduced.cost - self.reduced.gain - float(self.whitened @ self.whitened), 0.0)
-        )
+        rest = self.reduced.cost - self.reduced.gain - float(self.whitened @ self.whitened)
+        self.rest = np.sqrt(max(rest, 0.0))
         self.slope = la.solve_triangular(self.upper0, upper.T, trans="T", check_finite=False).T
-
-    def params(self, x: Array) -> Array:
-        """The unknowns (N, q) of whitened ones."""
-        step = np.zeros(self.start.size)
-        step[self.problem.free] = la.solve_triangular(self.upper0, x, check_finite=False)
-        return self.start + step.reshape(self.start.shape)
 
     def at(self, x: Array) -> None:
         """Linearise at whitened unknowns, unless that was the last thing done."""
         if x.tobytes() == self.key:
             return
-        step = self.params(x) - self.state.params
-        state = self.state.moved(step, self.reduced, np.inf)
+        step = np.zeros(self.start.size)
+        step[self.problem.free] = la.solve_triangular(self.upper0, x, check_finite=False)
+        params = self.start + step.reshape(self.start.shape)
+        state = self.state.moved(params - self.state.params, self.reduced, np.inf)
         self.reduced = self.problem.reduce(state.params, state.points, self.weight)
         cost = self.reduced.cost
         self.state = replace(state, cost=cost, history=(*self.state.history, cost))
         self.key = x.tobytes()
-        self._compress()
+        self._compress(la.cholesky(self.reduced.plain(self.problem.free), check_finite=False))
 
     def residual(self, x: Array) -> Array:
         """The N q + 1 residuals."""
@@ -248,11 +230,7 @@ class _Compressed:
 
 
 def _scipy(
-    problem: Problem,
-    state: State,
-    weight: Array,
-    tolerance: float,
-    projected: Projected | None,
+    problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
 ) -> Minimum:
     compressed = _Compressed(problem, state, weight, projected)
     found = least_squares(

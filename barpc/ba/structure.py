@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,6 +74,12 @@ def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: 
         pair_view,
         pair_bounds,
     )
+
+
+def parts(stop: int, size: int, start: int = 0) -> Iterator[slice]:
+    """Pieces of observations start .. stop, of `size` that stay in cache."""
+    for first in range(start, stop, size):
+        yield slice(first, min(first + size, stop))
 
 
 def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
