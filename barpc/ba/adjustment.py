@@ -35,10 +35,7 @@ _MUCH_LOST = 0.85  # of a view's observations are to be left
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
 _MANY_KEPT = 0.99  # of the observations: the others do not tell in a mean
 _BETTER = 0.8  # of the noise
-_MUCH_BETTER = (
-    0.7  # of the error on tracks that took no part: another model is worth what it may do to heights
-)
-
+_MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
 
 
@@ -58,10 +55,8 @@ def adjust_tracks(
 
     Parameters
     ----------
-    views : sequence of View
-        N views; `Tracks.view` counts them.
-    tracks : Tracks
-        Tie points.
+    views, tracks : sequence of View, Tracks
+        N views and their tie points; `Tracks.view` counts the views.
     options : AdjustOptions or None
         None: the defaults.
     gcps : GroundPoints or None
@@ -71,12 +66,11 @@ def adjust_tracks(
     centers : (N, 3) or None
         Camera centres [m], ECEF; None: regressed from the sensors.
     prior : BlockPrior or None
-        An earlier block, whose views are among these: they start at its corrections, and its joint
-        covariance is their prior. `tracks` then holds new observations only.
-    keep_largest : bool
-        Go on with the largest group of views where they are not all connected.
-    hold_out : bool
-        Keep a tenth of the tracks out, to measure the result on.
+        An earlier block, whose views are among these: its corrections and their joint covariance are the
+        prior. `tracks` then holds new observations only.
+    keep_largest, hold_out : bool
+        Go on with the largest group of views where they are not all connected; keep a tenth of the tracks out, to
+        measure the result on.
 
     Returns
     -------
@@ -84,10 +78,8 @@ def adjust_tracks(
 
     Raises
     ------
-    TiePointError
-        A view has too few observations.
-    DisconnectedError
-        The views fall into groups that share no tie point.
+    TiePointError, DisconnectedError
+        A view has too few observations; the views fall into groups that share no tie point.
     AdjustError
         There is no usable solution.
     InputError
@@ -98,15 +90,8 @@ def adjust_tracks(
     block = join(tuple(views), tracks, gcps, options, keep_largest)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     inner, outer = block.without(rows), block.without(~rows)
-    found = _solve(inner, outer, options, gcps, dem, centers, prior)
+    found, in_space = _choose_model(inner, outer, options, gcps, dem, centers, prior)
     found.heights.warn()
-    in_space = None
-    if options.model == AUTO and options.drift is None and prior is None:
-        skew = found.is_skew
-        if skew or found.has_trend:
-            in_image = _solve(inner, outer, replace(options, model="affine"), gcps, dem, None, None)
-            if in_image.after.error < (1.0 if skew else _MUCH_BETTER) * found.after.error:
-                in_space, found = found.after.whole_rms, in_image
     return _adjustment(found, inner, outer, gcps, options, in_space, start)
 
 
@@ -161,6 +146,27 @@ class _Solution:
         by_point = problem.project_points(self.final.params, self.final.points).by_point
         pixels = float(np.nanmedian(np.linalg.norm(by_point[1], axis=0)))  # a metre
         return learnt[0] > _SKEW * float(np.median(problem.cameras.unknowns.half[1])) / pixels
+
+
+def _choose_model(
+    block: Block,
+    outer: Block,
+    options: AdjustOptions,
+    gcps: GroundPoints | None,
+    dem: Terrain | None,
+    centers: Array | None,
+    prior: BlockPrior | None,
+) -> tuple[_Solution, float | None]:
+    """The block solved; by an affine in the image where the data choose it, and what the model in space left [px]."""
+    found = _solve(block, outer, options, gcps, dem, centers, prior)
+    if options.model != AUTO or options.drift is not None or prior is not None:
+        return found, None
+    skew = found.is_skew
+    if skew or found.has_trend:
+        in_image = _solve(block, outer, replace(options, model="affine"), gcps, dem, None, None)
+        if in_image.after.error < (1.0 if skew else _MUCH_BETTER) * found.after.error:
+            return in_image, found.after.whole_rms
+    return found, None
 
 
 def _solve(

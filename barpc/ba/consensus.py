@@ -31,21 +31,11 @@ _EVIDENT = 15.0  # gain in log-likelihood over one group
 
 @dataclass(frozen=True)
 class TwoGroups:
-    """A pair of views whose tie points fall into two groups: which of them is right, the pair does not tell.
+    """A pair of views whose tie points fall into two groups: which of them is right, the pair does not tell."""
 
-    Parameters
-    ----------
-    views : tuple of int
-        The pair.
-    share : float
-        Part of the matches in the smaller group.
-    apart : float
-        Across the epipolar lines [px].
-    """
-
-    views: tuple[int, int]
-    share: float
-    apart: float
+    views: tuple[int, int]  # the pair
+    share: float  # part of the matches in the smaller group
+    apart: float  # across the epipolar lines [px]
 
 
 def two_groups(

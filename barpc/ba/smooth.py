@@ -31,25 +31,18 @@ _BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=
 
 @dataclass(frozen=True, eq=False)
 class SmoothTest:
-    """The smooth part of every view's residuals, and whether it is more than chance.
+    """The smooth part of every view's residuals, and whether it is more than chance."""
 
-    Parameters
-    ----------
-    rms : (N,)
-        Root mean square of the smooth part over the view's observations, both coordinates together, less what
-        noise alone would leave [px]; 0 for a view with too few observations.
-    significance : (N,)
-        Probability that noise alone leaves as much (F-test); 1 for a view with too few observations.
-    by_row : (N,)
-        Part of the smooth part's square that the row alone explains; NaN where nothing was fitted.
-    shared : (N,)
-        Error that an observation shares with its neighbour in the row, or in the column where that is more [px]:
-        waves and steps that are too fine for the smooth part are in it, too. 0 where it is not significant.
-    """
-
+    # (N,) root mean square of the smooth part over the view's observations, both coordinates together, less
+    # what noise alone would leave [px]; 0 for a view with too few observations
     rms: Array
+    # (N,) probability that noise alone leaves as much (F-test); 1 for a view with too few observations
     significance: Array
+    # (N,) part of the smooth part's square that the row alone explains; NaN where nothing was fitted
     by_row: Array
+    # (N,) error that an observation shares with its neighbour in the row, or in the column where that is more
+    # [px]: waves and steps that are too fine for the smooth part are in it, too. 0 where it is not
+    # significant
     shared: Array
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
@@ -74,8 +67,8 @@ class Smooth:
         Zero for views with too few observations that count.
         """
         out = np.zeros_like(residual)
-        for v, rows in self._views(weight):
-            out[:, rows] = self._coefficients(v, residual, weight) @ self._basis[:, rows]
+        for _, rows in self._views(weight):
+            out[:, rows] = self._coefficients(rows, residual, weight) @ self._basis[:, rows]
         return out
 
     def parameters(self, weight: Array) -> int:
@@ -92,7 +85,7 @@ class Smooth:
         residual = np.where(use, residual, 0.0)
         for v, rows in self._views(weight):
             count = 2 * float(weight[rows].sum())
-            coefficients = self._coefficients(v, residual, weight)
+            coefficients = self._coefficients(rows, residual, weight)
             smooth = (coefficients @ self._basis[:, rows]) * weight[rows]
             explained = float((smooth**2).sum())
             left = float((residual[:, rows] ** 2).sum()) - explained
@@ -124,9 +117,8 @@ class Smooth:
         enough = np.flatnonzero(counts >= _PER_TERM * _TERMS)
         return [(int(v), slice(int(bounds[v]), int(bounds[v + 1]))) for v in enough]
 
-    def _coefficients(self, v: int, residual: Array, weight: Array) -> Array:
+    def _coefficients(self, rows: slice, residual: Array, weight: Array) -> Array:
         """Coefficients (2, terms) of one view."""
-        rows = slice(int(self.structure.bounds[v]), int(self.structure.bounds[v + 1]))
         basis = self._basis[:, rows]
         weighted = basis * weight[rows]
         matrix = weighted @ basis.T

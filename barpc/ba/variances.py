@@ -44,27 +44,15 @@ _LEAST = 0.5  # degrees of freedom below which nothing is said
 
 @dataclass(frozen=True, eq=False)
 class PriorTest:
-    """How the corrections of the views compare with the priors that were given.
+    """How the corrections of the views compare with the priors that were given."""
 
-    Parameters
-    ----------
-    ratio : float
-        Squared constant corrections (rotation, translation) over the variances given, over their degrees of
-        freedom: about 1 where the priors hold. NaN where the observations determine nothing.
-    freedom : float
-        Constant unknowns that the observations determine.
-    scale : (N,)
-        By how much the standard deviations given were widened; 1: not at all.
-    odd : (N,)
-        Views whose camera alone explains the corrections. More than one: any of them would.
-    drift_sigma : tuple of float
-        Standard deviation of the drift's coefficients in use, degree by degree [m].
-    """
-
+    # squared constant corrections (rotation, translation) over the variances given, over their degrees of
+    # freedom: about 1 where the priors hold. NaN where the observations determine nothing
     ratio: float
-    freedom: float
-    scale: Array
-    odd: BoolArray
+    freedom: float  # constant unknowns that the observations determine
+    scale: Array  # (N,) by how much the standard deviations given were widened; 1: not at all
+    odd: BoolArray  # (N,) views whose camera alone explains the corrections. More than one: any of them would
+    # standard deviation of the drift's coefficients in use, degree by degree [m]
     drift_sigma: tuple[float, ...]
 
 
@@ -141,7 +129,7 @@ class Variances:
         if around.small and (now.sigma != prior.sigma).any():
             _, params, covariance = around.under(prior)
         known = self._known(covariance, prior if around.small else now)
-        total, freedom = (float(part.sum()) for part in self._evidence(params, known))
+        total, freedom = (float(part.sum()) for part in self._squares(params, known))
         ratio = total / freedom if freedom > _LEAST else float("nan")
         for _ in range(_ITERATIONS):
             if self.learn_constant and self._too_large(params, known, scale):
@@ -183,7 +171,7 @@ class Variances:
         known = 1.0 - _posterior_variance(covariance, shape) / prior.sigma**2
         return np.where(use, known.clip(0.0, 1.0), 0.0)
 
-    def _evidence(
+    def _squares(
         self, params: Array, known: Array, scale: Array | float = 1.0, part: slice | None = None
     ) -> tuple[Array, Array]:
         """Squared unknowns of every view (the constants, or a part) over their variances, and their freedom (N,)."""
@@ -194,13 +182,13 @@ class Variances:
 
     def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
         """Whether the corrections are larger than chance allows."""
-        total, freedom = (float(part.sum()) for part in self._evidence(params, known, scale))
+        total, freedom = (float(part.sum()) for part in self._squares(params, known, scale))
         return freedom > _LEAST and float(chi2.sf(total, freedom)) < _LEVEL
 
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
         """By how much each view's prior is to be widened (N,), and which views are odd."""
         n = len(params)
-        total, freedom = self._evidence(params, known)
+        total, freedom = self._squares(params, known)
         factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
         odd = np.zeros(n, dtype=bool)
         with np.errstate(all="ignore"):
@@ -216,7 +204,7 @@ class Variances:
         if n > 2 and not around.small:  # one view of many is seen at once
             own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
             factor = max((_STRENGTH + own * freedom.sum()) / (_STRENGTH + freedom.sum()), 1.0)
-            odd = chi2.sf(total / factor, np.maximum(freedom, _LEAST)) < _LEVEL / n
+            odd = np.asarray(chi2.sf(total / factor, np.maximum(freedom, _LEAST)) < _LEVEL / n)
         alone = (_STRENGTH * factor + total) / (_STRENGTH + freedom)
         return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
 
@@ -247,7 +235,7 @@ class Variances:
         except np.linalg.LinAlgError:
             return -np.inf, 1.0
         known = self._known(covariance, prior)
-        total, freedom = (part[v] for part in self._evidence(params, known))
+        total, freedom = (part[v] for part in self._squares(params, known))
         trial[v] = max(np.sqrt((_STRENGTH + total) / (_STRENGTH + freedom)), 1.0)
         return around.under(self._prior(trial, wide))[0], float(trial[v])
 
@@ -255,7 +243,7 @@ class Variances:
         """By how much the drift's standard deviations are to be changed (D,), the given ones counting for a few."""
         factors = np.ones(self._degrees)
         for degree in range(self._degrees):
-            total, freedom = (x.sum() for x in self._evidence(params, known, part=self._drift_part(degree)))
+            total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
             factors[degree] = np.sqrt((_STRENGTH + total) / (_STRENGTH + freedom))
         return factors
 
