@@ -13,7 +13,7 @@ from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import agreeing, two_groups
 from barpc.ba.gauge import gauge_report
 from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control
-from barpc.ba.heldout import HeldOut, keep_out, measure
+from barpc.ba.heldout import HeldOut, enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior, apply_prior
 from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
@@ -22,7 +22,7 @@ from barpc.ba.rounds import Outcome, revived, run_rounds
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
-from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.geodesy import Array
 from barpc.options import AUTO, AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 
@@ -90,9 +90,9 @@ def adjust_tracks(
     block = join(tuple(views), tracks, gcps, options, keep_largest)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     inner, outer = block.without(rows), block.without(~rows)
-    found, in_space = _choose_model(inner, outer, options, gcps, dem, centers, prior)
+    found, in_space = _choose_model(inner, outer, options, dem, centers, prior)
     found.heights.warn()
-    return _adjustment(found, inner, outer, gcps, options, in_space, start)
+    return _adjustment(found, inner, outer, options, in_space, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,18 +152,17 @@ def _choose_model(
     block: Block,
     outer: Block,
     options: AdjustOptions,
-    gcps: GroundPoints | None,
     dem: Terrain | None,
     centers: Array | None,
     prior: BlockPrior | None,
 ) -> tuple[_Solution, float | None]:
     """The block solved; by an affine in the image where the data choose it, and what the model in space left [px]."""
-    found = _solve(block, outer, options, gcps, dem, centers, prior)
+    found = _solve(block, outer, options, dem, centers, prior)
     if options.model != AUTO or options.drift is not None or prior is not None:
         return found, None
     skew = found.is_skew
     if skew or found.has_trend:
-        in_image = _solve(block, outer, replace(options, model="affine"), gcps, dem, None, None)
+        in_image = _solve(block, outer, replace(options, model="affine"), dem, None, None)
         if in_image.after.error < (1.0 if skew else _MUCH_BETTER) * found.after.error:
             return in_image, found.after.whole_rms
     return found, None
@@ -173,7 +172,6 @@ def _solve(
     block: Block,
     outer: Block,
     options: AdjustOptions,
-    gcps: GroundPoints | None,
     dem: Terrain | None,
     centers: Array | None,
     prior: BlockPrior | None,
@@ -183,7 +181,7 @@ def _solve(
     Measured on the observations of `outer`.
     """
     problem = make_problem(block, options, centers, prior)
-    state, heights = _start(problem, block, options, gcps, dem)
+    state, heights = _start(problem, block, options, dem)
     before = problem.residuals(state.params, state.points)
     start = measure(problem, state.params, outer)
     outcome = run_rounds(problem, block, state, options, heights, block.use)
@@ -196,9 +194,8 @@ def _solve(
     drift = problem.cameras.unknowns.drift
     if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
         bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
-        there, _ = revived(
-            problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
-        )
+        ended, weight = outcome.minimum.state, block.use / block.sigma
+        there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
         problem, outcome = bent, run_rounds(bent, block, there, options, heights, outcome.inlier)
     after = measure(problem, outcome.minimum.state.params, outer)
@@ -206,13 +203,7 @@ def _solve(
 
 
 def _adjustment(
-    found: _Solution,
-    block: Block,
-    outer: Block,
-    gcps: GroundPoints | None,
-    options: AdjustOptions,
-    in_space: float | None,
-    start: float,
+    found: _Solution, block: Block, outer: Block, options: AdjustOptions, in_space: float | None, start: float
 ) -> Adjustment:
     """What is handed out, in the order of the tracks given."""
     outcome, final, seen = found.outcome, found.final, found.seen
@@ -222,7 +213,7 @@ def _adjustment(
     points = np.where(seen[:, None], final.points, np.nan)
     points[found.after.index] = found.after.points
     inlier = block.in_order(outcome.inlier)
-    ties = slice(0, len(inlier) - (0 if gcps is None else len(gcps.view)))
+    ties = slice(0, len(inlier) - len(block.gcps.view))
     view = np.maximum(block.in_order(block.view), outer.in_order(outer.view))[ties]
     before, after = (
         (block.in_order(inside.T) + outer.in_order(outside.residual.T))[ties]
@@ -255,7 +246,7 @@ def _adjustment(
         held=found.heights.weak[: block.num_tracks],
         left_out=block.left_out,
         gcp_inlier=inlier[ties.stop :],
-        gcp_residuals=_gcp_residuals(final.points[block.num_tracks :], gcps),
+        gcp_residuals=enu_offsets(final.points[block.num_tracks :], block.gcps.lonlatalt),
         seconds=time.process_time() - start,
         options=options,
     )
@@ -312,30 +303,22 @@ def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, 
 
 
 def _start(
-    problem: Problem, block: Block, options: AdjustOptions, gcps: GroundPoints | None, dem: Terrain | None
+    problem: Problem, block: Block, options: AdjustOptions, dem: Terrain | None
 ) -> tuple[State, Heights]:
     """Points triangulated with the delivered cameras, and what holds those that the rays do not."""
     params = problem.camera_prior.mean
-    points = block.first_points(gcps)
+    points = block.first_points()
     points[~np.isfinite(points)] = 0.0
-    control = [] if gcps is None else [ground_control(gcps, block.num_tracks + np.arange(len(gcps.names)))]
+    control = ground_control(block.gcps, np.arange(block.num_tracks, block.num_points))
     projected = problem.project_points(params, points)
     seen = np.bincount(block.point, minlength=block.num_points) > 0
     angles = convergence_angles(problem.structure, projected, points)
     weak = seen & (angles < np.radians(options.min_convergence))
     tracks = np.flatnonzero(seen[: block.num_tracks])
-    heights = Heights(tuple(control), weak, tracks, block.alt_range, options, dem)
+    heights = Heights((control,), weak, tracks, block.alt_range, options, dem)
     weight = block.use / block.sigma
     for _ in range(_FIRST_STEPS):
         points = heights.hold(problem, points).triangulate(points, projected, weight)
         projected = problem.project_points(params, points)
     points = heights.hold(problem, points).triangulate(points, projected, weight)
     return State(params, points), heights
-
-
-def _gcp_residuals(points: Array, gcps: GroundPoints | None) -> Array:
-    if gcps is None:
-        return np.zeros((0, 3))
-    offset = points - ecef_from_ground(gcps.lonlatalt)
-    enu: Array = (enu_basis(gcps.lonlatalt) @ offset[..., None])[..., 0]
-    return enu

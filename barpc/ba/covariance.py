@@ -49,8 +49,7 @@ class Covariance:
 
     def _places(self, views: IntArray) -> IntArray:
         q = self.num_unknowns
-        places: IntArray = (views[:, None] * q + np.arange(q)).ravel()
-        return places
+        return (views[:, None] * q + np.arange(q)).ravel()
 
     def _columns(self, place: IntArray, of_full: bool) -> Array:
         """Covariance (N q, m) of all unknowns with those at `place` (m,)."""
@@ -72,7 +71,7 @@ class Covariance:
         structure = self.reduced.structure
         out = np.empty((len(index), 3, 3))
         lower = self.reduced.lower[:, index]
-        inverse = _inverse_transposed(lower)
+        inverse = solve_transposed(lower, np.eye(3)[..., None]).transpose(2, 0, 1)  # L^-T
         for n, p in enumerate(index):
             rows = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
             sensitivity = -inverse[n] @ self.reduced.cross[rows].transpose(1, 0, 2).reshape(3, -1)
@@ -98,14 +97,3 @@ class Covariance:
                 sensitivity[:, at : at + q] -= inverse[n] @ self.reduced.cross[k]
             out[n] = inverse[n] @ inverse[n].T + shared @ shared.T + sensitivity @ self.solve(sensitivity.T)
         return out
-
-
-def _inverse_transposed(lower: Array) -> Array:
-    """L^-T (n, 3, 3) of factors (6, n)."""
-    n = lower.shape[1]
-    out = np.empty((n, 3, 3))
-    for i in range(3):
-        unit = np.zeros((3, n))
-        unit[i] = 1.0
-        out[:, :, i] = solve_transposed(lower, unit).T
-    return out

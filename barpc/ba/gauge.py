@@ -73,8 +73,7 @@ def _motion_by_unknowns(
     pick = _motion_of_points(local) @ enu  # (7, n, 3) by ECEF moves
     lower = reduced.lower[:, index]
     whitened = np.zeros((len(use), 3, count))  # L^-1 of each motion's weights: dX = -L^-T Y dp
-    for m in range(count):
-        whitened[index, :, m] = solve_lower(lower, pick[m].T).T
+    whitened[index] = solve_lower(lower, pick.transpose(2, 0, 1)).transpose(2, 0, 1)
     rows = np.flatnonzero(use[structure.point])
     products = np.swapaxes(reduced.cross[rows], 1, 2) @ whitened[structure.point[rows]]
     by_unknown = np.zeros((structure.num_views, q * count))
@@ -99,8 +98,7 @@ def _motion_of_points(local: Array) -> Array:
     motions = np.array([*shifts, [zero, zero, e], [zero, zero, o], [-o, e, zero], [e, o, zero]])
     flat = np.swapaxes(motions, 1, 2).reshape(len(MOTIONS), -1)
     gram = flat @ flat.T + 1e-9 * n * np.eye(len(MOTIONS))
-    solved: Array = np.linalg.solve(gram, flat).reshape(len(MOTIONS), n, 3)
-    return solved
+    return np.linalg.solve(gram, flat).reshape(len(MOTIONS), n, 3)
 
 
 def _modes(motion_covariance: Array) -> tuple[Mode, ...]:

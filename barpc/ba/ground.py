@@ -98,8 +98,7 @@ def convergence_angles(structure: Structure, projected: Projected, points: Array
     apart = np.linalg.norm(ray - mean.take(structure.point, axis=1, mode="clip"), axis=0)
     largest = np.zeros(structure.num_points)
     np.maximum.at(largest, structure.point, apart)
-    angle: Array = 4.0 * np.arcsin(np.minimum(0.5 * largest, 1.0))
-    return angle
+    return 4.0 * np.arcsin(np.minimum(0.5 * largest, 1.0))
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
         point_prior=None,
     )
     observations = Observations(part, block.sigma, 0.0, np.ones(len(point), dtype=bool))
-    points, counted = block.first_points(None)[index], np.ones(len(point))
+    points, counted = block.first_points()[index], np.ones(len(point))
     for step in range(_STEPS):
         projected = part.project_points(params, points)
         if step > 1:  # of three views that do not agree two may
@@ -151,9 +151,14 @@ def check_residuals(sensors: Sequence[SensorModel], points: GroundPoints) -> Che
         order = rows[np.lexsort((points.view[rows], points.point[rows]))]
         index, place = np.unique(points.point[order], return_inverse=True)
         found = triangulate(list(sensors), points.view[order], place.ravel(), points.xy[order])
-        offset = found.points - ecef_from_ground(points.lonlatalt[index])
-        ground[index] = (enu_basis(points.lonlatalt[index]) @ offset[..., None])[..., 0]
+        ground[index] = enu_offsets(found.points, points.lonlatalt[index])
     return CheckResiduals(image, ground)
+
+
+def enu_offsets(points: Array, known: Array) -> Array:
+    """East, north, up (n, 3) [m] of points, ECEF [m], minus known lon, lat, alt (n, 3)."""
+    offset = points - ecef_from_ground(known)
+    return (enu_basis(known) @ offset[..., None])[..., 0]
 
 
 def split_points(points: GroundPoints, checks: Sequence[str]) -> tuple[GroundPoints, GroundPoints]:

@@ -77,8 +77,7 @@ def _updated(factor: Factor, less: Array) -> Factor:
 
     def solve(b: Array) -> Array:
         first = factor.solve(b)
-        solved: Array = first + pulled @ la.cho_solve(small, less @ first)
-        return solved
+        return first + pulled @ la.cho_solve(small, less @ first)
 
     return Factor(solve, factor.method)
 

@@ -42,8 +42,7 @@ class Common:
 
     def step(self, step: Array) -> Array:
         """The move of the errors (m,) that goes with a step (N q,) of the camera unknowns."""
-        moved: Array = -la.solve_triangular(self.upper, self.half + self.by_camera @ step)
-        return moved
+        return -la.solve_triangular(self.upper, self.half + self.by_camera @ step)
 
 
 @dataclass(frozen=True)
@@ -144,9 +143,8 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
     products[rows] = (np.swapaxes(whitened[at[rows]], 1, 2) @ cross[rows]).reshape(
         len(rows), products.shape[1]
     )
-    by_camera = (
-        -structure.sum_views(products.T).reshape(structure.num_views, m, -1).swapaxes(0, 1).reshape(m, -1)
-    )
+    sums = structure.sum_views(products.T).reshape(structure.num_views, m, -1)
+    by_camera = -sums.swapaxes(0, 1).reshape(m, -1)
     gradient = -np.einsum("qim,iq->m", whitened, half[:, index])
     return Common(
         index,

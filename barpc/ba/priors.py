@@ -37,8 +37,7 @@ class CameraPrior:
 
     def residual(self, params: Array) -> Array:
         """Whitened residuals (N, q) of unknowns (N, q)."""
-        whitened: Array = (params - self.mean) / self.sigma
-        return whitened
+        return (params - self.mean) / self.sigma
 
     def jacobian(self) -> Array:
         """Diagonal of the derivative (N, q)."""
@@ -55,8 +54,7 @@ class JointPrior:
 
     def residual(self, params: Array) -> Array:
         """Whitened residuals (n,) of unknowns (N, q)."""
-        whitened: Array = self.root @ (params.ravel()[self.index] - self.mean)
-        return whitened
+        return self.root @ (params.ravel()[self.index] - self.mean)
 
     def jacobian(self) -> Array:
         """Derivative (n, n) by the unknowns `index`."""
@@ -79,13 +77,11 @@ class PointPrior:
     def offset(self, points: Array) -> Array:
         """The common errors (m,) that points (P, 3) [m] show, in their standard deviations."""
         whitened = self.apart(points)
-        offset: Array = np.linalg.solve(self.information(), np.einsum("qim,qi->m", self.common, whitened))
-        return offset
+        return np.linalg.solve(self.information(), np.einsum("qim,qi->m", self.common, whitened))
 
     def residual(self, points: Array) -> Array:
         """Whitened residuals (Q, 3) of points (P, 3) [m], the common errors taken away."""
-        residual: Array = self.apart(points) - self.common @ self.offset(points)
-        return residual
+        return self.apart(points) - self.common @ self.offset(points)
 
     def cost(self, points: Array) -> float:
         """Sum of the squared residuals, with the common errors' own."""
@@ -99,8 +95,7 @@ class PointPrior:
 
     def apart(self, points: Array) -> Array:
         """Whitened offsets (Q, 3) of points (P, 3) [m], the common errors still in them."""
-        whitened: Array = (self.rows @ (points[self.index] - self.mean)[..., None])[..., 0]
-        return whitened
+        return (self.rows @ (points[self.index] - self.mean)[..., None])[..., 0]
 
     def jacobian(self) -> Array:
         """Derivatives (Q, 3, 3) by the points `index` [1/m]."""
@@ -117,16 +112,12 @@ def prior_sigmas(views: tuple[View, ...], options: AdjustOptions, drift: int) ->
     """Prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px)."""
     stated = np.array([stated_accuracy(view) for view in views])
     parts = []
-    if "rotation" in options.first_model:
-        parts.append(np.tile(_given(options.sigma_attitude, stated), (1, 3)))
-    if "translation" in options.first_model:
-        parts.append(np.tile(_given(options.sigma_position, stated), (1, 3)))
+    for name, sigma in (("rotation", options.sigma_attitude), ("translation", options.sigma_position)):
+        if name in options.first_model:
+            one = stated if sigma is None else np.full(len(views), sigma)
+            parts.append(np.tile(one[:, None], (1, 3)))
     parts += [np.full((len(views), 3), options.sigma_drift or DRIFT_SIGMA)] * drift
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
         parts.append(np.full((len(views), size), IMAGE_SIGMA))
     return np.hstack(parts)
-
-
-def _given(value: float | None, stated: Array) -> Array:
-    return stated[:, None] if value is None else np.full((len(stated), 1), value)

@@ -204,8 +204,7 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
 
 def _points_of(adjustment: Adjustment, view: int) -> IntArray:
     structure = adjustment.covariance.reduced.structure
-    points: IntArray = structure.point[structure.bounds[view] : structure.bounds[view + 1]]
-    return points
+    return structure.point[structure.bounds[view] : structure.bounds[view + 1]]
 
 
 def _rms(rows: Array, covariance: Array) -> float:

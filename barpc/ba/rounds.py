@@ -123,13 +123,8 @@ class _Rounds:
         found = self._solve()
         prior, tested = self.variances.learnt(self.problem, found)
         self._estimate_noise()
-        _LOG.info(
-            "pass %d: %d of %d observations, noise %.3f",
-            self.passes,
-            self.use.sum(),
-            len(self.use),
-            self.noise,
-        )
+        numbers = self.passes, self.use.sum(), len(self.use), self.noise
+        _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
         settled &= same_prior(prior, self.problem.camera_prior, _SAME_PRIOR)
@@ -152,9 +147,8 @@ class _Rounds:
         """Least squares of what is used; a second pass follows the first robust one always, and is exact."""
         solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
         tolerance = TOLERANCE if self.passes > 1 or not self.robust else _FIRST_TOLERANCE
-        weight = self.observations.weight(
-            self.use, self.noise if self.options.estimate_noise else 1.0, self.misfit
-        )
+        noise = self.noise if self.options.estimate_noise else 1.0
+        weight = self.observations.weight(self.use, noise, self.misfit)
         found = minimise(self.problem, self.state, weight, solver, tolerance, self.projected)
         state, self.projected = found.state, None
         self.residual = self.problem.residuals(state.params, state.points)

@@ -31,13 +31,11 @@ class Structure:
 
     def sum_points(self, rows: Array) -> Array:
         """Sums (m, P) over every point's observations of rows (m, K)."""
-        total: Array = np.array([np.bincount(self.point, row, self.num_points) for row in rows])
-        return total
+        return np.array([np.bincount(self.point, row, self.num_points) for row in rows])
 
     def of_points(self, points: Array) -> Array:
         """Coordinates (3, K) of every observation's point, of points (P, 3)."""
-        rows: Array = np.ascontiguousarray(points.T).take(self.point, axis=1, mode="clip")
-        return rows
+        return np.ascontiguousarray(points.T).take(self.point, axis=1, mode="clip")
 
     def sum_views(self, rows: Array) -> Array:
         """Sums (N, m) over every view's observations of rows (m, K)."""

@@ -58,27 +58,23 @@ class Unknowns:
         """Rotation vectors (n, 3) [rad] at the middle row, of the views whose unknowns (n, q) are given."""
         if not self.rotates:
             return np.zeros((len(params), 3))
-        rotation: Array = params[:, :3] / self.distance[views, None]
-        return rotation
+        return params[:, :3] / self.distance[views, None]
 
     def translation(self, params: Array) -> Array:
         """Translations (N, 3) [m]."""
         if not self.translates:
             return np.zeros((len(params), 3))
         start = 3 * self.rotates
-        translation: Array = params[:, start : start + 3]
-        return translation
+        return params[:, start : start + 3]
 
     def drift_vectors(self, params: Array) -> Array:
         """Rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
         start = 3 * (self.rotates + self.translates)
-        vectors: Array = params[:, start:].reshape(len(params), self.drift, 3) / self.distance[:, None, None]
-        return vectors
+        return params[:, start:].reshape(len(params), self.drift, 3) / self.distance[:, None, None]
 
     def normalized(self, image: Array, index: IntArray) -> Array:
         """col, row (2, n) [px] -> -1 at the left and the top, 1 at the right and the bottom of their images."""
-        normalized: Array = (image - self.middle[:, index]) / self.half[:, index]
-        return normalized
+        return (image - self.middle[:, index]) / self.half[:, index]
 
     def drift_rotation(self, params: Array, index: IntArray, row: Array) -> Array:
         """Rotation (3, n) [rad] that the drift adds at normalised rows (n,)."""

@@ -120,5 +120,4 @@ class Observations:
         """`use` without the observations whose point is left without a second one (or a prior)."""
         structure = self.structure
         count = np.bincount(structure.point[use], minlength=structure.num_points)
-        tied: BoolArray = use & ((count >= 2) | self.has_prior)[structure.point]
-        return tied
+        return use & ((count >= 2) | self.has_prior)[structure.point]
