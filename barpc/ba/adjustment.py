@@ -18,7 +18,7 @@ from barpc.ba.incremental import BlockPrior, apply_prior
 from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
-from barpc.ba.rounds import Outcome, revived, run_rounds
+from barpc.ba.rounds import Outcome, Rounds, revived
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
@@ -26,9 +26,7 @@ from barpc.geodesy import Array
 from barpc.options import AUTO, AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 
-SMOOTH_LEAST = 0.06
-"""Smooth residuals below this [px] are left alone: two views share what one is wrong by."""
-
+SMOOTH_LEAST = 0.06  # smooth residuals below this [px] are left alone: two views share what one is wrong by
 _TREND = 0.03  # px: another model is tried
 _MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
@@ -184,11 +182,11 @@ def _solve(
     state, heights = _start(problem, block, options, dem)
     before = problem.residuals(state.params, state.points)
     start = measure(problem, state.params, outer)
-    outcome = run_rounds(problem, block, state, options, heights, block.use)
+    outcome = Rounds(problem, block, state, options, heights, block.use).run()
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
         agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
-        again = run_rounds(problem, block, state, options, heights, agree)
+        again = Rounds(problem, block, state, options, heights, agree).run()
         if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
     drift = problem.cameras.unknowns.drift
@@ -197,7 +195,7 @@ def _solve(
         ended, weight = outcome.minimum.state, block.use / block.sigma
         there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
-        problem, outcome = bent, run_rounds(bent, block, there, options, heights, outcome.inlier)
+        problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
     after = measure(problem, outcome.minimum.state.params, outer)
     return _Solution(problem, state, before, heights, outcome, start, after)
 

@@ -23,8 +23,7 @@ from barpc.sensor.corrected import Motion
 from barpc.sensor.rational import Rational, monomials
 from barpc.sensor.rpc import RPC
 
-CHUNK = 8192
-"""Observations worked on at a time, so that temporaries stay in cache."""
+CHUNK = 8192  # observations worked on at a time, so that temporaries stay in cache
 
 Wanted = Literal["image", "points", "unknowns"]
 

@@ -20,11 +20,8 @@ from barpc.ba.structure import Structure, parts
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-CHUNK = 8192
-"""Observations, or pairs of them, multiplied at a time."""
-
-DENSE_UNKNOWNS = 900
-"""Up to so many camera unknowns the reduced matrix is a plain array."""
+CHUNK = 8192  # observations, or pairs of them, multiplied at a time
+DENSE_UNKNOWNS = 900  # up to so many camera unknowns the reduced matrix is a plain array
 
 TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
 """Order of the elements of symmetric 3x3 matrices."""

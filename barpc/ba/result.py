@@ -179,7 +179,8 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
         NaN where the views share no point.
     """
     structure = adjustment.covariance.reduced.structure
-    seen = np.intersect1d(_points_of(adjustment, first), _points_of(adjustment, second))
+    by_view = [structure.point[slice(*structure.bounds[v : v + 2])] for v in (first, second)]
+    seen = np.intersect1d(by_view[0], by_view[1])
     seen = seen[seen < len(adjustment.points)]
     seen = seen[np.isfinite(adjustment.points[seen, 0])]
     if not len(seen):
@@ -200,11 +201,6 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     covariance = adjustment.covariance.joint(np.array(pair))
     relative = by_camera - by_camera.mean(axis=0)
     return PairHeights((first, second), _rms(by_camera, covariance), _rms(relative, covariance), n)
-
-
-def _points_of(adjustment: Adjustment, view: int) -> IntArray:
-    structure = adjustment.covariance.reduced.structure
-    return structure.point[structure.bounds[view] : structure.bounds[view + 1]]
 
 
 def _rms(rows: Array, covariance: Array) -> float:

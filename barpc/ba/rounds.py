@@ -36,8 +36,7 @@ _CLEAN = 5.0  # sigmas
 _FEW = 0.002  # of the observations farther away than that: there is nothing to be careful about
 _NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
 _SHRINK = 0.25  # of the loss's scale in one round, at most
-MAX_PASSES = 5
-"""Rounds of cutting and solving, at most: they end when nothing changes."""
+MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
 _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
 
 
@@ -55,25 +54,12 @@ class Outcome:
     smooth: SmoothTest  # what is smooth in the residuals that are left
 
 
-def run_rounds(
-    problem: Problem, block: Block, state: State, options: AdjustOptions, heights: Heights, use: BoolArray
-) -> Outcome:
+class Rounds:
     """Robust rounds, cuts and the final least squares, with the observations in use (K,) to start with.
 
     Outliers are judged by what is left of their residuals once the smooth part of every view is taken away: a
     camera that the unknowns cannot follow yet does not make its tie points wrong.
     """
-    rounds = _Rounds(problem, block, state, options, heights, use)
-    if rounds.robust:
-        rounds.search()
-    while True:
-        outcome = rounds.cut_and_solve()
-        if outcome is not None:
-            return outcome
-
-
-class _Rounds:
-    """Where the rounds stand: cameras and points, their residuals, and what is used of the observations."""
 
     def __init__(
         self,
@@ -101,7 +87,16 @@ class _Rounds:
         self.passes, self.noise = 0, 1.0
         self.misfit: Array | float = 0.0
 
-    def search(self) -> None:
+    def run(self) -> Outcome:
+        """Go on until nothing changes."""
+        if self.robust:
+            self._search()
+        while True:
+            outcome = self._cut_and_solve()
+            if outcome is not None:
+                return outcome
+
+    def _search(self) -> None:
         """Robust rounds, under priors that leave room for what is not expected."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
         assert self.projected is not None
@@ -110,7 +105,7 @@ class _Rounds:
         )
         self.misfit = self.smooth.test(self.residual, self.use, neighbours=False).rms
 
-    def cut_and_solve(self) -> Outcome | None:
+    def _cut_and_solve(self) -> Outcome | None:
         """One pass; the outcome where it is the last."""
         options, was_in_use, noise = self.options, self.use, self.noise
         many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()

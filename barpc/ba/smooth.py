@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.stats import f as f_distribution
 
 from barpc.ba.structure import Structure
@@ -133,12 +134,5 @@ class Smooth:
 def _bsplines(u: Array) -> Array:
     """Uniform cubic B-splines (SPLINES, n) at u (n,) in -1 .. 1."""
     pieces = SPLINES - 3
-    t = (u + 1.0) * (0.5 * pieces)
-    piece = np.minimum(t.astype(np.int64), pieces - 1)
-    t = t - piece
-    values = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]) / 6.0
-    out = np.zeros((SPLINES, len(u)))
-    columns = np.arange(len(u))
-    for k in range(4):
-        out[piece + k, columns] = values[k]
-    return out
+    basis = BSpline.design_matrix((u + 1.0) * (0.5 * pieces), np.arange(-3.0, pieces + 4), 3)
+    return np.asarray(basis.toarray().T)

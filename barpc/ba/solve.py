@@ -27,18 +27,14 @@ from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
-MAX_STEPS = 30
-"""Linearisations of one solve, at most."""
-TOLERANCE = 1e-6
-"""A solve ends when a step would lower the cost by less than this fraction."""
+MAX_STEPS = 30  # linearisations of one solve, at most
+TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
 SCIPY_UNKNOWNS = 200
 """Up to so many camera unknowns (22 views of 9) "auto" takes scipy, whose dense decomposition grows as their cube."""
 
 _XTOL = 1e-12
-_ROUNDING = 1e-9
-"""A cost does not fall any more where the step promises less than this fraction."""
-_LOST = 1e-6
-"""Nor where it promises less than this one, and no damping however strong makes it fall."""
+_ROUNDING = 1e-9  # a cost does not fall any more where the step promises less than this fraction
+_LOST = 1e-6  # nor where it promises less than this one, and no damping however strong makes it fall
 
 
 @dataclass(frozen=True)
