@@ -16,8 +16,7 @@ from barpc.geodesy import Array, ecef_from_ground
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, connected_groups
 
-MIN_OBSERVATIONS = 4
-"""A view with fewer observations stops the adjustment: six unknowns need three points, and one to check them."""
+MIN_OBSERVATIONS = 4  # of a view, or it stops: six unknowns need three points, and one to check them
 _LISTED = 10  # views named in a message
 
 _NONE = np.zeros(0, dtype=np.int64)

@@ -18,8 +18,7 @@ from barpc.scene import IntArray
 
 _LOG = logging.getLogger(__name__)
 
-BANDED_WORK = 2e11
-"""Banded Cholesky is taken up to so many multiplications (n times the band's width squared)."""
+BANDED_WORK = 2e11  # multiplications (n times the band's width squared) up to which Cholesky is banded
 
 Matrix = Array | sp.csr_array | sp.bsr_array
 

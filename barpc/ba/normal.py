@@ -23,8 +23,7 @@ from barpc.scene import BoolArray, IntArray
 CHUNK = 8192  # observations, or pairs of them, multiplied at a time
 DENSE_UNKNOWNS = 900  # up to so many camera unknowns the reduced matrix is a plain array
 
-TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
-"""Order of the elements of symmetric 3x3 matrices."""
+TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))  # order of the elements of symmetric 3x3 matrices
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,10 @@ from barpc.options import AdjustOptions
 from barpc.scene import IntArray, View
 from barpc.sensor.rpc import RPC
 
-DEFAULT_ACCURACY = 5.0
-"""Horizontal standard deviation [m] of a camera that does not state its own (Pleiades: CE90 8.5 m = 4 m)."""
-
-DRIFT_SIGMA = 0.2
-"""Drift of a view at its first and last row [m]: 0.3 microradian from 700 km, as good platforms have it."""
-
-USABLE_ACCURACY = 0.1
-"""Stated accuracies below this [m] are pixels of a fit (as Airbus states them), not metres of geolocation."""
-
-IMAGE_SIGMA = 20.0
-"""Models in the image: prior standard deviation of every coefficient, at the edge of the image [px]."""
+DEFAULT_ACCURACY = 5.0  # m, horizontal, of a camera that does not state its own (Pleiades: CE90 8.5 m = 4 m)
+DRIFT_SIGMA = 0.2  # m, at a view's first and last row: 0.3 microradian from 700 km, as good platforms have it
+USABLE_ACCURACY = 0.1  # m: less is stated in pixels of a fit (as Airbus does), not in metres of geolocation
+IMAGE_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image
 
 
 @dataclass(frozen=True)

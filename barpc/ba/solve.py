@@ -29,9 +29,7 @@ _LOG = logging.getLogger(__name__)
 
 MAX_STEPS = 30  # linearisations of one solve, at most
 TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
-SCIPY_UNKNOWNS = 200
-"""Up to so many camera unknowns (22 views of 9) "auto" takes scipy, whose dense decomposition grows as their cube."""
-
+SCIPY_UNKNOWNS = 200  # (22 views of 9) up to which "auto" takes scipy, whose dense work grows as their cube
 _XTOL = 1e-12
 _ROUNDING = 1e-9  # a cost does not fall any more where the step promises less than this fraction
 _LOST = 1e-6  # nor where it promises less than this one, and no damping however strong makes it fall
@@ -48,9 +46,8 @@ class State:
 
     def moved(self, step: Array, reduced: Reduced, cost: float) -> State:
         """The state after a step (N, q) of the cameras and the points' step that goes with it."""
-        return replace(
-            self, params=self.params + step, points=self.points + reduced.point_step(step), cost=cost
-        )
+        points = self.points + reduced.point_step(step)
+        return replace(self, params=self.params + step, points=points, cost=cost)
 
 
 @dataclass(frozen=True)
@@ -108,9 +105,8 @@ def minimise(
             projected = None
     if result is None:
         result = _levenberg_marquardt(problem, state, weight, tolerance, projected)
-    _LOG.info(
-        "%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, time.process_time() - start
-    )
+    seconds = time.process_time() - start
+    _LOG.info("%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, seconds)
     return result
 
 
