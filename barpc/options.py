@@ -278,7 +278,9 @@ class AdjustOptions(Options):
         least=0,
     )
     loss: str = option(
-        "geman_mcclure", "Robust loss of the first rounds; `linear` skips them.", rows="barpc.ba.loss.LOSSES"
+        "geman_mcclure",
+        "Robust loss of the first rounds; `linear` skips them.",
+        rows="barpc.ba.weights.LOSSES",
     )
     robust_threshold: float = option(
         4.0, "Observations beyond so many standard deviations are cut after the robust rounds.", above=0

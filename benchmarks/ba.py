@@ -34,8 +34,8 @@ from scipy.sparse import coo_matrix
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.adjustment import make_problem
 from barpc.ba.block import join
-from barpc.ba.rounds import Observations
 from barpc.ba.solve import State, camera_step
+from barpc.ba.weights import Observations
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.geometry import triangulate

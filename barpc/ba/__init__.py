@@ -6,10 +6,9 @@ what a block knows for a later run with more views; `pair_heights` says how well
 """
 
 from barpc.ba.adjustment import adjust_tracks
-from barpc.ba.control import CheckResiduals, check_residuals, split_points
+from barpc.ba.heldout import CheckResiduals, check_residuals, split_points
 from barpc.ba.incremental import BlockPrior, block_prior
-from barpc.ba.result import Adjustment
-from barpc.ba.stereo import PairHeights, pair_heights
+from barpc.ba.result import Adjustment, PairHeights, pair_heights
 from barpc.options import AdjustOptions
 
 __all__ = [

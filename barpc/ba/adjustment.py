@@ -9,29 +9,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.block import Block, join
-from barpc.ba.blocks import CameraPrior, Terrain, ground_control
 from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import agreeing, two_groups
 from barpc.ba.gauge import gauge_report
-from barpc.ba.heights import Heights, convergence_angles
-from barpc.ba.heldout import HeldOut, keep_out, measure
+from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control
+from barpc.ba.heldout import HeldOut, enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior, apply_prior
-from barpc.ba.priors import DRIFT_SIGMA, prior_sigmas
+from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
-from barpc.ba.rounds import Observations, Outcome, revived, run_rounds
-from barpc.ba.smooth import Smooth
+from barpc.ba.rounds import Outcome, Rounds, revived
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
-from barpc.ba.variances import Variances
-from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.geodesy import Array
 from barpc.options import AUTO, AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 
-SMOOTH_LEAST = 0.06
-"""Smooth residuals below this [px] are left alone: two views share what one is wrong by."""
-
+SMOOTH_LEAST = 0.06  # smooth residuals below this [px] are left alone: two views share what one is wrong by
 _TREND = 0.03  # px: another model is tried
 _MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
@@ -39,10 +34,7 @@ _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
 _MANY_KEPT = 0.99  # of the observations: the others do not tell in a mean
 _BETTER = 0.8  # of the noise
 _CLEARLY_BETTER = 0.9  # the same, where the drift that was learnt is no drift
-_MUCH_BETTER = (
-    0.7  # of the error on tracks that took no part: another model is worth what it may do to heights
-)
-
+_MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
 
 
@@ -62,10 +54,8 @@ def adjust_tracks(
 
     Parameters
     ----------
-    views : sequence of View
-        N views; `Tracks.view` counts them.
-    tracks : Tracks
-        Tie points.
+    views, tracks : sequence of View, Tracks
+        N views and their tie points; `Tracks.view` counts the views.
     options : AdjustOptions or None
         None: the defaults.
     gcps : GroundPoints or None
@@ -75,12 +65,11 @@ def adjust_tracks(
     centers : (N, 3) or None
         Camera centres [m], ECEF; None: regressed from the sensors.
     prior : BlockPrior or None
-        An earlier block, whose views are among these: they start at its corrections, and its joint
-        covariance is their prior. `tracks` then holds new observations only.
-    keep_largest : bool
-        Go on with the largest group of views where they are not all connected.
-    hold_out : bool
-        Keep a tenth of the tracks out, to measure the result on.
+        An earlier block, whose views are among these: its corrections and their joint covariance are the
+        prior. `tracks` then holds new observations only.
+    keep_largest, hold_out : bool
+        Go on with the largest group of views where they are not all connected; keep a tenth of the tracks out, to
+        measure the result on.
 
     Returns
     -------
@@ -88,10 +77,8 @@ def adjust_tracks(
 
     Raises
     ------
-    TiePointError
-        A view has too few observations.
-    DisconnectedError
-        The views fall into groups that share no tie point.
+    TiePointError, DisconnectedError
+        A view has too few observations; the views fall into groups that share no tie point.
     AdjustError
         There is no usable solution.
     InputError
@@ -102,45 +89,22 @@ def adjust_tracks(
     block = join(tuple(views), tracks, gcps, options, keep_largest)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     inner, outer = block.without(rows), block.without(~rows)
-    found = _solve(inner, outer, options, gcps, dem, centers, prior)
+    found, in_space = _choose_model(inner, outer, options, dem, centers, prior)
     found.heights.warn()
-    in_space = None
-    if options.model == AUTO and options.drift is None and prior is None:
-        skew = found.is_skew
-        if skew or found.has_trend:
-            in_image = _solve(inner, outer, replace(options, model="affine"), gcps, dem, None, None)
-            if in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error:
-                in_space, found = found.after.whole_rms, in_image
-    return _adjustment(found, inner, outer, gcps, options, in_space, start)
+    return _adjustment(found, inner, outer, options, in_space, start)
 
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """A block solved with one model.
+    """A block solved with one model."""
 
-    Parameters
-    ----------
-    problem : Problem
-        As it was solved last.
-    state : State
-        Where it started: delivered cameras, points triangulated with them.
-    before : (2, K)
-        Residuals there [px].
-    heights : Heights
-        What holds points.
-    outcome : Outcome
-        Of the rounds.
-    start, after : HeldOut
-        What the tracks that took no part say before and after.
-    """
-
-    problem: Problem
-    state: State
-    before: Array
-    heights: Heights
-    outcome: Outcome
-    start: HeldOut
-    after: HeldOut
+    problem: Problem  # as it was solved last
+    state: State  # where it started: delivered cameras, points triangulated with them
+    before: Array  # (2, K) residuals there [px]
+    heights: Heights  # what holds points
+    outcome: Outcome  # of the rounds
+    start: HeldOut  # what the tracks that took no part say before
+    after: HeldOut  # and after
 
     @property
     def final(self) -> State:
@@ -180,14 +144,33 @@ class _Solution:
         problem = self.problem
         by_point = problem.project_points(self.final.params, self.final.points).by_point
         pixels = float(np.nanmedian(np.linalg.norm(by_point[1], axis=0)))  # a metre
-        return learnt[0] > _SKEW * float(np.median(problem.cameras.unknowns.row_scale)) / pixels
+        return learnt[0] > _SKEW * float(np.median(problem.cameras.unknowns.half[1])) / pixels
+
+
+def _choose_model(
+    block: Block,
+    outer: Block,
+    options: AdjustOptions,
+    dem: Terrain | None,
+    centers: Array | None,
+    prior: BlockPrior | None,
+) -> tuple[_Solution, float | None]:
+    """The block solved; by an affine in the image where the data choose it, and what the model in space left [px]."""
+    found = _solve(block, outer, options, dem, centers, prior)
+    if options.model != AUTO or options.drift is not None or prior is not None:
+        return found, None
+    skew = found.is_skew
+    if skew or found.has_trend:
+        in_image = _solve(block, outer, replace(options, model="affine"), dem, None, None)
+        if in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error:
+            return in_image, found.after.whole_rms
+    return found, None
 
 
 def _solve(
     block: Block,
     outer: Block,
     options: AdjustOptions,
-    gcps: GroundPoints | None,
     dem: Terrain | None,
     centers: Array | None,
     prior: BlockPrior | None,
@@ -197,36 +180,29 @@ def _solve(
     Measured on the observations of `outer`.
     """
     problem = make_problem(block, options, centers, prior)
-    state, heights = _start(problem, block, options, gcps, dem)
+    state, heights = _start(problem, block, options, dem)
     before = problem.residuals(state.params, state.points)
     start = measure(problem, state.params, outer)
-    outcome = _rounds(problem, block, state, options, heights, block.use)
+    outcome = Rounds(problem, block, state, options, heights, block.use).run()
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
         agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
-        again = _rounds(problem, block, state, options, heights, agree)
+        again = Rounds(problem, block, state, options, heights, agree).run()
         if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
     drift = problem.cameras.unknowns.drift
     if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
         bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
-        there, _ = revived(
-            problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
-        )
+        ended, weight = outcome.minimum.state, block.use / block.sigma
+        there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
-        problem, outcome = bent, _rounds(bent, block, there, options, heights, outcome.inlier, outcome.noise)
+        problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
     after = measure(problem, outcome.minimum.state.params, outer)
     return _Solution(problem, state, before, heights, outcome, start, after)
 
 
 def _adjustment(
-    found: _Solution,
-    block: Block,
-    outer: Block,
-    gcps: GroundPoints | None,
-    options: AdjustOptions,
-    in_space: float | None,
-    start: float,
+    found: _Solution, block: Block, outer: Block, options: AdjustOptions, in_space: float | None, start: float
 ) -> Adjustment:
     """What is handed out, in the order of the tracks given."""
     outcome, final, seen = found.outcome, found.final, found.seen
@@ -236,7 +212,7 @@ def _adjustment(
     points = np.where(seen[:, None], final.points, np.nan)
     points[found.after.index] = found.after.points
     inlier = block.in_order(outcome.inlier)
-    ties = slice(0, len(inlier) - (0 if gcps is None else len(gcps.view)))
+    ties = slice(0, len(inlier) - len(block.gcps.view))
     view = np.maximum(block.in_order(block.view), outer.in_order(outer.view))[ties]
     before, after = (
         (block.in_order(inside.T) + outer.in_order(outside.residual.T))[ties]
@@ -269,7 +245,7 @@ def _adjustment(
         held=found.heights.weak[: block.num_tracks],
         left_out=block.left_out,
         gcp_inlier=inlier[ties.stop :],
-        gcp_residuals=_gcp_residuals(final.points[block.num_tracks :], gcps),
+        gcp_residuals=enu_offsets(final.points[block.num_tracks :], block.gcps.lonlatalt),
         seconds=time.process_time() - start,
         options=options,
     )
@@ -288,27 +264,6 @@ def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
     """Whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
     had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
     return outcome.noise > _MUCH_NOISE or bool((kept < _MUCH_LOST * had).any())
-
-
-def _rounds(
-    problem: Problem,
-    block: Block,
-    state: State,
-    options: AdjustOptions,
-    heights: Heights,
-    use: BoolArray,
-    known_noise: float | None = None,
-) -> Outcome:
-    """Robust rounds and cuts from a state, with the observations in use (K,) to start with."""
-    unknowns = problem.cameras.unknowns
-    observations = Observations(
-        heights.hold(problem, state.points), block.sigma, options.noise_floor, block.point < block.num_tracks
-    )
-    middle = np.column_stack([unknowns.col_offset, unknowns.row_offset])
-    half = np.column_stack([unknowns.col_scale, unknowns.row_scale])
-    smooth = Smooth(problem.structure, problem.xy, middle, half)
-    variances = Variances.of(problem.camera_prior, unknowns, options)
-    return run_rounds(problem, observations, state, options, block.use, use, heights.hold, variances, smooth)
 
 
 def make_problem(
@@ -347,30 +302,22 @@ def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, 
 
 
 def _start(
-    problem: Problem, block: Block, options: AdjustOptions, gcps: GroundPoints | None, dem: Terrain | None
+    problem: Problem, block: Block, options: AdjustOptions, dem: Terrain | None
 ) -> tuple[State, Heights]:
     """Points triangulated with the delivered cameras, and what holds those that the rays do not."""
     params = problem.camera_prior.mean
-    points = block.first_points(gcps)
+    points = block.first_points()
     points[~np.isfinite(points)] = 0.0
-    control = [] if gcps is None else [ground_control(gcps, block.num_tracks + np.arange(len(gcps.names)))]
+    control = ground_control(block.gcps, np.arange(block.num_tracks, block.num_points))
     projected = problem.project_points(params, points)
     seen = np.bincount(block.point, minlength=block.num_points) > 0
     angles = convergence_angles(problem.structure, projected, points)
     weak = seen & (angles < np.radians(options.min_convergence))
     tracks = np.flatnonzero(seen[: block.num_tracks])
-    heights = Heights(tuple(control), weak, tracks, block.alt_range, options, dem)
+    heights = Heights((control,), weak, tracks, block.alt_range, options, dem)
     weight = block.use / block.sigma
     for _ in range(_FIRST_STEPS):
         points = heights.hold(problem, points).triangulate(points, projected, weight)
         projected = problem.project_points(params, points)
     points = heights.hold(problem, points).triangulate(points, projected, weight)
     return State(params, points), heights
-
-
-def _gcp_residuals(points: Array, gcps: GroundPoints | None) -> Array:
-    if gcps is None:
-        return np.zeros((0, 3))
-    offset = points - ecef_from_ground(gcps.lonlatalt)
-    enu: Array = (enu_basis(gcps.lonlatalt) @ offset[..., None])[..., 0]
-    return enu

@@ -16,48 +16,31 @@ from barpc.geodesy import Array, ecef_from_ground
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, connected_groups
 
-MIN_OBSERVATIONS = 4
-"""A view with fewer observations stops the adjustment: six unknowns need three points, and one to check them."""
+MIN_OBSERVATIONS = 4  # of a view, or it stops: six unknowns need three points, and one to check them
 _LISTED = 10  # views named in a message
+
+_NONE = np.zeros(0, dtype=np.int64)
+_NO_POINTS = GroundPoints((), np.zeros((0, 3)), np.zeros((0, 3)), _NONE, _NONE, np.zeros((0, 2)), np.zeros(0))
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True)
 class Block:
-    """Observations of tracks and of GCPs together, sorted by view.
+    """Observations of tracks and of GCPs together, sorted by view."""
 
-    Parameters
-    ----------
-    views : tuple of View
-        N views.
-    view, point : (K,)
-        Indices; points from `num_tracks` on are GCPs.
-    xy : (2, K)
-        Observed col, row [px].
-    sigma : (K,)
-        [px], view weights applied.
-    order : (K,)
-        Row of each observation in the tracks, then in the GCPs, as given.
-    use : (K,)
-        False for observations in views that are left out.
-    num_tracks, num_points, num_rows : int
-        Tracks; tracks and GCPs; rows given.
-    left_out : tuple of str
-        Views outside the largest group.
-    """
-
-    views: tuple[View, ...]
-    view: IntArray
-    point: IntArray
-    xy: Array
-    sigma: Array
-    order: IntArray
-    use: BoolArray
+    views: tuple[View, ...]  # N views
+    view: IntArray  # (K,)
+    point: IntArray  # (K,) those from `num_tracks` on are GCPs
+    xy: Array  # (2, K) observed col, row [px]
+    sigma: Array  # (K,) [px], view weights applied
+    order: IntArray  # (K,) row of each observation in the tracks, then in the GCPs, as given
+    use: BoolArray  # (K,) false for observations in views that are left out
+    gcps: GroundPoints  # whose observations are the last of those given; none where there are none
     num_tracks: int
-    num_points: int
-    num_rows: int
-    left_out: tuple[str, ...]
+    num_points: int  # tracks and GCPs
+    num_rows: int  # given, used or not
+    left_out: tuple[str, ...]  # views outside the largest group
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,19 +71,17 @@ class Block:
         out[self.order] = rows
         return out
 
-    def first_points(self, gcps: GroundPoints | None) -> Array:
+    def first_points(self) -> Array:
         """Where each point's first observing view puts it at its middle altitude (P, 3), ECEF [m]."""
-        _, first = np.unique(self.point, return_index=True)
+        first = np.sort(np.unique(self.point, return_index=True)[1])
         points = np.full((self.num_points, 3), np.nan)
-        bounds = np.searchsorted(self.view[np.sort(first)], np.arange(len(self.views) + 1))
-        first = np.sort(first)
+        bounds = np.searchsorted(self.view[first], np.arange(len(self.views) + 1))
         for v, view in enumerate(self.views):
             rows = first[bounds[v] : bounds[v + 1]]
             if len(rows):
                 alt = np.full(len(rows), view.altitude)
                 points[self.point[rows]] = ecef_from_ground(view.sensor.localize(self.xy[:, rows].T, alt))
-        if gcps is not None:
-            points[self.num_tracks :] = ecef_from_ground(gcps.lonlatalt)
+        points[self.num_tracks :] = ecef_from_ground(self.gcps.lonlatalt)
         return points
 
 
@@ -111,35 +92,15 @@ def join(
     options: AdjustOptions,
     keep_largest: bool = False,
 ) -> Block:
-    """The block of tracks and GCPs.
-
-    Parameters
-    ----------
-    views : tuple of View
-        N views.
-    tracks, gcps, options, keep_largest
-        As in `barpc.ba.adjust_tracks`.
-
-    Returns
-    -------
-    Block
-
-    Raises
-    ------
-    TiePointError, DisconnectedError, InputError
-        See `barpc.ba.adjust_tracks`.
-    """
+    """The block of tracks and GCPs; arguments and errors as in `barpc.ba.adjust_tracks`."""
     names = [view.name for view in views]
     _check_names(names, options)
-    extra_view = gcps.view if gcps is not None else np.zeros(0, dtype=np.int64)
-    view = np.concatenate([tracks.view, extra_view])
+    gcps = _NO_POINTS if gcps is None else gcps
+    view = np.concatenate([tracks.view, gcps.view])
     if len(view) and view.max() >= len(views):
         raise InputError(f"tracks name view {view.max()}, but there are {len(views)} views")
-    point, xy, sigma = tracks.point, tracks.xy, tracks.sigma
-    if gcps is not None:
-        point = np.concatenate([point, tracks.num_points + gcps.point])
-        xy, sigma = np.concatenate([xy, gcps.xy]), np.concatenate([sigma, gcps.xy_sigma])
-    num_points = tracks.num_points + (len(gcps.names) if gcps is not None else 0)
+    point = np.concatenate([tracks.point, tracks.num_points + gcps.point])
+    xy, sigma = np.concatenate([tracks.xy, gcps.xy]), np.concatenate([tracks.sigma, gcps.xy_sigma])
     key = point * len(views) + view
     rows = np.arange(len(key)) if (np.diff(key) > 0).all() else np.argsort(key, kind="stable")
     if not (np.diff(key[rows]) > 0).all():
@@ -164,8 +125,9 @@ def join(
         (sigma / weight[view])[order],
         order,
         use[order],
+        gcps,
         tracks.num_points,
-        num_points,
+        tracks.num_points + len(gcps.names),
         len(order),
         left_out,
     )

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from barpc.ba.structure import parts
 from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array, ground_from_ecef, ground_rows_from_ecef, wrap_longitude
 from barpc.scene import IntArray, View
@@ -22,42 +23,24 @@ from barpc.sensor.corrected import Motion
 from barpc.sensor.rational import Rational, monomials
 from barpc.sensor.rpc import RPC
 
-CHUNK = 8192
-"""Observations worked on at a time, so that temporaries stay in cache."""
+CHUNK = 8192  # observations worked on at a time, so that temporaries stay in cache
 
 Wanted = Literal["image", "points", "unknowns"]
 
 
 @dataclass(frozen=True)
 class Projected:
-    """Image points of K observations and their derivatives, sorted by view.
+    """Image points of K observations and their derivatives, sorted by view."""
 
-    Parameters
-    ----------
-    image : (2, K)
-        col, row [px].
-    by_point : (2, 3, K)
-        d(image) / d(ECEF point) [px/m].
-    by_unknown : (2, q, K)
-        d(image) / d(unknowns of the observing view) [px per unit].
-    """
-
-    image: Array
-    by_point: Array
-    by_unknown: Array
+    image: Array  # (2, K) col, row [px]
+    by_point: Array  # (2, 3, K) d(image) / d(ECEF point) [px/m]
+    by_unknown: Array  # (2, q, K) d(image) / d(unknowns of the observing view) [px per unit]
 
 
 class Cameras:
     """The views of a block behind their corrections.
 
-    Parameters
-    ----------
-    views : sequence of View
-        N views.
-    unknowns : Unknowns
-        What is corrected, and in which units.
-    row : (K,) or None
-        Observed rows [px], sorted by view: when each point was seen, which a drift asks for.
+    A drift asks when each point was seen: `row` (K,), as observed [px], sorted by view.
     """
 
     def __init__(self, views: Sequence[View], unknowns: Unknowns, row: Array | None = None) -> None:
@@ -81,36 +64,22 @@ class Cameras:
         wanted: Wanted = "unknowns",
         out: Projected | None = None,
     ) -> Projected:
-        """Corrected image points with derivatives.
+        """Corrected image points with derivatives, put into `out` where it is given.
 
-        Parameters
-        ----------
-        params : (N, q)
-            Unknowns of every view.
-        ecef : (3, K)
-            The point of every observation [m], sorted by view.
-        bounds : (N + 1,)
-            Observations of view v are bounds[v] : bounds[v + 1].
-        wanted : str
-            "image": no derivatives; "points": by the points; "unknowns": by the unknowns too. What is not
-            wanted has no rows.
-        out : Projected or None
-            Where to put them.
-
-        Returns
-        -------
-        Projected
+        Of unknowns (N, q) and every observation's point (3, K) [m]; observations of view v are bounds[v] :
+        bounds[v + 1]. `wanted` are no derivatives ("image"), those by the "points", or by the "unknowns" too; what
+        is not wanted has no rows.
         """
         found = self.room(ecef.shape[1], wanted) if out is None else out
         image, by_point, by_unknown = found.image, found.by_point, found.by_unknown
         for views in self._chunks(bounds):
-            for part in _parts(bounds[views.start], bounds[views.stop]):
+            for part in parts(bounds[views.stop], CHUNK, bounds[views.start]):
                 of_view = np.clip(bounds[views.start : views.stop + 1], part.start, part.stop) - part.start
                 row = None if self.row is None else self.row[part]
                 piece = self._project(params, ecef[:, part], views, of_view, wanted, row)
                 image[:, part] = piece.image
-                by_point[..., part] = piece.by_point
-                by_unknown[..., part] = piece.by_unknown
+                by_point[..., part] = piece.by_point[:, : by_point.shape[1]]
+                by_unknown[..., part] = piece.by_unknown[:, : by_unknown.shape[1]]
         return found
 
     def room(self, count: int, wanted: Wanted = "unknowns") -> Projected:
@@ -124,12 +93,8 @@ class Cameras:
         start, n = 0, len(self.sensors)
         while start < n:
             stop = start + 1
-            while (
-                stop < n
-                and self.is_rpc[start]
-                and self.is_rpc[stop]
-                and bounds[stop + 1] - bounds[start] <= CHUNK
-            ):
+            rpcs = self.is_rpc[start]
+            while rpcs and stop < n and self.is_rpc[stop] and bounds[stop + 1] - bounds[start] <= CHUNK:
                 stop += 1
             if bounds[stop] > bounds[start]:
                 yield slice(start, stop)
@@ -142,28 +107,23 @@ class Cameras:
         unknowns = self.unknowns
         if not unknowns.geometric:
             image, by_point = self._by_ecef(ecef, views, bounds)
-            return _only(Projected(*unknowns.in_image(params, index, image, by_point)), wanted)
+            return Projected(*unknowns.in_image(params, index, image, by_point))
         drift = None
         if unknowns.drift:
             assert row is not None
-            row = unknowns.normalized_row(row, index)
+            row = (row - unknowns.middle[1, index]) / unknowns.half[1, index]
             drift = unknowns.drift_rotation(params, index, row)
         of_views = params[views]
-        motion = Motion(
-            ecef,
-            unknowns.rotation(of_views, views),
-            unknowns.translation(of_views),
-            unknowns.center[views],
-            bounds,
-            drift,
-        )
+        rotation, translation = unknowns.rotation(of_views, views), unknowns.translation(of_views)
+        motion = Motion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
         if wanted == "image":
             none = np.empty((2, 0, len(index)))
             return Projected(self._image(motion.ecef, views, bounds), none, none)
         image, by_moved = self._by_ecef(motion.ecef, views, bounds)
         by_point, by_rotation, by_drift = motion.derivatives(by_moved)
-        by_unknown = unknowns.stack(by_rotation, by_drift, by_point, index, row)
-        return _only(Projected(image, by_point, by_unknown), wanted)
+        if wanted == "points":
+            return Projected(image, by_point, by_point[:, :0])
+        return Projected(image, by_point, unknowns.stack(by_rotation, by_drift, by_point, index, row))
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
         """Uncorrected image points (2, n) without a derivative."""
@@ -180,7 +140,8 @@ class Cameras:
             image, by_ground = self._stack.project(ground, views, bounds)
         else:
             points, jacobian = self.sensors[views.start].project_jacobian(ground.T)
-            image, by_ground = points.T, _last(jacobian)
+            image = points.T  # components laid out anew: products of strided ones take twice as long
+            by_ground = np.ascontiguousarray(np.moveaxis(jacobian, 0, -1))
         return image, _times(by_ground, by_ecef)
 
 
@@ -243,24 +204,6 @@ def _polynomials(coeffs: Array, basis: Array, bounds: IntArray) -> Array:
     for matrix, start, stop in zip(coeffs, bounds[:-1], bounds[1:], strict=True):
         out[:, start:stop] = matrix @ basis[:, start:stop]
     return out
-
-
-def _only(piece: Projected, wanted: Wanted) -> Projected:
-    """`piece` without the derivatives that are not wanted."""
-    if wanted == "unknowns":
-        return piece
-    by_point = piece.by_point if wanted == "points" else piece.by_point[:2, :0]
-    return Projected(piece.image, by_point, piece.by_point[:2, :0])
-
-
-def _last(matrices: Array) -> Array:
-    """(n, i, j) -> (i, j, n), laid out anew: products of strided components take twice as long."""
-    return np.ascontiguousarray(np.moveaxis(matrices, 0, -1))
-
-
-def _parts(start: int, stop: int) -> Iterator[slice]:
-    for first in range(start, stop, CHUNK):
-        yield slice(first, min(first + CHUNK, stop))
 
 
 def _times(a: Array, b: Array) -> Array:

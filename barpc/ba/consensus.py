@@ -31,21 +31,11 @@ _EVIDENT = 15.0  # gain in log-likelihood over one group
 
 @dataclass(frozen=True)
 class TwoGroups:
-    """A pair of views whose tie points fall into two groups: which of them is right, the pair does not tell.
+    """A pair of views whose tie points fall into two groups: which of them is right, the pair does not tell."""
 
-    Parameters
-    ----------
-    views : tuple of int
-        The pair.
-    share : float
-        Part of the matches in the smaller group.
-    apart : float
-        Across the epipolar lines [px].
-    """
-
-    views: tuple[int, int]
-    share: float
-    apart: float
+    views: tuple[int, int]  # the pair
+    share: float  # part of the matches in the smaller group
+    apart: float  # across the epipolar lines [px]
 
 
 def two_groups(
@@ -95,22 +85,9 @@ def _mixture(z: Array) -> tuple[float, float, float]:
 def agreeing(
     structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray
 ) -> BoolArray:
-    """Observations (K,) that are left once those are put aside which most of their partners contradict.
+    """Observations (K,) of those to use that are left once those are put aside which most of their partners contradict.
 
-    Parameters
-    ----------
-    structure : Structure
-        Who sees what.
-    xy : (2, K)
-        Observed col, row [px].
-    residual : (2, K)
-        Projected - observed [px], points anywhere near.
-    projected : Projected
-        With derivatives by the points.
-    sigma : (K,)
-        Standard deviations [px].
-    use : (K,)
-        Observations to look at.
+    Of observed col, row `xy` (2, K), residuals (2, K) with points anywhere near and `sigma` (K,), all [px].
     """
     first, second = structure.first, structure.second
     offset = _across(residual, projected.by_point, first, second)

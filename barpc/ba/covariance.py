@@ -10,29 +10,21 @@ import scipy.linalg as la
 
 from barpc.ba.linear import Factor
 from barpc.ba.normal import Reduced, solve_transposed
+from barpc.ba.structure import parts
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _COLUMNS = 240  # unit vectors solved for at a time
+_SMALL = 2000  # unknowns up to which the whole matrix is kept
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Posterior covariance of an adjustment; computed when asked, from the factorised normal matrix.
+    """Posterior covariance of an adjustment; computed when asked, from the factorised normal matrix."""
 
-    Parameters
-    ----------
-    reduced : Reduced
-        The problem linearised at its solution.
-    factor : Factor
-        Of the reduced matrix, free unknowns only.
-    free : (N q,)
-        Unknowns that are not fixed.
-    """
-
-    reduced: Reduced
-    factor: Factor
-    free: BoolArray
+    reduced: Reduced  # the problem linearised at its solution
+    factor: Factor  # of the reduced matrix, free unknowns only
+    free: BoolArray  # (N q,) unknowns that are not fixed
 
     @property
     def num_unknowns(self) -> int:
@@ -47,24 +39,31 @@ class Covariance:
 
     def view(self, i: int, j: int | None = None) -> Array:
         """Covariance (q, q) of the unknowns of view i (with those of view j)."""
+        places = [self._places(np.array([v])) for v in (i, i if j is None else j)]
+        return self._columns(places[1], "full" in self.__dict__)[places[0]]
+
+    def joint(self, views: IntArray) -> Array:
+        """Covariance (m q, m q) of the unknowns of some views."""
+        place = self._places(views)
+        return self._columns(place, len(self.free) <= _SMALL or "full" in self.__dict__)[place]
+
+    def _places(self, views: IntArray) -> IntArray:
         q = self.num_unknowns
-        j = i if j is None else j
-        if "full" in self.__dict__:
-            return self.full[i * q : (i + 1) * q, j * q : (j + 1) * q]
-        unit = np.zeros((len(self.free), q))
-        unit[j * q + np.arange(q), np.arange(q)] = 1.0
-        return self.solve(unit)[i * q : (i + 1) * q]
+        return (views[:, None] * q + np.arange(q)).ravel()
+
+    def _columns(self, place: IntArray, of_full: bool) -> Array:
+        """Covariance (N q, m) of all unknowns with those at `place` (m,)."""
+        if of_full:
+            return self.full[:, place]
+        unit = np.zeros((len(self.free), len(place)))
+        unit[place, np.arange(len(place))] = 1.0
+        return self.solve(unit)
 
     @cached_property
     def full(self) -> Array:
         """Covariance (N q, N q) of all unknowns: N^2 numbers, meant for some hundred views."""
-        n = len(self.free)
-        out = np.empty((n, n))
-        for start in range(0, n, _COLUMNS):
-            stop = min(start + _COLUMNS, n)
-            unit = np.zeros((n, stop - start))
-            unit[np.arange(start, stop), np.arange(stop - start)] = 1.0
-            out[:, start:stop] = self.solve(unit)
+        every = np.arange(len(self.free))
+        out = np.hstack([self._columns(every[part], False) for part in parts(len(every), _COLUMNS)])
         return 0.5 * (out + out.T)
 
     def points(self, index: IntArray) -> Array:
@@ -72,7 +71,7 @@ class Covariance:
         structure = self.reduced.structure
         out = np.empty((len(index), 3, 3))
         lower = self.reduced.lower[:, index]
-        inverse = _inverse_transposed(lower)
+        inverse = solve_transposed(lower, np.eye(3)[..., None]).transpose(2, 0, 1)  # L^-T
         for n, p in enumerate(index):
             rows = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
             sensitivity = -inverse[n] @ self.reduced.cross[rows].transpose(1, 0, 2).reshape(3, -1)
@@ -98,26 +97,3 @@ class Covariance:
                 sensitivity[:, at : at + q] -= inverse[n] @ self.reduced.cross[k]
             out[n] = inverse[n] @ inverse[n].T + shared @ shared.T + sensitivity @ self.solve(sensitivity.T)
         return out
-
-    def joint(self, views: IntArray) -> Array:
-        """Covariance (m q, m q) of the unknowns of some views."""
-        q = self.num_unknowns
-        place = (views[:, None] * q + np.arange(q)).ravel()
-        if len(self.free) <= 2000 or "full" in self.__dict__:
-            of_views: Array = self.full[np.ix_(place, place)]
-            return of_views
-        unit = np.zeros((len(self.free), len(place)))
-        unit[place, np.arange(len(place))] = 1.0
-        solved: Array = self.solve(unit)[place]
-        return solved
-
-
-def _inverse_transposed(lower: Array) -> Array:
-    """L^-T (n, 3, 3) of factors (6, n)."""
-    n = lower.shape[1]
-    out = np.empty((n, 3, 3))
-    for i in range(3):
-        unit = np.zeros((3, n))
-        unit[i] = 1.0
-        out[:, :, i] = solve_transposed(lower, unit).T
-    return out

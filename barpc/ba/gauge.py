@@ -24,64 +24,28 @@ _SAMPLE = 5000  # points that stand for the scene's shape
 
 @dataclass(frozen=True)
 class Mode:
-    """A way in which the scene may move as a whole, independent of the other modes.
+    """A way in which the scene may move as a whole, independent of the other modes."""
 
-    Parameters
-    ----------
-    sigma : float
-        Posterior standard deviation [m].
-    motion : (7,)
-        The move of one standard deviation in terms of `MOTIONS` [m].
-    meaning : str
-        Its largest motion.
-    """
-
-    sigma: float
-    motion: Array
-    meaning: str
+    sigma: float  # posterior standard deviation [m]
+    motion: Array  # (7,) the move of one standard deviation in terms of `MOTIONS` [m]
+    meaning: str  # its largest motion
 
 
 @dataclass(frozen=True)
 class GaugeReport:
-    """How the adjustment moved the scene, and how well that is known.
+    """How the adjustment moved the scene, and how well that is known."""
 
-    Parameters
-    ----------
-    shift : (3,)
-        Mean move of the points from their place under the delivered cameras, east, north, up [m].
-    sigma : (3,)
-        Posterior standard deviation of the scene's place, east, north, up [m].
-    motion_sigma : (7,)
-        The same for all `MOTIONS` [m].
-    modes : tuple of Mode
-        The weakest first.
-    radius : float
-        RMS distance of the points from their middle [m]: where tilts, turn and scale are measured.
-    """
-
+    # (3,) mean move of the points from their place under the delivered cameras, east, north, up [m]
     shift: Array
-    sigma: Array
-    motion_sigma: Array
-    modes: tuple[Mode, ...]
+    sigma: Array  # (3,) posterior standard deviation of the scene's place, east, north, up [m]
+    motion_sigma: Array  # (7,) the same for all `MOTIONS` [m]
+    modes: tuple[Mode, ...]  # the weakest first
+    # RMS distance of the points from their middle [m]: where tilts, turn and scale are measured
     radius: float
 
 
 def gauge_report(covariance: Covariance, points: Array, before: Array, use: BoolArray) -> GaugeReport:
-    """The report for an adjustment.
-
-    Parameters
-    ----------
-    covariance : Covariance
-        Of the adjustment.
-    points, before : (P, 3)
-        ECEF [m], after and before.
-    use : (P,)
-        Points that count.
-
-    Returns
-    -------
-    GaugeReport
-    """
+    """The report for points (P, 3), ECEF [m], after and before an adjustment; those that count in `use` (P,)."""
     shift_of_all = (points[use] - before[use]).mean(axis=0)
     index = np.flatnonzero(use)
     use = np.zeros_like(use)
@@ -109,8 +73,7 @@ def _motion_by_unknowns(
     pick = _motion_of_points(local) @ enu  # (7, n, 3) by ECEF moves
     lower = reduced.lower[:, index]
     whitened = np.zeros((len(use), 3, count))  # L^-1 of each motion's weights: dX = -L^-T Y dp
-    for m in range(count):
-        whitened[index, :, m] = solve_lower(lower, pick[m].T).T
+    whitened[index] = solve_lower(lower, pick.transpose(2, 0, 1)).transpose(2, 0, 1)
     rows = np.flatnonzero(use[structure.point])
     products = np.swapaxes(reduced.cross[rows], 1, 2) @ whitened[structure.point[rows]]
     by_unknown = np.zeros((structure.num_views, q * count))
@@ -118,10 +81,8 @@ def _motion_by_unknowns(
     filled = np.flatnonzero(np.diff(bounds))
     by_unknown[filled] = -np.add.reduceat(products.reshape(-1, q * count), bounds[filled], axis=0)
     flat = whitened[index].reshape(-1, count)
-    by_camera, own = (
-        by_unknown.reshape(-1, q, count).transpose(2, 0, 1).reshape(count, -1),
-        share * flat.T @ flat,
-    )
+    by_camera = by_unknown.reshape(-1, q, count).transpose(2, 0, 1).reshape(count, -1)
+    own = share * flat.T @ flat
     if reduced.common is not None:
         moved = np.einsum("qic,qim->cm", whitened[reduced.common.index], reduced.common.cross)
         shared = -la.solve_triangular(reduced.common.upper, moved.T, trans="T").T
@@ -132,23 +93,12 @@ def _motion_by_unknowns(
 def _motion_of_points(local: Array) -> Array:
     """(7, n, 3): least-squares motions by the moves (east, north, up) of points at `local` (n, 3) radii."""
     n = len(local)
-    e, o, u = local[:, 0], local[:, 1], np.zeros(n)
-    one, zero = np.ones(n), np.zeros(n)
-    design = np.stack(
-        [
-            np.column_stack([one, zero, zero]),
-            np.column_stack([zero, one, zero]),
-            np.column_stack([zero, zero, one]),
-            np.column_stack([zero, zero, e]),
-            np.column_stack([zero, zero, o]),
-            np.column_stack([-o, e, zero]),
-            np.column_stack([e, o, u]),
-        ]
-    )
-    flat = design.reshape(len(MOTIONS), -1)
+    e, o, one, zero = local[:, 0], local[:, 1], np.ones(n), np.zeros(n)
+    shifts = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
+    motions = np.array([*shifts, [zero, zero, e], [zero, zero, o], [-o, e, zero], [e, o, zero]])
+    flat = np.swapaxes(motions, 1, 2).reshape(len(MOTIONS), -1)
     gram = flat @ flat.T + 1e-9 * n * np.eye(len(MOTIONS))
-    solved: Array = np.linalg.solve(gram, flat).reshape(len(MOTIONS), n, 3)
-    return solved
+    return np.linalg.solve(gram, flat).reshape(len(MOTIONS), n, 3)
 
 
 def _modes(motion_covariance: Array) -> tuple[Mode, ...]:

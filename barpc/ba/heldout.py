@@ -1,23 +1,26 @@
-"""Tie points that are kept out before anything is rejected: what an adjustment is measured on.
+"""What takes no part in the solve, and measures it: known check points, and tie points that are kept out.
 
-Survivors of a rejection agree because the others were cut. A tenth of the tracks, evenly over pairs and images, takes
-no part in it; triangulated by the adjusted cameras they tell what those are worth, wrong matches and all, so their
+Survivors of a rejection agree because the others were cut. A tenth of the tracks, evenly over pairs and images, is
+kept out before; triangulated by the adjusted cameras they tell what those are worth, wrong matches and all, so their
 figures are medians.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from barpc.ba.block import Block
-from barpc.ba.loss import geman_mcclure
 from barpc.ba.problem import Problem
-from barpc.ba.rounds import MEDIAN, Observations
 from barpc.ba.structure import counting_sort, make_structure
-from barpc.geodesy import Array
-from barpc.scene import BoolArray, IntArray
+from barpc.ba.weights import MEDIAN, Observations, geman_mcclure
+from barpc.errors import InputError
+from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.scene import BoolArray, GroundPoints, IntArray
+from barpc.sensor import SensorModel
+from barpc.sensor.geometry import triangulate
 
 _EVERY = 10
 _LEAST = 100  # observations of a view, or its tracks are all needed
@@ -29,25 +32,13 @@ _FEW = 20  # observations of a view that tell nothing by themselves
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What the tracks that were kept out say.
+    """What the tracks that were kept out say."""
 
-    Parameters
-    ----------
-    residual : (2, H)
-        Projected - observed [px], points triangulated by the cameras.
-    index, points : (Q,), (Q, 3)
-        Their points, ECEF [m].
-    noise : (N,)
-        Observed over stated standard deviation of every view's; NaN with too few.
-    rms : (N,)
-        The same as a root mean square of residuals [px].
-    """
-
-    residual: Array
-    index: IntArray
-    points: Array
-    noise: Array
-    rms: Array
+    residual: Array  # (2, H) projected - observed [px], points triangulated by the cameras
+    index: IntArray  # (Q,) their points
+    points: Array  # (Q, 3) where these are, ECEF [m]
+    noise: Array  # (N,) observed over stated standard deviation of every view's; NaN with too few
+    rms: Array  # (N,) the same as a root mean square of residuals [px]
 
     @property
     def error(self) -> float:
@@ -93,7 +84,7 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
         point_prior=None,
     )
     observations = Observations(part, block.sigma, 0.0, np.ones(len(point), dtype=bool))
-    points, counted = block.first_points(None)[index], np.ones(len(point))
+    points, counted = block.first_points()[index], np.ones(len(point))
     for step in range(_STEPS):
         projected = part.project_points(params, points)
         if step > 1:  # of three views that do not agree two may
@@ -109,3 +100,102 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
         noise[v] = np.sqrt(np.median(squared[rows]) / MEDIAN)
         rms[v] = noise[v] * np.sqrt(expected[rows].mean())
     return HeldOut(residual, index, points, noise, rms)
+
+
+@dataclass(frozen=True, eq=False)
+class CheckResiduals:
+    """Known points against cameras.
+
+    Parameters
+    ----------
+    image : (M, 2)
+        Projected - observed [px] of every observation.
+    ground : (G, 3)
+        Triangulated - known, east, north, up [m]; NaN for a point that fewer than two views see.
+    """
+
+    image: Array
+    ground: Array
+
+    def rms(self) -> tuple[Array, Array]:
+        """Root mean squares: col, row (2,) [px]; east, north, up (3,) [m], NaN without a triangulated point."""
+        known = np.isfinite(self.ground).all(axis=1)
+        ground = np.full(3, np.nan)
+        if known.any():
+            ground = np.sqrt((self.ground[known] ** 2).mean(axis=0))
+        return np.sqrt((self.image**2).mean(axis=0)), ground
+
+
+def check_residuals(sensors: Sequence[SensorModel], points: GroundPoints) -> CheckResiduals:
+    """What cameras make of known points.
+
+    Parameters
+    ----------
+    sensors : sequence of SensorModel
+        One a view: `Adjustment.sensors`, or the delivered ones.
+    points : GroundPoints
+        Check points.
+
+    Returns
+    -------
+    CheckResiduals
+    """
+    image = np.empty((len(points.view), 2))
+    for v in np.unique(points.view):
+        rows = points.view == v
+        image[rows] = sensors[v].project(points.lonlatalt[points.point[rows]]) - points.xy[rows]
+    ground = np.full((len(points.names), 3), np.nan)
+    seen = np.bincount(points.point, minlength=len(points.names)) >= 2
+    rows = np.flatnonzero(seen[points.point])
+    if len(rows):
+        order = rows[np.lexsort((points.view[rows], points.point[rows]))]
+        index, place = np.unique(points.point[order], return_inverse=True)
+        found = triangulate(list(sensors), points.view[order], place.ravel(), points.xy[order])
+        ground[index] = enu_offsets(found.points, points.lonlatalt[index])
+    return CheckResiduals(image, ground)
+
+
+def enu_offsets(points: Array, known: Array) -> Array:
+    """East, north, up (n, 3) [m] of points, ECEF [m], minus known lon, lat, alt (n, 3)."""
+    offset = points - ecef_from_ground(known)
+    return (enu_basis(known) @ offset[..., None])[..., 0]
+
+
+def split_points(points: GroundPoints, checks: Sequence[str]) -> tuple[GroundPoints, GroundPoints]:
+    """Points as control for the solve and as checks that stay out of it.
+
+    Parameters
+    ----------
+    points : GroundPoints
+        All of them.
+    checks : sequence of str
+        Names of the check points.
+
+    Returns
+    -------
+    control, check : GroundPoints
+
+    Raises
+    ------
+    InputError
+        A name is not among the points.
+    """
+    unknown = sorted(set(checks) - set(points.names))
+    if unknown:
+        raise InputError(f"no ground point is named {', '.join(unknown[:10])}")
+    is_check = np.isin(np.array(points.names, dtype=object), list(checks))
+    return _select(points, ~is_check), _select(points, is_check)
+
+
+def _select(points: GroundPoints, keep: BoolArray) -> GroundPoints:
+    rows = keep[points.point]
+    closed = np.cumsum(keep) - 1
+    return GroundPoints(
+        tuple(name for name, kept in zip(points.names, keep, strict=True) if kept),
+        points.lonlatalt[keep],
+        points.sigma[keep],
+        closed[points.point[rows]],
+        points.view[rows],
+        points.xy[rows],
+        points.xy_sigma[rows],
+    )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg as la
 
-from barpc.ba.blocks import CameraPrior, JointPrior
+from barpc.ba.priors import CameraPrior, JointPrior
 from barpc.errors import InputError
 from barpc.frozen import load_npz
 from barpc.geodesy import Array

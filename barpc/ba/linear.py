@@ -18,43 +18,21 @@ from barpc.scene import IntArray
 
 _LOG = logging.getLogger(__name__)
 
-BANDED_WORK = 2e11
-"""Banded Cholesky is taken up to so many multiplications (n times the band's width squared)."""
+BANDED_WORK = 2e11  # multiplications (n times the band's width squared) up to which Cholesky is banded
 
 Matrix = Array | sp.csr_array | sp.bsr_array
 
 
 @dataclass(frozen=True)
 class Factor:
-    """A factorised symmetric positive definite matrix.
+    """A factorised symmetric positive definite matrix."""
 
-    Parameters
-    ----------
-    solve : callable
-        (n,) or (n, m) right-hand sides -> solutions.
-    method : str
-        "dense", "banded", "sparse" or "iterative".
-    """
-
-    solve: Callable[[Array], Array]
-    method: str
+    solve: Callable[[Array], Array]  # (n,) or (n, m) right-hand sides -> solutions
+    method: str  # "dense", "banded", "sparse" or "iterative"
 
 
 def factorize(matrix: Matrix, damping: float = 0.0, less: Array | None = None) -> Factor:
-    """Factorise S + damping diag(S) - B^T B.
-
-    Parameters
-    ----------
-    matrix : (n, n) array or sparse
-        Symmetric, positive definite.
-    damping : float
-        Relative to the diagonal.
-    less : (m, n) or None
-        B, a few rows (Woodbury's formula).
-
-    Returns
-    -------
-    Factor
+    """Factorise S + damping diag(S) - B^T B, with a few rows `less` (m, n) as B (Woodbury's formula).
 
     Raises
     ------
@@ -98,8 +76,7 @@ def _updated(factor: Factor, less: Array) -> Factor:
 
     def solve(b: Array) -> Array:
         first = factor.solve(b)
-        solved: Array = first + pulled @ la.cho_solve(small, less @ first)
-        return solved
+        return first + pulled @ la.cho_solve(small, less @ first)
 
     return Factor(solve, factor.method)
 

@@ -8,103 +8,62 @@ points: they couple all cameras, so that what they take off S stays apart from i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from barpc.ba.blocks import PointPrior
 from barpc.ba.linear import Factor, Matrix, factorize
-from barpc.ba.structure import Structure
+from barpc.ba.priors import PointPrior
+from barpc.ba.structure import Structure, parts
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-CHUNK = 8192
-"""Observations, or pairs of them, multiplied at a time."""
+CHUNK = 8192  # observations, or pairs of them, multiplied at a time
+DENSE_UNKNOWNS = 900  # up to so many camera unknowns the reduced matrix is a plain array
 
-DENSE_UNKNOWNS = 900
-"""Up to so many camera unknowns the reduced matrix is a plain array."""
-
-TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
-"""Order of the elements of symmetric 3x3 matrices."""
+TRIANGLE = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))  # order of the elements of symmetric 3x3 matrices
 
 
 @dataclass(frozen=True)
 class Common:
-    """Errors that points have in common, eliminated after the points.
+    """Errors that points have in common, eliminated after the points."""
 
-    Parameters
-    ----------
-    index : (Q,)
-        The points.
-    cross : (Q, 3, m)
-        L^-1 times the points' second derivative with the errors.
-    upper : (m, m)
-        U of their matrix U^T U once the points are eliminated.
-    by_camera : (m, N q)
-        U^-T times their second derivative with the cameras.
-    half : (m,)
-        U^-T times their gradient.
-    """
-
-    index: IntArray
-    cross: Array
-    upper: Array
-    by_camera: Array
-    half: Array
+    index: IntArray  # (Q,) the points
+    cross: Array  # (Q, 3, m) L^-1 times the points' second derivative with the errors
+    upper: Array  # (m, m) U of their matrix U^T U once the points are eliminated
+    by_camera: Array  # (m, N q) U^-T times their second derivative with the cameras
+    half: Array  # (m,) U^-T times their gradient
 
     def step(self, step: Array) -> Array:
         """The move of the errors (m,) that goes with a step (N q,) of the camera unknowns."""
-        moved: Array = -la.solve_triangular(self.upper, self.half + self.by_camera @ step)
-        return moved
+        return -la.solve_triangular(self.upper, self.half + self.by_camera @ step)
 
 
 @dataclass(frozen=True)
 class Reduced:
-    """The linearised problem with its points eliminated.
-
-    Parameters
-    ----------
-    matrix : (N q, N q) array or sparse
-        S; where it is sparse, without what the common errors take off it.
-    gradient : (N q,)
-        g: derivative of half the cost by the camera unknowns, points at their (linear) optimum.
-    cost : float
-        Sum of squared whitened residuals.
-    gain : float
-        What moving the points (and common errors) alone would take off the cost: sum |h|^2.
-    lower : (6, P)
-        L: its elements 00, 10, 20, 11, 21, 22.
-    half : (P, 3)
-        h.
-    cross : (K, 3, q)
-        Y.
-    common : Common or None
-        Errors that the points have in common.
-    """
+    """The linearised problem with its points eliminated."""
 
     structure: Structure
-    matrix: Matrix
+    matrix: Matrix  # (N q, N q) S; where it is sparse, without what the common errors take off it
+    # (N q,) g: derivative of half the cost by the camera unknowns, points at their (linear) optimum
     gradient: Array
-    cost: float
-    gain: float
-    lower: Array
-    half: Array
-    cross: Array
-    common: Common | None = None
+    cost: float  # sum of squared whitened residuals
+    gain: float  # what moving the points (and common errors) alone would take off the cost: sum |h|^2
+    lower: Array  # (6, P) L: its elements 00, 10, 20, 11, 21, 22
+    half: Array  # (P, 3) h
+    cross: Array  # (K, 3, q) Y
+    common: Common | None = None  # errors that the points have in common
 
     def plain(self, free: BoolArray) -> Array:
         """S (n, n) as an array, of the unknowns that are free (N q,)."""
         if isinstance(self.matrix, np.ndarray):
             return self.matrix if free.all() else self.matrix[np.ix_(free, free)]
         matrix: Array = self.matrix.tocsr()[free][:, free].toarray()
-        return (
-            matrix
-            if self.common is None
-            else matrix - self.common.by_camera[:, free].T @ self.common.by_camera[:, free]
-        )
+        if self.common is not None:
+            matrix -= self.common.by_camera[:, free].T @ self.common.by_camera[:, free]
+        return matrix
 
     def factor(self, free: BoolArray, damping: float = 0.0) -> Factor:
         """The factorised S, of the unknowns that are free (N q,)."""
@@ -137,27 +96,11 @@ def reduce_normal(
     camera_gradient: Array,
     point_prior: PointPrior | None = None,
 ) -> Reduced:
-    """Eliminate the points of a linearised problem.
+    """Eliminate the points of a linearised problem; the cost is without the priors' part.
 
-    Parameters
-    ----------
-    structure : Structure
-        Who sees what.
-    residual : (2, K)
-        Whitened residuals.
-    by_point, by_unknown : (2, 3, K), (2, q, K)
-        Their derivatives.
-    point_matrix, point_gradient : (6, P), (3, P)
-        What priors add to V (elements as in `Reduced.lower`) and to the points' gradient.
-    camera_diagonal, camera_gradient : (N, q)
-        What priors add to the diagonal of S and to g.
-    point_prior : PointPrior or None
-        Whose common errors are to be eliminated, too.
-
-    Returns
-    -------
-    Reduced
-        `cost` without the priors' part.
+    Of whitened residuals (2, K) and their derivatives (2, 3, K) and (2, q, K). Priors add `point_matrix` (6, P,
+    elements as in `Reduced.lower`) to V, `point_gradient` (3, P) to the points' gradient, `camera_diagonal` and
+    `camera_gradient` (N, q) to the diagonal of S and to g; the common errors of `point_prior` are eliminated too.
     """
     q = by_unknown.shape[1]
     sums = structure.sum_points(point_products(by_point, residual))
@@ -196,9 +139,8 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
     products[rows] = (np.swapaxes(whitened[at[rows]], 1, 2) @ cross[rows]).reshape(
         len(rows), products.shape[1]
     )
-    by_camera = (
-        -structure.sum_views(products.T).reshape(structure.num_views, m, -1).swapaxes(0, 1).reshape(m, -1)
-    )
+    sums = structure.sum_views(products.T).reshape(structure.num_views, m, -1)
+    by_camera = -sums.swapaxes(0, 1).reshape(m, -1)
     gradient = -np.einsum("qim,iq->m", whitened, half[:, index])
     return Common(
         index,
@@ -212,18 +154,12 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
 def point_products(by_point: Array, residual: Array) -> Array:
     """(9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r."""
     products = np.empty((9, residual.shape[1]))
-    for part in parts(residual.shape[1]):
+    for part in parts(residual.shape[1], CHUNK):
         (a, b), r = by_point[..., part], residual[:, part]
         for n, (i, j) in enumerate(TRIANGLE):
             np.add(a[i] * a[j], b[i] * b[j], out=products[n, part])
         np.add(a * r[0], b * r[1], out=products[6:, part])
     return products
-
-
-def parts(count: int) -> Iterator[slice]:
-    """Pieces of `count` observations that stay in cache."""
-    for start in range(0, count, CHUNK):
-        yield slice(start, min(start + CHUNK, count))
 
 
 def cholesky3(matrix: Array) -> Array:
@@ -265,7 +201,7 @@ def _eliminate(
     """Y (K, 3, q), and what every observation adds to the gradient, B^T r - Y^T h, (q, K)."""
     q, count = by_unknown.shape[1:]
     cross, slope = np.empty((count, 3, q)), np.empty((q, count))
-    for part in parts(count):
+    for part in parts(count, CHUNK):
         point = structure.point[part]
         whitened = _whiten(by_point[..., part], lower.take(point, axis=1, mode="clip"))
         unknown, r = by_unknown[..., part], residual[:, part]

@@ -1,25 +1,98 @@
-"""What is expected of the cameras' corrections before any is known."""
+"""What is expected of cameras and points before any is known, as whitened residual blocks.
+
+Every block gives residuals and their derivative, divided by sigma. All of them are linear in the unknowns; the tie
+observations, which are not, are in `problem`.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
-from barpc.scene import View
+from barpc.scene import IntArray, View
 from barpc.sensor.rpc import RPC
 
-DEFAULT_ACCURACY = 5.0
-"""Horizontal standard deviation [m] of a camera that does not state its own (Pleiades: CE90 8.5 m = 4 m)."""
+DEFAULT_ACCURACY = 5.0  # m, horizontal, of a camera that does not state its own (Pleiades: CE90 8.5 m = 4 m)
+DRIFT_SIGMA = 0.2  # m, at a view's first and last row: 0.3 microradian from 700 km, as good platforms have it
+USABLE_ACCURACY = 0.1  # m: less is stated in pixels of a fit (as Airbus does), not in metres of geolocation
+IMAGE_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image
 
-DRIFT_SIGMA = 0.2
-"""Drift of a view at its first and last row [m]: 0.3 microradian from 700 km, as good platforms have it."""
 
-USABLE_ACCURACY = 0.1
-"""Stated accuracies below this [m] are pixels of a fit (as Airbus states them), not metres of geolocation."""
+@dataclass(frozen=True)
+class CameraPrior:
+    """Independent priors: (p - mean) / sigma."""
 
-IMAGE_SIGMA = 20.0
-"""Models in the image: prior standard deviation of every coefficient, at the edge of the image [px]."""
+    mean: Array  # (N, q) of every view's unknowns
+    sigma: Array  # (N, q)
+
+    def residual(self, params: Array) -> Array:
+        """Whitened residuals (N, q) of unknowns (N, q)."""
+        return (params - self.mean) / self.sigma
+
+    def jacobian(self) -> Array:
+        """Diagonal of the derivative (N, q)."""
+        return 1.0 / self.sigma
+
+
+@dataclass(frozen=True)
+class JointPrior:
+    """A prior on several views together, with all of their correlations: root (p - mean)."""
+
+    index: IntArray  # (n,) places of the unknowns in the raveled (N, q) array
+    mean: Array  # (n,) their prior mean
+    root: Array  # (n, n) upper triangular factor of the information matrix
+
+    def residual(self, params: Array) -> Array:
+        """Whitened residuals (n,) of unknowns (N, q)."""
+        return self.root @ (params.ravel()[self.index] - self.mean)
+
+    def jacobian(self) -> Array:
+        """Derivative (n, n) by the unknowns `index`."""
+        return self.root
+
+
+@dataclass(frozen=True)
+class PointPrior:
+    """Priors on points with errors in common: rows (X - mean) - common b, and b itself is standard normal.
+
+    b is never a state of its own: residuals are those that the best b for the points leaves.
+    """
+
+    index: IntArray  # (Q,) which points; none twice
+    mean: Array  # (Q, 3) ECEF [m]
+    rows: Array  # (Q, 3, 3) whitening rows [1/m]; rows of zeros say nothing
+    # (Q, 3, m) what one standard deviation of each of m common errors adds to the whitened residuals
+    common: Array
+
+    def offset(self, points: Array) -> Array:
+        """The common errors (m,) that points (P, 3) [m] show, in their standard deviations."""
+        whitened = self.apart(points)
+        return np.linalg.solve(self.information(), np.einsum("qim,qi->m", self.common, whitened))
+
+    def residual(self, points: Array) -> Array:
+        """Whitened residuals (Q, 3) of points (P, 3) [m], the common errors taken away."""
+        return self.apart(points) - self.common @ self.offset(points)
+
+    def cost(self, points: Array) -> float:
+        """Sum of the squared residuals, with the common errors' own."""
+        return float((self.residual(points) ** 2).sum() + (self.offset(points) ** 2).sum())
+
+    def information(self) -> Array:
+        """Information (m, m) on the common errors where the points are known."""
+        information: Array = np.einsum("qim,qin->mn", self.common, self.common)
+        information += np.eye(len(information))
+        return information
+
+    def apart(self, points: Array) -> Array:
+        """Whitened offsets (Q, 3) of points (P, 3) [m], the common errors still in them."""
+        return (self.rows @ (points[self.index] - self.mean)[..., None])[..., 0]
+
+    def jacobian(self) -> Array:
+        """Derivatives (Q, 3, 3) by the points `index` [1/m]."""
+        return self.rows
 
 
 def stated_accuracy(view: View) -> float:
@@ -32,16 +105,12 @@ def prior_sigmas(views: tuple[View, ...], options: AdjustOptions, drift: int) ->
     """Prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px)."""
     stated = np.array([stated_accuracy(view) for view in views])
     parts = []
-    if "rotation" in options.first_model:
-        parts.append(np.tile(_given(options.sigma_attitude, stated), (1, 3)))
-    if "translation" in options.first_model:
-        parts.append(np.tile(_given(options.sigma_position, stated), (1, 3)))
+    for name, sigma in (("rotation", options.sigma_attitude), ("translation", options.sigma_position)):
+        if name in options.first_model:
+            one = stated if sigma is None else np.full(len(views), sigma)
+            parts.append(np.tile(one[:, None], (1, 3)))
     parts += [np.full((len(views), 3), options.sigma_drift or DRIFT_SIGMA)] * drift
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
         parts.append(np.full((len(views), size), IMAGE_SIGMA))
     return np.hstack(parts)
-
-
-def _given(value: float | None, stated: Array) -> Array:
-    return stated[:, None] if value is None else np.full((len(stated), 1), value)

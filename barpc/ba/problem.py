@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.sparse as sp
 
-from barpc.ba.blocks import CameraPrior, JointPrior, PointPrior
 from barpc.ba.cameras import Cameras, Projected
 from barpc.ba.normal import (
     TRIANGLE,
@@ -18,6 +17,7 @@ from barpc.ba.normal import (
     solve_lower,
     solve_transposed,
 )
+from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.structure import Structure
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
@@ -25,42 +25,16 @@ from barpc.scene import BoolArray
 
 @dataclass(frozen=True)
 class Problem:
-    """Observations sorted by view, cameras, priors.
+    """Observations sorted by view, cameras, priors."""
 
-    Parameters
-    ----------
-    cameras : Cameras
-        N views with q unknowns each.
-    structure : Structure
-        Who sees what.
-    xy : (2, K)
-        Observed col, row [px].
-    camera_prior : CameraPrior
-        On every view's unknowns.
-    joint_prior : JointPrior or None
-        On several views together.
-    point_prior : PointPrior or None
-        GCPs and heights.
-    free : (N q,)
-        False for the unknowns of fixed views.
-    """
-
-    cameras: Cameras
-    structure: Structure
-    xy: Array
-    camera_prior: CameraPrior
-    free: BoolArray
-    joint_prior: JointPrior | None = None
-    point_prior: PointPrior | None = None
+    cameras: Cameras  # N views with q unknowns each
+    structure: Structure  # who sees what
+    xy: Array  # (2, K) observed col, row [px]
+    camera_prior: CameraPrior  # on every view's unknowns
+    free: BoolArray  # (N q,) false for the unknowns of fixed views
+    joint_prior: JointPrior | None = None  # on several views together
+    point_prior: PointPrior | None = None  # GCPs and heights
     _room: list[Projected] = field(default_factory=list, repr=False)
-
-    def with_point_prior(self, prior: PointPrior | None) -> Problem:
-        """The same problem with other priors on its points."""
-        return replace(self, point_prior=prior)
-
-    def with_camera_prior(self, prior: CameraPrior) -> Problem:
-        """The same problem with other priors on its cameras."""
-        return replace(self, camera_prior=prior)
 
     def residuals(self, params: Array, points: Array) -> Array:
         """Projected - observed (2, K) [px], sorted by view."""
@@ -93,20 +67,8 @@ class Problem:
     ) -> Reduced:
         """Linearise at a state and eliminate the points.
 
-        Parameters
-        ----------
-        params : (N, q)
-            Unknowns of the views.
-        points : (P, 3)
-            ECEF [m].
-        weight : (K,)
-            1 / sigma of every observation [1/px], 0 for one that does not count.
-        projected : Projected or None
-            `linearise` of this state, which is used up.
-
-        Returns
-        -------
-        Reduced
+        `weight` (K,) is 1 / sigma of every observation [1/px], 0 for one that does not count; `projected` is
+        `linearise` of this state, and is used up.
         """
         structure = self.structure
         projected = self.linearise(params, points) if projected is None else projected

@@ -3,244 +3,181 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from barpc.ba.block import Block
 from barpc.ba.cameras import Projected
-from barpc.ba.loss import LOSSES
+from barpc.ba.ground import Heights
 from barpc.ba.problem import Problem
-from barpc.ba.smooth import SPLINES, Smooth, SmoothTest
+from barpc.ba.smooth import Smooth, SmoothTest
 from barpc.ba.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
 from barpc.ba.variances import PriorTest, Variances, same_prior
+from barpc.ba.weights import LOSSES, MEDIAN, Observations
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
-MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
 _LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that they stay below, about
 _LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
 _SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
 _SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
 _SAME_PRIOR = 0.2  # nor of a prior's standard deviation
-_LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
 _BACKFITTING = 6
 _MANY_CUT = 0.01  # of the observations: more are looked at again
 _REVIVING = 2
-_LEAST_FREEDOM = 20
 _ROBUST_ROUNDS = 20
 _AS_STATED = 1.5  # times the noise stated, and
 _CLEAN = 5.0  # sigmas
 _FEW = 0.002  # of the observations farther away than that: there is nothing to be careful about
 _NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
 _SHRINK = 0.25  # of the loss's scale in one round, at most
-MAX_PASSES = 5
-"""Rounds of cutting and solving, at most: they end when nothing changes."""
+MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
 _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the rounds end with.
+    """What the rounds end with."""
 
-    Parameters
-    ----------
-    problem : Problem
-        With the priors on points as they ended.
-    minimum : Minimum
-        Unknowns, points, the last linearisation.
-    residual : (2, K)
-        Projected - observed [px].
-    inlier : (K,)
-        Observations in the final solve.
-    noise : float
-        Observed over stated standard deviation.
-    passes : int
-        Rounds of cutting.
-    prior : PriorTest
-        How the corrections compare with the priors given, and what the priors became.
-    smooth : SmoothTest
-        What is smooth in the residuals that are left.
-    """
-
-    problem: Problem
-    minimum: Minimum
-    residual: Array
-    inlier: BoolArray
-    noise: float
-    passes: int
-    prior: PriorTest
-    smooth: SmoothTest
+    problem: Problem  # with the priors on points as they ended
+    minimum: Minimum  # unknowns, points, the last linearisation
+    residual: Array  # (2, K) projected - observed [px]
+    inlier: BoolArray  # (K,) observations in the final solve
+    noise: float  # observed over stated standard deviation
+    passes: int  # rounds of cutting
+    prior: PriorTest  # how the corrections compare with the priors given, and what the priors became
+    smooth: SmoothTest  # what is smooth in the residuals that are left
 
 
-class Observations:
-    """How much observations count: stated sigmas, the observed noise, and the cap on a view's information."""
-
-    def __init__(self, problem: Problem, sigma: Array, noise_floor: float, is_tie: BoolArray) -> None:
-        self.structure, self.sigma, self.noise_floor = problem.structure, sigma, noise_floor
-        self.is_tie = is_tie
-        self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
-        if problem.point_prior is not None:
-            self.has_prior[problem.point_prior.index] = True
-
-    def freedom(self, counted: Array) -> Array:
-        """Degrees of freedom (K,) of an observation once its point is estimated: 1/2 of two views', to 2.
-
-        `counted` (K,) says how much each observation counts; a track with one that counts for nothing is a
-        track of the others.
-        """
-        structure = self.structure
-        largest = np.zeros(structure.num_points)
-        np.maximum.at(largest, structure.point, counted)
-        count = structure.sum_points(counted[None])[0] / np.maximum(largest, 1e-300)
-        rows = 2.0 * np.maximum(count, 1.0)
-        free = np.where(self.has_prior, rows, np.maximum(rows - 3.0, 0.25))
-        freedom: Array = (2.0 * free / rows)[structure.point]
-        return freedom
-
-    def squared(self, residual: Array, counted: Array) -> Array:
-        """|r|^2 (K,) over its expectation under the stated sigmas."""
-        s: Array = (residual**2).sum(axis=0) / self.sigma**2 / self.freedom(counted)
-        return np.where(np.isfinite(s), s, np.inf)
-
-    def weight(self, use: BoolArray, noise: float, misfit: Array | float = 0.0) -> Array:
-        """1 / sigma (K,) [1/px], tie points under the cap; 0 where not used.
-
-        What a view's camera cannot follow, `misfit` (N,) [px], does not average away either: it is as good as
-        `SPLINES` independent errors.
-        """
-        weight: Array = use / (self.sigma * noise)
-        information = self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0]
-        floor = self.noise_floor**2 + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
-        cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
-        return np.where(self.is_tie, weight * cap[self.structure.view], weight)
-
-    def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
-        """Observed over stated standard deviation of the observations in use; 1 where there are too few.
-
-        `fitted` further parameters have been taken out of the residuals.
-        """
-        whitened = residual[:, use] / self.sigma[use]
-        seen = np.zeros(self.structure.num_points, dtype=bool)
-        seen[self.structure.point[use]] = True
-        freedom = whitened.size - 3 * int((seen & ~self.has_prior).sum()) - int(problem.free.sum()) - fitted
-        if freedom < _LEAST_FREEDOM:
-            return 1.0
-        return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
-
-    def tied(self, use: BoolArray) -> BoolArray:
-        """`use` without the observations whose point is left without a second one (or a prior)."""
-        structure = self.structure
-        count = np.bincount(structure.point[use], minlength=structure.num_points)
-        tied: BoolArray = use & ((count >= 2) | self.has_prior)[structure.point]
-        return tied
-
-
-def run_rounds(
-    problem: Problem,
-    observations: Observations,
-    state: State,
-    options: AdjustOptions,
-    everything: BoolArray,
-    use: BoolArray,
-    hold: Callable[[Problem, Array], Problem],
-    variances: Variances,
-    smooth: Smooth,
-    known_noise: float | None = None,
-) -> Outcome:
-    """Robust rounds, cuts and the final least squares.
+class Rounds:
+    """Robust rounds, cuts and the final least squares, with the observations in use (K,) to start with.
 
     Outliers are judged by what is left of their residuals once the smooth part of every view is taken away: a
     camera that the unknowns cannot follow yet does not make its tie points wrong.
-
-    Parameters
-    ----------
-    problem : Problem
-        What is minimised.
-    observations : Observations
-        What each observation counts.
-    state : State
-        Unknowns at their prior, points triangulated.
-    options : AdjustOptions
-        Loss, threshold, number of passes, solver.
-    everything : (K,)
-        Observations that may be used.
-    use : (K,)
-        Those to start with.
-    hold : callable
-        The problem with its points' priors renewed at points (P, 3).
-    variances : Variances
-        What may be learnt about the cameras' priors.
-    smooth : Smooth
-        The smooth model of the views.
-    known_noise : float, optional
-        Of rounds that have ended near here: what is in use has been chosen, and nothing robust comes first.
-
-    Returns
-    -------
-    Outcome
     """
-    robust = options.loss != "linear"
-    projected: Projected | None = problem.linearise(state.params, state.points)
-    assert projected is not None
-    residual = projected.image - problem.xy
-    everything = observations.tied(everything & np.isfinite(residual).all(axis=0))
-    use = observations.tied(use & everything)
-    problem = hold(problem, state.points)
-    noise, passes, counted = 1.0, 0, use.astype(np.float64)
-    floor: Array | float = 0.0
-    if known_noise is not None:
-        noise = known_noise
-    elif robust:
-        start = problem.with_camera_prior(variances.for_search())
-        state, residual, counted, noise = _robust(start, observations, state, projected, use, options, smooth)
-        floor = smooth.test(residual, use, neighbours=False).rms
-    while True:
-        if robust and projected is None and use.sum() < (1.0 - _MANY_CUT) * everything.sum():
-            state, residual = revived(problem, state, residual, use, everything / observations.sigma)
-        problem = hold(problem, state.points)
-        passes += 1
-        kept = use
-        if robust:
-            scatter = _scatter(problem, observations, smooth, state, residual, counted)
-            s = observations.squared(scatter, use.astype(np.float64))
-            kept = observations.tied(everything & (s <= (options.robust_threshold * noise) ** 2))
-        wanted = noise if options.estimate_noise else 1.0
-        weight = observations.weight(kept, wanted, floor)
-        found = minimise(
-            problem,
-            state,
-            weight,
-            "sparse"
-            if options.solver == "auto" and passes == 1
-            else options.solver,  # a second pass follows always
-            TOLERANCE if passes > 1 or not robust else _FIRST_TOLERANCE,
-            projected,
+
+    def __init__(
+        self,
+        problem: Problem,
+        block: Block,
+        state: State,
+        options: AdjustOptions,
+        heights: Heights,
+        use: BoolArray,
+    ) -> None:
+        unknowns = problem.cameras.unknowns
+        projected = problem.linearise(state.params, state.points)
+        residual = projected.image - problem.xy
+        self.problem = heights.hold(problem, state.points)
+        self.state, self.options, self.heights, self.residual = state, options, heights, residual
+        self.robust = options.loss != "linear"
+        is_tie = block.point < block.num_tracks
+        self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie)
+        self.smooth = Smooth(problem.structure, problem.xy, unknowns)
+        self.variances = Variances.of(problem.camera_prior, unknowns, options)
+        self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
+        self.use = self.observations.tied(use & self.everything)
+        self.counted = self.use.astype(np.float64)
+        self.projected: Projected | None = projected  # of the state, until the first pass moves it
+        self.passes, self.noise = 0, 1.0
+        self.misfit: Array | float = 0.0
+
+    def run(self) -> Outcome:
+        """Go on until nothing changes."""
+        if self.robust:
+            self._search()
+        while True:
+            outcome = self._cut_and_solve()
+            if outcome is not None:
+                return outcome
+
+    def _search(self) -> None:
+        """Robust rounds, under priors that leave room for what is not expected."""
+        start = replace(self.problem, camera_prior=self.variances.for_search())
+        assert self.projected is not None
+        self.state, self.residual, self.counted, self.noise = _robust(
+            start, self.observations, self.state, self.projected, self.use, self.options, self.smooth
         )
-        state, projected = found.state, None
-        residual = problem.residuals(state.params, state.points)
-        cost = problem.cost(state.params, state.points, residual * weight)
-        state = replace(state, cost=cost, history=(*state.history, cost))
-        prior, tested = variances.learnt(problem, found)
-        same = passes > 1 and int((kept != use).sum()) <= _SAME * len(use)
-        use, counted, before = kept, kept.astype(np.float64), noise
-        if robust:
-            scatter = _scatter(problem, observations, smooth, state, residual, counted)
-            noise = observations.noise(scatter, use, problem, smooth.parameters(counted))
-            floor = smooth.test(residual, use, neighbours=False).rms
+        self.misfit = self.smooth.test(self.residual, self.use, neighbours=False).rms
+
+    def _cut_and_solve(self) -> Outcome | None:
+        """One pass; the outcome where it is the last."""
+        options, was_in_use, noise = self.options, self.use, self.noise
+        many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
+        if self.robust and self.projected is None and many_cut:
+            weight = self.everything / self.observations.sigma
+            self.state, self.residual = revived(self.problem, self.state, self.residual, self.use, weight)
+        self.problem = self.heights.hold(self.problem, self.state.points)
+        self.passes += 1
+        self._cut()
+        found = self._solve()
+        prior, tested = self.variances.learnt(self.problem, found)
+        self._estimate_noise()
+        numbers = self.passes, self.use.sum(), len(self.use), self.noise
+        _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
+        same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
+        settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
+        settled &= same_prior(prior, self.problem.camera_prior, _SAME_PRIOR)
+        if self.passes > MAX_PASSES or (settled and (same or not self.robust)):
+            smooth = self.smooth.test(self.residual, self.use)
+            return Outcome(
+                self.problem, found, self.residual, self.use, self.noise, self.passes, tested, smooth
+            )
+        self.problem = replace(self.problem, camera_prior=prior)
+        return None
+
+    def _cut(self) -> None:
+        """Choose what is used by the residuals that scatter."""
+        if self.robust:
+            s = self.observations.squared(self._scatter(), self.use.astype(np.float64))
+            near = s <= (self.options.robust_threshold * self.noise) ** 2
+            self.use = self.observations.tied(self.everything & near)
+
+    def _solve(self) -> Minimum:
+        """Least squares of what is used; a second pass follows the first robust one always, and is exact."""
+        solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
+        tolerance = TOLERANCE if self.passes > 1 or not self.robust else _FIRST_TOLERANCE
+        noise = self.noise if self.options.estimate_noise else 1.0
+        weight = self.observations.weight(self.use, noise, self.misfit)
+        found = minimise(self.problem, self.state, weight, solver, tolerance, self.projected)
+        state, self.projected = found.state, None
+        self.residual = self.problem.residuals(state.params, state.points)
+        cost = self.problem.cost(state.params, state.points, self.residual * weight)
+        self.state = replace(state, cost=cost, history=(*state.history, cost))
+        self.counted = self.use.astype(np.float64)
+        return replace(found, state=self.state)
+
+    def _estimate_noise(self) -> None:
+        """The noise, and what no camera can follow, by the residuals of the observations in use."""
+        if self.robust:
+            fitted = self.smooth.parameters(self.counted)
+            self.noise = self.observations.noise(self._scatter(), self.use, self.problem, fitted)
+            self.misfit = self.smooth.test(self.residual, self.use, neighbours=False).rms
         else:
-            noise = observations.noise(residual, use, problem)
-        _LOG.info("pass %d: %d of %d observations, noise %.3f", passes, use.sum(), len(use), noise)
-        settled = not options.estimate_noise or abs(noise / before - 1.0) < _SAME_NOISE
-        settled &= same_prior(prior, problem.camera_prior, _SAME_PRIOR)
-        if passes > MAX_PASSES or (settled and (same or not robust)):
-            minimum = replace(found, state=state)
-            return Outcome(problem, minimum, residual, use, noise, passes, tested, smooth.test(residual, use))
-        problem = problem.with_camera_prior(prior)
+            self.noise = self.observations.noise(self.residual, self.use, self.problem)
+
+    def _scatter(self) -> Array:
+        """Residuals (2, K) [px] without the smooth parts of all views that see a point.
+
+        A point shares what one of its views is wrong by among all of them, and relief moves the rows of the views
+        against each other: so the smooth parts are found view by view and the points follow, until they stand.
+        """
+        residual, counted, sigma = self.residual, self.counted, self.observations.sigma
+        part = self.smooth.part(residual, counted)
+        size = float(np.sqrt((counted * (part / sigma) ** 2).sum() / max(counted.sum(), 1.0)))
+        if size < _SMOOTH_SEEN:
+            return residual - part
+        projected = self.problem.project_points(self.state.params, self.state.points)
+        weight = counted**0.5 / sigma
+        for _ in range(_BACKFITTING):
+            left = self.problem.settled_residual(residual - part, projected, weight)
+            part += self.smooth.part(left, counted)
+        return self.problem.settled_residual(residual - part, projected, weight)
 
 
 def _robust(
@@ -254,12 +191,9 @@ def _robust(
 ) -> tuple[State, Array, Array, float]:
     """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
 
-    `projected` is of the state, and in the end of the one that is returned, with its residuals, how much every
-    observation counts, and the noise.
-
-    The noise is a median that counts observations by their weights: as the scale shrinks, it leaves the
-    wrong ones behind. It cannot fall below what the best fifth of all observations shows, nor below half of
-    what is stated, or a few that fit by chance would be left.
+    The state, its residuals, how much every observation counts, and the noise: a median that counts observations by
+    their weights and so leaves the wrong ones behind, but not below what the best fifth of all shows, nor below half of
+    what is stated, or a few that fit by chance would be left. `projected` is of the state, before and after.
     """
     loss = LOSSES[options.loss]
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
@@ -296,32 +230,6 @@ def revived(
         points[dead] = moved[dead]
     again = problem.residuals(state.params, points)
     return replace(state, points=points), np.where(dead[structure.point], again, residual)
-
-
-def _scatter(
-    problem: Problem,
-    observations: Observations,
-    smooth: Smooth,
-    state: State,
-    residual: Array,
-    counted: Array,
-) -> Array:
-    """Residuals (2, K) [px] without the smooth parts of all views that see a point.
-
-    A point shares what one of its views is wrong by among all of them, and relief moves the rows of the views against
-    each other: so the smooth parts are found view by view and the points follow, until they stand.
-    """
-    part = smooth.part(residual, counted)
-    size = float(np.sqrt((counted * (part / observations.sigma) ** 2).sum() / max(counted.sum(), 1.0)))
-    if size < _SMOOTH_SEEN:
-        return residual - part
-    projected = problem.project_points(state.params, state.points)
-    weight = counted**0.5 / observations.sigma
-    left = residual
-    for _ in range(_BACKFITTING):
-        left = problem.settled_residual(residual - part, projected, weight)
-        part += smooth.part(left, counted)
-    return problem.settled_residual(residual - part, projected, weight)
 
 
 def _median(values: Array, weights: Array) -> float:

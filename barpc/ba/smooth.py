@@ -11,9 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.stats import f as f_distribution
 
 from barpc.ba.structure import Structure
+from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
@@ -30,25 +32,18 @@ _BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=
 
 @dataclass(frozen=True, eq=False)
 class SmoothTest:
-    """The smooth part of every view's residuals, and whether it is more than chance.
+    """The smooth part of every view's residuals, and whether it is more than chance."""
 
-    Parameters
-    ----------
-    rms : (N,)
-        Root mean square of the smooth part over the view's observations, both coordinates together, less what
-        noise alone would leave [px]; 0 for a view with too few observations.
-    significance : (N,)
-        Probability that noise alone leaves as much (F-test); 1 for a view with too few observations.
-    by_row : (N,)
-        Part of the smooth part's square that the row alone explains; NaN where nothing was fitted.
-    shared : (N,)
-        Error that an observation shares with its neighbour in the row, or in the column where that is more [px]:
-        waves and steps that are too fine for the smooth part are in it, too. 0 where it is not significant.
-    """
-
+    # (N,) root mean square of the smooth part over the view's observations, both coordinates together, less
+    # what noise alone would leave [px]; 0 for a view with too few observations
     rms: Array
+    # (N,) probability that noise alone leaves as much (F-test); 1 for a view with too few observations
     significance: Array
+    # (N,) part of the smooth part's square that the row alone explains; NaN where nothing was fitted
     by_row: Array
+    # (N,) error that an observation shares with its neighbour in the row, or in the column where that is more
+    # [px]: waves and steps that are too fine for the smooth part are in it, too. 0 where it is not
+    # significant
     shared: Array
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
@@ -57,21 +52,11 @@ class SmoothTest:
 
 
 class Smooth:
-    """The smooth model of a block's views.
+    """The smooth model of a block's views, of observations at `xy` (2, K) [px]."""
 
-    Parameters
-    ----------
-    structure : Structure
-        Observations sorted by view.
-    xy : (2, K)
-        col, row [px].
-    middle, half : (N, 2)
-        Middle and half size of every image, col and row [px].
-    """
-
-    def __init__(self, structure: Structure, xy: Array, middle: Array, half: Array) -> None:
+    def __init__(self, structure: Structure, xy: Array, unknowns: Unknowns) -> None:
         self.structure = structure
-        col, row = ((xy - middle.T[:, structure.view]) / half.T[:, structure.view]).clip(-1.0, 1.0)
+        col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
         self._place = xy
         self._basis = np.empty((_TERMS, xy.shape[1]))
         self._basis[:SPLINES] = _bsplines(row)
@@ -83,8 +68,8 @@ class Smooth:
         Zero for views with too few observations that count.
         """
         out = np.zeros_like(residual)
-        for v, rows in self._views(weight):
-            out[:, rows] = self._coefficients(v, residual, weight) @ self._basis[:, rows]
+        for _, rows in self._views(weight):
+            out[:, rows] = self._coefficients(rows, residual, weight) @ self._basis[:, rows]
         return out
 
     def parameters(self, weight: Array) -> int:
@@ -101,7 +86,7 @@ class Smooth:
         residual = np.where(use, residual, 0.0)
         for v, rows in self._views(weight):
             count = 2 * float(weight[rows].sum())
-            coefficients = self._coefficients(v, residual, weight)
+            coefficients = self._coefficients(rows, residual, weight)
             smooth = (coefficients @ self._basis[:, rows]) * weight[rows]
             explained = float((smooth**2).sum())
             left = float((residual[:, rows] ** 2).sum()) - explained
@@ -133,9 +118,8 @@ class Smooth:
         enough = np.flatnonzero(counts >= _PER_TERM * _TERMS)
         return [(int(v), slice(int(bounds[v]), int(bounds[v + 1]))) for v in enough]
 
-    def _coefficients(self, v: int, residual: Array, weight: Array) -> Array:
+    def _coefficients(self, rows: slice, residual: Array, weight: Array) -> Array:
         """Coefficients (2, terms) of one view."""
-        rows = slice(int(self.structure.bounds[v]), int(self.structure.bounds[v + 1]))
         basis = self._basis[:, rows]
         weighted = basis * weight[rows]
         matrix = weighted @ basis.T
@@ -150,12 +134,5 @@ class Smooth:
 def _bsplines(u: Array) -> Array:
     """Uniform cubic B-splines (SPLINES, n) at u (n,) in -1 .. 1."""
     pieces = SPLINES - 3
-    t = (u + 1.0) * (0.5 * pieces)
-    piece = np.minimum(t.astype(np.int64), pieces - 1)
-    t = t - piece
-    values = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]) / 6.0
-    out = np.zeros((SPLINES, len(u)))
-    columns = np.arange(len(u))
-    for k in range(4):
-        out[piece + k, columns] = values[k]
-    return out
+    basis = BSpline.design_matrix((u + 1.0) * (0.5 * pieces), np.arange(-3.0, pieces + 4), 3)
+    return np.asarray(basis.toarray().T)

@@ -27,68 +27,37 @@ from barpc.scene import BoolArray
 
 _LOG = logging.getLogger(__name__)
 
-MAX_STEPS = 30
-"""Linearisations of one solve, at most."""
-TOLERANCE = 1e-6
-"""A solve ends when a step would lower the cost by less than this fraction."""
-SCIPY_UNKNOWNS = 200
-"""Up to so many camera unknowns (22 views of 9) "auto" takes scipy, whose dense decomposition grows as their cube."""
-
+MAX_STEPS = 30  # linearisations of one solve, at most
+TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
+SCIPY_UNKNOWNS = 200  # (22 views of 9) up to which "auto" takes scipy, whose dense work grows as their cube
 _XTOL = 1e-12
-_ROUNDING = 1e-9
-"""A cost does not fall any more where the step promises less than this fraction."""
-_LOST = 1e-6
-"""Nor where it promises less than this one, and no damping however strong makes it fall."""
+_ROUNDING = 1e-9  # a cost does not fall any more where the step promises less than this fraction
+_LOST = 1e-6  # nor where it promises less than this one, and no damping however strong makes it fall
 
 
 @dataclass(frozen=True)
 class State:
-    """Where the iteration stands.
+    """Where the iteration stands."""
 
-    Parameters
-    ----------
-    params : (N, q)
-        Unknowns of the views.
-    points : (P, 3)
-        ECEF [m].
-    cost : float
-        Sum of squared whitened residuals.
-    history : tuple of float
-        The cost at every linearisation, and at the end of every pass, so far.
-    """
-
-    params: Array
-    points: Array
-    cost: float = np.inf
-    history: tuple[float, ...] = ()
+    params: Array  # (N, q) unknowns of the views
+    points: Array  # (P, 3) ECEF [m]
+    cost: float = np.inf  # sum of squared whitened residuals
+    history: tuple[float, ...] = ()  # the cost at every linearisation, and at the end of every pass, so far
 
     def moved(self, step: Array, reduced: Reduced, cost: float) -> State:
         """The state after a step (N, q) of the cameras and the points' step that goes with it."""
-        return replace(
-            self, params=self.params + step, points=self.points + reduced.point_step(step), cost=cost
-        )
+        points = self.points + reduced.point_step(step)
+        return replace(self, params=self.params + step, points=points, cost=cost)
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where a minimisation ended.
+    """Where a minimisation ended."""
 
-    Parameters
-    ----------
-    state : State
-        The minimum.
-    reduced : Reduced
-        The last linearisation: at the minimum (scipy), or one small step before it.
-    factor : Factor or None
-        Of its matrix, free unknowns only, where it was factorised.
-    status : str
-        Which solver ran, and why it stopped.
-    """
-
-    state: State
-    reduced: Reduced
-    factor: Factor | None = None
-    status: str = ""
+    state: State  # the minimum
+    reduced: Reduced  # the last linearisation: at the minimum (scipy), or one small step before it
+    factor: Factor | None = None  # of its matrix, free unknowns only, where it was factorised
+    status: str = ""  # which solver ran, and why it stopped
 
     def covariance(self, free: BoolArray) -> Covariance:
         """The posterior covariance, by the last linearisation."""
@@ -112,27 +81,11 @@ def minimise(
     tolerance: float = TOLERANCE,
     projected: Projected | None = None,
 ) -> Minimum:
-    """Minimise at fixed weights from a state near the minimum.
+    """Minimise at fixed weights (K,) [1/px] from a state near the minimum.
 
-    Parameters
-    ----------
-    problem : Problem
-        What is minimised.
-    state : State
-        Where it starts.
-    weight : (K,)
-        1 / sigma of every observation [1/px], 0 for one that does not count.
-    solver : str
-        "scipy", "sparse" or "auto".
-    tolerance : float
-        The step that is expected to gain less than this fraction of the cost is taken and is the last, and
-        so is one that is expected to leave a thousandth of it (see `_settled`).
-    projected : Projected or None
-        `Problem.linearise` of the state, which is used up.
-
-    Returns
-    -------
-    Minimum
+    The step that is expected to gain less than `tolerance` of the cost is taken and is the last, and so is one
+    that is expected to leave a thousandth of it (see `_settled`). `projected` is `Problem.linearise` of the state,
+    and is used up.
 
     Raises
     ------
@@ -152,9 +105,8 @@ def minimise(
             projected = None
     if result is None:
         result = _levenberg_marquardt(problem, state, weight, tolerance, projected)
-    _LOG.info(
-        "%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, time.process_time() - start
-    )
+    seconds = time.process_time() - start
+    _LOG.info("%s: %d unknowns, cost %.6g, %.2f s", solver, unknowns, result.state.cost, seconds)
     return result
 
 
@@ -186,11 +138,7 @@ def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tup
 
 
 def _levenberg_marquardt(
-    problem: Problem,
-    state: State,
-    weight: Array,
-    tolerance: float,
-    projected: Projected | None,
+    problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
 ) -> Minimum:
     """Gauss-Newton steps, damped only when one fails."""
     damping, before = 0.0, np.inf
@@ -204,12 +152,8 @@ def _levenberg_marquardt(
             continue
         ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
         if _settled(gain, before, state.cost, tolerance):
-            return Minimum(
-                ahead,
-                reduced,
-                factor if not damping else None,
-                _status(state, "the next step gains too little"),
-            )
+            status = _status(state, "the next step gains too little")
+            return Minimum(ahead, reduced, None if damping else factor, status)
         trial = problem.reduce(ahead.params, ahead.points, weight)
         if trial.cost <= state.cost * (1.0 + 1e-12):
             state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
@@ -241,40 +185,30 @@ class _Compressed:
         cost = _finite(self.reduced.cost)
         self.state = replace(state, cost=cost, history=(*state.history, cost))
         self.start = state.params
-        self.upper0 = self._cholesky()
+        self.upper0 = la.cholesky(self.reduced.plain(self.problem.free), check_finite=False)
         self.key = np.zeros(len(self.upper0)).tobytes()
-        self._compress()
+        self._compress(self.upper0)
 
-    def _cholesky(self) -> Array:
-        upper: Array = la.cholesky(self.reduced.plain(self.problem.free), check_finite=False)
-        return upper
-
-    def _compress(self) -> None:
-        upper = self._cholesky()
+    def _compress(self, upper: Array) -> None:
         gradient = self.reduced.gradient[self.problem.free]
         self.whitened = la.solve_triangular(upper, gradient, trans="T", check_finite=False)
-        self.rest = np.sqrt(
-            max(self.reduced.cost - self.reduced.gain - float(self.whitened @ self.whitened), 0.0)
-        )
+        rest = self.reduced.cost - self.reduced.gain - float(self.whitened @ self.whitened)
+        self.rest = np.sqrt(max(rest, 0.0))
         self.slope = la.solve_triangular(self.upper0, upper.T, trans="T", check_finite=False).T
-
-    def params(self, x: Array) -> Array:
-        """The unknowns (N, q) of whitened ones."""
-        step = np.zeros(self.start.size)
-        step[self.problem.free] = la.solve_triangular(self.upper0, x, check_finite=False)
-        return self.start + step.reshape(self.start.shape)
 
     def at(self, x: Array) -> None:
         """Linearise at whitened unknowns, unless that was the last thing done."""
         if x.tobytes() == self.key:
             return
-        step = self.params(x) - self.state.params
-        state = self.state.moved(step, self.reduced, np.inf)
+        step = np.zeros(self.start.size)
+        step[self.problem.free] = la.solve_triangular(self.upper0, x, check_finite=False)
+        params = self.start + step.reshape(self.start.shape)
+        state = self.state.moved(params - self.state.params, self.reduced, np.inf)
         self.reduced = self.problem.reduce(state.params, state.points, self.weight)
         cost = self.reduced.cost
         self.state = replace(state, cost=cost, history=(*self.state.history, cost))
         self.key = x.tobytes()
-        self._compress()
+        self._compress(la.cholesky(self.reduced.plain(self.problem.free), check_finite=False))
 
     def residual(self, x: Array) -> Array:
         """The N q + 1 residuals."""
@@ -288,11 +222,7 @@ class _Compressed:
 
 
 def _scipy(
-    problem: Problem,
-    state: State,
-    weight: Array,
-    tolerance: float,
-    projected: Projected | None,
+    problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
 ) -> Minimum:
     compressed = _Compressed(problem, state, weight, projected)
     found = least_squares(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,49 +14,28 @@ from barpc.scene import IntArray
 
 @dataclass(frozen=True)
 class Structure:
-    """Index arrays of K observations of P points in N views; observations sorted by view.
-
-    Parameters
-    ----------
-    num_views, num_points : int
-        N and P.
-    view, point : (K,)
-        Indices of every observation.
-    bounds : (N + 1,)
-        Observations of view v are bounds[v] : bounds[v + 1].
-    by_point : (K,)
-        Observations sorted by point.
-    point_bounds : (P + 1,)
-        Observations of point p are by_point[point_bounds[p] : point_bounds[p + 1]].
-    first, second : (Q,)
-        Pairs of observations of one point, sorted by their pair of views.
-    pair_view : (M, 2)
-        Pairs of views i < j that share a point.
-    pair_bounds : (M + 1,)
-        Observation pairs of view pair m are pair_bounds[m] : pair_bounds[m + 1].
-    """
+    """Index arrays of K observations of P points in N views; observations sorted by view."""
 
     num_views: int
     num_points: int
-    view: IntArray
-    point: IntArray
-    bounds: IntArray
-    by_point: IntArray
+    view: IntArray  # (K,)
+    point: IntArray  # (K,)
+    bounds: IntArray  # (N + 1,) observations of view v are bounds[v] : bounds[v + 1]
+    by_point: IntArray  # (K,) observations sorted by point
+    # (P + 1,) observations of point p are by_point[point_bounds[p] : point_bounds[p + 1]]
     point_bounds: IntArray
-    first: IntArray
-    second: IntArray
-    pair_view: IntArray
-    pair_bounds: IntArray
+    first: IntArray  # (Q,) pairs of observations of one point, sorted by their pair of views
+    second: IntArray  # (Q,)
+    pair_view: IntArray  # (M, 2) pairs of views i < j that share a point
+    pair_bounds: IntArray  # (M + 1,) observation pairs of view pair m are pair_bounds[m] : pair_bounds[m + 1]
 
     def sum_points(self, rows: Array) -> Array:
         """Sums (m, P) over every point's observations of rows (m, K)."""
-        total: Array = np.array([np.bincount(self.point, row, self.num_points) for row in rows])
-        return total
+        return np.array([np.bincount(self.point, row, self.num_points) for row in rows])
 
     def of_points(self, points: Array) -> Array:
         """Coordinates (3, K) of every observation's point, of points (P, 3)."""
-        rows: Array = np.ascontiguousarray(points.T).take(self.point, axis=1, mode="clip")
-        return rows
+        return np.ascontiguousarray(points.T).take(self.point, axis=1, mode="clip")
 
     def sum_views(self, rows: Array) -> Array:
         """Sums (N, m) over every view's observations of rows (m, K)."""
@@ -67,19 +47,7 @@ class Structure:
 
 
 def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: int) -> Structure:
-    """The structure of observations that are already sorted by view.
-
-    Parameters
-    ----------
-    view, point : (K,)
-        Indices of every observation, views ascending.
-    num_views, num_points : int
-        N and P.
-
-    Returns
-    -------
-    Structure
-    """
+    """The structure of observations (K,) that are already sorted by view."""
     bounds = np.searchsorted(view, np.arange(num_views + 1))
     by_point, point_bounds = counting_sort(point, num_points)
     first, second = _pairs(by_point, point_bounds)
@@ -104,6 +72,12 @@ def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: 
         pair_view,
         pair_bounds,
     )
+
+
+def parts(stop: int, size: int, start: int = 0) -> Iterator[slice]:
+    """Pieces of observations start .. stop, of `size` that stay in cache."""
+    for first in range(start, stop, size):
+        yield slice(first, min(first + size, stop))
 
 
 def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:

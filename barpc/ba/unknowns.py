@@ -23,30 +23,14 @@ _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Layout of the unknowns of N views.
+    """Layout of the unknowns of N views."""
 
-    Parameters
-    ----------
-    model : str
-        A name of `AdjustOptions.model`.
-    drift : int
-        Degree of the rotation in the image row.
-    center : (N, 3)
-        Camera centres [m], ECEF.
-    distance : (N,)
-        From the centre to the scene [m]: a rotation unknown is angle x distance.
-    col_offset, col_scale, row_offset, row_scale : (N,)
-        Middle and half width or height of every image [px].
-    """
-
-    model: str
-    drift: int
-    center: Array
-    distance: Array
-    col_offset: Array
-    col_scale: Array
-    row_offset: Array
-    row_scale: Array
+    model: str  # A name of `AdjustOptions.model`
+    drift: int  # degree of the rotation in the image row
+    center: Array  # (N, 3) camera centres [m], ECEF
+    distance: Array  # (N,) from the centre to the scene [m]: a rotation unknown is angle x distance
+    middle: Array  # (2, N) of every image, col and row [px]
+    half: Array  # (2, N) its half width and height [px]
 
     @property
     def geometric(self) -> bool:
@@ -74,27 +58,23 @@ class Unknowns:
         """Rotation vectors (n, 3) [rad] at the middle row, of the views whose unknowns (n, q) are given."""
         if not self.rotates:
             return np.zeros((len(params), 3))
-        rotation: Array = params[:, :3] / self.distance[views, None]
-        return rotation
+        return params[:, :3] / self.distance[views, None]
 
     def translation(self, params: Array) -> Array:
         """Translations (N, 3) [m]."""
         if not self.translates:
             return np.zeros((len(params), 3))
         start = 3 * self.rotates
-        translation: Array = params[:, start : start + 3]
-        return translation
+        return params[:, start : start + 3]
 
     def drift_vectors(self, params: Array) -> Array:
         """Rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
         start = 3 * (self.rotates + self.translates)
-        vectors: Array = params[:, start:].reshape(len(params), self.drift, 3) / self.distance[:, None, None]
-        return vectors
+        return params[:, start:].reshape(len(params), self.drift, 3) / self.distance[:, None, None]
 
-    def normalized_row(self, row: Array, index: IntArray) -> Array:
-        """Row [px] -> -1 at the top, 1 at the bottom of its image."""
-        normalized: Array = (row - self.row_offset[index]) / self.row_scale[index]
-        return normalized
+    def normalized(self, image: Array, index: IntArray) -> Array:
+        """col, row (2, n) [px] -> -1 at the left and the top, 1 at the right and the bottom of their images."""
+        return (image - self.middle[:, index]) / self.half[:, index]
 
     def drift_rotation(self, params: Array, index: IntArray, row: Array) -> Array:
         """Rotation (3, n) [rad] that the drift adds at normalised rows (n,)."""
@@ -129,15 +109,13 @@ class Unknowns:
         self, params: Array, index: IntArray, image: Array, by_point: Array
     ) -> tuple[Array, Array, Array]:
         """Image models: corrected image points (2, n), and the derivatives by point and by unknown."""
-        scale = np.array([self.col_scale[index], self.row_scale[index]])
-        offset = np.array([self.col_offset[index], self.row_offset[index]])
-        basis = np.vstack([np.ones((1, image.shape[1])), (image - offset) / scale])
+        basis = np.vstack([np.ones((1, image.shape[1])), self.normalized(image, index)])
         chosen = list(_IMAGE_TERMS[self.model])
         m = len(chosen)
         coefficients = np.zeros((2, 3, image.shape[1]))
         coefficients[:, chosen] = np.moveaxis(params.reshape(-1, 2, m)[index], 0, -1)
         moved = image + (coefficients * basis).sum(axis=1)
-        slope = coefficients[:, 1:] / scale
+        slope = coefficients[:, 1:] / self.half[:, index]
         by_moved = by_point + slope[:, 0, None] * by_point[0] + slope[:, 1, None] * by_point[1]
         by_unknown = np.zeros((2, 2 * m, image.shape[1]))
         by_unknown[0, :m] = by_unknown[1, m:] = basis[chosen]
@@ -149,54 +127,27 @@ class Unknowns:
             return tuple(
                 ImageCorrected(view.sensor, self._affine(params[i], i)) for i, view in enumerate(views)
             )
-        rotation, translation, drift = (
-            self.rotation(params),
-            self.translation(params),
-            self.drift_vectors(params),
-        )
-        return tuple(
-            Corrected(
-                view.sensor,
-                Correction(
-                    rotation[i],
-                    translation[i],
-                    self.center[i],
-                    drift[i],
-                    float(self.row_offset[i]) if self.drift else 0.0,
-                    float(self.row_scale[i]) if self.drift else 1.0,
-                ),
-            )
-            for i, view in enumerate(views)
-        )
+        vectors = self.rotation(params), self.translation(params), self.center, self.drift_vectors(params)
+        rows = zip(self.middle[1].tolist(), self.half[1].tolist(), strict=True)
+        corrections = [
+            Correction(*of_view, *(row if self.drift else ()))
+            for *of_view, row in zip(*vectors, rows, strict=True)
+        ]
+        return tuple(Corrected(view.sensor, found) for view, found in zip(views, corrections, strict=True))
 
     def _affine(self, params: Array, i: int) -> ImageAffine:
         normalized = np.zeros((2, 3))
         normalized[:, list(_IMAGE_TERMS[self.model])] = params.reshape(2, -1)
-        slope = normalized[:, 1:] / [self.col_scale[i], self.row_scale[i]]
-        shift = normalized[:, 0] - slope @ [self.col_offset[i], self.row_offset[i]]
+        slope = normalized[:, 1:] / self.half[:, i]
+        shift = normalized[:, 0] - slope @ self.middle[:, i]
         return ImageAffine(shift, slope)
 
 
 def make_unknowns(
     views: Sequence[View], model: str, drift: int = 0, centers: Array | None = None
 ) -> Unknowns:
-    """The layout for a block of views.
-
-    Parameters
-    ----------
-    views : sequence of View
-        N views.
-    model, drift : str, int
-        As in `barpc.options.AdjustOptions`.
-    centers : (N, 3) or None
-        Camera centres [m], ECEF; None: `barpc.sensor.geometry.camera_center` of the sensors.
-
-    Returns
-    -------
-    Unknowns
-    """
+    """The layout for N views; `centers` (N, 3), ECEF [m], are regressed from the sensors where None."""
     size = np.array([view.size for view in views], dtype=np.float64).reshape(-1, 2)
-    middle = (size - 1.0) / 2.0
     if model in _IMAGE_TERMS:
         centers = np.zeros((len(views), 3))
     elif centers is None:
@@ -204,8 +155,7 @@ def make_unknowns(
         centers = np.array(found).reshape(-1, 3)
     scene = np.array([_middle_of_scene(view) for view in views]).reshape(-1, 3)
     distance = np.linalg.norm(centers - scene, axis=1)
-    half = size / 2.0
-    return Unknowns(model, drift, centers, distance, middle[:, 0], half[:, 0], middle[:, 1], half[:, 1])
+    return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0)
 
 
 def _middle_of_scene(view: View) -> Array:

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from barpc.ba.blocks import CameraPrior
 from barpc.ba.covariance import Covariance
 from barpc.ba.linear import factorize
+from barpc.ba.priors import CameraPrior
 from barpc.ba.problem import Problem
 from barpc.ba.solve import Minimum
 from barpc.ba.unknowns import Unknowns
@@ -34,9 +34,7 @@ _LIKELIER = 2.3  # but one odd view is named where it is ten times as likely as 
 _GROSS = 16.0  # times the variance stated: a view whose corrections are smaller is not called odd
 _FREE = 100.0  # times its prior: a view whose camera may be anywhere
 _SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
-_MOVING = (
-    0.01  # of a rotation, as drift: the centre it turns about flies some kilometres while an image is taken
-)
+_MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
 _ITERATIONS = 10
 _STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
 _SMALL = 400  # unknowns up to which every view is tried and the covariance's diagonal is exact
@@ -46,27 +44,15 @@ _LEAST = 0.5  # degrees of freedom below which nothing is said
 
 @dataclass(frozen=True, eq=False)
 class PriorTest:
-    """How the corrections of the views compare with the priors that were given.
+    """How the corrections of the views compare with the priors that were given."""
 
-    Parameters
-    ----------
-    ratio : float
-        Squared constant corrections (rotation, translation) over the variances given, over their degrees of
-        freedom: about 1 where the priors hold. NaN where the observations determine nothing.
-    freedom : float
-        Constant unknowns that the observations determine.
-    scale : (N,)
-        By how much the standard deviations given were widened; 1: not at all.
-    odd : (N,)
-        Views whose camera alone explains the corrections. More than one: any of them would.
-    drift_sigma : tuple of float
-        Standard deviation of the drift's coefficients in use, degree by degree [m].
-    """
-
+    # squared constant corrections (rotation, translation) over the variances given, over their degrees of
+    # freedom: about 1 where the priors hold. NaN where the observations determine nothing
     ratio: float
-    freedom: float
-    scale: Array
-    odd: BoolArray
+    freedom: float  # constant unknowns that the observations determine
+    scale: Array  # (N,) by how much the standard deviations given were widened; 1: not at all
+    odd: BoolArray  # (N,) views whose camera alone explains the corrections. More than one: any of them would
+    # standard deviation of the drift's coefficients in use, degree by degree [m]
     drift_sigma: tuple[float, ...]
 
 
@@ -102,21 +88,11 @@ class _Around:
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """The priors of a block and what may be learnt about them.
+    """The priors of a block and what may be learnt about them."""
 
-    Parameters
-    ----------
-    given : CameraPrior
-        With the standard deviations as they were given.
-    unknowns : Unknowns
-        Which unknown is what.
-    learn_constant, learn_drift : bool
-        Whether the constants' and the drift's standard deviations may change.
-    """
-
-    given: CameraPrior
-    unknowns: Unknowns
-    learn_constant: bool
+    given: CameraPrior  # with the standard deviations as they were given
+    unknowns: Unknowns  # which unknown is what
+    learn_constant: bool  # whether the constants' standard deviations may change
     learn_drift: bool
 
     @classmethod
@@ -135,15 +111,7 @@ class Variances:
         return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, _SEARCH))
 
     def learnt(self, problem: Problem, minimum: Minimum) -> tuple[CameraPrior, PriorTest]:
-        """The priors that the block supports, in its linearisation at a minimum.
-
-        Parameters
-        ----------
-        problem : Problem
-            With the priors of the minimum.
-        minimum : Minimum
-            What `minimise` found.
-        """
+        """The priors that the block supports, in its linearisation at a minimum."""
         try:
             return self._learnt(problem, minimum)
         except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
@@ -156,14 +124,13 @@ class Variances:
         around = _Around(problem, minimum)
         now, params = problem.camera_prior, minimum.state.params
         covariance = minimum.covariance(problem.free)
-        n = len(params)
-        wide = np.ones(self._degrees)
-        if around.small and (now.sigma != self._prior(np.ones(n), wide).sigma).any():
-            _, params, covariance = around.under(self._prior(np.ones(n), wide))
-        prior, scale = self._prior(np.ones(n), wide), np.ones(n)
-        odd = np.zeros(n, dtype=bool)
+        scale, wide, odd = np.ones(len(params)), np.ones(self._degrees), np.zeros(len(params), dtype=bool)
+        prior = self._prior(scale, wide)
+        if around.small and (now.sigma != prior.sigma).any():
+            _, params, covariance = around.under(prior)
         known = self._known(covariance, prior if around.small else now)
-        ratio, freedom = self._ratio(params, known)
+        total, freedom = (float(part.sum()) for part in self._squares(params, known))
+        ratio = total / freedom if freedom > _LEAST else float("nan")
         for _ in range(_ITERATIONS):
             if self.learn_constant and self._too_large(params, known, scale):
                 scale, odd = self._widened(around, params, known, wide)
@@ -174,20 +141,24 @@ class Variances:
                 break
             _, params, covariance = around.under(prior)
             known = self._known(covariance, prior)
-        c = self.constants
-        drift = tuple(float(np.median(prior.sigma[:, c + 3 * d])) for d in range(self._degrees))
+        drift = tuple(
+            float(np.median(prior.sigma[:, self._drift_part(d).start])) for d in range(self._degrees)
+        )
         return prior, PriorTest(ratio, freedom, scale, odd, drift)
 
     @property
     def _degrees(self) -> int:
         return self.unknowns.drift if self.unknowns.geometric else 0
 
+    def _drift_part(self, degree: int) -> slice:
+        return slice(self.constants + 3 * degree, self.constants + 3 * degree + 3)
+
     def _prior(self, scale: Array, wide: Array) -> CameraPrior:
         """The priors given, constants wider by `scale` (N,), drifts by `wide` (D,)."""
-        sigma, c = self.given.sigma.copy(), self.constants
-        sigma[:, :c] *= scale[:, None]
+        sigma = self.given.sigma.copy()
+        sigma[:, : self.constants] *= scale[:, None]
         for degree, factor in enumerate(wide):
-            part = slice(c + 3 * degree, c + 3 * degree + 3)
+            part = self._drift_part(degree)
             sigma[:, part] *= factor
             if degree == 0 and self.learn_drift:
                 sigma[:, part] = np.hypot(sigma[:, part], _MOVING * sigma[:, :3])
@@ -197,48 +168,43 @@ class Variances:
         """How far the observations determine each unknown (N, q): 0 not at all, 1 wholly."""
         shape = prior.sigma.shape
         use = covariance.free.reshape(shape) & np.isfinite(prior.sigma)
-        known = 1.0 - posterior_variance(covariance, shape) / prior.sigma**2
+        known = 1.0 - _posterior_variance(covariance, shape) / prior.sigma**2
         return np.where(use, known.clip(0.0, 1.0), 0.0)
 
-    def _squares(self, params: Array, known: Array, scale: Array | float = 1.0) -> Array:
-        """Squared constants of every view over their variances (N,)."""
-        c = self.constants
-        sigma = self.given.sigma[:, :c] * np.reshape(scale, (-1, 1))
-        used = np.where(known[:, :c] > 0, ((params - self.given.mean)[:, :c] / sigma) ** 2, 0.0)
-        return np.asarray(used.sum(axis=1))
-
-    def _ratio(self, params: Array, known: Array) -> tuple[float, float]:
-        freedom = float(known[:, : self.constants].sum())
-        total = float(self._squares(params, known).sum())
-        return (total / freedom if freedom > _LEAST else float("nan")), freedom
+    def _squares(
+        self, params: Array, known: Array, scale: Array | float = 1.0, part: slice | None = None
+    ) -> tuple[Array, Array]:
+        """Squared unknowns of every view (the constants, or a part) over their variances, and their freedom (N,)."""
+        part = slice(self.constants) if part is None else part
+        sigma = self.given.sigma[:, part] * np.reshape(scale, (-1, 1))
+        squared = ((params - self.given.mean)[:, part] / sigma) ** 2
+        return np.where(known[:, part] > 0, squared, 0.0).sum(axis=1), known[:, part].sum(axis=1)
 
     def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
         """Whether the corrections are larger than chance allows."""
-        freedom = float(known[:, : self.constants].sum())
-        total = float(self._squares(params, known, scale).sum())
+        total, freedom = (float(part.sum()) for part in self._squares(params, known, scale))
         return freedom > _LEAST and float(chi2.sf(total, freedom)) < _LEVEL
 
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
         """By how much each view's prior is to be widened (N,), and which views are odd."""
         n = len(params)
-        total, freedom = self._squares(params, known), known[:, : self.constants].sum(axis=1)
+        total, freedom = self._squares(params, known)
         factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
         odd = np.zeros(n, dtype=bool)
         with np.errstate(all="ignore"):
             gross = bool((total > _GROSS * freedom)[freedom > _LEAST].any())
         if around.small and n > 2 and gross:
             common = np.full(n, np.sqrt(factor))
-            scale, odd, evidence = self._odd(around, wide)
+            scale, alone, evidence = self._odd(around, wide)
             together = around.under(self._prior(common, wide))[0]
-            if evidence < together - _SURE:
-                return common, np.zeros(n, dtype=bool)
-            if evidence < together + _LIKELIER:  # both may be: the priors cover both
-                return np.maximum(scale, common), np.zeros(n, dtype=bool)
-            return scale, odd
+            if evidence >= together + _LIKELIER:
+                return scale, alone
+            both_may_be = evidence >= together - _SURE  # the priors cover both
+            return (np.maximum(scale, common) if both_may_be else common), odd
         if n > 2 and not around.small:  # one view of many is seen at once
             own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
             factor = max((_STRENGTH + own * freedom.sum()) / (_STRENGTH + freedom.sum()), 1.0)
-            odd = chi2.sf(total / factor, np.maximum(freedom, _LEAST)) < _LEVEL / n
+            odd = np.asarray(chi2.sf(total / factor, np.maximum(freedom, _LEAST)) < _LEVEL / n)
         alone = (_STRENGTH * factor + total) / (_STRENGTH + freedom)
         return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
 
@@ -269,21 +235,16 @@ class Variances:
         except np.linalg.LinAlgError:
             return -np.inf, 1.0
         known = self._known(covariance, prior)
-        total, freedom = self._squares(params, known)[v], known[v, : self.constants].sum()
+        total, freedom = (part[v] for part in self._squares(params, known))
         trial[v] = max(np.sqrt((_STRENGTH + total) / (_STRENGTH + freedom)), 1.0)
         return around.under(self._prior(trial, wide))[0], float(trial[v])
 
     def _drift(self, params: Array, known: Array) -> Array:
         """By how much the drift's standard deviations are to be changed (D,), the given ones counting for a few."""
-        c = self.constants
         factors = np.ones(self._degrees)
         for degree in range(self._degrees):
-            part = slice(c + 3 * degree, c + 3 * degree + 3)
-            use = known[:, part] > 0
-            total = float(
-                (use * ((params - self.given.mean)[:, part] / self.given.sigma[:, part]) ** 2).sum()
-            )
-            factors[degree] = np.sqrt((_STRENGTH + total) / (_STRENGTH + float(known[:, part].sum())))
+            total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
+            factors[degree] = np.sqrt((_STRENGTH + total) / (_STRENGTH + freedom))
         return factors
 
 
@@ -293,7 +254,7 @@ def same_prior(a: CameraPrior, b: CameraPrior, share: float) -> bool:
     return bool((np.abs(np.log(a.sigma[finite] / b.sigma[finite])) < share).all())
 
 
-def posterior_variance(covariance: Covariance, shape: tuple[int, ...]) -> Array:
+def _posterior_variance(covariance: Covariance, shape: tuple[int, ...]) -> Array:
     """Posterior variances (N, q) of all unknowns: exact for small blocks, else by random probes (Hutchinson)."""
     n = len(covariance.free)
     if n <= _SMALL:

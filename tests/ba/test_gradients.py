@@ -8,10 +8,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.ba.blocks import CameraPrior, JointPrior, PointPrior, flat_heights, ground_control, terrain_heights
 from barpc.ba.cameras import Cameras
-from barpc.ba.loss import LOSSES
+from barpc.ba.ground import flat_heights, ground_control, terrain_heights
+from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.unknowns import make_unknowns
+from barpc.ba.weights import LOSSES
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import GroundPoints, View
 from barpc.sensor.corrected import Corrected

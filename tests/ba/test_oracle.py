@@ -12,12 +12,11 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, normal, rounds
 from barpc.ba.adjustment import make_problem
 from barpc.ba.block import join
-from barpc.ba.blocks import ground_control
 from barpc.ba.gauge import gauge_report
-from barpc.ba.heights import Heights, convergence_angles
+from barpc.ba.ground import Heights, convergence_angles, ground_control
 from barpc.ba.problem import Problem
-from barpc.ba.rounds import Observations
 from barpc.ba.solve import Minimum, State, camera_step, gauss_newton
+from barpc.ba.weights import Observations
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
@@ -333,7 +332,7 @@ def observations() -> tuple[Observations, Any]:
     with chosen(AdjustOptions, min_observations=1) as options:
         block = join(made.views, made.tracks, made.gcps, options)
     problem = make_problem(block, options, centers_of(made), None)
-    problem = problem.with_point_prior(ground_control(made.gcps, np.array([10, 11])))
+    problem = replace(problem, point_prior=ground_control(made.gcps, np.array([10, 11])))
     return Observations(problem, block.sigma, 0.05, block.point < 10), block, problem
 
 

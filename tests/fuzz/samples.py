@@ -17,8 +17,8 @@ import numpy as np
 import rasterio
 
 from barpc.ba import BlockPrior
-from barpc.ba.blocks import CameraPrior
 from barpc.ba.incremental import apply_prior
+from barpc.ba.priors import CameraPrior
 from barpc.cli.options import image_paths
 from barpc.cli.points import read_points
 from barpc.cli.tables import print_comparison

@@ -1,0 +1,144 @@
+"""What is known of points: GCPs, a terrain, and heights for tracks that the rays alone do not fix."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barpc.ba.cameras import Projected
+from barpc.ba.priors import PointPrior
+from barpc.ba.problem import Problem
+from barpc.ba.structure import Structure
+from barpc.errors import BarpcWarning
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.options import AdjustOptions
+from barpc.scene import BoolArray, GroundPoints, IntArray
+
+Terrain = Callable[[Array, Array], Array]
+"""lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN where it is unknown."""
+
+_SLOPE_STEP = 15.0  # m: terrain slopes are taken over twice this distance
+_FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
+_TOGETHER = 0.25  # of it: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
+
+
+def _join(priors: Sequence[PointPrior | None]) -> PointPrior | None:
+    """One block of several that speak of different points, and share their errors; None where all are empty."""
+    given = [prior for prior in priors if prior is not None and len(prior.index)]
+    if not given:
+        return None
+    most = max(prior.common.shape[2] for prior in given)
+    common = [np.pad(p.common, ((0, 0), (0, 0), (0, most - p.common.shape[2]))) for p in given]
+    index, mean, rows = (
+        np.concatenate([getattr(p, name) for p in given]) for name in ("index", "mean", "rows")
+    )
+    return PointPrior(index, mean, rows, np.concatenate(common))
+
+
+def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
+    """GCPs as priors on the points `index` (G,): east, north and up by their sigmas."""
+    rows = enu_basis(gcps.lonlatalt) / gcps.sigma[..., None]
+    return PointPrior(index, ecef_from_ground(gcps.lonlatalt), rows, np.zeros((len(index), 3, 0)))
+
+
+def terrain_heights(
+    points: Array, index: IntArray, terrain: Terrain, sigma: float, common_sigma: float
+) -> PointPrior:
+    """Points `index` (Q,) of (P, 3) held to a terrain: the height above its tangent plane where they stand now.
+
+    Single altitudes are known to `sigma` [m]; all of them may be wrong by `common_sigma` [m], and by a slope that
+    is as much at the scene's edges. Points where the terrain is unknown are left out.
+    """
+    ground = ground_from_ecef(points[index])
+    step = _SLOPE_STEP / metres_per_unit(ground)[:, :2]
+    lon, lat = ground[:, 0], ground[:, 1]
+    alt = terrain(lon, lat)
+    slope_east = (terrain(lon + step[:, 0], lat) - terrain(lon - step[:, 0], lat)) / (2.0 * _SLOPE_STEP)
+    slope_north = (terrain(lon, lat + step[:, 1]) - terrain(lon, lat - step[:, 1])) / (2.0 * _SLOPE_STEP)
+    normal = np.stack([-np.nan_to_num(slope_east), -np.nan_to_num(slope_north), np.ones(len(alt))], axis=1)
+    return _heights(ground, index, alt, normal, sigma, common_sigma)
+
+
+def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
+    """Points `index` held to one altitude [m]: each within `sigma` [m], all together within `common_sigma` [m]."""
+    ground = ground_from_ecef(points[index])
+    n = len(index)
+    return _heights(ground, index, np.full(n, alt), np.tile([0.0, 0.0, 1.0], (n, 1)), sigma, common_sigma)
+
+
+def _heights(
+    ground: Array, index: IntArray, alt: Array, normal: Array, sigma: float, common_sigma: float
+) -> PointPrior:
+    known = np.isfinite(alt)
+    foot = np.column_stack([ground[known, :2], alt[known]])
+    rows, common = np.zeros((len(foot), 3, 3)), np.zeros((len(foot), 3, 3))
+    rows[:, 0] = np.einsum("qe,qex->qx", normal[known], enu_basis(foot)) / sigma
+    common[:, 0, 0] = common_sigma / sigma
+    mean = ecef_from_ground(foot)
+    if len(foot):
+        middle = mean.mean(axis=0)
+        plane = (mean - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
+        common[:, 0, 1:] = plane / np.maximum(np.abs(plane).max(axis=0), 1.0) * (common_sigma / sigma)
+    return PointPrior(index[known], mean, rows, common)
+
+
+def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:
+    """Largest angle (P,) [rad] between a point's rays and their mean, doubled: the angle of two rays."""
+    by_point = projected.by_point
+    ray = np.cross(by_point[0], by_point[1], axis=0)
+    up = structure.of_points(points)
+    with np.errstate(all="ignore"):
+        ray *= np.sign((ray * up).sum(axis=0)) / np.linalg.norm(ray, axis=0)
+    ray = np.nan_to_num(ray)
+    mean = structure.sum_points(ray)
+    mean /= np.maximum(np.linalg.norm(mean, axis=0), 1e-12)
+    apart = np.linalg.norm(ray - mean.take(structure.point, axis=1, mode="clip"), axis=0)
+    largest = np.zeros(structure.num_points)
+    np.maximum.at(largest, structure.point, apart)
+    return 4.0 * np.arcsin(np.minimum(0.5 * largest, 1.0))
+
+
+@dataclass(frozen=True)
+class Heights:
+    """The priors on points: GCPs, and heights for tracks that need (or are given) them."""
+
+    control: tuple[PointPrior, ...]  # GCPs
+    weak: BoolArray  # (P,) points whose rays meet under too small an angle
+    tracks: IntArray  # (T,) points that are tracks (GCPs are held already)
+    alt_range: tuple[float, float]  # altitudes [m] to expect where no other track tells
+    options: AdjustOptions  # `dem_sigma`, `dem_for_all`
+    dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
+
+    def hold(self, problem: Problem, points: Array) -> Problem:
+        """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
+        return replace(problem, point_prior=_join([*self.control, self._held(points)]))
+
+    def _held(self, points: Array) -> PointPrior | None:
+        dem, options = self.dem, self.options
+        weak = self.weak[self.tracks]
+        index = self.tracks if dem is not None and options.dem_for_all else self.tracks[weak]
+        if not len(index):
+            return None
+        if dem is not None:
+            return terrain_heights(points, index, dem, options.dem_sigma, options.dem_bias_sigma)
+        others = self.tracks[~weak]
+        if len(others) >= 10:
+            low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
+        else:
+            low, high = self.alt_range
+            middle = 0.5 * (low + high)
+        sigma = max(float(high - low) * (1.0 if len(others) >= 10 else 0.5), _FLAT_SIGMA)
+        return flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)
+
+    def warn(self) -> None:
+        """Say that tracks are held in height without a DEM."""
+        count = int(self.weak[self.tracks].sum())
+        if count and self.dem is None:
+            message = (
+                f"{count} of {len(self.tracks)} tracks are seen under less than "
+                f"{self.options.min_convergence:g} deg: without a DEM they are held in height"
+            )
+            warnings.warn(message, BarpcWarning, stacklevel=3)
