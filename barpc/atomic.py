@@ -27,14 +27,10 @@ def replacing(
 
     Parameters
     ----------
-    path : Path or str
-        The file to be written; its folder is made where it is missing.
-    overwrite : bool
-        Replace an existing file.
-    durable : bool
-        Wait until the file is on the disk; not needed for what can be made again.
-    room : Path, optional
-        Where the temporary folder is made, on the same disk; None: beside `path`.
+    path : Path or str, the file to be written; its folder is made where it is missing
+    overwrite : bool, replace an existing file
+    durable : bool, wait until the file is on the disk; not needed for what can be made again
+    room : Path, optional, where the temporary folder is made, on the same disk; None: beside `path`
 
     Raises
     ------

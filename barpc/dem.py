@@ -215,12 +215,9 @@ def localize_on_terrain(
     Parameters
     ----------
     sensor : SensorModel
-    image : (N, 2)
-        col, row [px].
-    terrain : callable
-        lon, lat [deg] -> altitude [m above the ellipsoid], such as a `Dem`.
-    alt_range : (low, high)
-        Altitudes between which the terrain lies [m].
+    image : (N, 2), col, row [px]
+    terrain : callable, lon, lat [deg] -> altitude [m above the ellipsoid], such as a `Dem`
+    alt_range : (low, high), altitudes between which the terrain lies [m]
 
     Returns
     -------

@@ -42,8 +42,7 @@ class DisconnectedError(TiePointError):
 
     Attributes
     ----------
-    groups : tuple of tuple of str
-        View names, one tuple a connected group, the largest first.
+    groups : tuple of tuple of str, view names, one tuple a connected group, the largest first
     """
 
     def __init__(self, message: str, groups: Sequence[Sequence[str]] = ()) -> None:

@@ -38,14 +38,10 @@ def pointwise(
     function : callable
         (n, k) points, (n,) altitudes if there are any, and (rows, n) memory to overwrite if it asks for `rows`
         -> arrays (n, ...); what is not finite is no news.
-    chunk : int
-        Points worked on at a time.
-    shapes : sequence of tuple of int
-        Of what a point gives.
-    points, alt : (..., k), (...)
-        Broadcast together; there may be no `alt`.
-    rows : int
-        Of memory that is kept for all pieces: fresh memory costs more than sums.
+    chunk : int, points worked on at a time
+    shapes : sequence of tuple of int, of what a point gives
+    points, alt : (..., k), (...), broadcast together; there may be no `alt`
+    rows : int, of memory that is kept for all pieces: fresh memory costs more than sums
     """
     points = np.asarray(points, dtype=np.float64)
     lead, k = points.shape[:-1], points.shape[-1]

@@ -39,14 +39,11 @@ class Rule:
 
     Parameters
     ----------
-    help : str
-        Sentences; Markdown's back quotes mark code.
-    unit : str
-        Of numbers; of texts what they are: "file", "dir", "name".
+    help : str, sentences; Markdown's back quotes mark code
+    unit : str, of numbers; of texts what they are: "file", "dir", "name"
     least, above, most, below : float, optional
         Bounds of a number, or of each in a list; `above` and `below` are not reached.
-    rows : str
-        The table whose keys are the values allowed, as module and name.
+    rows : str, the table whose keys are the values allowed, as module and name
     """
 
     help: str
@@ -419,12 +416,9 @@ def with_values(options: Record, values: Mapping[str, Any], where: str = "option
 
     Parameters
     ----------
-    options : Options
-        The record.
-    values : mapping of str to object
-        New values.
-    where : str
-        What a message calls the source.
+    options : Options, the record
+    values : mapping of str to object, new values
+    where : str, what a message calls the source
 
     Raises
     ------

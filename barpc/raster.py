@@ -67,8 +67,7 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
 
     Parameters
     ----------
-    path : path
-        An existing regular file.
+    path : path, an existing regular file
     driver : str, optional
         The one that may open it, of a kind whose first bytes do not tell (`barpc.dem.HEIGHTS`).
 

@@ -123,10 +123,8 @@ class Workspace:
     ----------
     folder : str or Path
         Where results go. That of an unfinished run is gone on with; any other that is not empty needs `overwrite`.
-    overwrite : bool
-        Replace what an earlier run wrote here and nobody has changed since; never anything else.
-    keep : iterable of Path
-        Files that must never be written: the inputs.
+    overwrite : bool, replace what an earlier run wrote here and nobody has changed since; never anything else
+    keep : iterable of Path, files that must never be written: the inputs
     names : iterable of str
         The outputs to come, as far as they are known: what is in their way is refused before any work.
     adds : bool

@@ -58,8 +58,7 @@ class CachingExecutor(Executor):
 
     Parameters
     ----------
-    workspace : Workspace
-        Where results are kept.
+    workspace : Workspace, where results are kept
     fingerprints : mapping of str to str
         Path of every input file to the hash of its content: results belong to contents, not to names.
     executor : Executor, optional

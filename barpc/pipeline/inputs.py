@@ -86,10 +86,8 @@ def read_pairs(
     ----------
     path : path
         The list. Relative paths in it start from where it lies, or from the current folder.
-    views : sequence of View
-        The images, whose indices are returned.
-    left_out : sequence of path
-        Images that a run was given but does not use: their pairs are passed over.
+    views : sequence of View, the images, whose indices are returned
+    left_out : sequence of path, images that a run was given but does not use: their pairs are passed over
 
     Raises
     ------

@@ -51,8 +51,7 @@ class AdjustResult:
     run : Run
         Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`,
         files) images stand in the order of their names, `run.views`, so that the order given does not matter.
-    record : Summary
-        What summary.json holds, as a typed record.
+    record : Summary, what summary.json holds, as a typed record
     """
 
     views: tuple[View, ...]
@@ -113,14 +112,11 @@ def adjust(
         Two or more rasters, in any order: the files written do not depend on it. They are opened read-only. What
         a camera is read from is found as `barpc.cameras.open_camera` does; a View brings its own model (a frozen
         dataclass, so that its results can be kept).
-    out_dir : path
-        Folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``.
-    options : RunOptions, optional
-        None: the defaults.
+    out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``
+    options : RunOptions, optional, None: the defaults
     executor : concurrent.futures.Executor, optional
         Works on tiles and pairs; the result does not depend on it.
-    progress : callable, optional
-        `progress(stage, done, total)`.
+    progress : callable, optional, `progress(stage, done, total)`
 
     Raises
     ------

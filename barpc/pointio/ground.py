@@ -47,14 +47,11 @@ def read_gcps(
 
     Parameters
     ----------
-    path : path
-        A `.gcp` file, a GeoJSON file, or an image with GCP tags.
+    path : path, a `.gcp` file, a GeoJSON file, or an image with GCP tags
     names : sequence of str
         The views; observations in other images are left out, and these named in `strangers`.
-    sigma : float or None
-        East, north, up standard deviation [m] instead of the file's.
-    image_sigma : float or None
-        Standard deviation of image coordinates [px] instead of the file's.
+    sigma : float or None, east, north, up standard deviation [m] instead of the file's
+    image_sigma : float or None, standard deviation of image coordinates [px] instead of the file's
 
     Raises
     ------
@@ -180,8 +177,7 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
         CSV (a header of names, or the columns lon, lat, alt, col, row), npz (arrays ``ground`` and ``image``
         or one a column), GeoJSON (GCPs with ``ji`` = [col, row]), or a GeoTIFF whose bands are longitude and
         latitude of one altitude layer after the other, on a regular grid of image points.
-    altitudes : sequence of float, optional
-        Altitudes of the layers of a grid that does not state them [m].
+    altitudes : sequence of float, optional, altitudes of the layers of a grid that does not state them [m]
 
     Raises
     ------
@@ -332,8 +328,7 @@ def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspon
 
     Parameters
     ----------
-    path : Path
-        GeoTIFF.
+    path : Path, GeoTIFF
     altitudes : sequence of float, optional
         Of the layers [m]; by default from the tags ``ALTITUDE_B0``, ``ALTITUDE_B2``, ...
     """

@@ -31,12 +31,9 @@ def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA
 
     Parameters
     ----------
-    path : path
-        CSV, npz, an ASP text match file, or a folder of these.
-    names : sequence of str
-        The views, in order; observations in other images are left out.
-    sigma : float
-        Standard deviation of each coordinate [px] where the file states none.
+    path : path, CSV, npz, an ASP text match file, or a folder of these
+    names : sequence of str, the views, in order; observations in other images are left out
+    sigma : float, standard deviation of each coordinate [px] where the file states none
 
     Raises
     ------

@@ -102,8 +102,7 @@ def rpc_from_fields(
     ----------
     fields : mapping
         `Fields`; ERR_BIAS and ERR_RAND may be missing, and are unknown where they are not positive.
-    options : ReadOptions, optional
-        Its `first_pixel` goes before the format's.
+    options : ReadOptions, optional, its `first_pixel` goes before the format's
     first_pixel : float
         The format's coordinate of the centre of the first pixel, subtracted from the image offsets.
 

@@ -134,12 +134,9 @@ def write_rpc_copy(
 
     Parameters
     ----------
-    rpc : RPC
-        The camera of `image_path`.
-    image_path, copy_path : Path or str
-        The image, and the file to write.
-    overwrite : bool
-        Replace an existing file, never the image itself.
+    rpc : RPC, the camera of `image_path`
+    image_path, copy_path : Path or str, the image, and the file to write
+    overwrite : bool, replace an existing file, never the image itself
 
     Raises
     ------
@@ -175,19 +172,14 @@ def write_crop(
 
     Parameters
     ----------
-    rpc : RPC
-        The camera of `image_path`.
-    image_path, crop_path : Path or str
-        The image, and the tiled GeoTIFF to write.
-    window : (col, row, width, height)
-        Whole pixels, inside the image.
-    overwrite : bool
-        Replace an existing file, never the image itself.
+    rpc : RPC, the camera of `image_path`
+    image_path, crop_path : Path or str, the image, and the tiled GeoTIFF to write
+    window : (col, row, width, height), whole pixels, inside the image
+    overwrite : bool, replace an existing file, never the image itself
 
     Returns
     -------
-    rpc : RPC
-        The crop's camera, as it stands in the file.
+    rpc : RPC, the crop's camera, as it stands in the file
 
     Raises
     ------

@@ -135,8 +135,7 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
 
     Parameters
     ----------
-    path : Path or str
-        An image or an RPC file.
+    path : Path or str, an image or an RPC file
     first_pixel, band
         As of `ReadOptions`.
 

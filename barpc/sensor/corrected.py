@@ -102,17 +102,13 @@ class Correction(Frozen):
 
     Parameters
     ----------
-    rotation : (3,)
-        Rotation vector [rad], ECEF axes.
-    translation : (3,)
-        [m], ECEF.
-    center : (3,)
-        Camera centre [m], ECEF.
+    rotation : (3,), rotation vector [rad], ECEF axes
+    translation : (3,), [m], ECEF
+    center : (3,), camera centre [m], ECEF
     drift : (D, 3)
         A second rotation [rad] after the first: the vectors times the powers u, u^2, ... of the normalised image
         row u = (row - row_offset) / row_scale at which the point is seen; D = 0: none.
-    row_offset, row_scale : float
-        Row of u = 0 and rows to u = 1 [px].
+    row_offset, row_scale : float, row of u = 0 and rows to u = 1 [px]
     """
 
     rotation: Array
@@ -152,18 +148,10 @@ class Correction(Frozen):
 
 @dataclass(frozen=True)
 class Corrected:
-    """P_BA: `sensor` behind `correction`; itself a `SensorModel`.
+    """P_BA: `sensor` behind `correction`; itself a `SensorModel`."""
 
-    Parameters
-    ----------
-    sensor : SensorModel
-        The model as delivered, P.
-    correction : Correction
-        R, T and C.
-    """
-
-    sensor: SensorModel
-    correction: Correction
+    sensor: SensorModel  # the model as delivered, P
+    correction: Correction  # R, T and C
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
@@ -189,13 +177,11 @@ class Corrected:
 
         Parameters
         ----------
-        ecef : (..., 3)
-            x, y, z [m].
+        ecef : (..., 3), x, y, z [m]
 
         Returns
         -------
-        image : (..., 2)
-            col, row [px].
+        image : (..., 2), col, row [px]
         by_ecef, by_rotation, by_translation : (..., 2, 3)
             d(image)/dX [px/m], d(image)/dR [px/rad], d(image)/dT [px/m].
         """
@@ -243,16 +229,10 @@ class Corrected:
 
 @dataclass(frozen=True, eq=False)
 class ImageAffine(Frozen):
-    """image + shift + slope @ image.
+    """image + shift + slope @ image."""
 
-    Parameters
-    ----------
-    shift : (2,), col, row [px]
-    slope : (2, 2), change of (col, row) by (col, row) [px/px]
-    """
-
-    shift: Array
-    slope: Array
+    shift: Array  # (2,): col, row [px]
+    slope: Array  # (2, 2): change of (col, row) by (col, row) [px/px]
 
     def __post_init__(self) -> None:
         self._array("shift", (2,), RpcError)
@@ -266,15 +246,10 @@ class ImageCorrected:
     The bias corrections (shift, drift, affine) of Fraser and Hanley ("Bias compensation in rational functions for
     Ikonos satellite imagery", 2003) and Grodecki and Dial ("Block adjustment of high-resolution satellite images
     described by rational polynomials", 2003), for comparison with the correction in space.
-
-    Parameters
-    ----------
-    sensor : SensorModel, the model as delivered
-    correction : ImageAffine, what is added to its image points
     """
 
-    sensor: SensorModel
-    correction: ImageAffine
+    sensor: SensorModel  # the model as delivered
+    correction: ImageAffine  # what is added to its image points
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""

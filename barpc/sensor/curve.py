@@ -31,16 +31,10 @@ _GAIN = 1.5  # a higher degree must lower the residual across the track by this 
 
 @dataclass(frozen=True, eq=False)
 class Curve(Frozen):
-    """A piecewise polynomial of time with values in three dimensions.
+    """A piecewise polynomial of time with values in three dimensions."""
 
-    Parameters
-    ----------
-    knots : (M + 1,), times [s], ascending; piece m holds between knots m and m + 1
-    coeffs : (M, K, 3), piece m is the sum over k of coeffs[m, k] (t - knots[m])^k
-    """
-
-    knots: Array
-    coeffs: Array
+    knots: Array  # (M + 1,): times [s], ascending; piece m holds between knots m and m + 1
+    coeffs: Array  # (M, K, 3): piece m is the sum over k of coeffs[m, k] (t - knots[m])^k
     _table: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -93,11 +87,6 @@ class Curve(Frozen):
         """First and last time that the curve is believed for [s]."""
         return float(self.knots[0]) - EXTRAPOLATION, float(self.knots[-1]) + EXTRAPOLATION
 
-    @property
-    def degree(self) -> int:
-        """Degree of the polynomials."""
-        return int(self.coeffs.shape[1]) - 1
-
     def __call__(self, time: Array) -> tuple[Array, Array]:
         """Values (3, N) and their derivatives by time (3, N) at times (N,) [s]."""
         out = self._evaluate(time, 6)
@@ -145,10 +134,7 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
     mount : (3, 3), ecef_from_camera at the middle sample
     attitude : Curve, rotation vector [rad] in the axes of `mount`: a cubic spline
 
-    Raises
-    ------
-    RpcError
-        A quaternion that is zero or not finite, an attitude that turns by more than 2 rad from the middle.
+    RpcError for a quaternion that is zero or not finite, an attitude that turns by more than 2 rad from the middle.
     """
     q = np.asarray(quaternions, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != 4 or not (np.isfinite(q).all() and q.any(axis=1).all()):
@@ -161,15 +147,9 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Orbit(Curve):
-    """The polynomial through state vectors.
+    """The polynomial through state vectors."""
 
-    Parameters
-    ----------
-    sigma : (3,)
-        Standard deviations of the state vectors: positions along and across the track [m], velocities [m/s].
-    """
-
-    sigma: Array
+    sigma: Array  # (3,): standard deviations of positions along and across the track [m], of velocities [m/s]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -258,12 +238,7 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
 
 
 class Turn:
-    """The rotations exp([w]x) and their derivatives.
-
-    Parameters
-    ----------
-    w : (..., 3, N), rotation vectors [rad]
-    """
+    """The rotations exp([w]x) of rotation vectors w (..., 3, N) [rad], and their derivatives."""
 
     def __init__(self, w: Array) -> None:
         x = (w * w).sum(axis=-2, keepdims=True)  # the angles, squared
@@ -299,10 +274,7 @@ def rotation_matrix(rotation: npt.ArrayLike) -> Array:
 
 
 def rotation_left_jacobian(rotation: npt.ArrayLike) -> Array:
-    """Left Jacobians (..., 3, 3) of rotation vectors (..., 3) [rad].
-
-    R(w + dw) = R(J dw) R(w) to first order: d(R v)/dw = -skew(R v) J.
-    """
+    """Left Jacobians J (..., 3, 3) of rotation vectors (..., 3) [rad]: R(w + dw) = R(J dw) R(w) to first order."""
     return Turn(-np.asarray(rotation, dtype=np.float64)[..., None]).rate(np.eye(3))
 
 

@@ -45,22 +45,17 @@ class Pushbroom(Frozen):
 
     Parameters
     ----------
-    orbit : Curve
-        Position of the camera over time [m], ECEF.
-    attitude : Curve
-        Rotation vector w over time [rad], in the axes of `mount`.
+    orbit : Curve, position of the camera over time [m], ECEF
+    attitude : Curve, rotation vector w over time [rad], in the axes of `mount`
     mount : (3, 3)
         ecef_from_camera where w = 0: columns are the camera's x (along the scan), y (along the detector
         line) and z (towards the ground).
     look : (2, K)
         Tangents l_x and l_y of the detector's line of sight as polynomials of (col - look_origin), ascending
         powers [1/px^k].
-    look_origin : float
-        Column [px] from which `look` counts.
-    line_period : float
-        Time from one row to the next [s].
-    first_line : float
-        Time of row 0 [s].
+    look_origin : float, column [px] from which `look` counts
+    line_period : float, time from one row to the next [s]
+    first_line : float, time of row 0 [s]
 
     Raises
     ------

@@ -27,10 +27,8 @@ class RPC(Frozen):
     coeffs : (4, 20)
         Rows: numerator and denominator of the column, numerator and denominator of the row, each in
         RPC00B order (`MONOMIALS`).
-    ground_offset, ground_scale : (3,)
-        lon, lat [deg], alt [m].
-    image_offset, image_scale : (2,)
-        col, row [px]; (0, 0) is the centre of the top-left pixel.
+    ground_offset, ground_scale : (3,), lon, lat [deg], alt [m]
+    image_offset, image_scale : (2,), col, row [px]; (0, 0) is the centre of the top-left pixel
     err_bias, err_rand : float or None
         Stated accuracy [m], RMS per horizontal axis: the part common to the image, the part of each
         point. None where it is unknown.
@@ -145,8 +143,7 @@ class RPC(Frozen):
         ----------
         col, row : float
             The new image's top-left CORNER, counted from this image's top-left corner [px of this image].
-        step_col, step_row : float
-            Size of a new pixel [px of this image]; 2 halves the resolution.
+        step_col, step_row : float, size of a new pixel [px of this image]; 2 halves the resolution
         """
         step = np.array([step_col, step_row], dtype=np.float64)
         corner = np.array([col, row], dtype=np.float64)

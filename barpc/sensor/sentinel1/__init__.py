@@ -63,8 +63,7 @@ def mosaic(
 
     Parameters
     ----------
-    sources : sequence of Path or Annotation
-        Annotations of swaths of one product.
+    sources : sequence of Path or Annotation, annotations of swaths of one product
     orbit, atmosphere, bistatic
         As of `RangeDoppler.from_annotation`; no full bistatic correction, which jumps between swaths.
 
@@ -130,10 +129,8 @@ def open_product(
 
     Parameters
     ----------
-    path : str or Path
-        A ``.SAFE`` folder, its ``manifest.safe``, a ``.zip`` of it, or one annotation XML.
-    swath : str, optional
-        "iw1", "s3", ..., or "mosaic" for all of them; may be left out where there is one.
+    path : str or Path, a ``.SAFE`` folder, its ``manifest.safe``, a ``.zip`` of it, or one annotation XML
+    swath : str, optional, "iw1", "s3", ..., or "mosaic" for all of them; may be left out where there is one
     polarisation : str, optional
         "vv", "vh", "hh" or "hv"; the geometry is the same, the first one is taken if left out.
     orbit, burst, atmosphere, bistatic

@@ -31,18 +31,11 @@ _ZENITH = (2.41, -1.0 / 3411.0, 1.0 / 8.55e7)  # m, per m, per m^2 of altitude
 
 @dataclass(frozen=True, eq=False)
 class SlantFrame(Frozen):
-    """The frame of an SLC: columns at a constant interval of slant range time.
+    """The frame of an SLC: columns at a constant interval of slant range time."""
 
-    Parameters
-    ----------
-    first_range_time : float, two-way slant range time of column 0 [s]
-    sampling_rate : float, columns a second of two-way time [Hz]
-    interval : float, azimuth time between rows [s]
-    """
-
-    first_range_time: float
-    sampling_rate: float
-    interval: float
+    first_range_time: float  # two-way slant range time of column 0 [s]
+    sampling_rate: float  # columns a second of two-way time [Hz]
+    interval: float  # azimuth time between rows [s]
 
     def image(self, times: Array) -> tuple[Array, Array]:
         """Image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
@@ -63,23 +56,14 @@ class GroundFrame(Frozen):
 
     Ground range is a polynomial of slant range, whose coefficients and origin are interpolated linearly
     between the times they are listed for (Sentinel-1 Product Specification, "coordinate conversion").
-
-    Parameters
-    ----------
-    interval : float, azimuth time between rows [s]
-    spacing : float, ground range between columns [m]
-    listed : (M,), times of the polynomials [s from the epoch], ascending
-    origin : (M,), slant range origins [m]
-    coeffs : (M, K), ascending powers of (slant range - origin) [m]
-    slope : float, slant range a ground range at mid swath, roughly: where the inversion starts
     """
 
-    interval: float
-    spacing: float
-    listed: Array
-    origin: Array
-    coeffs: Array
-    slope: float
+    interval: float  # azimuth time between rows [s]
+    spacing: float  # ground range between columns [m]
+    listed: Array  # (M,): times of the polynomials [s from the epoch], ascending
+    origin: Array  # (M,): slant range origins [m]
+    coeffs: Array  # (M, K): ascending powers of (slant range - origin) [m]
+    slope: float  # slant range a ground range at mid swath, roughly: where the inversion starts
 
     def image(self, times: Array) -> tuple[Array, Array]:
         """Image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
@@ -189,7 +173,6 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
 
     Parameters
     ----------
-    annotation : Annotation, one swath, or a GRD
     form : "annotated" or "full"
         "annotated": that constant, so that the model meets the lines of the product's own grid: 0.04 to
         0.14 line in an SLC, to 0.19 in a GRD (Schubert et al., "Sentinel-1A Product Geolocation Accuracy:

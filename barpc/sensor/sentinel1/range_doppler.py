@@ -66,19 +66,13 @@ class RangeDoppler(Frozen):
 
     Parameters
     ----------
-    orbit : Curve
-        Position of the satellite [m], ECEF; its time counts from `epoch`.
-    epoch : datetime64[ns]
-        Zero-Doppler time (UTC) of row 0.
-    frame : SlantFrame or GroundFrame
-        (azimuth time, slant range time) to (col, row).
+    orbit : Curve, position of the satellite [m], ECEF; its time counts from `epoch`
+    epoch : datetime64[ns], Zero-Doppler time (UTC) of row 0
+    frame : SlantFrame or GroundFrame, (azimuth time, slant range time) to (col, row)
     size : (width, height) [px]
-    alt_range : (low, high)
-        Altitudes that the image is used for [m above the ellipsoid].
-    look : "right" or "left"
-        Side of the track; a point on the other side projects to NaN.
-    delays : Delays
-        Smooth corrections between geometry and annotated times; none by default.
+    alt_range : (low, high), altitudes that the image is used for [m above the ellipsoid]
+    look : "right" or "left", side of the track; a point on the other side projects to NaN
+    delays : Delays, smooth corrections between geometry and annotated times; none by default
     """
 
     orbit: Curve
@@ -113,16 +107,11 @@ class RangeDoppler(Frozen):
 
         Parameters
         ----------
-        source : Path or Annotation
-            The annotation XML.
-        burst : int, optional
-            The model of this burst alone, from 0; row 0 is its first line.
-        orbit : Path, optional
-            Precise orbit file (``.EOF``) to use in place of the annotated state vectors.
-        atmosphere : bool
-            Add the path delay of the atmosphere (see `Delays`).
-        bistatic : "annotated" or "full", optional
-            Add a bistatic correction (see `bistatic_constant`).
+        source : Path or Annotation, the annotation XML
+        burst : int, optional, the model of this burst alone, from 0; row 0 is its first line
+        orbit : Path, optional, precise orbit file (``.EOF``) to use in place of the annotated state vectors
+        atmosphere : bool, add the path delay of the atmosphere (see `Delays`)
+        bistatic : "annotated" or "full", optional, add a bistatic correction (see `bistatic_constant`)
 
         Raises
         ------
