@@ -1,8 +1,7 @@
 """barpc: bundle adjustment of satellite images with RPC cameras.
 
-Images become tie points, tie points become corrections, corrections compose into P_BA, and P_BA is
-fitted into an RPC. The names below are the public ones; they are imported when first used, so that
-``import barpc`` costs nothing.
+Images become tie points, tie points become corrections, corrections compose into P_BA, and P_BA is fitted into an RPC.
+The names below are the public ones; they are imported when first used, so that ``import barpc`` costs nothing.
 """
 
 from __future__ import annotations

@@ -28,14 +28,9 @@ def replacing(
     Parameters
     ----------
     path : Path or str, the file to be written; its folder is made where it is missing
-    overwrite : bool, replace an existing file
+    overwrite : bool, replace an existing file, else an OutputError
     durable : bool, wait until the file is on the disk; not needed for what can be made again
     room : Path, optional, where the temporary folder is made, on the same disk; None: beside `path`
-
-    Raises
-    ------
-    OutputError
-        The file exists and `overwrite` is false, or it cannot be written.
     """
     path = Path(path)
     _refuse_existing(path, overwrite)

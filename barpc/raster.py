@@ -65,17 +65,9 @@ _WARNINGS = threading.Lock()  # catch_warnings is process-wide
 def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iterator[Any]:
     """Open a raster read-only, as a rasterio.DatasetReader or a Mosaic; an error while it is open names the file, too.
 
-    Parameters
-    ----------
-    path : path, an existing regular file
-    driver : str, optional
-        The one that may open it, of a kind whose first bytes do not tell (`barpc.dem.HEIGHTS`).
-
-    Raises
-    ------
-    ImageError
-        The file is missing, a folder, empty, of a kind that barpc does not read, damaged, remote, or a
-        VRT that is not of the grammar of `barpc.vrt` or points at anything else than plain local rasters.
+    `driver` may open a file whose first bytes do not tell its kind (`barpc.dem.HEIGHTS`). ImageError for a file that
+    is missing, a folder, empty, of no kind that barpc reads, damaged, remote, or a VRT that is not of the grammar of
+    `barpc.vrt` or points at anything else than plain local rasters.
     """
     name = os.fspath(path)
     file, driver = identify(name, driver)

@@ -32,8 +32,7 @@ class View(Frozen):
     path : str, absolute path of the raster; empty for a view without pixels
     size : (int, int), width, height [px]
     sensor : SensorModel, the camera as delivered
-    alt_range : (float, float)
-        Lowest and highest altitude [m above the ellipsoid] that the camera is used for.
+    alt_range : (float, float), altitudes [m above the ellipsoid] that the camera is used for
     """
 
     name: str
@@ -61,8 +60,7 @@ class Tracks(Frozen):
     Parameters
     ----------
     view : (K,), index of the view
-    point : (K,)
-        Index of the track, 0 .. P-1; rows of one track stand together, views ascending.
+    point : (K,), index of the track, 0 .. P-1; rows of one track stand together, views ascending
     xy : (K, 2), col, row [px]
     sigma : (K,), standard deviation of each coordinate [px]
     """

@@ -164,8 +164,7 @@ class Vrt:
 def read_vrt(path: Path, *, name: str | None = None) -> Vrt:
     """Read a VRT; its sources are not looked at, and are relative to what `path` links to, as in GDAL.
 
-    ImageError where it does not parse, holds anything outside the grammar, or names a source by anything else than a
-    plain path.
+    ImageError where it does not parse, holds anything outside the grammar, or a source that is no plain path.
     """
     name = name or str(path)
     try:

@@ -121,14 +121,11 @@ class Workspace:
 
     Parameters
     ----------
-    folder : str or Path
-        Where results go. That of an unfinished run is gone on with; any other that is not empty needs `overwrite`.
+    folder : str or Path, that of an unfinished run is gone on with; another that is not empty needs `overwrite`
     overwrite : bool, replace what an earlier run wrote here and nobody has changed since; never anything else
     keep : iterable of Path, files that must never be written: the inputs
-    names : iterable of str
-        The outputs to come, as far as they are known: what is in their way is refused before any work.
-    adds : bool
-        Other things may be in the folder: what earlier runs wrote stays theirs, free names are written.
+    names : iterable of str, the outputs to come, if known: what is in their way is refused before any work
+    adds : bool, other things may be in the folder: what earlier runs wrote stays theirs, free names are written
 
     Raises
     ------

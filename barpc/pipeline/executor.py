@@ -54,15 +54,10 @@ def worker_count(executor: Executor | None) -> int:
 
 
 class CachingExecutor(Executor):
-    """An executor that keeps results.
+    """An executor that keeps results in a workspace.
 
-    Parameters
-    ----------
-    workspace : Workspace, where results are kept
-    fingerprints : mapping of str to str
-        Path of every input file to the hash of its content: results belong to contents, not to names.
-    executor : Executor, optional
-        Works on the tasks; None: this process does, one after the other, when their result is asked for.
+    `fingerprints` holds the path and hash of every input file: results belong to contents, not to names. Without an
+    `executor` this process works on the tasks, one after the other, when their result is asked for.
     """
 
     def __init__(

@@ -82,17 +82,8 @@ def read_pairs(
 ) -> list[tuple[int, int]]:
     """The pairs of a list: two image names or paths a line; blank lines and # comments are skipped.
 
-    Parameters
-    ----------
-    path : path
-        The list. Relative paths in it start from where it lies, or from the current folder.
-    views : sequence of View, the images, whose indices are returned
-    left_out : sequence of path, images that a run was given but does not use: their pairs are passed over
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, a line is not two images of the run, or none is left; the message names it.
+    Relative paths start from where the list lies, or from the current folder; pairs with an image that was `left_out`
+    of the run are passed over. InputError where a line is not two images of the run, or none is left.
     """
     lines = read_names(path, "a list of pairs")
     find = _finder(Path(path).parent, views, left_out)
@@ -117,10 +108,7 @@ def read_pairs(
 def _finder(
     folder: Path, views: Sequence[View], left_out: Sequence[str | Path]
 ) -> Callable[[str], int | None]:
-    """Index of the view that a list in a folder calls by its path, from there or from here, or by its name.
-
-    None for an image that was left out; a stranger is an InputError.
-    """
+    """Index of the view that a list calls by its path or its name; None if it was left out, InputError if unknown."""
     names = ViewNames([view.name for view in views], "the list of pairs")
     without = ViewNames([Path(path).name for path in left_out], "")
     places: dict[Path, int | None] = {Path(path).resolve(): None for path in left_out}

@@ -45,12 +45,10 @@ class AdjustResult:
 
     Parameters
     ----------
-    views : tuple of View
-        The images in the order given, without those left out; after an adjustment with their refitted RPCs
-        as sensors.
+    views : tuple of View, the images used, in the order given; after an adjustment with their refitted RPCs as sensors
     run : Run
-        Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`,
-        files) images stand in the order of their names, `run.views`, so that the order given does not matter.
+        Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`, files) images
+        stand in the order of their names, `run.views`, so that the order given does not matter.
     record : Summary, what summary.json holds, as a typed record
     """
 
@@ -114,8 +112,7 @@ def adjust(
         dataclass, so that its results can be kept).
     out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``
     options : RunOptions, optional, None: the defaults
-    executor : concurrent.futures.Executor, optional
-        Works on tiles and pairs; the result does not depend on it.
+    executor : concurrent.futures.Executor, optional, works on tiles and pairs; the result does not depend on it
     progress : callable, optional, `progress(stage, done, total)`
 
     Raises

@@ -65,18 +65,14 @@ def load_views(
 
     Parameters
     ----------
-    images : sequence of path or View
-        The image files, perhaps with choices behind them (`barpc.cameras.open_camera`), or views of them with
-        a camera of one's own.
-    min_views, keep_going, band : int, bool, int
-        How many are needed; leave a bad file out instead of stopping; the band that will be read, from 1.
-    distinct : bool
-        Refuse an image that is there twice, also as other files or under another RPC (see `Twins`).
+    images : sequence of path or View, files, perhaps with choices behind them (`open_camera`), or views of them
+    min_views : int, how many are needed
+    keep_going : bool, leave a bad file (ImageError, RpcError) out instead of stopping
+    band : int, the band that will be read, from 1
+    distinct : bool, refuse an image that is there twice, also as other files or under another RPC (see `Twins`)
 
     Raises
     ------
-    ImageError, RpcError
-        A file cannot be used; the message names it.
     InputError
         Too few images, the same image twice, or a name that the files of a run cannot carry.
     """

@@ -191,7 +191,6 @@ def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrit
 
     Parameters
     ----------
-    rpc : RPC
     path : Path or str
         Its name chooses the format: ``_RPC.TXT``, ``.RPB``, ``.geom``, ``.XML`` (Maxar), ``.json`` (rpcm). An RPC
         goes into a raster by `write_rpc_vrt` or `write_rpc_copy`, never into the input.

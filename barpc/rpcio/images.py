@@ -43,10 +43,8 @@ def write_rpc_vrt(
 
     Parameters
     ----------
-    rpc, image_path, vrt_path, overwrite
-        As of `write_rpc_copy`.
-    relative : bool
-        Point at the image relative to the VRT, so that both may move together; else by absolute path.
+    rpc, image_path, vrt_path, overwrite : as of `write_rpc_copy`
+    relative : bool, point at the image relative to the VRT, so that both may move; else by absolute path
 
     Raises
     ------

@@ -58,18 +58,9 @@ class Curve(Frozen):
     def through(cls, times: npt.ArrayLike, values: npt.ArrayLike, degree: int = 5) -> Curve:
         """The spline through samples: smooth to the second but one derivative, not-a-knot at its ends.
 
-        Parameters
-        ----------
-        times : (N,) [s], ascending
-        values : (N, 3), positions [m] or rotation vectors [rad]
-        degree : int
-            3 or 5; less where there are too few samples. A quintic through positions every 10 s is true to
-            1e-4 m between them.
-
-        Raises
-        ------
-        RpcError
-            Fewer than two samples, times that do not ascend, numbers that are not finite.
+        `values` (N, 3) are positions [m] or rotation vectors [rad]; `degree` is 3 or 5, less where there are too few
+        samples. A quintic through positions every 10 s is true to 1e-4 m between them. RpcError for fewer than two
+        samples, times that do not ascend, numbers that are not finite.
         """
         times, values = np.asarray(times, dtype=np.float64), np.asarray(values, dtype=np.float64)
         if times.ndim != 1 or len(times) < 2 or values.shape != (len(times), 3):
@@ -176,8 +167,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
     Raises
     ------
     RpcError
-        Fewer than `MIN_VECTORS` vectors, an image more than `EXTRAPOLATION` beyond them, or vectors that
-        are not one orbit.
+        Fewer than `MIN_VECTORS` vectors, an image more than `EXTRAPOLATION` beyond them, or no one orbit.
     """
     time, first = np.unique(time, return_index=True)
     use = (time >= window[0] - MARGIN) & (time <= window[1] + MARGIN)

@@ -75,17 +75,11 @@ class _Inverse:
 
 
 class Rational:
-    """The map (3, N) -> (2, N) of two quotients of cubics.
-
-    Parameters
-    ----------
-    coeffs : (4, 20), numerator and denominator of the first value, then of the second
-    accuracy : (2,), what `solve` may be off by in each value; rounding comes on top
-    """
+    """The map (3, N) -> (2, N) of two quotients of cubics."""
 
     def __init__(self, coeffs: Array, accuracy: Array) -> None:
-        self.coeffs = coeffs
-        self.accuracy = accuracy
+        self.coeffs = coeffs  # (4, 20): numerator and denominator of the first value, then of the second
+        self.accuracy = accuracy  # (2,): what `solve` may be off by in each value; rounding comes on top
         # d/dL, d/dP, d/dH of the four polynomials on the first ten monomials, by axis: (12, 10)
         self.gradients = np.einsum("pi,aij->apj", coeffs, DERIVATIVE).reshape(12, 10)
 
@@ -190,10 +184,7 @@ class Rational:
         return ok
 
     def _damped_newton(self, target: Array, x: Array, steps: int = 60) -> Array:
-        """Newton on `x[:2]`, steps halved until the error falls, never across a pole; the error (2, N) left.
-
-        The points that have come to rest leave the batch, so that a few stubborn ones cost little.
-        """
+        """Newton on `x[:2]`, steps halved until the error falls, never across a pole; the error (2, N) left."""
         left = np.full(target.shape, np.inf)
         active = np.arange(target.shape[1])
         sign = np.sign(self.coeffs[1::2, :1])
@@ -207,7 +198,7 @@ class Rational:
             step /= np.maximum(1.0, np.abs(step).max(axis=0))  # at most one box width at a time
             improved = self._line_search(goal, here, step, sign)
             x[:, active] = here
-            active = active[improved]
+            active = active[improved]  # so a few stubborn points cost little
             if not len(active):
                 break
         return left

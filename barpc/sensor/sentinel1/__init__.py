@@ -61,16 +61,8 @@ def mosaic(
     Column 0 is pixel 0 of the nearest swath (IW1, EW1) and row 0 the earliest line 0; the other swaths
     start at ``mosaic_offsets``.
 
-    Parameters
-    ----------
-    sources : sequence of Path or Annotation, annotations of swaths of one product
-    orbit, atmosphere, bistatic
-        As of `RangeDoppler.from_annotation`; no full bistatic correction, which jumps between swaths.
-
-    Raises
-    ------
-    InputError
-        A GRD, swaths that are not of one product, or the full bistatic correction.
+    The rest is as of `RangeDoppler.from_annotation`. InputError for a GRD, swaths that are not of one product, or the
+    full bistatic correction, which jumps between swaths.
     """
     swaths = [s if isinstance(s, Annotation) else read_annotation(s) for s in sources]
     if bistatic == "full":
@@ -83,16 +75,9 @@ def mosaic(
 
 
 def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
-    """Where the stitched frames of the swaths of one SLC product begin in the frame of their mosaic.
+    """Where the stitched frames of the swaths of one SLC product begin in that of their mosaic: col, row (S, 2) [px].
 
-    Returns
-    -------
-    offsets : (S, 2), col, row [px]: whole numbers to within 1e-3 in products since 2016
-
-    Raises
-    ------
-    InputError
-        A GRD, or swaths that are not of one product.
+    Whole numbers to within 1e-3 in products since 2016. InputError for a GRD, or swaths that are not of one product.
     """
     if not swaths:
         raise InputError("a mosaic of no swaths: give the annotations of IW1, IW2 and IW3")
@@ -131,16 +116,13 @@ def open_product(
     ----------
     path : str or Path, a ``.SAFE`` folder, its ``manifest.safe``, a ``.zip`` of it, or one annotation XML
     swath : str, optional, "iw1", "s3", ..., or "mosaic" for all of them; may be left out where there is one
-    polarisation : str, optional
-        "vv", "vh", "hh" or "hv"; the geometry is the same, the first one is taken if left out.
-    orbit, burst, atmosphere, bistatic
-        As of `RangeDoppler.from_annotation`.
+    polarisation : str, optional, "vv", "vh", "hh" or "hv"; the geometry is the same
+    orbit, burst, atmosphere, bistatic : as of `RangeDoppler.from_annotation`
 
     Raises
     ------
     InputError
-        No such swath or polarisation, or a choice that does not go with the product; the message lists
-        what there is.
+        No such swath or polarisation, or a choice that does not go with the product.
     RpcFormatError
         Not a Sentinel-1 product.
     """

@@ -117,19 +117,13 @@ Frame = SlantFrame | GroundFrame
 class Delays:
     """Which delays are added to the geometric times.
 
-    Parameters
-    ----------
-    atmosphere : bool
-        Path delay of the atmosphere, (2.41 - h/3411 + h^2/8.55e7) m / cos(incidence), one way, h the
-        altitude [m] (Jehle et al., "Estimation of Atmospheric Path Delays in TerraSAR-X Data using Models
-        vs. Measurements", Sensors 2008): 0.8 to 1.6 px in range.
-    bistatic : float, optional
-        Constant b [s] of the bistatic correction of azimuth time, b - tau/2 with tau the two-way slant
-        range time; None for none.
+    That of the path through the atmosphere, one way, is (2.41 - h/3411 + h^2/8.55e7) m / cos(incidence), h the altitude
+    [m] (Jehle et al., "Estimation of Atmospheric Path Delays in TerraSAR-X Data using Models vs. Measurements", Sensors
+    2008): 0.8 to 1.6 px in range. The bistatic correction of azimuth time is b - tau/2, tau the slant range time.
     """
 
     atmosphere: bool = False
-    bistatic: float | None = None
+    bistatic: float | None = None  # b [s]; None for no correction
 
     def __bool__(self) -> bool:
         return self.atmosphere or self.bistatic is not None
@@ -171,20 +165,12 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
     middle of the whole product (IW2, EW3), which shows in its geolocation grid: the time of a grid line
     less the grid's azimuth time is b - tau/2 to 2 us, with b half the two-way time of that range.
 
-    Parameters
-    ----------
-    form : "annotated" or "full"
-        "annotated": that constant, so that the model meets the lines of the product's own grid: 0.04 to
-        0.14 line in an SLC, to 0.19 in a GRD (Schubert et al., "Sentinel-1A Product Geolocation Accuracy:
-        Commissioning Phase Results", Remote Sensing 2015). "full": also the pulses on their way, rank
-        times pulse interval, for one SLC swath: to 0.26 line (Gisinger et al., "Recent Findings on the
-        Sentinel-1 Geolocation Accuracy Using the Australian Corner Reflector Array", IGARSS 2018).
-
-    Raises
-    ------
-    InputError
-        The processor did not correct the bistatic delay, the grid does not tell how, or "full" is asked
-        for a GRD.
+    "annotated": that constant, so that the model meets the lines of the product's own grid: 0.04 to 0.14 line in an
+    SLC, to 0.19 in a GRD (Schubert et al., "Sentinel-1A Product Geolocation Accuracy: Commissioning Phase Results",
+    Remote Sensing 2015). "full": also the pulses on their way, rank times pulse interval, for one SLC swath: to 0.26
+    line (Gisinger et al., "Recent Findings on the Sentinel-1 Geolocation Accuracy Using the Australian Corner Reflector
+    Array", IGARSS 2018). InputError where the processor did not correct it, the grid does not tell how, or "full" is
+    asked for a GRD.
     """
     if not annotation.bistatic_applied:
         raise InputError(

@@ -1,8 +1,7 @@
 """The Range-Doppler model: a ground point is seen when the satellite passes it at zero Doppler.
 
-The satellite's orbit is O(t) with velocity V(t). The azimuth time t of a ground point X is the zero of
-E(t) = V(t) . (X - O(t)); its two-way slant range time is tau = 2 |X - O(t)| / c. A frame turns (t, tau)
-into (col, row).
+The satellite's orbit is O(t) with velocity V(t). The azimuth time t of a ground point X is the zero of E(t) = V(t) .
+(X - O(t)); its two-way slant range time is tau = 2 |X - O(t)| / c. A frame turns (t, tau) into (col, row).
 """
 
 from __future__ import annotations
@@ -130,13 +129,9 @@ class RangeDoppler(Frozen):
         return build([annotation], epoch, (annotation.samples, lines), orbit, atmosphere, bistatic)
 
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
-        """Times at which ground points (..., 3) are seen: pure geometry, without `delays`.
+        """Zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points (..., 3).
 
-        Returns
-        -------
-        azimuth_time : (...)
-            Zero-Doppler time [s from `epoch`]; NaN off the orbit's time span or on the other side.
-        range_time : (...), two-way slant range time [s]
+        Pure geometry, without `delays`; NaN off the orbit's time span or on the other side.
         """
         azimuth_time, range_time = pointwise(
             lambda part: self._geometry(ecef_from_ground(part)).times, CHUNK, [(), ()], ground
@@ -146,17 +141,13 @@ class RangeDoppler(Frozen):
     def incidence(self, ground: Array) -> Array:
         """Angles (...) [deg] between the ellipsoid's normal and the beam at ground points (..., 3).
 
-        Not those of `barpc.sensor.geometry.view_angles`, which follows the ground points of one pixel over
-        altitude: for a radar they lie on a circle about the track, at a right angle to the beam. NaN where
-        `azimuth_range` is.
+        Not those of `barpc.sensor.geometry.view_angles`, which follows the ground points of one pixel over altitude:
+        for a radar they lie on a circle about the track, at a right angle to the beam. NaN where `azimuth_range` is.
         """
         return pointwise(self._incidence, CHUNK, [()], ground)[0]
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m].
-
-        NaN off the orbit's time span or on the other side of the track.
-        """
+        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN where `azimuth_range` is."""
         return pointwise(self._project, CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
@@ -167,9 +158,8 @@ class RangeDoppler(Frozen):
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
 
-        On the circle of zero Doppler and given slant range, Newton on the look angle until the point has the
-        altitude. Longitudes run on across the antimeridian; NaN off the orbit's time span or where the range does
-        not reach.
+        On the circle of zero Doppler and given slant range, Newton on the look angle until the point has the altitude.
+        Longitudes run on across the antimeridian; NaN off the orbit's time span or where the range does not reach.
         """
         ground = pointwise(lambda part, alt: [self._localize(part.T, alt)], CHUNK, [(3,)], image, alt)[0]
         with np.errstate(all="ignore"):
@@ -212,13 +202,11 @@ class RangeDoppler(Frozen):
         return right if self.look == "right" else -right
 
     def _incidence(self, ground: Array) -> list[Array]:
-        """`incidence` of points (N, 3)."""
         seen = self._geometry(ecef_from_ground(ground))
         cosine = _dot(up(ground), seen.sight)
         return [np.where(np.isnan(seen.times[0]), np.nan, np.rad2deg(np.arccos(cosine)))]
 
     def _project(self, ground: Array) -> list[Array]:
-        """`project` of points (N, 3)."""
         seen = self._geometry(ecef_from_ground(ground))
         times = seen.times
         if self.delays:
@@ -228,7 +216,6 @@ class RangeDoppler(Frozen):
         return [image.T]
 
     def _jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """`project_jacobian` of points (N, 3)."""
         seen = self._geometry(ecef_from_ground(ground))
         by_ecef = np.stack([seen.time_by_ecef.T, seen.sight.T * (-2.0 / SPEED_OF_LIGHT)])  # (2, N, 3)
         ecef_by_ground = ecef_from_ground_jacobian(ground)
@@ -245,7 +232,6 @@ class RangeDoppler(Frozen):
         return image.T, jacobian
 
     def _localize(self, image: Array, alt: Array) -> Array:
-        """`localize` of image points (2, N)."""
         measured = times = self.frame.times(image)
         ground, sight = self._on_circle(times, alt)
         for _ in range(3 if self.delays else 0):  # delays change by 1e-5 of a step: three rounds are exact
@@ -351,12 +337,7 @@ def build(
 
 
 def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
-    """The model against a product's own geolocation grid (of one swath of a mosaic).
-
-    Returns
-    -------
-    residuals : (G, 2), range [samples of `range_sampling_rate`], azimuth [lines]: model - grid, geometry only
-    """
+    """Model - a swath's own geolocation grid, geometry only: range [samples], azimuth [lines], (G, 2)."""
     grid = annotation.grid
     azimuth_time, range_time = model.azimuth_range(grid.ground)
     samples = (range_time - grid.range_time) * annotation.range_sampling_rate
