@@ -60,7 +60,6 @@ def _refuse_existing(path: Path, overwrite: bool) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Ask the system to put a file, or a folder's entries, on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -158,7 +158,6 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _pixels(path: Path) -> tuple[int, int] | None:
-    """Width and height [px] of a raster; None of another file."""
     try:
         with open_raster(path) as dataset:
             return int(dataset.width), int(dataset.height)

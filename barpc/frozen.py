@@ -59,7 +59,6 @@ class Frozen:
         return value
 
     def _given(self) -> list[str]:
-        """Names of the fields that the constructor takes."""
         return [field.name for field in fields(self) if field.init]  # type: ignore[arg-type]  # children are dataclasses
 
     def _content(self) -> tuple[object, ...]:

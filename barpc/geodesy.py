@@ -31,17 +31,10 @@ def pointwise(
     alt: npt.ArrayLike | None = None,
     rows: int = 0,
 ) -> list[Array]:
-    """What a function of a batch of points gives for points with any leading axes, in pieces that stay in cache.
+    """What a function of a batch of points gives for points (..., k) and altitudes (...), broadcast, `chunk` at a time.
 
-    Parameters
-    ----------
-    function : callable
-        (n, k) points, (n,) altitudes if there are any, and (rows, n) memory to overwrite if it asks for `rows`
-        -> arrays (n, ...); what is not finite is no news.
-    chunk : int, points worked on at a time
-    shapes : sequence of tuple of int, of what a point gives
-    points, alt : (..., k), (...), broadcast together; there may be no `alt`
-    rows : int, of memory that is kept for all pieces: fresh memory costs more than sums
+    The function takes (n, k) points, (n,) altitudes if there are any, and (rows, n) memory to overwrite if it asks for
+    `rows` (fresh memory costs more than sums), and gives arrays (n, *shape); what is not finite is no news.
     """
     points = np.asarray(points, dtype=np.float64)
     lead, k = points.shape[:-1], points.shape[-1]

@@ -444,7 +444,8 @@ def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
         else:
             properties[name] = {**_schema(one.kind, one.rule), "description": one.rule.help}
             if one.default is not None:
-                properties[name]["default"] = _listed(one.default)
+                listed = isinstance(one.default, tuple)
+                properties[name]["default"] = list(one.default) if listed else one.default
     return {"type": "object", "additionalProperties": False, "properties": properties}
 
 
@@ -467,12 +468,7 @@ def _schema(kind: Any, rule: Rule) -> dict[str, Any]:
     return {"type": name, **{key: value for key, value in bounds.items() if value is not None}}
 
 
-def _listed(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
-
-
 def _documented(record: type[Options]) -> str:
-    """The docstring of a record, with its fields as numpydoc has them."""
     rows = []
     for name, one in declared(record).items():
         rows += [f"{name} : {wanted(one.kind, Rule('') if one.rule.rows else one.rule)}"]

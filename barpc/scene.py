@@ -82,7 +82,6 @@ class Tracks(Frozen):
             raise InputError("tracks: negative view or track index")
 
     def __len__(self) -> int:
-        """Number of observations K."""
         return len(self.view)
 
     @property

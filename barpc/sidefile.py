@@ -147,9 +147,8 @@ def read_names(path: Path | str, words: str) -> list[str]:
     return lines
 
 
-_REFUSED = "\ufffe\uffff" + (
-    "\\" if os.sep == "/" else ""
-)  # no XML takes two, GDAL splits a name at the third
+# No XML takes the first two, GDAL splits a name at the third.
+_REFUSED = "\ufffe\uffff" + ("\\" if os.sep == "/" else "")
 
 
 def plain_path(path: str | os.PathLike[str]) -> Path:

@@ -1,11 +1,10 @@
 """Who works on the tasks: an executor that remembers results, and keeps only a few tasks in flight.
 
-Stages hand their tasks (per tile, per pair) to any `concurrent.futures.Executor`. `CachingExecutor` looks each up among
-the kept results, gives the rest to the executor behind it (or works on them itself, when asked for the result), and
+`CachingExecutor` looks a task (a tile, a pair) up among the kept results, gives the rest to the executor behind it, and
 keeps what comes back at once: an interrupted run goes on where it was, and a thousand pairs do not stand pickled in a
-queue. Quick tasks travel in batches: what a task costs on the way (0.2 ms to a process, 10 ms over dask) is paid once
-for half a second of work. Large arrays (the keypoints of a view go to all its pairs) are spilled once into the run
-folder, which all workers see as they see the images: what dask scatters dies with the worker that holds it.
+queue. Quick tasks travel in batches: the way (0.2 ms to a process, 10 ms over dask) is paid once for half a second of
+work. Large arrays (the keypoints of a view go to all its pairs) are spilled once into the run folder, which all workers
+see as they see the images: what dask scatters dies with the worker that holds it.
 """
 
 from __future__ import annotations

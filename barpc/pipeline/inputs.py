@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -37,24 +36,19 @@ def load_gcps(paths: Sequence[str], views: Sequence[str]) -> GroundPoints | None
     return GroundPoints(names, point=point, **joined, strangers=strangers)
 
 
-@dataclass(frozen=True, eq=False)
-class Given:
-    """Side inputs, read before any work starts: the terrain, and what an earlier run knows about its views."""
+def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None, BlockPrior | None]:
+    """The terrain, and what an earlier run knows about its views, read before any work starts.
 
-    dem: Dem | None
-    prior: BlockPrior | None
-
-    @classmethod
-    def read(cls, options: RunOptions, views: Sequence[View]) -> Given:
-        """Read them all; a file that cannot be used stops the run here (InputError), and not after an hour."""
-        names = [view.name for view in views]
-        load_gcps(options.gcp, names)
-        load_gcps(options.check_points, names)
-        dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
-        if dem is not None:
-            _require_cover(dem, str(options.dem), views)
-        prior = None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
-        return cls(dem, prior)
+    A file that cannot be used, those of ground points included, stops the run here (InputError), not after an hour.
+    """
+    names = [view.name for view in views]
+    load_gcps(options.gcp, names)
+    load_gcps(options.check_points, names)
+    dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
+    if dem is not None:
+        _require_cover(dem, str(options.dem), views)
+    prior = None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
+    return dem, prior
 
 
 def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:

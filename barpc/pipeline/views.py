@@ -134,10 +134,9 @@ def _altitudes(camera: Camera) -> tuple[float, float]:
 class Twins:
     """Finds an image that was given before: the same file, the same camera, or the same pixels.
 
-    Pixels of a band are compared as decoded values, so that copies in another compression, layout, number type or
-    behind a VRT are found. Three small windows of each image are read; images in which these agree are then
-    read whole, each once. An image in which nothing varies, in these and in 36 more, is compared with none. The
-    work is linear in the number of images.
+    Pixels of a band are compared as decoded values: copies in another compression, layout, number type or behind a VRT
+    are found. Three small windows of each image are read; images in which these agree are then read whole, each once.
+    An image in which nothing varies, in these and in 36 more, is compared with none. Work is linear in the images.
     """
 
     def __init__(self, band: int = 1) -> None:
@@ -200,7 +199,6 @@ def _whole(image: Any, band: int) -> bytes | None:
 
 
 def _digest(image: Any, band: int, windows: list[Window]) -> bytes | None:
-    """A hash of pixels; None where nothing varies."""
     found = blake2b(digest_size=16)
     low = high = np.nan
     for window in windows:

@@ -275,7 +275,6 @@ def _checked(path: Path, ground: Array, image: Array, sigma: Array | None) -> Co
 
 
 def _read_features(path: Path) -> Correspondences:
-    """GCPs (see `geojson_points`)."""
     table = np.array([numbers for numbers, _ in geojson_points(path)])
     if not len(table):
         raise InputError(f"{path}: no points in it")

@@ -240,7 +240,6 @@ def _copy_window(dataset: Any, target: Path, window: Window, **options: str) -> 
 
 
 def _blocks(copy: Any, window: Window) -> Iterator[tuple[Window, Window]]:
-    """Blocks of a copy of a window, in the copy and in the image."""
     for _, block in copy.block_windows(1):
         col, row = window.col_off + block.col_off, window.row_off + block.row_off
         yield block, Window(col, row, block.width, block.height)

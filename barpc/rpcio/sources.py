@@ -188,7 +188,6 @@ def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:
 
 
 def _own_rpc(path: Path, head: bytes) -> RPC | None:
-    """The RPC inside a TIFF or NITF."""
     reader = {"GTiff": read_tag, "NITF": read_nitf}.get(driver_of(head) or "")
     return reader(path) if reader else None
 

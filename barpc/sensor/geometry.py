@@ -97,10 +97,7 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
 
 
 def sight_enu(sensor: SensorModel, ground: Array) -> Array:
-    """Unit vectors (..., 3) east, north, up from ground points (..., 3) towards the sensor.
-
-    The null vector of the projection's derivative: so a point can move without moving in the image.
-    """
+    """Unit vectors (..., 3) east, north, up from ground points (..., 3) to the sensor: along them no pixel changes."""
     ground = np.asarray(ground, dtype=np.float64)
     _, jacobian = sensor.project_jacobian(ground)
     metric = jacobian / metres_per_unit(ground)[..., None, :]

@@ -103,10 +103,9 @@ class Rational:
     def solve(self, target: Array, z: Array, work: Array | None = None) -> tuple[Array, BoolArray]:
         """The inverse: points (3, N) whose third variable is `z` (N,) and whose values are `target` (2, N).
 
-        The cubic inverse and one Newton step; where the step is too long to prove that it was enough, one
-        more; where that is too long or the point lies out of the box, damped Newton from the centre
-        and a check of the value, the sign of the denominators and the orientation. The second result (N,) says which
-        points were found, on the sheet of the map that holds the centre; `work` (20, N) is overwritten.
+        The cubic inverse and one Newton step; one more where that was too long to prove it enough; then, and out
+        of the box, damped Newton from the centre and a check of value, denominators and orientation. The second result
+        (N,) says which were found, on the sheet of the map that holds the centre; `work` (20, N) is overwritten.
         """
         inverse = self._inverse
         x = np.empty((3, len(z)))

@@ -13,7 +13,7 @@ import numpy as np
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
-from barpc.sensor.rational import CHUNK, MONOMIALS, REACH, BoolArray, Rational, monomials
+from barpc.sensor.rational import CHUNK, REACH, BoolArray, Rational
 
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 
@@ -140,6 +140,3 @@ class RPC(Frozen):
             return self.crop(col, row)  # the same, without a rounding
         offset = (self.image_offset + 0.5 - corner) / step - 0.5
         return replace(self, image_offset=offset, image_scale=self.image_scale / step)
-
-
-__all__ = ["CHUNK", "MONOMIALS", "RPC", "monomials"]

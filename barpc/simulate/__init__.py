@@ -270,7 +270,6 @@ def _cameras(grid: _Grid, num_views: int, options: BlockOptions) -> tuple[tuple[
 
 
 def _turned(rpc: RPC, degrees: float) -> RPC:
-    """The RPC of the same camera turned about the Earth's axis."""
     offset = rpc.ground_offset + np.array([degrees, 0.0, 0.0])
     offset[0] = wrap_longitude(offset[0])
     return replace(rpc, ground_offset=offset)

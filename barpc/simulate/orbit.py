@@ -87,7 +87,6 @@ def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbro
 
 
 def _level(azimuth: float) -> Array:
-    """The horizontal direction (3,) east, north, up of an azimuth [rad]."""
     return np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
 
 

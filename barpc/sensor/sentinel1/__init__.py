@@ -164,17 +164,11 @@ class _File:
         if self.member is None:
             return read_annotation(self.path)
         member, name = self.member, PurePosixPath(self.member).name
-        data = _from_zip(self.path, name, lambda archive: _content(archive, member))
+        data = _from_zip(self.path, name, lambda archive: archive.open(member).read(MAX_XML + 1))
         return read_annotation(data, name=name)
 
 
-def _content(archive: zipfile.ZipFile, member: str) -> bytes:
-    with archive.open(member) as file:
-        return file.read(MAX_XML + 1)
-
-
 def _from_zip(path: Path, what: str, use: Callable[[zipfile.ZipFile], T]) -> T:
-    """What `use` gets out of a zip file."""
     try:
         with opened(path, PRODUCT) as file, zipfile.ZipFile(file) as archive:
             return use(archive)
@@ -206,7 +200,6 @@ def _named(path: Path, member: str | None) -> _File | None:
 
 
 def _choose(path: Path, polarisation: str | None) -> dict[str, _File]:
-    """Swath -> annotation, of one polarisation."""
     files = _annotations(path)
     if not files:
         raise RpcFormatError(f"{path}: no Sentinel-1 annotation (annotation/s1?-*.xml) in it")

@@ -46,9 +46,7 @@ class Burst:
     """One burst of a TOPS swath."""
 
     time: np.datetime64  # zero-Doppler time of the burst's first line (`azimuthTime`)
-    first_valid: npt.NDArray[
-        np.int64
-    ]  # (L,): first valid sample of every line; -1 in a line that is not valid
+    first_valid: npt.NDArray[np.int64]  # (L,): first valid sample of every line; -1: the line is not valid
     last_valid: npt.NDArray[np.int64]  # (L,): the last one
 
 

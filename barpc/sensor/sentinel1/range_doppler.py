@@ -115,14 +115,10 @@ class RangeDoppler(Frozen):
         Raises
         ------
         RpcError
-            Not a Sentinel-1 annotation (an `RpcFormatError`), or an orbit that cannot be used.
+            Not a Sentinel-1 annotation (an `RpcFormatError`), or an orbit that cannot be used. A geolocation grid that
+            does not belong to the orbit is a BarpcWarning; only its range of heights is used then.
         InputError
             No such burst, or a correction that this product does not take.
-
-        Warns
-        -----
-        BarpcWarning
-            The geolocation grid does not belong to the orbit; it is not used but for its range of heights.
         """
         annotation = source if isinstance(source, Annotation) else read_annotation(source)
         epoch, lines = extent(annotation, burst)
@@ -168,13 +164,11 @@ class RangeDoppler(Frozen):
 
     @cached_property
     def _middle(self) -> float:
-        """Longitude of the middle of the image [deg]."""
         image = 0.5 * np.array(self.size, dtype=np.float64)[:, None]
         lon = float(self._localize(image, np.array([np.mean(self.alt_range)]))[0, 0])
         return lon if np.isfinite(lon) else 0.0
 
     def _geometry(self, ecef: Array) -> _Seen:
-        """Zero-Doppler geometry of ECEF points (N, 3)."""
         point = ecef.T
         low, high = self.orbit.span
         time = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan)
@@ -289,7 +283,6 @@ class _Seen:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Scalar products (N,) of vectors (3, N)."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
@@ -346,7 +339,6 @@ def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
 
 
 def _orbit(annotation: Annotation, file: Path | None, epoch: np.datetime64) -> Orbit:
-    """The orbit over the image, its times counted from `epoch`."""
     states = annotation.states if file is None else read_orbit_file(file, annotation)
     start, stop = (float(seconds(t, epoch)) for t in (annotation.first_line_time, annotation.last_line_time))
     return fit_orbit(seconds(states.time, epoch), states.position, states.velocity, (start, stop))
