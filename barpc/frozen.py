@@ -84,8 +84,7 @@ def _plain(value: object) -> object:
 
 # --- values as named arrays -------------------------------------------------------------------------------
 
-Arrays = dict[str, npt.NDArray[Any]]
-"""Named plain arrays: what an ``.npz`` file holds."""
+Arrays = dict[str, npt.NDArray[Any]]  # named plain arrays: what an ``.npz`` file holds
 
 _FRAME = "frame"
 

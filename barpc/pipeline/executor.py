@@ -31,17 +31,14 @@ from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
 
-BATCH_SECONDS = 0.5
-"""Work that is handed in at a time [s], as far as there are tasks for all workers."""
-LARGE = 1 << 20
-"""Arrays of so many bytes are sent as paths."""
+BATCH_SECONDS = 0.5  # work that is handed in at a time [s], as far as there are tasks for all workers
+LARGE = 1 << 20  # arrays of so many bytes are sent as paths
 _PER_WORKER = 3  # batches in flight for each worker: enough that none waits
 _CLUSTER = 32  # workers of a cluster, at least: it may grow when there is work
 _LOST = ("KilledWorker", "FutureCancelledError")  # of distributed, which may not be installed
 
 Function = Callable[..., Any]
-Outcome = tuple[float, Any, BaseException | None]
-"""Seconds, result, error of one task."""
+Outcome = tuple[float, Any, BaseException | None]  # seconds, result, error of one task
 
 
 def worker_count(executor: Executor | None) -> int:

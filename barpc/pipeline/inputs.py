@@ -18,8 +18,7 @@ from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import read_names
 
-PRIOR = "block.npz"
-"""The file in a run folder that a later run starts from."""
+PRIOR = "block.npz"  # the file in a run folder that a later run starts from
 
 
 def load_gcps(paths: Sequence[str], views: Sequence[str]) -> GroundPoints | None:

@@ -22,10 +22,8 @@ from barpc.raster import driver_of, open_raster
 from barpc.scene import GroundPoints
 from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
 
-GROUND_SIGMA = 1.0
-"""East, north, up standard deviation [m] of a GCP whose file states none."""
-IMAGE_SIGMA = 0.5
-"""Standard deviation of each image coordinate [px] where the file states none."""
+GROUND_SIGMA = 1.0  # east, north, up standard deviation [m] of a GCP whose file states none
+IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px] where the file states none
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from barpc.pointio.names import ViewNames, cell, from_cell
 from barpc.scene import IntArray, Tracks, connected_labels
 from barpc.sidefile import TABLE, opened_text, read_text
 
-SIGMA = 0.5
-"""Standard deviation of each coordinate [px] where the file states none."""
+SIGMA = 0.5  # standard deviation of each coordinate [px] where the file states none
 
 _COLUMNS = ("image", "col", "row", "track")
 

@@ -20,8 +20,7 @@ SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")
 COEFFICIENTS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
 ERRORS = ("ERR_BIAS", "ERR_RAND")
 SINGLE = ERRORS + OFFSETS + SCALES
-KEYS = SINGLE + COEFFICIENTS
-"""GDAL's names of all fields, in the order of the GeoTIFF tag."""
+KEYS = SINGLE + COEFFICIENTS  # GDAL's names of all fields, in the order of the GeoTIFF tag
 
 _MAXAR = (
     "errBias errRand lineOffset sampOffset latOffset longOffset heightOffset lineScale sampScale latScale longScale "

@@ -15,10 +15,8 @@ from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array
 
-EXTRAPOLATION = 1.0
-"""Seconds beyond its knots that a curve is still believed."""
-MARGIN = 70.0
-"""State vectors so far before and after the image take part in the fit of an orbit [s]."""
+EXTRAPOLATION = 1.0  # seconds beyond its knots that a curve is still believed
+MARGIN = 70.0  # state vectors so far before and after the image take part in the fit of an orbit [s]
 MIN_VECTORS = 4
 MIN_DEGREE, MAX_DEGREE = 5, 11
 

@@ -17,8 +17,7 @@ from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
 from barpc.sensor.rational import DERIVATIVE, monomials
 
-CHUNK = 2048
-"""Points worked on at a time: what belongs to them stays in cache."""
+CHUNK = 2048  # points worked on at a time: what belongs to them stays in cache
 
 _FAR = 1e9  # px and m: beyond it no node lies
 _STEPS = 8

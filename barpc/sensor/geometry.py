@@ -26,10 +26,8 @@ IntArray = npt.NDArray[np.int64]
 CenterMethod = Literal["line", "nominal"]
 _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
-NOMINAL_ALTITUDE = 650e3
-"""Orbit altitude [m] assumed where a model does not tell its own."""
-PLAUSIBLE_ALTITUDE = (380e3, 1000e3)
-"""A camera centre regressed outside this range [m] is not believed."""
+NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
+PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
 
 def altitude_range(rpc: RPC) -> tuple[float, float]:

@@ -32,8 +32,7 @@ from barpc.geodesy import (
 )
 from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
-CHUNK = 4096
-"""Points worked on at a time, so that what Newton's method needs stays in cache."""
+CHUNK = 4096  # points worked on at a time, so that what Newton's method needs stays in cache
 
 _STEPS = 12
 _SETTLED = 1e-4  # px: Newton is quadratic, what is left after a step of this size is below rounding

@@ -17,8 +17,7 @@ from barpc.geodesy import Array
 
 BoolArray = npt.NDArray[np.bool_]
 
-CHUNK = 8192
-"""Points worked on at a time."""
+CHUNK = 8192  # points worked on at a time
 
 MONOMIALS = (
     "1", "L", "P", "H", "LP", "LH", "PH", "LL", "PP", "HH",
@@ -26,8 +25,7 @@ MONOMIALS = (
 )  # fmt: skip
 """The twenty monomials in RPC00B order; L = longitude, P = latitude, H = altitude, normalised."""
 
-REACH = 1.25
-"""The cubic inverse is trusted this far out of the box; what lies beyond is solved with care."""
+REACH = 1.25  # the cubic inverse is trusted this far out of the box; what lies beyond is solved with care
 
 
 def _derivative_matrices() -> Array:
@@ -43,8 +41,7 @@ def _derivative_matrices() -> Array:
     return out
 
 
-DERIVATIVE = _derivative_matrices()
-"""The derivatives of the monomials on the first ten: (3, 20, 10)."""
+DERIVATIVE = _derivative_matrices()  # the derivatives of the monomials on the first ten: (3, 20, 10)
 
 
 def monomials(normalized: Array, out: Array | None = None) -> Array:

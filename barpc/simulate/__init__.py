@@ -234,15 +234,8 @@ def simulate_block(
 def _gcps(ground: Array, seen: Tracks, options: BlockOptions, rng: np.random.Generator) -> GroundPoints:
     """GCPs at ground points (G, 3), where they are seen but for noise."""
     noisy, _ = _disturbed(seen, replace(options, outliers=0.0), rng)
-    return GroundPoints(
-        names=tuple(f"gcp_{i:03d}" for i in range(len(ground))),
-        lonlatalt=ground,
-        sigma=np.full((len(ground), 3), 0.1),
-        point=noisy.point,
-        view=noisy.view,
-        xy=noisy.xy,
-        xy_sigma=noisy.sigma,
-    )
+    names, sigma = tuple(f"gcp_{i:03d}" for i in range(len(ground))), np.full((len(ground), 3), 0.1)
+    return GroundPoints(names, ground, sigma, noisy.point, noisy.view, noisy.xy, noisy.sigma)
 
 
 def _cameras(grid: _Grid, num_views: int, options: BlockOptions) -> tuple[tuple[View, ...], list[Array]]:

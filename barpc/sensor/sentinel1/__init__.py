@@ -42,8 +42,7 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-MOSAIC = "mosaic"
-"""The swath of all swaths."""
+MOSAIC = "mosaic"  # the swath of all swaths
 _SAME = 1e-9  # relative: intervals and rates of the swaths of one mosaic
 _NAME = re.compile(r"s1[a-d]-(?P<swath>\w+)-(slc|grd)-(?P<pol>vv|hh|vh|hv)-.*\.xml", re.IGNORECASE)
 _POLARISATIONS = ("vv", "hh", "vh", "hv")

@@ -18,12 +18,10 @@ from barpc.frozen import Frozen
 from barpc.geodesy import Array, enu_basis, up
 from barpc.sensor.sentinel1.annotation import Annotation, seconds
 
-SPEED_OF_LIGHT = 299792458.0
-"""In vacuum [m/s]."""
+SPEED_OF_LIGHT = 299792458.0  # in vacuum [m/s]
 
 _INVERSION_STEPS = 8
-Bistatic = Literal["annotated", "full"]
-"""Which bistatic correction; see `bistatic_constant`."""
+Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`
 _RAD = np.pi / 180.0
 _SPREAD = 1e-5  # s: what lines and azimuth times of a grid may scatter
 _ZENITH = (2.41, -1.0 / 3411.0, 1.0 / 8.55e7)  # m, per m, per m^2 of altitude

@@ -44,12 +44,10 @@ from barpc.sensor.sentinel1.frames import (
     bistatic_constant,
 )
 
-CHUNK = 8192
-"""Points worked on at a time."""
+CHUNK = 8192  # points worked on at a time
 RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
-NO_DELAYS = Delays()
-"""Pure geometry."""
+NO_DELAYS = Delays()  # pure geometry
 
 _GRID_TOLERANCE = 5.0  # px and lines: a grid farther off does not belong to the orbit
 _STEPS = 12  # at most; three are enough near the image
