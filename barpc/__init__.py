@@ -1,8 +1,7 @@
 """barpc: bundle adjustment of satellite images with RPC cameras.
 
-Images become tie points, tie points become corrections, corrections compose into P_BA, and P_BA is
-fitted into an RPC. The names below are the public ones; they are imported when first used, so that
-``import barpc`` costs nothing.
+Images become tie points, tie points become corrections, corrections compose into P_BA, and P_BA is fitted into an RPC.
+The names below are the public ones; they are imported when first used, so that ``import barpc`` costs nothing.
 """
 
 from __future__ import annotations
@@ -12,31 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-_PUBLIC = {
-    "RPC": "barpc.sensor.rpc",
-    "Pushbroom": "barpc.sensor.pushbroom",
-    "RangeDoppler": "barpc.sensor.sentinel1",
-    "SensorModel": "barpc.sensor",
-    "Correction": "barpc.sensor.corrected",
-    "Corrected": "barpc.sensor.corrected",
-    "View": "barpc.scene",
-    "Tracks": "barpc.scene",
-    "GroundPoints": "barpc.scene",
-    "read_rpc": "barpc.rpcio",
-    "write_rpc": "barpc.rpcio",
-    "fit_rpc": "barpc.fit",
-    "fit_rpc_points": "barpc.fit",
-    "adjust": "barpc.pipeline",
-    "check": "barpc.pipeline",
-    "AdjustResult": "barpc.pipeline",
-    "RunOptions": "barpc.options",
-    "TieOptions": "barpc.options",
-    "AdjustOptions": "barpc.options",
-    "FitOptions": "barpc.options",
-    "open_camera": "barpc.cameras",
-    "BarpcError": "barpc.errors",
-    "BarpcWarning": "barpc.errors",
+_MODULES = {
+    "barpc.sensor.rpc": "RPC",
+    "barpc.sensor.pushbroom": "Pushbroom",
+    "barpc.sensor.sentinel1": "RangeDoppler",
+    "barpc.sensor": "SensorModel",
+    "barpc.sensor.corrected": "Correction Corrected",
+    "barpc.scene": "View Tracks GroundPoints",
+    "barpc.rpcio": "read_rpc write_rpc",
+    "barpc.fit": "fit_rpc fit_rpc_points",
+    "barpc.pipeline": "adjust check AdjustResult",
+    "barpc.options": "RunOptions TieOptions AdjustOptions FitOptions",
+    "barpc.cameras": "open_camera",
+    "barpc.errors": "BarpcError BarpcWarning",
 }
+_PUBLIC = {name: module for module, names in _MODULES.items() for name in names.split()}
 
 if TYPE_CHECKING:
     from barpc.cameras import open_camera as open_camera

@@ -27,19 +27,10 @@ def replacing(
 
     Parameters
     ----------
-    path : Path or str
-        The file to be written; its folder is made where it is missing.
-    overwrite : bool
-        Replace an existing file.
-    durable : bool
-        Wait until the file is on the disk; not needed for what can be made again.
-    room : Path, optional
-        Where the temporary folder is made, on the same disk; None: beside `path`.
-
-    Raises
-    ------
-    OutputError
-        The file exists and `overwrite` is false, or it cannot be written.
+    path : Path or str, the file to be written; its folder is made where it is missing
+    overwrite : bool, replace an existing file, else an OutputError
+    durable : bool, wait until the file is on the disk; not needed for what can be made again
+    room : Path, optional, where the temporary folder is made, on the same disk; None: beside `path`
     """
     path = Path(path)
     _refuse_existing(path, overwrite)
@@ -69,7 +60,6 @@ def _refuse_existing(path: Path, overwrite: bool) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Ask the system to put a file, or a folder's entries, on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -87,13 +87,11 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
     Parameters
     ----------
     spec : str or Path
-        A file or folder, perhaps with choices behind it: ``,name=value``. A file whose whole name is this goes
-        first.
+        A file or folder, perhaps with choices behind it, ``,name=value``; a file of this whole name goes first.
     **choices
-        The same as values; they go before those in `spec`. For every kind: ``camera`` (the file with the camera of
-        the image `spec`), ``size`` (width, height). RPC: ``first_pixel`` (the coordinate that the file gives to
-        the centre of the first pixel), ``band``. Sentinel-1: those of `sentinel1.open_product`. Localisation
-        grid: ``altitudes`` of its layers.
+        The same as values; they go before those in `spec`. For every kind: ``camera`` (the file with the camera of the
+        image `spec`), ``size`` (width, height). RPC: ``first_pixel`` (the file's coordinate of the first pixel's
+        centre), ``band``. Sentinel-1: those of `sentinel1.open_product`. Grid: ``altitudes`` of its layers.
 
     Raises
     ------
@@ -160,7 +158,6 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _pixels(path: Path) -> tuple[int, int] | None:
-    """Width and height [px] of a raster; None of another file."""
     try:
         with open_raster(path) as dataset:
             return int(dataset.width), int(dataset.height)

@@ -173,11 +173,8 @@ class Dem:
     def open(cls, path: Path | str, geoid: Path | str | None = None) -> Dem:
         """Open a DEM (``.hgt``, or any raster with a CRS), and the ``.gtx`` or raster with the height of its geoid.
 
-        Raises
-        ------
-        InputError, ImageError
-            Not a DEM that is read, or a geoid for heights that are ellipsoidal already. A vertical reference that is
-            unknown, or orthometric heights that are taken as they are, raise a BarpcWarning.
+        InputError or ImageError where it is none, or a geoid is given for heights that are ellipsoidal already; a
+        BarpcWarning for an unknown vertical reference, or orthometric heights that are taken as they are.
         """
         grid = HeightGrid.open(path)
         known = grid.reference
@@ -214,18 +211,13 @@ def localize_on_terrain(
 
     Parameters
     ----------
-    sensor : SensorModel
-    image : (N, 2)
-        col, row [px].
-    terrain : callable
-        lon, lat [deg] -> altitude [m above the ellipsoid], such as a `Dem`.
-    alt_range : (low, high)
-        Altitudes between which the terrain lies [m].
+    image : (N, 2), col, row [px]
+    terrain : callable, lon, lat [deg] -> altitude [m above the ellipsoid], such as a `Dem`
+    alt_range : (low, high), altitudes between which the terrain lies [m]
 
     Returns
     -------
-    ground : (N, 3)
-        lon, lat [deg], alt [m], to a tenth of a millimetre; NaN where a line meets a void or no terrain.
+    ground : (N, 3), lon, lat [deg], alt [m], to 0.1 mm; NaN where a line meets a void or no terrain
     """
     image = np.asarray(image, dtype=np.float64)
 

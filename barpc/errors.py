@@ -38,13 +38,7 @@ class TiePointError(BarpcError):
 
 
 class DisconnectedError(TiePointError):
-    """The views fall into groups that share no tie point.
-
-    Attributes
-    ----------
-    groups : tuple of tuple of str
-        View names, one tuple a connected group, the largest first.
-    """
+    """The views fall into groups that share no tie point: `groups`, tuples of their names, the largest first."""
 
     def __init__(self, message: str, groups: Sequence[Sequence[str]] = ()) -> None:
         super().__init__(message)

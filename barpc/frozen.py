@@ -59,7 +59,6 @@ class Frozen:
         return value
 
     def _given(self) -> list[str]:
-        """Names of the fields that the constructor takes."""
         return [field.name for field in fields(self) if field.init]  # type: ignore[arg-type]  # children are dataclasses
 
     def _content(self) -> tuple[object, ...]:
@@ -85,8 +84,7 @@ def _plain(value: object) -> object:
 
 # --- values as named arrays -------------------------------------------------------------------------------
 
-Arrays = dict[str, npt.NDArray[Any]]
-"""Named plain arrays: what an ``.npz`` file holds."""
+Arrays = dict[str, npt.NDArray[Any]]  # named plain arrays: what an ``.npz`` file holds
 
 _FRAME = "frame"
 

@@ -31,21 +31,10 @@ def pointwise(
     alt: npt.ArrayLike | None = None,
     rows: int = 0,
 ) -> list[Array]:
-    """What a function of a batch of points gives for points with any leading axes, in pieces that stay in cache.
+    """What a function of a batch of points gives for points (..., k) and altitudes (...), broadcast, `chunk` at a time.
 
-    Parameters
-    ----------
-    function : callable
-        (n, k) points, (n,) altitudes if there are any, and (rows, n) memory to overwrite if it asks for `rows`
-        -> arrays (n, ...); what is not finite is no news.
-    chunk : int
-        Points worked on at a time.
-    shapes : sequence of tuple of int
-        Of what a point gives.
-    points, alt : (..., k), (...)
-        Broadcast together; there may be no `alt`.
-    rows : int
-        Of memory that is kept for all pieces: fresh memory costs more than sums.
+    The function takes (n, k) points, (n,) altitudes if there are any, and (rows, n) memory to overwrite if it asks for
+    `rows` (fresh memory costs more than sums), and gives arrays (n, *shape); what is not finite is no news.
     """
     points = np.asarray(points, dtype=np.float64)
     lead, k = points.shape[:-1], points.shape[-1]
@@ -122,10 +111,8 @@ def ground_rows_from_ecef(ecef: Array) -> tuple[Array, Array]:
 def _geodetic(x: Array, y: Array, z: Array) -> tuple[Array, ...]:
     """Ground (3, N); sin, cos of latitude, distance from the axis [m], sqrt(1 - e^2 sin^2(lat)), (N,) each.
 
-    Latitude by two of Bowring's steps for the reduced latitude, from his start of 1985.
-
-    Bowring, "Transformation from spatial to geographical coordinates", Survey Review 1976, and "The accuracy
-    of geodetic latitude and height equations", Survey Review 1985. One step leaves 1e-6 m, two 4e-9 m.
+    Two steps (one leaves 1e-6 m, two 4e-9 m) of Bowring, "Transformation from spatial to geographical coordinates",
+    from the start in "The accuracy of geodetic latitude and height equations", Survey Review 1976 and 1985.
     """
     square = x * x + y * y
     horizontal = np.sqrt(square)
@@ -171,10 +158,7 @@ def up(ground: Array) -> Array:
 
 
 def metres_per_unit(ground: npt.ArrayLike) -> Array:
-    """Metres east, north and up (..., 3) of one degree of longitude, one of latitude, one metre of altitude.
-
-    At ground points (..., 3); the first is zero at a pole.
-    """
+    """Metres (..., 3) of one degree of longitude (zero at a pole), of latitude, one metre up, at points (..., 3)."""
     ground = np.asarray(ground, dtype=np.float64)
     lat, alt = ground[..., 1] * _RAD, ground[..., 2]
     w2 = 1.0 - WGS84_E2 * np.sin(lat) ** 2
@@ -192,10 +176,7 @@ def ecef_from_ground_jacobian(ground: npt.ArrayLike) -> Array:
 
 
 def ground_from_ecef_jacobian(ground: npt.ArrayLike) -> Array:
-    """d(lon, lat, alt) / d(x, y, z) (..., 3, 3) [deg/m, deg/m, m/m] at *ground* points (..., 3).
-
-    Infinite for longitude at a pole.
-    """
+    """d(lon, lat, alt) / d(x, y, z) (..., 3, 3) [deg/m, deg/m, m/m] at GROUND points; infinite for lon at a pole."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return enu_basis(ground) / metres_per_unit(ground)[..., None]
 

@@ -12,16 +12,8 @@ from barpc.geodesy import Array
 def polygon(ring: Array) -> dict[str, Any] | None:
     """The geometry of a footprint: counter-clockwise, closed; led to the pole where it goes once around one.
 
-    Parameters
-    ----------
-    ring : (N, 2)
-        lon, lat [deg] of the outline, not closed; longitudes run on continuously across the antimeridian,
-        as those of `barpc.sensor.geometry.footprint` do.
-
-    Returns
-    -------
-    geometry : dict or None
-        A Polygon, or a MultiPolygon where the antimeridian cuts it; None for an outline that is not finite.
+    Of a ring (N, 2) as `barpc.sensor.geometry.footprint` gives it; a MultiPolygon where the antimeridian cuts it, None
+    for an outline that is not finite.
     """
     ring = np.asarray(ring, dtype=np.float64)
     if not np.isfinite(ring).all():

@@ -35,27 +35,15 @@ _SHORT.maxstring, _SHORT.maxother = 60, 200
 
 @dataclass(frozen=True)
 class Rule:
-    """What a field may hold beside its type, and what it means.
+    """What a field may hold beside its type, and what it means."""
 
-    Parameters
-    ----------
-    help : str
-        Sentences; Markdown's back quotes mark code.
-    unit : str
-        Of numbers; of texts what they are: "file", "dir", "name".
-    least, above, most, below : float, optional
-        Bounds of a number, or of each in a list; `above` and `below` are not reached.
-    rows : str
-        The table whose keys are the values allowed, as module and name.
-    """
-
-    help: str
-    unit: str = ""
-    least: float | None = None
-    above: float | None = None
+    help: str  # sentences; Markdown's back quotes mark code
+    unit: str = ""  # of numbers; of texts what they are: "file", "dir", "name"
+    least: float | None = None  # bounds of a number, or of each in a list
+    above: float | None = None  # not reached
     most: float | None = None
-    below: float | None = None
-    rows: str = ""
+    below: float | None = None  # not reached
+    rows: str = ""  # the table whose keys are the values allowed, as module and name
 
     def holds(self, number: float) -> bool:
         """Whether a number lies within the bounds; NaN and the infinities do not."""
@@ -419,19 +407,7 @@ class RunOptions(Options):
 def with_values(options: Record, values: Mapping[str, Any], where: str = "options") -> Record:
     """A copy of a record with some fields changed, nested records by nested mappings.
 
-    Parameters
-    ----------
-    options : Options
-        The record.
-    values : mapping of str to object
-        New values.
-    where : str
-        What a message calls the source.
-
-    Raises
-    ------
-    InputError
-        An unknown field, or a value of the wrong type or out of range; the message names it.
+    InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`.
     """
     known, changed = declared(type(options)), dict(values)
     for name, value in values.items():
@@ -451,10 +427,7 @@ def with_values(options: Record, values: Mapping[str, Any], where: str = "option
 def read_options(path: str | Path, options: RunOptions | None = None) -> RunOptions:
     """Options from a TOML file: top-level keys, and the tables [tie], [adjust], [fit].
 
-    Raises
-    ------
-    InputError
-        The file does not exist or parse, or holds an option that does not exist or a value that it cannot have.
+    InputError where it does not exist or parse, or holds an unknown option or a value that it cannot have.
     """
     text = read_text(path, OPTIONS)
     try:
@@ -473,7 +446,8 @@ def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
         else:
             properties[name] = {**_schema(one.kind, one.rule), "description": one.rule.help}
             if one.default is not None:
-                properties[name]["default"] = _listed(one.default)
+                listed = isinstance(one.default, tuple)
+                properties[name]["default"] = list(one.default) if listed else one.default
     return {"type": "object", "additionalProperties": False, "properties": properties}
 
 
@@ -496,12 +470,7 @@ def _schema(kind: Any, rule: Rule) -> dict[str, Any]:
     return {"type": name, **{key: value for key, value in bounds.items() if value is not None}}
 
 
-def _listed(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
-
-
 def _documented(record: type[Options]) -> str:
-    """The docstring of a record, with its fields as numpydoc has them."""
     rows = []
     for name, one in declared(record).items():
         rows += [f"{name} : {wanted(one.kind, Rule('') if one.rule.rows else one.rule)}"]

@@ -65,18 +65,9 @@ _WARNINGS = threading.Lock()  # catch_warnings is process-wide
 def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iterator[Any]:
     """Open a raster read-only, as a rasterio.DatasetReader or a Mosaic; an error while it is open names the file, too.
 
-    Parameters
-    ----------
-    path : path
-        An existing regular file.
-    driver : str, optional
-        The one that may open it, of a kind whose first bytes do not tell (`barpc.dem.HEIGHTS`).
-
-    Raises
-    ------
-    ImageError
-        The file is missing, a folder, empty, of a kind that barpc does not read, damaged, remote, or a
-        VRT that is not of the grammar of `barpc.vrt` or points at anything else than plain local rasters.
+    `driver` may open a file whose first bytes do not tell its kind (`barpc.dem.HEIGHTS`). ImageError for a file that
+    is missing, a folder, empty, of no kind that barpc reads, damaged, remote, or a VRT that is not of the grammar of
+    `barpc.vrt` or points at anything else than plain local rasters.
     """
     name = os.fspath(path)
     file, driver = identify(name, driver)
@@ -164,7 +155,6 @@ class Mosaic:
         return self
 
     def __exit__(self, *failure: object) -> None:
-        """Close the sources."""
         self._open.clear()
         self._stack.close()
 
@@ -210,10 +200,6 @@ class Mosaic:
             alpha = self._vrt.bands[self.colorinterp.index(ColorInterp.alpha)]
             return np.asarray(self._assembled(alpha, box), np.uint8)
         return np.full((box[3], box[2]), 255, np.uint8)
-
-    def dataset_mask(self) -> npt.NDArray[np.uint8]:
-        """Largest of the bands' masks, of the whole raster."""
-        return np.asarray(np.max([self.read_masks(i) for i in self.indexes], axis=0), np.uint8)
 
     def plain_source(self) -> Path | None:
         """The raster that the VRT shows whole, as it is and alone; None if there is no such."""
@@ -322,7 +308,6 @@ def _converted(values: Pixels, dtype: np.dtype[Any]) -> Pixels:
 
 
 def _common(a: Rect, b: Rect) -> Rect | None:
-    """The rectangle that two have in common."""
     left, top = max(a[0], b[0]), max(a[1], b[1])
     right, bottom = min(a[0] + a[2], b[0] + b[2]), min(a[1] + a[3], b[1] + b[3])
     return (left, top, right - left, bottom - top) if right > left and bottom > top else None

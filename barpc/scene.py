@@ -28,16 +28,11 @@ class View(Frozen):
 
     Parameters
     ----------
-    name : str
-        Unique in a run: the file's stem, with its folder where stems repeat.
-    path : str
-        Absolute path of the raster; empty for a view without pixels.
-    size : (int, int)
-        Width, height [px].
-    sensor : SensorModel
-        The camera as delivered.
-    alt_range : (float, float)
-        Lowest and highest altitude [m above the ellipsoid] that the camera is used for.
+    name : str, unique in a run: the file's stem, with its folder where stems repeat
+    path : str, absolute path of the raster; empty for a view without pixels
+    size : (int, int), width, height [px]
+    sensor : SensorModel, the camera as delivered
+    alt_range : (float, float), altitudes [m above the ellipsoid] that the camera is used for
     """
 
     name: str
@@ -64,14 +59,10 @@ class Tracks(Frozen):
 
     Parameters
     ----------
-    view : (K,)
-        Index of the view.
-    point : (K,)
-        Index of the track, 0 .. P-1; rows of one track stand together, views ascending.
-    xy : (K, 2)
-        col, row [px].
-    sigma : (K,)
-        Standard deviation of each coordinate [px].
+    view : (K,), index of the view
+    point : (K,), index of the track, 0 .. P-1; rows of one track stand together, views ascending
+    xy : (K, 2), col, row [px]
+    sigma : (K,), standard deviation of each coordinate [px]
     """
 
     view: IntArray
@@ -91,7 +82,6 @@ class Tracks(Frozen):
             raise InputError("tracks: negative view or track index")
 
     def __len__(self) -> int:
-        """Number of observations K."""
         return len(self.view)
 
     @property
@@ -113,20 +103,13 @@ class GroundPoints(Frozen):
 
     Parameters
     ----------
-    names : tuple of str
-        One a point.
-    lonlatalt : (G, 3)
-        lon, lat [deg], alt [m above the ellipsoid].
-    sigma : (G, 3)
-        East, north, up standard deviation [m].
-    point, view : (M,)
-        Observations: index of the ground point, index of the view.
-    xy : (M, 2)
-        col, row [px].
-    xy_sigma : (M,)
-        Standard deviation of each coordinate [px].
-    strangers : tuple of str
-        Images that their file names and that are none of the views.
+    names : tuple of str, one a point
+    lonlatalt : (G, 3), lon, lat [deg], alt [m above the ellipsoid]
+    sigma : (G, 3), east, north, up standard deviation [m]
+    point, view : (M,), observations: index of the ground point, index of the view
+    xy : (M, 2), col, row [px]
+    xy_sigma : (M,), standard deviation of each coordinate [px]
+    strangers : tuple of str, images that their file names and that are none of the views
     """
 
     names: tuple[str, ...]

@@ -66,8 +66,7 @@ SUMMARY = Kind("a run's summary", 512 * MB)
 def opened(path: Path | str, kind: Kind) -> Iterator[BinaryIO]:
     """A regular file, open for reading; links are followed.
 
-    What fails while it is read is one line that names it, of the class of `kind`: there is no such file, it is a
-    folder, pipe or device, it is too large or cannot be read.
+    One line of the class of `kind` where there is no such file, it is a folder, pipe or device, or cannot be read.
     """
     try:
         with _regular(path, kind) as file:
@@ -148,9 +147,8 @@ def read_names(path: Path | str, words: str) -> list[str]:
     return lines
 
 
-_REFUSED = "\ufffe\uffff" + (
-    "\\" if os.sep == "/" else ""
-)  # no XML takes two, GDAL splits a name at the third
+# No XML takes the first two, GDAL splits a name at the third.
+_REFUSED = "\ufffe\uffff" + ("\\" if os.sep == "/" else "")
 
 
 def plain_path(path: str | os.PathLike[str]) -> Path:
@@ -242,12 +240,8 @@ def parse_xml(
     """The root element of an XML document: bytes, or the file that holds it; messages call it `name`, or by its path.
 
     No document type: an entity cannot be declared without one, so neither "billion laughs" nor a reference to another
-    file can be written. `strip_namespaces` drops the ``{namespace}`` of every tag.
-
-    Raises
-    ------
-    RpcFormatError
-        Not a readable file, more than `max_bytes`, a DOCTYPE, or not well-formed XML. The message names the file.
+    file can be written. `strip_namespaces` drops the ``{namespace}`` of every tag. RpcFormatError where it cannot be
+    read, has more than `max_bytes`, or is not well-formed.
     """
     name = name or (str(source) if isinstance(source, Path) else "XML document")
     data = read_bytes(source, replace(XML, most=max_bytes)) if isinstance(source, Path) else source

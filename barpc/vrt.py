@@ -18,14 +18,8 @@ from barpc.sidefile import parse_xml
 
 _INTEGERS = {f"{u}int{n}": f"{u.upper()}Int{n}" for n in (16, 32, 64) for u in ("u", "")}
 _COMPLEX = {"complex_int16": "CInt16", "complex64": "CFloat32", "complex128": "CFloat64"}
-GDAL_TYPES = {
-    "uint8": "Byte",
-    "int8": "Int8",
-    **_INTEGERS,
-    "float32": "Float32",
-    "float64": "Float64",
-    **_COMPLEX,
-}
+_FLOATS = {"float32": "Float32", "float64": "Float64"}
+GDAL_TYPES = {"uint8": "Byte", "int8": "Int8"} | _INTEGERS | _FLOATS | _COMPLEX
 """rasterio's names of pixel types -> GDAL's."""
 MAGIC = b"<VRTDataset"
 _MAX_BYTES = 1 << 20  # larger files are no VRTs; one that carries an RPC takes a few thousand
@@ -57,6 +51,7 @@ _SIZES = ("RasterXSize", "RasterYSize", "BlockXSize", "BlockYSize")
 _SOURCE = "SourceFilename SourceBand SourceProperties SrcRect DstRect"
 _BAND = "ColorInterp NoDataValue HideNoDataValue SimpleSource ComplexSource"
 _FORGOTTEN = "Description UnitType Offset Scale Metadata CategoryNames ColorTable Histograms"
+_COUNTS = ("BlockXSize", "BlockYSize", "BucketCount", "IncludeOutOfRange", "Approximate")
 _AXES = r"-?\d(,-?\d){0,3}"
 _GRAMMAR: dict[str, _Tag] = {
     "VRTDataset": _Tag(
@@ -91,26 +86,12 @@ _GRAMMAR: dict[str, _Tag] = {
     "SourceBand": _Tag(rf"{_WHOLE}|mask,{_WHOLE}"),
     "SourceProperties": _Tag(None, {"DataType": r"\w+", **dict.fromkeys(_SIZES, _WHOLE)}),
     **dict.fromkeys(("SrcRect", "DstRect"), _Tag(None, dict.fromkeys(_RECT, _NUMBER))),
-    **dict.fromkeys(
-        ("BlockXSize", "BlockYSize", "BucketCount", "IncludeOutOfRange", "Approximate"), _Tag(_WHOLE)
-    ),
+    **dict.fromkeys(_COUNTS, _Tag(_WHOLE)),
     **dict.fromkeys(("Description", "UnitType", "Category"), _Tag(_ANY)),
     **dict.fromkeys(("Offset", "Scale", "ScaleOffset", "ScaleRatio"), _Tag(_NUMBER)),
     **dict.fromkeys(("NoDataValue", "NODATA", "HistMin", "HistMax"), _Tag(_NODATA)),
 }
-_REPEATED = frozenset(
-    [
-        "Metadata",
-        "MDI",
-        "GCP",
-        "Entry",
-        "Category",
-        "HistItem",
-        "VRTRasterBand",
-        "SimpleSource",
-        "ComplexSource",
-    ]
-)
+_REPEATED = "Metadata MDI GCP Entry Category HistItem VRTRasterBand SimpleSource ComplexSource"
 
 
 @dataclass(frozen=True)
@@ -164,8 +145,7 @@ class Vrt:
 def read_vrt(path: Path, *, name: str | None = None) -> Vrt:
     """Read a VRT; its sources are not looked at, and are relative to what `path` links to, as in GDAL.
 
-    ImageError where it does not parse, holds anything outside the grammar, or names a source by anything else than a
-    plain path.
+    ImageError where it does not parse, holds anything outside the grammar, or a source that is no plain path.
     """
     name = name or str(path)
     try:
@@ -198,7 +178,7 @@ def _check(element: Element, name: str) -> None:
     for child in element:
         if child.tag not in tag.children.split():
             raise _refused(name, f"<{child.tag}> in <{element.tag}>")
-        if child.tag in seen and child.tag not in _REPEATED:
+        if child.tag in seen and child.tag not in _REPEATED.split():
             raise _refused(name, f"two <{child.tag}> in <{element.tag}>")
         seen.add(child.tag)
         _check(child, name)
@@ -248,9 +228,8 @@ class _Reader:
 
     def band(self, element: Element, index: int) -> Band:
         if int(element.get("band", index)) != index:
-            raise ImageError(
-                f"{self.name}: a VRT whose band {index} says that it is band {element.get('band')}"
-            )
+            found = element.get("band")
+            raise ImageError(f"{self.name}: a VRT whose band {index} says that it is band {found}")
         nodata = element.findtext("NoDataValue")
         value = None if nodata is None else float(nodata)
         hidden = element.findtext("HideNoDataValue", "0").strip() == "1"

@@ -9,10 +9,9 @@
     OUT/.barpc/partial/      files on their way; emptied at the next start
     OUT/.barpc/cache/<stage>/<key>.npz   results of tasks; a damaged one is made again
 
-The key of a stage is a hash of its inputs, its options and the code; resuming is running the same command again.
-A run notes the sha256 of an output before the output takes its name: only a file with a noted content is ever replaced
-or taken away. The notes may be anybody's: a name counts only for a regular file inside the folder, reached through
-no symbolic link, and a folder below with a run of its own is that run's.
+Resuming is running the same command again. A run notes the sha256 of an output before the output takes its name: only
+a file with a noted content is ever replaced or taken away. The notes may be anybody's: a name counts only for a regular
+file inside the folder, reached through no symbolic link, and a folder below with a run of its own is that run's.
 """
 
 from __future__ import annotations
@@ -121,16 +120,11 @@ class Workspace:
 
     Parameters
     ----------
-    folder : str or Path
-        Where results go. That of an unfinished run is gone on with; any other that is not empty needs `overwrite`.
-    overwrite : bool
-        Replace what an earlier run wrote here and nobody has changed since; never anything else.
-    keep : iterable of Path
-        Files that must never be written: the inputs.
-    names : iterable of str
-        The outputs to come, as far as they are known: what is in their way is refused before any work.
-    adds : bool
-        Other things may be in the folder: what earlier runs wrote stays theirs, free names are written.
+    folder : str or Path, that of an unfinished run is gone on with; another that is not empty needs `overwrite`
+    overwrite : bool, replace what an earlier run wrote here and nobody has changed since; never anything else
+    keep : iterable of Path, files that must never be written: the inputs
+    names : iterable of str, the outputs to come, if known: what is in their way is refused before any work
+    adds : bool, other things may be in the folder: what earlier runs wrote stays theirs, free names are written
 
     Raises
     ------
@@ -192,7 +186,6 @@ class Workspace:
             self._refuse_foreign(name)
 
     def _refuse_foreign(self, name: str) -> None:
-        """Raise if an output may not take its name."""
         path = self.folder / name
         if path.resolve() in self._keep:
             raise OutputError(f"{path}: is an input and is never written; give another -o")

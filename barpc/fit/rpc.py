@@ -16,7 +16,8 @@ from barpc.fit.solve import Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
-from barpc.sensor.rpc import RPC, monomials
+from barpc.sensor.rational import monomials
+from barpc.sensor.rpc import RPC
 
 _CHUNK = 8192
 _LOOPS = 4096  # round trips that a table of points is tried on, about

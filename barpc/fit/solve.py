@@ -32,7 +32,8 @@ from barpc.fit.points import extent
 from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
-from barpc.sensor.rpc import MONOMIALS, RPC, monomials
+from barpc.sensor.rational import MONOMIALS, monomials
+from barpc.sensor.rpc import RPC
 
 IntArray = npt.NDArray[np.int64]
 Rounding = Callable[[Array], Array]

@@ -1,11 +1,10 @@
 """Who works on the tasks: an executor that remembers results, and keeps only a few tasks in flight.
 
-Stages hand their tasks (per tile, per pair) to any `concurrent.futures.Executor`. `CachingExecutor` looks each up among
-the kept results, gives the rest to the executor behind it (or works on them itself, when asked for the result), and
+`CachingExecutor` looks a task (a tile, a pair) up among the kept results, gives the rest to the executor behind it, and
 keeps what comes back at once: an interrupted run goes on where it was, and a thousand pairs do not stand pickled in a
-queue. Quick tasks travel in batches: what a task costs on the way (0.2 ms to a process, 10 ms over dask) is paid once
-for half a second of work. Large arrays (the keypoints of a view go to all its pairs) are spilled once into the run
-folder, which all workers see as they see the images: what dask scatters dies with the worker that holds it.
+queue. Quick tasks travel in batches: the way (0.2 ms to a process, 10 ms over dask) is paid once for half a second of
+work. Large arrays (the keypoints of a view go to all its pairs) are spilled once into the run folder, which all workers
+see as they see the images: what dask scatters dies with the worker that holds it.
 """
 
 from __future__ import annotations
@@ -32,17 +31,14 @@ from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
 
-BATCH_SECONDS = 0.5
-"""Work that is handed in at a time [s], as far as there are tasks for all workers."""
-LARGE = 1 << 20
-"""Arrays of so many bytes are sent as paths."""
+BATCH_SECONDS = 0.5  # work that is handed in at a time [s], as far as there are tasks for all workers
+LARGE = 1 << 20  # arrays of so many bytes are sent as paths
 _PER_WORKER = 3  # batches in flight for each worker: enough that none waits
 _CLUSTER = 32  # workers of a cluster, at least: it may grow when there is work
 _LOST = ("KilledWorker", "FutureCancelledError")  # of distributed, which may not be installed
 
 Function = Callable[..., Any]
-Outcome = tuple[float, Any, BaseException | None]
-"""Seconds, result, error of one task."""
+Outcome = tuple[float, Any, BaseException | None]  # seconds, result, error of one task
 
 
 def worker_count(executor: Executor | None) -> int:
@@ -54,16 +50,10 @@ def worker_count(executor: Executor | None) -> int:
 
 
 class CachingExecutor(Executor):
-    """An executor that keeps results.
+    """An executor that keeps results in a workspace.
 
-    Parameters
-    ----------
-    workspace : Workspace
-        Where results are kept.
-    fingerprints : mapping of str to str
-        Path of every input file to the hash of its content: results belong to contents, not to names.
-    executor : Executor, optional
-        Works on the tasks; None: this process does, one after the other, when their result is asked for.
+    `fingerprints` holds the path and hash of every input file: results belong to contents, not to names. Without an
+    `executor` this process works on the tasks, one after the other, when their result is asked for.
     """
 
     def __init__(

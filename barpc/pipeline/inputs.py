@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +18,7 @@ from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import read_names
 
-PRIOR = "block.npz"
-"""The file in a run folder that a later run starts from."""
+PRIOR = "block.npz"  # the file in a run folder that a later run starts from
 
 
 def load_gcps(paths: Sequence[str], views: Sequence[str]) -> GroundPoints | None:
@@ -37,24 +35,19 @@ def load_gcps(paths: Sequence[str], views: Sequence[str]) -> GroundPoints | None
     return GroundPoints(names, point=point, **joined, strangers=strangers)
 
 
-@dataclass(frozen=True, eq=False)
-class Given:
-    """Side inputs, read before any work starts: the terrain, and what an earlier run knows about its views."""
+def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None, BlockPrior | None]:
+    """The terrain, and what an earlier run knows about its views, read before any work starts.
 
-    dem: Dem | None
-    prior: BlockPrior | None
-
-    @classmethod
-    def read(cls, options: RunOptions, views: Sequence[View]) -> Given:
-        """Read them all; a file that cannot be used stops the run here (InputError), and not after an hour."""
-        names = [view.name for view in views]
-        load_gcps(options.gcp, names)
-        load_gcps(options.check_points, names)
-        dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
-        if dem is not None:
-            _require_cover(dem, str(options.dem), views)
-        prior = None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
-        return cls(dem, prior)
+    A file that cannot be used, those of ground points included, stops the run here (InputError), not after an hour.
+    """
+    names = [view.name for view in views]
+    load_gcps(options.gcp, names)
+    load_gcps(options.check_points, names)
+    dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
+    if dem is not None:
+        _require_cover(dem, str(options.dem), views)
+    prior = None if options.fixed_run is None else BlockPrior.load(Path(options.fixed_run) / PRIOR)
+    return dem, prior
 
 
 def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
@@ -82,19 +75,8 @@ def read_pairs(
 ) -> list[tuple[int, int]]:
     """The pairs of a list: two image names or paths a line; blank lines and # comments are skipped.
 
-    Parameters
-    ----------
-    path : path
-        The list. Relative paths in it start from where it lies, or from the current folder.
-    views : sequence of View
-        The images, whose indices are returned.
-    left_out : sequence of path
-        Images that a run was given but does not use: their pairs are passed over.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, a line is not two images of the run, or none is left; the message names it.
+    Relative paths start from where the list lies, or from the current folder; pairs with an image that was `left_out`
+    of the run are passed over. InputError where a line is not two images of the run, or none is left.
     """
     lines = read_names(path, "a list of pairs")
     find = _finder(Path(path).parent, views, left_out)
@@ -119,10 +101,7 @@ def read_pairs(
 def _finder(
     folder: Path, views: Sequence[View], left_out: Sequence[str | Path]
 ) -> Callable[[str], int | None]:
-    """Index of the view that a list in a folder calls by its path, from there or from here, or by its name.
-
-    None for an image that was left out; a stranger is an InputError.
-    """
+    """Index of the view that a list calls by its path or its name; None if it was left out, InputError if unknown."""
     names = ViewNames([view.name for view in views], "the list of pairs")
     without = ViewNames([Path(path).name for path in left_out], "")
     places: dict[Path, int | None] = {Path(path).resolve(): None for path in left_out}

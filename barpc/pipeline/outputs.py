@@ -33,16 +33,8 @@ def write_view(
 ) -> dict[str, dict[str, float | str]]:
     """Write one view's corrected RPC, and open every file again as its consumers do.
 
-    Returns
-    -------
-    written : dict of str to dict
-        File name, and for each consumer that was tried the largest difference to P_BA, `model` [px], or why it does
-        not read the file.
-
-    Raises
-    ------
-    OutputError
-        A file cannot be written, or barpc and GDAL do not read it back.
+    File name -> consumer -> its largest difference to P_BA, `model` [px], or why it does not read the file. OutputError
+    where a file cannot be written, or barpc and GDAL do not read it back.
     """
     names = file_names(view, images, formats)
     for name in names:

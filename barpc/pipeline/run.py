@@ -12,13 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.ba import Adjustment, adjust_tracks, block_prior
+from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
+from barpc.dem import Dem
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.handoff import refuse_hiding, unverified
 from barpc.options import RunOptions
 from barpc.pipeline.executor import CachingExecutor
-from barpc.pipeline.inputs import PRIOR, Given, input_files, load_gcps, only_new, read_pairs
+from barpc.pipeline.inputs import PRIOR, input_files, load_gcps, only_new, read_pairs, side_inputs
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import Image, image_path, load_views
 from barpc.pointio.matches import asp_text, read_matches, write_matches
@@ -45,14 +46,11 @@ class AdjustResult:
 
     Parameters
     ----------
-    views : tuple of View
-        The images in the order given, without those left out; after an adjustment with their refitted RPCs
-        as sensors.
+    views : tuple of View, the images used, in the order given; after an adjustment with their refitted RPCs as sensors
     run : Run
-        Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`,
-        files) images stand in the order of their names, `run.views`, so that the order given does not matter.
-    record : Summary
-        What summary.json holds, as a typed record.
+        Everything found on the way. Here and in all that comes of it (`tracks`, `adjustment`, `summary`, files) images
+        stand in the order of their names, `run.views`, so that the order given does not matter.
+    record : Summary, what summary.json holds, as a typed record
     """
 
     views: tuple[View, ...]
@@ -113,14 +111,10 @@ def adjust(
         Two or more rasters, in any order: the files written do not depend on it. They are opened read-only. What
         a camera is read from is found as `barpc.cameras.open_camera` does; a View brings its own model (a frozen
         dataclass, so that its results can be kept).
-    out_dir : path
-        Folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``.
-    options : RunOptions, optional
-        None: the defaults.
-    executor : concurrent.futures.Executor, optional
-        Works on tiles and pairs; the result does not depend on it.
-    progress : callable, optional
-        `progress(stage, done, total)`.
+    out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``
+    options : RunOptions, optional, None: the defaults
+    executor : concurrent.futures.Executor, optional, works on tiles and pairs; the result does not depend on it
+    progress : callable, optional, `progress(stage, done, total)`
 
     Raises
     ------
@@ -171,7 +165,6 @@ def _as_given(views: Iterable[View], images: Sequence[Image]) -> tuple[View, ...
 
 
 def _loaded(kind: Literal["adjust", "check"], images: Sequence[Image], options: RunOptions) -> Run:
-    """The run before anything is found."""
     for path in input_files(options):
         plain_path(path)
     least = 1 if options.gcp else 2  # one image and control points are enough
@@ -199,8 +192,7 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
 def _solve(
     run: Run, options: RunOptions, workspace: Workspace, executor: Executor, progress: Progress | None
 ) -> Run:
-    """Tie points and the adjustment, as often as there are passes."""
-    given = Given.read(options, run.views)
+    given = side_inputs(options, run.views)
     for number in range(1 if options.matches is not None else options.num_passes):
         again = f" (pass {number + 1})" if number else ""
         with workspace.stage("tie points" + again):
@@ -209,15 +201,15 @@ def _solve(
             _write_matches(run, workspace)
             return replace(run, kind="match")
         with workspace.stage("adjustment" + again):
-            run = _adjusted(run, options, given)
+            run = _adjusted(run, options, *given)
     return run
 
 
-def _adjusted(run: Run, options: RunOptions, given: Given) -> Run:
+def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior | None) -> Run:
     """The run with an adjustment and what went into it."""
     names = [view.name for view in run.views]
-    if given.prior is not None:
-        run = replace(run, tracks=only_new(run.tracks, np.isin(names, given.prior.names)))
+    if prior is not None:
+        run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)))
     gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
     centers = tuple(_center(view) for view in run.views)
     adjustment = adjust_tracks(
@@ -225,9 +217,9 @@ def _adjusted(run: Run, options: RunOptions, given: Given) -> Run:
         run.tracks,
         options.adjust,
         gcps,
-        given.dem,
+        dem,
         centers=np.array([center.ecef for center in centers]),
-        prior=given.prior,
+        prior=prior,
         keep_largest=options.keep_going,
     )
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment)

@@ -65,18 +65,14 @@ def load_views(
 
     Parameters
     ----------
-    images : sequence of path or View
-        The image files, perhaps with choices behind them (`barpc.cameras.open_camera`), or views of them with
-        a camera of one's own.
-    min_views, keep_going, band : int, bool, int
-        How many are needed; leave a bad file out instead of stopping; the band that will be read, from 1.
-    distinct : bool
-        Refuse an image that is there twice, also as other files or under another RPC (see `Twins`).
+    images : sequence of path or View, files, perhaps with choices behind them (`open_camera`), or views of them
+    min_views : int, how many are needed
+    keep_going : bool, leave a bad file (ImageError, RpcError) out instead of stopping
+    band : int, the band that will be read, from 1
+    distinct : bool, refuse an image that is there twice, also as other files or under another RPC (see `Twins`)
 
     Raises
     ------
-    ImageError, RpcError
-        A file cannot be used; the message names it.
     InputError
         Too few images, the same image twice, or a name that the files of a run cannot carry.
     """
@@ -138,10 +134,9 @@ def _altitudes(camera: Camera) -> tuple[float, float]:
 class Twins:
     """Finds an image that was given before: the same file, the same camera, or the same pixels.
 
-    Pixels of a band are compared as decoded values, so that copies in another compression, layout, number type or
-    behind a VRT are found. Three small windows of each image are read; images in which these agree are then
-    read whole, each once. An image in which nothing varies, in these and in 36 more, is compared with none. The
-    work is linear in the number of images.
+    Pixels of a band are compared as decoded values: copies in another compression, layout, number type or behind a VRT
+    are found. Three small windows of each image are read; images in which these agree are then read whole, each once.
+    An image in which nothing varies, in these and in 36 more, is compared with none. Work is linear in the images.
     """
 
     def __init__(self, band: int = 1) -> None:
@@ -204,7 +199,6 @@ def _whole(image: Any, band: int) -> bytes | None:
 
 
 def _digest(image: Any, band: int, windows: list[Window]) -> bytes | None:
-    """A hash of pixels; None where nothing varies."""
     found = blake2b(digest_size=16)
     low = high = np.nan
     for window in windows:

@@ -22,10 +22,8 @@ from barpc.raster import driver_of, open_raster
 from barpc.scene import GroundPoints
 from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
 
-GROUND_SIGMA = 1.0
-"""East, north, up standard deviation [m] of a GCP whose file states none."""
-IMAGE_SIGMA = 0.5
-"""Standard deviation of each image coordinate [px] where the file states none."""
+GROUND_SIGMA = 1.0  # east, north, up standard deviation [m] of a GCP whose file states none
+IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px] where the file states none
 
 
 @dataclass(frozen=True)
@@ -40,26 +38,11 @@ class _Point:
     xy_sigma: float
 
 
-def read_gcps(
-    path: Path | str, names: Sequence[str], *, sigma: float | None = None, image_sigma: float | None = None
-) -> GroundPoints:
-    """GCPs and where they are seen.
+def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
+    """GCPs and where they are seen, of a `.gcp` file, a GeoJSON file, or an image with GCP tags.
 
-    Parameters
-    ----------
-    path : path
-        A `.gcp` file, a GeoJSON file, or an image with GCP tags.
-    names : sequence of str
-        The views; observations in other images are left out, and these named in `strangers`.
-    sigma : float or None
-        East, north, up standard deviation [m] instead of the file's.
-    image_sigma : float or None
-        Standard deviation of image coordinates [px] instead of the file's.
-
-    Raises
-    ------
-    InputError
-        The file does not parse, or holds no point of these views.
+    Observations in other images than the views called `names` are left out, and these named in `strangers`. InputError
+    where the file does not parse, or holds no point of these views.
     """
     path = Path(path)
     head = read_head(path, TABLE, 4096)
@@ -73,7 +56,7 @@ def read_gcps(
     if not found:
         raise InputError(f"{path}: no GCP of {', '.join(names[:10])}")
     try:
-        return replace(_assembled(found, sigma, image_sigma), strangers=tuple(views.strangers))
+        return replace(_assembled(found), strangers=tuple(views.strangers))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -125,7 +108,7 @@ def _read_tags(path: Path, views: ViewNames) -> Iterator[_Point]:
         yield _Point(str(gcp.id or n), place, (GROUND_SIGMA,) * 3, view, xy, IMAGE_SIGMA)
 
 
-def _assembled(found: list[_Point], sigma: float | None, image_sigma: float | None) -> GroundPoints:
+def _assembled(found: list[_Point]) -> GroundPoints:
     """Observations of points of the same name and place belong to one point."""
     first: dict[tuple[str, tuple[float, float, float]], _Point] = {}
     for point in found:
@@ -141,11 +124,11 @@ def _assembled(found: list[_Point], sigma: float | None, image_sigma: float | No
     return GroundPoints(
         names=tuple(point.name for point in points),
         lonlatalt=numbers,
-        sigma=np.array([point.sigma if sigma is None else (sigma,) * 3 for point in points]),
+        sigma=np.array([point.sigma for point in points]),
         point=np.array([index[point.name, point.lonlatalt] for point in found]),
         view=np.array([point.view for point in found]),
         xy=np.array([point.xy for point in found]),
-        xy_sigma=np.array([point.xy_sigma if image_sigma is None else image_sigma for point in found]),
+        xy_sigma=np.array([point.xy_sigma for point in found]),
     )
 
 
@@ -177,16 +160,10 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
     Parameters
     ----------
     path : Path or str
-        CSV (a header of names, or the columns lon, lat, alt, col, row), npz (arrays ``ground`` and ``image``
-        or one a column), GeoJSON (GCPs with ``ji`` = [col, row]), or a GeoTIFF whose bands are longitude and
-        latitude of one altitude layer after the other, on a regular grid of image points.
-    altitudes : sequence of float, optional
-        Altitudes of the layers of a grid that does not state them [m].
-
-    Raises
-    ------
-    InputError
-        No such file, not one of these, columns that are missing or do not parse.
+        CSV (a header of names, or the columns lon, lat, alt, col, row), npz (arrays ``ground`` and ``image`` or one a
+        column), GeoJSON (GCPs with ``ji`` = [col, row]), or a GeoTIFF whose bands are longitude and latitude of one
+        altitude layer after the other, on a regular grid of image points; else an InputError.
+    altitudes : sequence of float, optional, altitudes of the layers of a grid that does not state them [m]
     """
     path = Path(path)
     kind = correspondence_kind(path, altitudes)
@@ -296,7 +273,6 @@ def _checked(path: Path, ground: Array, image: Array, sigma: Array | None) -> Co
 
 
 def _read_features(path: Path) -> Correspondences:
-    """GCPs (see `geojson_points`)."""
     table = np.array([numbers for numbers, _ in geojson_points(path)])
     if not len(table):
         raise InputError(f"{path}: no points in it")
@@ -328,14 +304,8 @@ def _feature(feature: dict[str, Any], needed: Sequence[str]) -> tuple[list[float
 def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspondences:
     """A direct-localisation grid: bands lon, lat of each altitude layer, nodes by the geotransform.
 
-    The geotransform counts from the corner of the first pixel, as GDAL does; half a pixel is taken off.
-
-    Parameters
-    ----------
-    path : Path
-        GeoTIFF.
-    altitudes : sequence of float, optional
-        Of the layers [m]; by default from the tags ``ALTITUDE_B0``, ``ALTITUDE_B2``, ...
+    The geotransform counts from the corner of the first pixel, as GDAL does; half a pixel is taken off. Altitudes of
+    the layers [m] are those given, or of the tags ``ALTITUDE_B0``, ``ALTITUDE_B2``, ...
     """
     with open_raster(path) as dataset:
         Kind("a localisation grid", TABLE.most).check(

@@ -20,40 +20,28 @@ from barpc.pointio.names import ViewNames, cell, from_cell
 from barpc.scene import IntArray, Tracks, connected_labels
 from barpc.sidefile import TABLE, opened_text, read_text
 
-SIGMA = 0.5
-"""Standard deviation of each coordinate [px] where the file states none."""
+SIGMA = 0.5  # standard deviation of each coordinate [px] where the file states none
 
 _COLUMNS = ("image", "col", "row", "track")
 
 
-def read_matches(path: Path | str, names: Sequence[str], *, sigma: float = SIGMA) -> Tracks:
+def read_matches(path: Path | str, names: Sequence[str]) -> Tracks:
     """Tie points of a file; tracks with fewer than two views, or with two observations in one, are left out.
 
-    Parameters
-    ----------
-    path : path
-        CSV, npz, an ASP text match file, or a folder of these.
-    names : sequence of str
-        The views, in order; observations in other images are left out.
-    sigma : float
-        Standard deviation of each coordinate [px] where the file states none.
-
-    Raises
-    ------
-    InputError
-        The file does not parse, or holds no track of these views.
+    A CSV, an npz, an ASP text match file or a folder of these; observations in other images than the views called
+    `names` are left out. InputError where it does not parse, or holds no track of these views.
     """
     path = Path(path)
     views = ViewNames(names, str(path))
     try:
         if path.is_dir():
-            view, point, xy, spread = _read_asp(sorted(path.glob("*__*.txt")), views, sigma)
+            view, point, xy, spread = _read_asp(sorted(path.glob("*__*.txt")), views)
         elif path.suffix.lower() == ".npz":
-            view, point, xy, spread = _read_npz(path, views, sigma)
+            view, point, xy, spread = _read_npz(path, views)
         elif "__" in path.name and path.suffix.lower() in (".txt", ".match"):
-            view, point, xy, spread = _read_asp([path], views, sigma)
+            view, point, xy, spread = _read_asp([path], views)
         else:
-            view, point, xy, spread = _read_csv(path, views, sigma)
+            view, point, xy, spread = _read_csv(path, views)
     except (OSError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as tie points ({error})") from error
     if not (np.isfinite(xy).all() and np.isfinite(spread).all() and (spread > 0).all()):
@@ -105,7 +93,7 @@ def asp_text(first: Array, second: Array) -> str:
 Columns = tuple[IntArray, IntArray, Array, Array]
 
 
-def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
+def _read_csv(path: Path, views: ViewNames) -> Columns:
     with opened_text(path, TABLE, newline="") as text:
         lines = csv.reader(line for line in text if line.strip() and not line.startswith("#"))
         header = [word.strip().lower() for word in next(lines, [])]
@@ -120,7 +108,7 @@ def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
             try:
                 view = views.find(from_cell(line[image]))
                 col, row = (float(line[i]) for i in numbers[:2])
-                own = sigma if spread is None else float(line[spread])
+                own = SIGMA if spread is None else float(line[spread])
                 track = line[numbers[2]].strip()
             except (ValueError, IndexError) as error:
                 raise InputError(
@@ -135,13 +123,13 @@ def _read_csv(path: Path, views: ViewNames, sigma: float) -> Columns:
     return table[:, 0].astype(np.int64), point, table[:, 1:3], table[:, 3]
 
 
-def _read_npz(path: Path, views: ViewNames, sigma: float) -> Columns:
+def _read_npz(path: Path, views: ViewNames) -> Columns:
     file = load_npz(path)
     try:
         own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
         index, point = (np.asarray(file[key], dtype=np.int64) for key in ("view", "track"))
         xy = np.asarray(file["xy"], dtype=np.float64)
-        spread = np.asarray(file.get("sigma", np.full(len(index), sigma)), dtype=np.float64)
+        spread = np.asarray(file.get("sigma", np.full(len(index), SIGMA)), dtype=np.float64)
         if {(*index.shape, 2), (*point.shape, 2), (*spread.shape, 2), xy.shape} != {(len(xy), 2)}:
             raise ValueError(f"shapes {index.shape}, {point.shape}, {xy.shape}, {spread.shape}")
         if len(index) and not 0 <= index.min() <= index.max() < len(own):
@@ -153,7 +141,7 @@ def _read_npz(path: Path, views: ViewNames, sigma: float) -> Columns:
     return view[keep], point[keep], xy[keep], spread[keep]
 
 
-def _read_asp(paths: Sequence[Path], views: ViewNames, sigma: float) -> Columns:
+def _read_asp(paths: Sequence[Path], views: ViewNames) -> Columns:
     """Pairs that share a keypoint are one track."""
     view, xy, pairs = [], [], []
     count = 0
@@ -172,7 +160,7 @@ def _read_asp(paths: Sequence[Path], views: ViewNames, sigma: float) -> Columns:
     keypoints = np.column_stack([np.concatenate(view), np.concatenate(xy)])
     unique, index = np.unique(keypoints, axis=0, return_inverse=True)
     point = connected_labels(len(unique), index.ravel()[np.concatenate(pairs)])
-    return unique[:, 0].astype(np.int64), point, unique[:, 1:], np.full(len(unique), sigma)
+    return unique[:, 0].astype(np.int64), point, unique[:, 1:], np.full(len(unique), SIGMA)
 
 
 def _asp_images(path: Path, views: ViewNames) -> tuple[str, str]:

@@ -23,12 +23,8 @@ def unique_names(files: Sequence[Path]) -> list[str]:
     """A name for each file: its stem, with as many folders before it as it takes to tell them apart.
 
     Names that differ in case or composition only are taken for one, as file systems and GDAL do; two files of one
-    folder that differ in their ending alone keep it.
-
-    Raises
-    ------
-    InputError
-        A name is longer than `MAX_NAME`, or two files cannot be told apart.
+    folder that differ in their ending alone keep it. InputError for a name longer than `MAX_NAME`, or files that
+    cannot be told apart.
 
     Examples
     --------

@@ -107,7 +107,7 @@ class CenterEntry(Record):
 
     ecef_m: Vector = said("Place, ECEF", "m")
     altitude_m: Number = said("Above the ellipsoid", "m")
-    method: str = said("line, projective, or nominal where neither was plausible", head="found by")
+    method: str = said("line, or nominal where that was not plausible", head="found by")
 
 
 class FitEntry(Record):

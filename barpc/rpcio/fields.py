@@ -20,8 +20,7 @@ SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")
 COEFFICIENTS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
 ERRORS = ("ERR_BIAS", "ERR_RAND")
 SINGLE = ERRORS + OFFSETS + SCALES
-KEYS = SINGLE + COEFFICIENTS
-"""GDAL's names of all fields, in the order of the GeoTIFF tag."""
+KEYS = SINGLE + COEFFICIENTS  # GDAL's names of all fields, in the order of the GeoTIFF tag
 
 _MAXAR = (
     "errBias errRand lineOffset sampOffset latOffset longOffset heightOffset lineScale sampScale latScale longScale "
@@ -48,10 +47,7 @@ class ReadOptions:
 
 
 def number(text: str, name: str, key: str) -> float:
-    """The number at the start of `text`; a unit may follow, and the exponent may be Fortran's D.
-
-    File and field, `name` and `key`, are for the RpcFormatError if there is no finite number.
-    """
+    """The number at the start of `text` (or RpcFormatError); a unit may follow, the exponent may be Fortran's D."""
     text = text.strip()
     match = _NUMBER.match(text)
     rest = text[match.end() :] if match else text
@@ -98,19 +94,9 @@ def rpc_from_fields(
 ) -> RPC:
     """The RPC of the fields of a file called `name`.
 
-    Parameters
-    ----------
-    fields : mapping
-        `Fields`; ERR_BIAS and ERR_RAND may be missing, and are unknown where they are not positive.
-    options : ReadOptions, optional
-        Its `first_pixel` goes before the format's.
-    first_pixel : float
-        The format's coordinate of the centre of the first pixel, subtracted from the image offsets.
-
-    Raises
-    ------
-    RpcFormatError
-        A field is missing, has the wrong length, is not finite, or a scale is zero.
+    The format's coordinate of the centre of the first pixel, or the options', is subtracted from the image offsets.
+    RpcFormatError where a field (but ERR_BIAS and ERR_RAND) is missing, has the wrong length, is not finite, or a
+    scale is zero.
     """
     if options is not None and options.first_pixel is not None:
         first_pixel = options.first_pixel

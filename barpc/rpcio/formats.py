@@ -21,16 +21,12 @@ class Format:
     """One syntax of RPC files: how it is called, told from others, read, written and verified."""
 
     name: str  # as --rpc-format and messages call it
-    suffixes: tuple[
-        str, ...
-    ]  # ends of the names of written files, the usual one first; reading goes by content
+    suffixes: tuple[str, ...]  # ends of the names of written files in any case, the usual one first
     sniff: Callable[[str], bool]  # whether a file's text is of this format
     read: Callable[[str, str, ReadOptions], RPC]  # of text, file name for messages, options
     write: Callable[[RPC], str] | None = None
     beside: str = ""  # end of the name of the file that a run writes for an image, after the image's name
-    consumers: tuple[
-        str, ...
-    ] = ()  # tools that read what is written (`barpc.handoff.CONSUMERS`), besides barpc
+    consumers: tuple[str, ...] = ()  # that read what is written (`barpc.handoff.CONSUMERS`), besides barpc
 
 
 def _has(*patterns: str) -> Callable[[str], bool]:
@@ -39,52 +35,25 @@ def _has(*patterns: str) -> Callable[[str], bool]:
 
 
 _BESIDE = "gdal, beside an image"
-_ROWS = (
+_TXT = _has(r"(?im)^[ \t]*+LINE_NUM_COEFF_1[ \t]*+[:=]")
+_RPB = _has(r"(?i)lineNumCoef\s*+=")
+_GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
+_MAXAR = _has(r"<(\w+:)?LINENUMCOEF")
+_JSON = _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")')
+_SYNTAXES = (
     Format(
         "txt",
-        ("_RPC.TXT", "_rpc.txt", ".rpc", ".txt"),
-        _has(r"(?im)^[ \t]*+LINE_NUM_COEFF_1[ \t]*+[:=]"),
+        ("_RPC.TXT", ".rpc", ".txt"),
+        _TXT,
         text.read_txt,
         text.write_txt,
         "_RPC.TXT",
         (_BESIDE, "rpcm"),
     ),
-    Format(
-        "rpb",
-        (".RPB", ".rpb"),
-        _has(r"(?i)lineNumCoef\s*+="),
-        text.read_rpb,
-        text.write_rpb,
-        ".RPB",
-        (_BESIDE,),
-    ),
-    Format(
-        "geom",
-        (".geom",),
-        _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:"),
-        text.read_geom,
-        text.write_geom,
-        ".geom",
-        ("keywords", "shareloc"),
-    ),
-    Format(
-        "xml",
-        (".XML", ".xml"),
-        _has(r"<(\w+:)?LINENUMCOEF"),
-        xml.read_maxar,
-        xml.write_maxar,
-        ".rpc.xml",
-        (_BESIDE,),
-    ),
-    Format(
-        "json",
-        (".json",),
-        _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")'),
-        text.read_json,
-        text.write_json,
-        ".rpc.json",
-        ("rpcm",),
-    ),
+    Format("rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,)),
+    Format("geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc")),
+    Format("xml", (".XML",), _MAXAR, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,)),
+    Format("json", (".json",), _JSON, text.read_json, text.write_json, ".rpc.json", ("rpcm",)),
     Format("dimap", (), _has(r"<(\w+:)?Global_RFM"), xml.read_dimap),  # a Dimap_Document, or the model alone
     Format("enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>"), xml.read_enmap),
     Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"'), xml.read_gdal),
@@ -92,7 +61,7 @@ _ROWS = (
     Format("envi", (), _has(r"(?im)^[ \t]*+rpc info\s*+=\s*+\{"), text.read_envi),
     Format("alos", (), _has(r"\A[\d+\-. ]{66}[\d+\-. Ee]{960}"), text.read_alos),
 )
-FORMATS: dict[str, Format] = {row.name: row for row in _ROWS}
+FORMATS: dict[str, Format] = {row.name: row for row in _SYNTAXES}
 """Name -> format. One row a syntax; readers are tried in this order."""
 
 WRITABLE: dict[str, Format] = {name: row for name, row in FORMATS.items() if row.write is not None}
@@ -191,14 +160,11 @@ def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrit
 
     Parameters
     ----------
-    rpc : RPC
     path : Path or str
         Its name chooses the format: ``_RPC.TXT``, ``.RPB``, ``.geom``, ``.XML`` (Maxar), ``.json`` (rpcm). An RPC
         goes into a raster by `write_rpc_vrt` or `write_rpc_copy`, never into the input.
-    format : str, optional
-        A row of `FORMATS`, whatever the name.
-    overwrite : bool
-        Replace an existing file.
+    format : str, optional, a row of `FORMATS`, whatever the name
+    overwrite : bool, replace an existing file
 
     Raises
     ------

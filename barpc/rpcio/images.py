@@ -43,10 +43,8 @@ def write_rpc_vrt(
 
     Parameters
     ----------
-    rpc, image_path, vrt_path, overwrite
-        As of `write_rpc_copy`.
-    relative : bool
-        Point at the image relative to the VRT, so that both may move together; else by absolute path.
+    rpc, image_path, vrt_path, overwrite : as of `write_rpc_copy`
+    relative : bool, point at the image relative to the VRT, so that both may move; else by absolute path
 
     Raises
     ------
@@ -134,12 +132,9 @@ def write_rpc_copy(
 
     Parameters
     ----------
-    rpc : RPC
-        The camera of `image_path`.
-    image_path, copy_path : Path or str
-        The image, and the file to write.
-    overwrite : bool
-        Replace an existing file, never the image itself.
+    rpc : RPC, the camera of `image_path`
+    image_path, copy_path : Path or str, the image, and the file to write
+    overwrite : bool, replace an existing file, never the image itself
 
     Raises
     ------
@@ -175,19 +170,14 @@ def write_crop(
 
     Parameters
     ----------
-    rpc : RPC
-        The camera of `image_path`.
-    image_path, crop_path : Path or str
-        The image, and the tiled GeoTIFF to write.
-    window : (col, row, width, height)
-        Whole pixels, inside the image.
-    overwrite : bool
-        Replace an existing file, never the image itself.
+    rpc : RPC, the camera of `image_path`
+    image_path, crop_path : Path or str, the image, and the tiled GeoTIFF to write
+    window : (col, row, width, height), whole pixels, inside the image
+    overwrite : bool, replace an existing file, never the image itself
 
     Returns
     -------
-    rpc : RPC
-        The crop's camera, as it stands in the file.
+    rpc : RPC, the crop's camera, as it stands in the file
 
     Raises
     ------
@@ -250,7 +240,6 @@ def _copy_window(dataset: Any, target: Path, window: Window, **options: str) -> 
 
 
 def _blocks(copy: Any, window: Window) -> Iterator[tuple[Window, Window]]:
-    """Blocks of a copy of a window, in the copy and in the image."""
     for _, block in copy.block_windows(1):
         col, row = window.col_off + block.col_off, window.row_off + block.row_off
         yield block, Window(col, row, block.width, block.height)

@@ -90,8 +90,8 @@ def _holds_rpc(path: Path, kind: str) -> bool:
 def shadows(image: Path | str) -> list[Sidecar]:
     """The files beside an image that some tool reads instead of the RPC in the image itself.
 
-    A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and
-    CARS are given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
+    A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and CARS are
+    given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
     """
     image = Path(image)
     head = read_head(image, IMAGE, 64)
@@ -135,10 +135,8 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
 
     Parameters
     ----------
-    path : Path or str
-        An image or an RPC file.
-    first_pixel, band
-        As of `ReadOptions`.
+    path : Path or str, an image or an RPC file
+    first_pixel, band : as of `ReadOptions`
 
     Raises
     ------
@@ -190,7 +188,6 @@ def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:
 
 
 def _own_rpc(path: Path, head: bytes) -> RPC | None:
-    """The RPC inside a TIFF or NITF."""
     reader = {"GTiff": read_tag, "NITF": read_nitf}.get(driver_of(head) or "")
     return reader(path) if reader else None
 

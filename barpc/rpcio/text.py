@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,30 +44,30 @@ def decode(data: bytes) -> str:
 
 
 def _pairs(text: str) -> Iterator[tuple[str, str]]:
-    """Key and value of every line that has both."""
     for match in _LINE.finditer(text):
         yield match[1], match[2].strip().removesuffix(";").rstrip()
 
 
+def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[str]:
+    """A line for every number; the coefficients of a list have these indices."""
+    lines = []
+    for key, values in fields.items():
+        names = [f"{key}_{index}" for index in indices] if key in COEFFICIENTS else [key]
+        lines += [f"{k}{separator}{format_number(value)}" for k, value in zip(names, values, strict=True)]
+    return lines
+
+
 def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
     """``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT)."""
-    pairs = []
-    for key, value in _pairs(text):
-        key = key.upper()
-        if key in SINGLE or key.rpartition("_")[0] in COEFFICIENTS:
-            pairs.append((key, number(value, name, key)))
+    found = ((key.upper(), value) for key, value in _pairs(text))
+    known = ((k, v) for k, v in found if k in SINGLE or k.rpartition("_")[0] in COEFFICIENTS)
+    pairs = [(key, number(value, name, key)) for key, value in known]
     return rpc_from_fields(collect_numbered(pairs, name), name, options)
 
 
 def write_txt(rpc: RPC) -> str:
     """``KEY: value`` without units (rpcm stumbles on them); every number reads back to the bit."""
-    lines = []
-    for key, values in fields_from_rpc(rpc).items():
-        if key in COEFFICIENTS:
-            lines += [f"{key}_{i}: {format_number(value)}" for i, value in enumerate(values, 1)]
-        else:
-            lines.append(f"{key}: {format_number(values[0])}")
-    return "\n".join(lines) + "\n"
+    return "\n".join(_numbered(fields_from_rpc(rpc), ": ", [str(i) for i in range(1, 21)])) + "\n"
 
 
 # --- .RPB -------------------------------------------------------------------------------------------------
@@ -122,13 +122,9 @@ def write_geom(rpc: RPC) -> str:
     """OSSIM's keyword list with all keys that its readers ask for (they add the half pixel themselves)."""
     fields = fields_from_rpc(rpc)
     errors = {word: fields.pop(key, [0.0]) for word, key in _GEOM_ERRORS.items()}  # 0 is OSSIM's "unknown"
-    lines = ["type:  ossimRpcModel", "polynomial_format:  B"]
-    for key, values in (errors | fields).items():
-        if key in COEFFICIENTS:
-            lines += [f"{key.lower()}_{i:02d}:  {format_number(value)}" for i, value in enumerate(values)]
-        else:
-            lines.append(f"{key.lower()}:  {format_number(values[0])}")
-    return "\n".join(lines) + "\n"
+    lines = _numbered(errors | fields, ":  ", [f"{i:02d}" for i in range(20)])
+    head = ["type:  ossimRpcModel", "polynomial_format:  B"]
+    return "\n".join([*head, *(line.lower() for line in lines)]) + "\n"
 
 
 _ENVI = re.compile(r"^[ \t]*+rpc info\s*+=\s*+\{([^{}]*+)\}", re.MULTILINE | re.IGNORECASE)
@@ -145,10 +141,11 @@ def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
     return rpc_from_fields(fields, name, options)
 
 
+# The errors are not rpcm's own; it passes over them.
 _RPCM_WORDS = (
     "err_bias err_rand row_offset col_offset lat_offset lon_offset alt_offset row_scale col_scale lat_scale lon_scale "
     "alt_scale row_num row_den col_num col_den"
-)  # the errors are not rpcm's own; it passes over them
+)
 _RPCM = dict(zip(KEYS, _RPCM_WORDS.split(), strict=True))
 _PLAIN = {key: key.lower() for key in KEYS}
 
@@ -284,7 +281,6 @@ def nitf_record(rpc: RPC) -> str:
 
 
 def _nitf_coefficient(value: float, key: str) -> str:
-    """+d.ddddddE-d."""
     mantissa, exponent = f"{value:+.6E}".split("E")
     power = int(exponent)
     if power < -9:

@@ -25,11 +25,8 @@ from barpc.sidefile import IMAGE, opened
 RPC_TAG = 50844
 _GEOREFERENCE_TAGS = (33550, 33922, 34264)  # ModelPixelScale, ModelTiepoint, ModelTransformation
 
-_SIZES = dict(enumerate((1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4), 1)) | {
-    16: 8,
-    17: 8,
-    18: 8,
-}  # of a type [bytes]
+# Of a type [bytes].
+_SIZES = dict(enumerate((1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4), 1)) | {16: 8, 17: 8, 18: 8}
 _DOUBLE = 12
 _MAX_ENTRIES = 4096
 _MAX_VALUES = 1 << 24  # bytes

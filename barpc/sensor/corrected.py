@@ -37,8 +37,7 @@ _TOLERANCE = 1e-7  # px: a localised point must project this near to where it wa
 class Motion:
     """exp(d) R (X - T - C) + C for points of one view or many, and the derivatives: all that P_BA adds to P.
 
-    Arrays are component-major, columns sorted by view; R, T and C are those of each view, the drift d is that of
-    each point.
+    Arrays are component-major, columns sorted by view; R, T, C are each view's, the drift d is each point's.
 
     Parameters
     ----------
@@ -68,16 +67,9 @@ class Motion:
         self.ecef = self._turned + np.repeat(center.T, count, axis=1)
 
     def derivatives(self, by_moved: Array) -> tuple[Array, Array, Array]:
-        """Derivatives by X, by R and by d of what depends on the moved points; by T they are those by X, negative.
+        """Derivatives (2, 3, n) by X [1/m], R and d [1/rad], each, of what has these by the moved points [1/m].
 
-        Parameters
-        ----------
-        by_moved : (2, 3, n), derivatives by the moved points [1/m]
-
-        Returns
-        -------
-        by_point : (2, 3, n) [1/m], the drift held
-        by_rotation, by_drift : (2, 3, n) [1/rad]; the second is the first where there is no drift
+        By T they are those by X, negative; those by d are those by R where there is no drift.
         """
         back = by_moved if self._drift is None else self._drift.back(by_moved)
         by_point = _by_view(self._matrix.swapaxes(1, 2), back, self._bounds)
@@ -102,17 +94,13 @@ class Correction(Frozen):
 
     Parameters
     ----------
-    rotation : (3,)
-        Rotation vector [rad], ECEF axes.
-    translation : (3,)
-        [m], ECEF.
-    center : (3,)
-        Camera centre [m], ECEF.
+    rotation : (3,), rotation vector [rad], ECEF axes
+    translation : (3,), [m], ECEF
+    center : (3,), camera centre [m], ECEF
     drift : (D, 3)
         A second rotation [rad] after the first: the vectors times the powers u, u^2, ... of the normalised image
         row u = (row - row_offset) / row_scale at which the point is seen; D = 0: none.
-    row_offset, row_scale : float
-        Row of u = 0 and rows to u = 1 [px].
+    row_offset, row_scale : float, row of u = 0 and rows to u = 1 [px]
     """
 
     rotation: Array
@@ -152,18 +140,10 @@ class Correction(Frozen):
 
 @dataclass(frozen=True)
 class Corrected:
-    """P_BA: `sensor` behind `correction`; itself a `SensorModel`.
+    """P_BA: `sensor` behind `correction`; itself a `SensorModel`."""
 
-    Parameters
-    ----------
-    sensor : SensorModel
-        The model as delivered, P.
-    correction : Correction
-        R, T and C.
-    """
-
-    sensor: SensorModel
-    correction: Correction
+    sensor: SensorModel  # the model as delivered, P
+    correction: Correction  # R, T and C
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
@@ -185,19 +165,9 @@ class Corrected:
         return image, by_ecef @ ecef_from_ground_jacobian(ground)
 
     def project_ecef(self, ecef: Array) -> tuple[Array, Array, Array, Array]:
-        """Image points of ECEF points, with the derivatives that the adjustment needs.
+        """Image points (..., 2) [px] of ECEF points X (..., 3) [m], with the derivatives that the adjustment needs.
 
-        Parameters
-        ----------
-        ecef : (..., 3)
-            x, y, z [m].
-
-        Returns
-        -------
-        image : (..., 2)
-            col, row [px].
-        by_ecef, by_rotation, by_translation : (..., 2, 3)
-            d(image)/dX [px/m], d(image)/dR [px/rad], d(image)/dT [px/m].
+        d(image)/dX [px/m], d(image)/dR [px/rad], d(image)/dT [px/m], (..., 2, 3) each.
         """
         ecef = np.asarray(ecef, dtype=np.float64)
         columns, shape = np.ascontiguousarray(ecef.reshape(-1, 3).T), ecef.shape[:-1]
@@ -243,16 +213,10 @@ class Corrected:
 
 @dataclass(frozen=True, eq=False)
 class ImageAffine(Frozen):
-    """image + shift + slope @ image.
+    """image + shift + slope @ image."""
 
-    Parameters
-    ----------
-    shift : (2,), col, row [px]
-    slope : (2, 2), change of (col, row) by (col, row) [px/px]
-    """
-
-    shift: Array
-    slope: Array
+    shift: Array  # (2,): col, row [px]
+    slope: Array  # (2, 2): change of (col, row) by (col, row) [px/px]
 
     def __post_init__(self) -> None:
         self._array("shift", (2,), RpcError)
@@ -266,15 +230,10 @@ class ImageCorrected:
     The bias corrections (shift, drift, affine) of Fraser and Hanley ("Bias compensation in rational functions for
     Ikonos satellite imagery", 2003) and Grodecki and Dial ("Block adjustment of high-resolution satellite images
     described by rational polynomials", 2003), for comparison with the correction in space.
-
-    Parameters
-    ----------
-    sensor : SensorModel, the model as delivered
-    correction : ImageAffine, what is added to its image points
     """
 
-    sensor: SensorModel
-    correction: ImageAffine
+    sensor: SensorModel  # the model as delivered
+    correction: ImageAffine  # what is added to its image points
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""

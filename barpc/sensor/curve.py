@@ -15,10 +15,8 @@ from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array
 
-EXTRAPOLATION = 1.0
-"""Seconds beyond its knots that a curve is still believed."""
-MARGIN = 70.0
-"""State vectors so far before and after the image take part in the fit of an orbit [s]."""
+EXTRAPOLATION = 1.0  # seconds beyond its knots that a curve is still believed
+MARGIN = 70.0  # state vectors so far before and after the image take part in the fit of an orbit [s]
 MIN_VECTORS = 4
 MIN_DEGREE, MAX_DEGREE = 5, 11
 
@@ -31,16 +29,10 @@ _GAIN = 1.5  # a higher degree must lower the residual across the track by this 
 
 @dataclass(frozen=True, eq=False)
 class Curve(Frozen):
-    """A piecewise polynomial of time with values in three dimensions.
+    """A piecewise polynomial of time with values in three dimensions."""
 
-    Parameters
-    ----------
-    knots : (M + 1,), times [s], ascending; piece m holds between knots m and m + 1
-    coeffs : (M, K, 3), piece m is the sum over k of coeffs[m, k] (t - knots[m])^k
-    """
-
-    knots: Array
-    coeffs: Array
+    knots: Array  # (M + 1,): times [s], ascending; piece m holds between knots m and m + 1
+    coeffs: Array  # (M, K, 3): piece m is the sum over k of coeffs[m, k] (t - knots[m])^k
     _table: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -64,18 +56,9 @@ class Curve(Frozen):
     def through(cls, times: npt.ArrayLike, values: npt.ArrayLike, degree: int = 5) -> Curve:
         """The spline through samples: smooth to the second but one derivative, not-a-knot at its ends.
 
-        Parameters
-        ----------
-        times : (N,) [s], ascending
-        values : (N, 3), positions [m] or rotation vectors [rad]
-        degree : int
-            3 or 5; less where there are too few samples. A quintic through positions every 10 s is true to
-            1e-4 m between them.
-
-        Raises
-        ------
-        RpcError
-            Fewer than two samples, times that do not ascend, numbers that are not finite.
+        `values` (N, 3) are positions [m] or rotation vectors [rad]; `degree` is 3 or 5, less where there are too few
+        samples. A quintic through positions every 10 s is true to 1e-4 m between them. RpcError for fewer than two
+        samples, times that do not ascend, numbers that are not finite.
         """
         times, values = np.asarray(times, dtype=np.float64), np.asarray(values, dtype=np.float64)
         if times.ndim != 1 or len(times) < 2 or values.shape != (len(times), 3):
@@ -92,11 +75,6 @@ class Curve(Frozen):
     def span(self) -> tuple[float, float]:
         """First and last time that the curve is believed for [s]."""
         return float(self.knots[0]) - EXTRAPOLATION, float(self.knots[-1]) + EXTRAPOLATION
-
-    @property
-    def degree(self) -> int:
-        """Degree of the polynomials."""
-        return int(self.coeffs.shape[1]) - 1
 
     def __call__(self, time: Array) -> tuple[Array, Array]:
         """Values (3, N) and their derivatives by time (3, N) at times (N,) [s]."""
@@ -145,10 +123,7 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
     mount : (3, 3), ecef_from_camera at the middle sample
     attitude : Curve, rotation vector [rad] in the axes of `mount`: a cubic spline
 
-    Raises
-    ------
-    RpcError
-        A quaternion that is zero or not finite, an attitude that turns by more than 2 rad from the middle.
+    RpcError for a quaternion that is zero or not finite, an attitude that turns by more than 2 rad from the middle.
     """
     q = np.asarray(quaternions, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != 4 or not (np.isfinite(q).all() and q.any(axis=1).all()):
@@ -161,15 +136,9 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Orbit(Curve):
-    """The polynomial through state vectors.
+    """The polynomial through state vectors."""
 
-    Parameters
-    ----------
-    sigma : (3,)
-        Standard deviations of the state vectors: positions along and across the track [m], velocities [m/s].
-    """
-
-    sigma: Array
+    sigma: Array  # (3,): standard deviations of positions along and across the track [m], of velocities [m/s]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -196,8 +165,7 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
     Raises
     ------
     RpcError
-        Fewer than `MIN_VECTORS` vectors, an image more than `EXTRAPOLATION` beyond them, or vectors that
-        are not one orbit.
+        Fewer than `MIN_VECTORS` vectors, an image more than `EXTRAPOLATION` beyond them, or no one orbit.
     """
     time, first = np.unique(time, return_index=True)
     use = (time >= window[0] - MARGIN) & (time <= window[1] + MARGIN)
@@ -258,12 +226,7 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
 
 
 class Turn:
-    """The rotations exp([w]x) and their derivatives.
-
-    Parameters
-    ----------
-    w : (..., 3, N), rotation vectors [rad]
-    """
+    """The rotations exp([w]x) of rotation vectors w (..., 3, N) [rad], and their derivatives."""
 
     def __init__(self, w: Array) -> None:
         x = (w * w).sum(axis=-2, keepdims=True)  # the angles, squared
@@ -299,10 +262,7 @@ def rotation_matrix(rotation: npt.ArrayLike) -> Array:
 
 
 def rotation_left_jacobian(rotation: npt.ArrayLike) -> Array:
-    """Left Jacobians (..., 3, 3) of rotation vectors (..., 3) [rad].
-
-    R(w + dw) = R(J dw) R(w) to first order: d(R v)/dw = -skew(R v) J.
-    """
+    """Left Jacobians J (..., 3, 3) of rotation vectors (..., 3) [rad]: R(w + dw) = R(J dw) R(w) to first order."""
     return Turn(-np.asarray(rotation, dtype=np.float64)[..., None]).rate(np.eye(3))
 
 

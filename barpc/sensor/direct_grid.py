@@ -17,8 +17,7 @@ from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
 from barpc.sensor.rational import DERIVATIVE, monomials
 
-CHUNK = 2048
-"""Points worked on at a time: what belongs to them stays in cache."""
+CHUNK = 2048  # points worked on at a time: what belongs to them stays in cache
 
 _FAR = 1e9  # px and m: beyond it no node lies
 _STEPS = 8
@@ -32,6 +31,8 @@ _VALUE, _BY_COL, _BY_ROW, _BY_ALT = (0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)
 class DirectGrid(Frozen):
     """A camera given by the ground points of a grid of image points: itself a `SensorModel`.
 
+    The spline is continued by one cell around the grid and by a tenth of its altitudes; beyond, points are NaN.
+
     Parameters
     ----------
     cols : (W,), columns of the nodes [px], ascending; (0, 0) is the centre of the top-left pixel
@@ -43,11 +44,6 @@ class DirectGrid(Frozen):
     ------
     RpcError
         Fewer than two nodes along an axis, nodes that do not ascend, values that are not finite.
-
-    Notes
-    -----
-    The spline is continued by one cell around the grid and by a tenth of its altitude range; beyond, points
-    are NaN.
     """
 
     cols: Array
@@ -84,18 +80,7 @@ class DirectGrid(Frozen):
 
     @classmethod
     def from_points(cls, ground: npt.ArrayLike, image: npt.ArrayLike) -> DirectGrid:
-        """The grid whose nodes are listed in any order.
-
-        Parameters
-        ----------
-        ground : (N, 3), lon, lat [deg], alt [m] of every node
-        image : (N, 2), col, row [px]
-
-        Raises
-        ------
-        RpcError
-            The points are not the nodes of a full regular grid.
-        """
+        """The grid whose nodes, ground (N, 3) and image (N, 2), are listed in any order; RpcError if one is missing."""
         ground = np.asarray(ground, dtype=np.float64)
         image = np.asarray(image, dtype=np.float64)
         values = (ground[:, 2], image[:, 1], image[:, 0])
@@ -121,11 +106,9 @@ class DirectGrid(Frozen):
         return pointwise(self._localize, CHUNK, [(3,)], image, alt)[0]
 
     def _localize(self, image: Array, alt: Array) -> list[Array]:
-        """`localize` of points (N, 2) at altitudes (N,)."""
         return [np.column_stack([self._value(image, alt) + np.array([self._lon, 0.0]), alt])]
 
     def _jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """`project_jacobian` of points (N, 3)."""
         image, alt = self._solve(ground), ground[:, 2]
         by_lon, by_lat = self._inverse_2x2(image, alt)
         rise = self._value(image, alt, _BY_ALT)
@@ -133,10 +116,7 @@ class DirectGrid(Frozen):
         return image, np.stack([by_lon, by_lat, by_alt], axis=2)
 
     def _solve(self, ground: Array) -> Array:
-        """Image points (N, 2) of ground points (N, 3): Newton from an inverse cubic polynomial.
-
-        Its derivatives serve for all steps where these shrink fast enough, and make way for the spline's where not.
-        """
+        """Image points (N, 2) of ground points (N, 3): Newton from an inverse cubic, whose derivatives mostly serve."""
         target, alt = ground[:, :2].copy(), ground[:, 2]
         target[:, 0] = wrap_longitude(target[:, 0], self._lon) - self._lon
         with np.errstate(all="ignore"):

@@ -23,13 +23,11 @@ from barpc.sensor.rpc import RPC
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
-CenterMethod = Literal["line", "projective", "nominal"]
+CenterMethod = Literal["line", "nominal"]
 _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
-NOMINAL_ALTITUDE = 650e3
-"""Orbit altitude [m] assumed where a model does not tell its own."""
-PLAUSIBLE_ALTITUDE = (380e3, 1000e3)
-"""A camera centre regressed outside this range [m] is not believed."""
+NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
+PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
 
 def altitude_range(rpc: RPC) -> tuple[float, float]:
@@ -62,18 +60,13 @@ def footprint(
 
     Parameters
     ----------
-    sensor : SensorModel
     size : (width, height) [px]
-    alt : float or (4 per_side,)
-        Altitude of the ground [m above the ellipsoid].
-    per_side : int
-        Points on each side; an edge is a curve on the ground.
+    alt : float or (4 per_side,), altitude of the ground [m above the ellipsoid]
+    per_side : int, points on each side; an edge is a curve on the ground
 
     Returns
     -------
-    ring : (4 per_side, 2)
-        lon, lat [deg], not closed, in the order of the image's outline; longitudes run on continuously
-        across the antimeridian.
+    ring : (4 per_side, 2), lon, lat [deg], not closed; longitudes run on across the antimeridian
     """
     border = image_border(size, per_side)
     ring = sensor.localize(border, np.broadcast_to(np.asarray(alt, dtype=np.float64), len(border)))[:, :2]
@@ -86,18 +79,13 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
 
     Parameters
     ----------
-    sensor : SensorModel
-    image : (..., 2)
-        col, row [px].
-    alt_range : (low, high)
-        The two altitudes [m]; at least 100 m apart are taken.
+    image : (..., 2), col, row [px]
+    alt_range : (low, high), the two altitudes [m]; at least 100 m apart are taken
 
     Returns
     -------
-    origin : (..., 3)
-        ECEF [m], at the lower altitude.
-    direction : (..., 3)
-        Unit vector in ECEF, pointing up, towards the sensor.
+    origin : (..., 3), ECEF [m], at the lower altitude
+    direction : (..., 3), unit vector in ECEF, pointing up, towards the sensor
     """
     image = np.asarray(image, dtype=np.float64)
     low, high = alt_range[0], max(alt_range[1], alt_range[0] + 100.0)
@@ -107,11 +95,7 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
 
 
 def sight_enu(sensor: SensorModel, ground: Array) -> Array:
-    """Unit vectors (..., 3) east, north, up from ground points (..., 3) towards the sensor.
-
-    The direction in which a point can move without moving in the image: the null vector of the
-    projection's derivative.
-    """
+    """Unit vectors (..., 3) east, north, up from ground points (..., 3) to the sensor: along them no pixel changes."""
     ground = np.asarray(ground, dtype=np.float64)
     _, jacobian = sensor.project_jacobian(ground)
     metric = jacobian / metres_per_unit(ground)[..., None, :]
@@ -122,20 +106,12 @@ def sight_enu(sensor: SensorModel, ground: Array) -> Array:
 
 
 def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """Incidence and azimuth of the line of sight at ground points.
-
-    Parameters
-    ----------
-    sensor : SensorModel
-    ground : (..., 3)
-        lon, lat [deg], alt [m].
+    """Incidence and azimuth of the line of sight at ground points (..., 3).
 
     Returns
     -------
-    incidence : (...)
-        Angle between the local vertical and the direction to the sensor [deg].
-    azimuth : (...)
-        Direction to the sensor, clockwise from north [deg, 0 to 360].
+    incidence : (...), angle between the local vertical and the direction to the sensor [deg]
+    azimuth : (...), direction to the sensor, clockwise from north [deg, 0 to 360]
     """
     east, north, up = np.moveaxis(sight_enu(sensor, ground), -1, 0)
     return np.degrees(np.arctan2(np.hypot(east, north), up)), np.degrees(np.arctan2(east, north)) % 360.0
@@ -146,10 +122,8 @@ def ground_sample_distance(sensor: SensorModel, ground: Array) -> tuple[Array, A
 
     Returns
     -------
-    sides : (..., 2)
-        Metres from one pixel to the next along col and along row.
-    mean : (...)
-        Side [m] of the square that has the area of a pixel.
+    sides : (..., 2), metres from one pixel to the next along col and along row
+    mean : (...), side [m] of the square that has the area of a pixel
     """
     _, jacobian = sensor.project_jacobian(ground)
     metric = jacobian[..., :2] / metres_per_unit(ground)[..., None, :2]  # px a metre east, north
@@ -179,57 +153,40 @@ def base_to_height(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) 
 
 @dataclass(frozen=True, eq=False)
 class CameraCenter:
-    """Where a camera stands.
+    """Where a camera stands."""
 
-    Parameters
-    ----------
-    ecef : (3,) [m]
-    altitude : float [m above the ellipsoid]
-    method : str, how it was found: "line", "projective", or "nominal" where the first was not plausible
-    """
-
-    ecef: Array
+    ecef: Array  # (3,) [m]
     altitude: float
-    method: CenterMethod
+    method: CenterMethod  # how it was found: "nominal" where "line" was not plausible
 
 
-def camera_center(
-    sensor: SensorModel,
-    size: tuple[int, int],
-    alt_range: tuple[float, float],
-    method: Literal["line", "projective"] = "line",
-) -> CameraCenter:
+def camera_center(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
     """Camera centre regressed from a sensor model.
 
+    One image line of a pushbroom camera IS a perspective camera, so its rays meet in one point, found by least
+    squares. (A projective camera regressed over the whole image, as in the paper, stands at about twice the distance:
+    the image is perspective across the track and affine along it.) A point outside `PLAUSIBLE_ALTITUDE` is replaced
+    by one at `NOMINAL_ALTITUDE` on the central ray, and says so in its ``method``.
+
     Parameters
     ----------
-    sensor : SensorModel
     size : (width, height) [px]
-    alt_range : (low, high)
-        Altitudes [m] between which rays are drawn.
-    method : {"line", "projective"}
-        ``line``: one image line of a pushbroom camera IS a perspective camera, so its rays meet in one point, found
-        by least squares; a point outside `PLAUSIBLE_ALTITUDE` is replaced by one at `NOMINAL_ALTITUDE` on the central
-        ray, and says so in its ``method``. ``projective``: a 3x4 projective camera by direct linear transformation
-        over the whole image, as in the paper; of a pushbroom image it finds a point at about twice the distance, for
-        the image is perspective across the track and affine along it.
+    alt_range : (low, high), altitudes [m] between which rays are drawn
 
     Raises
     ------
     RpcError
         The model cannot be localised over its own image.
     """
-    found: CenterMethod = method
-    ecef = (_center_of_line if method == "line" else _center_projective)(sensor, size, alt_range)
+    ecef = _center_of_line(sensor, size, alt_range)
     altitude = float(ground_from_ecef(ecef)[2])
-    if not np.isfinite(altitude):
-        if not np.isfinite(sensor.localize(np.array(size) / 2.0, np.array(alt_range[0]))).all():
-            raise RpcError("camera centre: the model has no ground point at its image's centre")
-        altitude = np.inf
-    if method == "line" and not PLAUSIBLE_ALTITUDE[0] <= altitude <= PLAUSIBLE_ALTITUDE[1]:
-        ecef, found = _center_nominal(sensor, size, alt_range), "nominal"
-        altitude = float(ground_from_ecef(ecef)[2])
-    return CameraCenter(ecef, altitude, found)
+    if PLAUSIBLE_ALTITUDE[0] <= altitude <= PLAUSIBLE_ALTITUDE[1]:
+        return CameraCenter(ecef, altitude, "line")
+    middle = sensor.localize(np.array(size) / 2.0, np.array(alt_range[0]))
+    if not np.isfinite(altitude) and not np.isfinite(middle).all():
+        raise RpcError("camera centre: the model has no ground point at its image's centre")
+    ecef = _center_nominal(sensor, size, alt_range)
+    return CameraCenter(ecef, float(ground_from_ecef(ecef)[2]), "nominal")
 
 
 def _center_of_line(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
@@ -243,21 +200,6 @@ def _center_of_line(sensor: SensorModel, size: tuple[int, int], alt_range: tuple
     if not np.isfinite(normal).all():
         return np.full(3, np.nan)
     return np.asarray(np.linalg.lstsq(normal, rhs, rcond=1e-15)[0] + shift)
-
-
-def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    image, alt = image_grid(size, (alt_range[0], max(alt_range[1], alt_range[0] + 100.0)), (10, 6))
-    ecef = ecef_from_ground(sensor.localize(image, alt))
-    if not np.isfinite(ecef).all():
-        return np.full(3, np.nan)
-    shift, scale = ecef.mean(axis=0), ecef.std(axis=0).max()
-    x = np.column_stack([(ecef - shift) / scale, np.ones(len(ecef))])
-    u = (image - image.mean(axis=0)) / image.std(axis=0).max()
-    zero = np.zeros_like(x)
-    system = np.concatenate([np.hstack([x, zero, -u[:, :1] * x]), np.hstack([zero, x, -u[:, 1:] * x])])
-    camera = np.linalg.svd(system, full_matrices=False)[2][-1].reshape(3, 4)
-    center = np.linalg.svd(camera)[2][-1]
-    return np.asarray(center[:3] / center[3] * scale + shift)
 
 
 def _center_nominal(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
@@ -285,16 +227,14 @@ def epipolar_offset(
 
     Parameters
     ----------
-    sensor_a, sensor_b : SensorModel
     image_a, image_b : (N, 2), col, row [px] of the matches
     alt : float or (N,), first guess of the altitude [m]
-    steps : int, Gauss-Newton steps
 
     Returns
     -------
     offset : (N,)
-        Signed distance in image b [px], positive to the right of the direction of rising altitude
-        (columns to the right, rows down: clockwise); NaN where the rays are parallel.
+        Signed distance in image b [px], positive to the right of the direction of rising altitude (columns to the
+        right, rows down: clockwise); NaN where the rays are parallel.
     alt : (N,), the altitudes [m]
     """
     alt = np.array(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(image_a)))
@@ -315,19 +255,11 @@ def epipolar_offset(
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """Ground points intersected from tracks.
+    """Ground points intersected from tracks."""
 
-    Parameters
-    ----------
-    points : (P, 3)
-        ECEF [m]; NaN where the rays do not meet (fewer than two, parallel, or outside a model's domain).
-    residuals : (K, 2), projected - observed [px]; NaN for the rows of such points
-    ok : (P,), whether the point is usable
-    """
-
-    points: Array
-    residuals: Array
-    ok: BoolArray
+    points: Array  # (P, 3): ECEF [m]; NaN where fewer than two rays meet, parallel ones, or outside a model
+    residuals: Array  # (K, 2): projected - observed [px]; NaN for the rows of such points
+    ok: BoolArray  # (P,): whether the point is usable
 
 
 def triangulate(
@@ -344,18 +276,11 @@ def triangulate(
 
     Parameters
     ----------
-    sensors : sequence of SensorModel
-        One for each view.
-    view, point : (K,)
-        View and track of each observation.
-    xy : (K, 2)
-        col, row [px].
-    sigma : (K,), optional
-        Standard deviations [px]; equal if not given.
-    alt : float or (P,)
-        Altitude [m] that the first guess is localised at.
-    steps : int
-        At most so many steps.
+    sensors : sequence of SensorModel, one a view
+    view, point : (K,), view and track of each observation
+    xy : (K, 2), col, row [px]
+    sigma : (K,), optional, standard deviations [px]; equal if not given
+    alt : float or (P,), altitude [m] that the first guess is localised at
     """
     view, point = np.asarray(view, dtype=np.int64), np.asarray(point, dtype=np.int64)
     xy = np.asarray(xy, dtype=np.float64)
@@ -384,10 +309,7 @@ def triangulate(
 def _intersect(
     rows: _Rows, point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
 ) -> tuple[Array, BoolArray]:
-    """Gauss-Newton from where one of a track's views sees it at `alt`: ground (P, 3), and whether a step was possible.
-
-    The unknowns of a step are metres east, north and up at the point: the step in ECEF without the conversions.
-    """
+    """Gauss-Newton on metres east, north, up from where a view sees a track at `alt`: ground (P, 3), if possible."""
     ground = np.full((len(alt), 3), np.nan)
     for sensor, part in rows:
         new = np.flatnonzero(np.isnan(ground[point[part], 0])) + part.start
@@ -409,10 +331,9 @@ def _intersect(
 
 
 def _normal_step(jacobian: Array, residual: Array, point: IntArray, scale: Array) -> tuple[Array, BoolArray]:
-    """Gauss-Newton steps (3, num) [m], and for which points the rays determine one.
+    """Gauss-Newton steps (3, num) [m] by cofactors, and for which points the rays determine one.
 
-    `jacobian` (3, 2, K) by (lon, lat, alt) and `residual` (2, K) are weighted; `scale` (3, num) holds the
-    metres of a unit of each. The 3 x 3 systems are solved by their cofactors, one vector an entry.
+    `jacobian` (3, 2, K) and `residual` (2, K) are weighted; `scale` (3, num): metres of a unit of lon, lat, alt.
     """
     num = scale.shape[1]
 

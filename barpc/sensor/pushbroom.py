@@ -32,8 +32,7 @@ from barpc.geodesy import (
 )
 from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
-CHUNK = 4096
-"""Points worked on at a time, so that what Newton's method needs stays in cache."""
+CHUNK = 4096  # points worked on at a time, so that what Newton's method needs stays in cache
 
 _STEPS = 12
 _SETTLED = 1e-4  # px: Newton is quadratic, what is left after a step of this size is below rounding
@@ -45,28 +44,18 @@ class Pushbroom(Frozen):
 
     Parameters
     ----------
-    orbit : Curve
-        Position of the camera over time [m], ECEF.
-    attitude : Curve
-        Rotation vector w over time [rad], in the axes of `mount`.
-    mount : (3, 3)
-        ecef_from_camera where w = 0: columns are the camera's x (along the scan), y (along the detector
-        line) and z (towards the ground).
-    look : (2, K)
-        Tangents l_x and l_y of the detector's line of sight as polynomials of (col - look_origin), ascending
-        powers [1/px^k].
-    look_origin : float
-        Column [px] from which `look` counts.
-    line_period : float
-        Time from one row to the next [s].
-    first_line : float
-        Time of row 0 [s].
+    orbit : Curve, position of the camera over time [m], ECEF
+    attitude : Curve, rotation vector w over time [rad], in the axes of `mount`
+    mount : (3, 3), ecef_from_camera where w = 0: columns are the camera's x, y and z
+    look : (2, K), l_x and l_y as polynomials of (col - look_origin), ascending powers [1/px^k]
+    look_origin : float, column [px] from which `look` counts
+    line_period : float, time from one row to the next [s]
+    first_line : float, time of row 0 [s]
 
     Raises
     ------
     RpcError
-        A wrong shape, a value that is not finite, a `mount` that is no rotation, a line period that is not
-        positive.
+        A wrong shape, a value that is not finite, a `mount` that is no rotation, a line period not positive.
     """
 
     orbit: Curve
@@ -115,10 +104,7 @@ class Pushbroom(Frozen):
         return np.moveaxis(self.orbit(time.reshape(-1))[0], 0, -1).reshape(*time.shape, 3)
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m].
-
-        NaN behind the camera and more than `curve.EXTRAPOLATION` beyond the orbit or attitude.
-        """
+        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN behind the camera, off the orbit."""
         return pointwise(lambda part: [self._solve(ecef_from_ground(part).T).T], CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
@@ -212,7 +198,6 @@ class Pushbroom(Frozen):
         return out
 
     def _jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """`project_jacobian` of points (N, 3)."""
         ecef = ecef_from_ground(ground).T
         found = self._solve(ecef)
         return found.T, self._by_ecef(ecef, found) @ ecef_from_ground_jacobian(ground)

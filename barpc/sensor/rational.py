@@ -17,8 +17,7 @@ from barpc.geodesy import Array
 
 BoolArray = npt.NDArray[np.bool_]
 
-CHUNK = 8192
-"""Points worked on at a time."""
+CHUNK = 8192  # points worked on at a time
 
 MONOMIALS = (
     "1", "L", "P", "H", "LP", "LH", "PH", "LL", "PP", "HH",
@@ -26,8 +25,7 @@ MONOMIALS = (
 )  # fmt: skip
 """The twenty monomials in RPC00B order; L = longitude, P = latitude, H = altitude, normalised."""
 
-REACH = 1.25
-"""The cubic inverse is trusted this far out of the box; what lies beyond is solved with care."""
+REACH = 1.25  # the cubic inverse is trusted this far out of the box; what lies beyond is solved with care
 
 
 def _derivative_matrices() -> Array:
@@ -43,8 +41,7 @@ def _derivative_matrices() -> Array:
     return out
 
 
-DERIVATIVE = _derivative_matrices()
-"""The derivatives of the monomials on the first ten: (3, 20, 10)."""
+DERIVATIVE = _derivative_matrices()  # the derivatives of the monomials on the first ten: (3, 20, 10)
 
 
 def monomials(normalized: Array, out: Array | None = None) -> Array:
@@ -75,17 +72,11 @@ class _Inverse:
 
 
 class Rational:
-    """The map (3, N) -> (2, N) of two quotients of cubics.
-
-    Parameters
-    ----------
-    coeffs : (4, 20), numerator and denominator of the first value, then of the second
-    accuracy : (2,), what `solve` may be off by in each value; rounding comes on top
-    """
+    """The map (3, N) -> (2, N) of two quotients of cubics."""
 
     def __init__(self, coeffs: Array, accuracy: Array) -> None:
-        self.coeffs = coeffs
-        self.accuracy = accuracy
+        self.coeffs = coeffs  # (4, 20): numerator and denominator of the first value, then of the second
+        self.accuracy = accuracy  # (2,): what `solve` may be off by in each value; rounding comes on top
         # d/dL, d/dP, d/dH of the four polynomials on the first ten monomials, by axis: (12, 10)
         self.gradients = np.einsum("pi,aij->apj", coeffs, DERIVATIVE).reshape(12, 10)
 
@@ -109,10 +100,9 @@ class Rational:
     def solve(self, target: Array, z: Array, work: Array | None = None) -> tuple[Array, BoolArray]:
         """The inverse: points (3, N) whose third variable is `z` (N,) and whose values are `target` (2, N).
 
-        The cubic inverse and one Newton step; where the step is too long to prove that it was enough, one
-        more; where that is too long or the point lies out of the box, damped Newton from the centre
-        and a check of the value, the sign of the denominators and the orientation. The second result (N,) says which
-        points were found, on the sheet of the map that holds the centre; `work` (20, N) is overwritten.
+        The cubic inverse and one Newton step; one more where that was too long to prove it enough; then, and out
+        of the box, damped Newton from the centre and a check of value, denominators and orientation. The second result
+        (N,) says which were found, on the sheet of the map that holds the centre; `work` (20, N) is overwritten.
         """
         inverse = self._inverse
         x = np.empty((3, len(z)))
@@ -190,10 +180,7 @@ class Rational:
         return ok
 
     def _damped_newton(self, target: Array, x: Array, steps: int = 60) -> Array:
-        """Newton on `x[:2]`, steps halved until the error falls, never across a pole; the error (2, N) left.
-
-        The points that have come to rest leave the batch, so that a few stubborn ones cost little.
-        """
+        """Newton on `x[:2]`, steps halved until the error falls, never across a pole; the error (2, N) left."""
         left = np.full(target.shape, np.inf)
         active = np.arange(target.shape[1])
         sign = np.sign(self.coeffs[1::2, :1])
@@ -207,7 +194,7 @@ class Rational:
             step /= np.maximum(1.0, np.abs(step).max(axis=0))  # at most one box width at a time
             improved = self._line_search(goal, here, step, sign)
             x[:, active] = here
-            active = active[improved]
+            active = active[improved]  # so a few stubborn points cost little
             if not len(active):
                 break
         return left

@@ -13,7 +13,7 @@ import numpy as np
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
-from barpc.sensor.rational import CHUNK, MONOMIALS, REACH, BoolArray, Rational, monomials
+from barpc.sensor.rational import CHUNK, REACH, BoolArray, Rational
 
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 
@@ -22,28 +22,20 @@ _ACCURACY = 1e-9  # px: a localised point must project this near to where it was
 class RPC(Frozen):
     """A rational polynomial camera: itself a `SensorModel`.
 
+    Longitudes are taken by whole turns to within 180 degrees of the offset: across the antimeridian, and as 0..360.
+
     Parameters
     ----------
-    coeffs : (4, 20)
-        Rows: numerator and denominator of the column, numerator and denominator of the row, each in
-        RPC00B order (`MONOMIALS`).
-    ground_offset, ground_scale : (3,)
-        lon, lat [deg], alt [m].
-    image_offset, image_scale : (2,)
-        col, row [px]; (0, 0) is the centre of the top-left pixel.
+    coeffs : (4, 20), numerator and denominator of the column, then of the row, in RPC00B order (`MONOMIALS`)
+    ground_offset, ground_scale : (3,), lon, lat [deg], alt [m]
+    image_offset, image_scale : (2,), col, row [px]; (0, 0) is the centre of the top-left pixel
     err_bias, err_rand : float or None
-        Stated accuracy [m], RMS per horizontal axis: the part common to the image, the part of each
-        point. None where it is unknown.
+        Stated accuracy [m], RMS per horizontal axis: common to the image, of each point; None where unknown.
 
     Raises
     ------
     RpcError
         A wrong shape, a value that is not finite, a scale or a denominator that is zero.
-
-    Notes
-    -----
-    Longitudes are taken by whole turns to within 180 degrees of the offset, so that a scene across the
-    antimeridian and longitudes of 0..360 degrees project as any other.
     """
 
     coeffs: Array
@@ -125,11 +117,7 @@ class RPC(Frozen):
         return [ground]
 
     def _holds(self, ground: Array, image: Array) -> BoolArray:
-        """Whether ground points (N, 3), as rounded to degrees, are on Earth and project to `image` (N, 2).
-
-        Far out a unit in the last place of a degree can be many pixels; beyond half a turn a longitude
-        would wrap, and beyond a pole there is no latitude.
-        """
+        """Whether ground points (N, 3) are on Earth and project to `image`: far out an ulp can be pixels."""
         tolerance = 10 * _ACCURACY + 1e-12 * np.abs(image)
         on_earth = (np.abs(ground[:, 0] - self.ground_offset[0]) <= 180.0) & (np.abs(ground[:, 1]) <= 90.0)
         return np.asarray(on_earth & (np.abs(self.project(ground) - image) <= tolerance).all(axis=1))
@@ -143,10 +131,8 @@ class RPC(Frozen):
 
         Parameters
         ----------
-        col, row : float
-            The new image's top-left CORNER, counted from this image's top-left corner [px of this image].
-        step_col, step_row : float
-            Size of a new pixel [px of this image]; 2 halves the resolution.
+        col, row : float, the new image's top-left CORNER, counted from this image's top-left corner [px of this image]
+        step_col, step_row : float, size of a new pixel [px of this image]; 2 halves the resolution
         """
         step = np.array([step_col, step_row], dtype=np.float64)
         corner = np.array([col, row], dtype=np.float64)
@@ -154,6 +140,3 @@ class RPC(Frozen):
             return self.crop(col, row)  # the same, without a rounding
         offset = (self.image_offset + 0.5 - corner) / step - 0.5
         return replace(self, image_offset=offset, image_scale=self.image_scale / step)
-
-
-__all__ = ["CHUNK", "MONOMIALS", "RPC", "monomials"]

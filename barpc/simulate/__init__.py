@@ -29,36 +29,20 @@ __all__ = ["Block", "BlockOptions", "BlockTruth", "Look", "fly", "recentred", "s
 
 @dataclass(frozen=True)
 class BlockOptions:
-    """How a block is laid out and disturbed.
+    """How a block is laid out and disturbed."""
 
-    Parameters
-    ----------
-    per_site : int, views of every site
-    size : tuple of int, width, height of every image [px]
-    gsd : float, ground sampling distance at nadir [m]
-    overlap : float, part of an image's side that it shares with the next site, at most 0.5
-    alt_range : tuple of float, altitudes of the ground [m]
-    visible : float, probability that a view that covers a point shows it
-    attitude : float, standard deviation of each component of the attitude error [rad]
-    position : float, standard deviation of each component of the position error [m]
-    drift : float, standard deviation of each component of the attitude drift over an image's height [rad]
-    noise : float, standard deviation of each image coordinate [px]
-    outliers : float, part of the observations that are wrong
-    outlier_size : float, wrong observations are off by up to so much in each coordinate [px]
-    """
-
-    per_site: int = 3
-    size: tuple[int, int] = (20000, 20000)
-    gsd: float = 0.5
-    overlap: float = 0.2
-    alt_range: tuple[float, float] = (0.0, 600.0)
-    visible: float = 0.9
-    attitude: float = 15e-6
-    position: float = 1.0
-    drift: float = 0.0
-    noise: float = 0.1
-    outliers: float = 0.0
-    outlier_size: float = 30.0
+    per_site: int = 3  # views of every site
+    size: tuple[int, int] = (20000, 20000)  # width, height of every image [px]
+    gsd: float = 0.5  # ground sampling distance at nadir [m]
+    overlap: float = 0.2  # part of an image's side that it shares with the next site, at most 0.5
+    alt_range: tuple[float, float] = (0.0, 600.0)  # altitudes of the ground [m]
+    visible: float = 0.9  # probability that a view that covers a point shows it
+    attitude: float = 15e-6  # standard deviation of each component of the attitude error [rad]
+    position: float = 1.0  # standard deviation of each component of the position error [m]
+    drift: float = 0.0  # standard deviation of each component of the attitude's drift over an image [rad]
+    noise: float = 0.1  # standard deviation of each image coordinate [px]
+    outliers: float = 0.0  # part of the observations that are wrong
+    outlier_size: float = 30.0  # wrong observations are off by up to so much in each coordinate [px]
 
     def __post_init__(self) -> None:
         if self.per_site < 1 or min(self.size) < 64 or not self.gsd > 0:
@@ -161,54 +145,30 @@ class _Scene:
 
 @dataclass(frozen=True, eq=False)
 class BlockTruth:
-    """What a block was made from.
+    """What a block was made from."""
 
-    Parameters
-    ----------
-    corrections : tuple of Correction
-        The exact correction of every view: `Corrected(view.sensor, correction)` is the exact camera but for its drift.
-    drift : (V, 3)
-        The drift's rotation vector over the height of the image [rad]; it is zero in the middle row.
-    ground : (P, 3), the tracks' ground points; lon, lat [deg], alt [m]
-    outlier : (K,), which observations are wrong
-    check_ground : (Q, 3), held-out ground points; lon, lat [deg], alt [m]
-    check : Tracks, their exact image points in every view that sees them
-    """
-
-    corrections: tuple[Correction, ...]
-    drift: Array
-    ground: Array
-    outlier: BoolArray
-    check_ground: Array
-    check: Tracks
+    corrections: tuple[Correction, ...]  # of each view's sensor: with it, and its drift, the camera is exact
+    drift: Array  # (V, 3): rotation vector over the height of the image [rad]; zero in the middle row
+    ground: Array  # (P, 3): the tracks' ground points; lon, lat [deg], alt [m]
+    outlier: BoolArray  # (K,): which observations are wrong
+    check_ground: Array  # (Q, 3): held-out ground points; lon, lat [deg], alt [m]
+    check: Tracks  # their exact image points in every view that sees them
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Views, tie points and GCPs as an adjustment receives them, with the truth.
+    """Views, tie points and GCPs as an adjustment receives them, with the truth."""
 
-    Parameters
-    ----------
-    views : tuple of View, without pixels; `sensor` is the delivered RPC
-    tracks : Tracks, observations with noise and outliers
-    gcps : GroundPoints, exact ground points with noisy observations; empty unless asked for
-    truth : BlockTruth, what is to be found
-    """
-
-    views: tuple[View, ...]
-    tracks: Tracks
-    gcps: GroundPoints
-    truth: BlockTruth
+    views: tuple[View, ...]  # without pixels; `sensor` is the delivered RPC
+    tracks: Tracks  # observations with noise and outliers
+    gcps: GroundPoints  # exact ground points with noisy observations; empty unless asked for
+    truth: BlockTruth  # what is to be found
 
     def held_out_rms(self, sensors: list[SensorModel]) -> float:
         """Root mean square residual [px, per coordinate] of the held-out points in other cameras.
 
-        The points are triangulated anew from their exact image points: what no image can tell (a shift of
-        the whole scene) does not count.
-
-        Parameters
-        ----------
-        sensors : list of SensorModel, one a view: delivered, adjusted or refitted cameras
+        The points are triangulated anew from their exact image points: what no image can tell (a shift of the whole
+        scene) does not count.
         """
         check = self.truth.check
         found = triangulate(sensors, check.view, check.point, check.xy)
@@ -239,19 +199,11 @@ def simulate_block(
 
     Parameters
     ----------
-    num_views, num_tracks, num_checks, num_gcps : int
-        How many; a track or check point is seen by two views or more, a GCP by one or more.
-    seed : int
-        The same seed gives the same block.
-    lon, lat : float
-        Centre of the block [deg].
+    num_tracks, num_checks, num_gcps : int, a track or check point is seen by two views or more, a GCP by one
+    seed : int, the same seed gives the same block
+    lon, lat : float, centre of the block [deg]
     **options
-        Fields of `BlockOptions`.
-
-    Raises
-    ------
-    InputError
-        Options that contradict each other, or a layout whose views do not overlap.
+        Fields of `BlockOptions`; InputError where they contradict each other, or the views do not overlap.
     """
     if num_views < 1 or num_tracks < 0 or num_checks < 0 or num_gcps < 0:
         raise InputError("block: at least one view, and no negative count")
@@ -282,15 +234,8 @@ def simulate_block(
 def _gcps(ground: Array, seen: Tracks, options: BlockOptions, rng: np.random.Generator) -> GroundPoints:
     """GCPs at ground points (G, 3), where they are seen but for noise."""
     noisy, _ = _disturbed(seen, replace(options, outliers=0.0), rng)
-    return GroundPoints(
-        names=tuple(f"gcp_{i:03d}" for i in range(len(ground))),
-        lonlatalt=ground,
-        sigma=np.full((len(ground), 3), 0.1),
-        point=noisy.point,
-        view=noisy.view,
-        xy=noisy.xy,
-        xy_sigma=noisy.sigma,
-    )
+    names, sigma = tuple(f"gcp_{i:03d}" for i in range(len(ground))), np.full((len(ground), 3), 0.1)
+    return GroundPoints(names, ground, sigma, noisy.point, noisy.view, noisy.xy, noisy.sigma)
 
 
 def _cameras(grid: _Grid, num_views: int, options: BlockOptions) -> tuple[tuple[View, ...], list[Array]]:
@@ -318,7 +263,6 @@ def _cameras(grid: _Grid, num_views: int, options: BlockOptions) -> tuple[tuple[
 
 
 def _turned(rpc: RPC, degrees: float) -> RPC:
-    """The RPC of the same camera turned about the Earth's axis."""
     offset = rpc.ground_offset + np.array([degrees, 0.0, 0.0])
     offset[0] = wrap_longitude(offset[0])
     return replace(rpc, ground_offset=offset)

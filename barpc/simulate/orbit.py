@@ -12,50 +12,27 @@ from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.sensor.curve import Curve, about_middle
 from barpc.sensor.pushbroom import Pushbroom
 
-GM = 3.986004418e14
-"""Gravitational constant of the Earth (WGS84) [m^3/s^2]."""
-EARTH_RATE = 7.292115e-5
-"""Rotation of the Earth (WGS84) [rad/s]."""
-PITCH = 10.0
-"""Views of one site are spread from -PITCH to +PITCH degrees of incidence along the flight."""
-ROLL = 8.0
-"""Largest incidence across the flight [deg]."""
+GM = 3.986004418e14  # gravitational constant of the Earth (WGS84) [m^3/s^2]
+EARTH_RATE = 7.292115e-5  # rotation of the Earth (WGS84) [rad/s]
+PITCH = 10.0  # views of one site are spread from -PITCH to +PITCH degrees of incidence along the flight
+ROLL = 8.0  # largest incidence across the flight [deg]
 _DEGREE = 4  # of the polynomials of time for position and attitude
 _NODES = 9  # times at which the guided motion is sampled for them
 
 
 @dataclass(frozen=True)
 class Look:
-    """Where a satellite stands and how it scans.
+    """Where a satellite stands and how it scans."""
 
-    Parameters
-    ----------
-    incidence : float, angle between the local vertical at the target and the direction to the satellite [deg]
-    azimuth : float, azimuth of the direction from the target to the satellite, clockwise from north [deg]
-    altitude : float, of the satellite above the ellipsoid [m]
-    heading : float
-        Direction of flight at the target, clockwise from north [deg]; 192 is a descending sun-synchronous
-        pass in middle latitudes.
-    scan : float or None
-        Direction in which the rows advance over the ground, clockwise from north [deg]; None: the heading.
-    """
-
-    incidence: float = 0.0
-    azimuth: float = 90.0
-    altitude: float = 694e3
-    heading: float = 192.0
-    scan: float | None = None
+    incidence: float = 0.0  # angle between the vertical at the target and the satellite [deg]
+    azimuth: float = 90.0  # of the satellite seen from the target, clockwise from north [deg]
+    altitude: float = 694e3  # of the satellite above the ellipsoid [m]
+    heading: float = 192.0  # of the flight [deg]; 192: a descending sun-synchronous pass in middle latitudes
+    scan: float | None = None  # direction in which the rows advance over the ground [deg]; None: the heading
 
 
 def looks(count: int, turn: float = 0.0, altitude: float = 694e3) -> list[Look]:
-    """So many looks at one place: pitch spread evenly, roll by the golden section.
-
-    Parameters
-    ----------
-    count : int, number of views
-    turn : float, start of the sequence of rolls, in turns
-    altitude : float, of the satellites above the ellipsoid [m]
-    """
+    """So many looks at one place: pitch spread evenly, roll by the golden section, which starts at `turn` [turns]."""
     flight = Look().heading
     out = []
     for k in range(count):
@@ -79,8 +56,7 @@ def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbro
     Parameters
     ----------
     target : (3,), ground point at the image's centre; lon, lat [deg], alt [m]
-    look : Look, where the satellite stands
-    size : tuple of int, width, height of the image [px]
+    size : (width, height) [px]
     gsd : float, ground sampling distance at nadir [m]; the pixel's angle is gsd / altitude
     """
     place, aim, enu = _standpoint(target, look), ecef_from_ground(target), enu_basis(target)
@@ -107,15 +83,11 @@ def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbro
 
 
 def _level(azimuth: float) -> Array:
-    """The horizontal direction (3,) east, north, up of an azimuth [rad]."""
     return np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
 
 
 def _standpoint(target: Array, look: Look) -> Array:
-    """Where the satellite of `look` stands (3,) [m, ECEF].
-
-    On the line of sight, at a distance from the Earth's centre of the radius below the target + altitude.
-    """
+    """Where the satellite stands (3,) [m, ECEF]: on the line of sight, `altitude` beyond the radius at the target."""
     incidence, azimuth = np.radians([look.incidence, look.azimuth])
     enu = np.sin(incidence) * _level(azimuth) + [0.0, 0.0, np.cos(incidence)]
     origin, direction = ecef_from_ground(target), enu @ enu_basis(target)

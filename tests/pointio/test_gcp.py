@@ -33,14 +33,6 @@ def test_an_asp_file_gives_points_sigmas_and_observations(tmp_path):
     np.testing.assert_array_equal(found.xy_sigma, [0.5, 1, 1])
 
 
-def test_sigmas_can_be_given_instead_of_the_files(tmp_path):
-    path = tmp_path / "a.gcp"
-    path.write_text(ASP)
-    found = read_gcps(path, NAMES, sigma=0.2, image_sigma=0.7)
-    assert (found.sigma == 0.2).all()
-    assert (found.xy_sigma == 0.7).all()
-
-
 def test_a_text_whose_first_letters_are_those_of_a_tiff_is_a_text(tmp_path):
     path = tmp_path / "a.gcp"
     path.write_text("II-7 43.26 5.45 130 1 1 1 left.tif 300 400 1 1\n")

@@ -16,7 +16,9 @@ from barpc.rpcio.text import nitf_record, write_rpb, write_txt
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
 
 WRITABLE = [row for row in FORMATS.values() if row.write is not None]
-NAMES = [f"scene{suffix}" for row in WRITABLE for suffix in row.suffixes]
+NAMES = [
+    f"scene{case}" for row in WRITABLE for end in row.suffixes for case in dict.fromkeys((end, end.lower()))
+]
 
 
 @pytest.mark.parametrize("name", NAMES)

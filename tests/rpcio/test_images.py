@@ -108,7 +108,7 @@ def test_overviews_and_masks_of_a_copy_stay(rpc, tmp_path):
         assert copy.overviews(1) == [2, 4]
         np.testing.assert_array_equal(copy.dataset_mask() > 0, np.eye(512, dtype=bool))
     with open_raster(tmp_path / "scene.vrt") as vrt:
-        np.testing.assert_array_equal(vrt.dataset_mask() > 0, np.eye(512, dtype=bool))
+        np.testing.assert_array_equal(vrt.read_masks(1) > 0, np.eye(512, dtype=bool))
 
 
 def test_a_cloud_optimised_image_is_copied_and_no_longer_claims_its_layout(rpc, tmp_path):

@@ -42,8 +42,7 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-MOSAIC = "mosaic"
-"""The swath of all swaths."""
+MOSAIC = "mosaic"  # the swath of all swaths
 _SAME = 1e-9  # relative: intervals and rates of the swaths of one mosaic
 _NAME = re.compile(r"s1[a-d]-(?P<swath>\w+)-(slc|grd)-(?P<pol>vv|hh|vh|hv)-.*\.xml", re.IGNORECASE)
 _POLARISATIONS = ("vv", "hh", "vh", "hv")
@@ -61,17 +60,8 @@ def mosaic(
     Column 0 is pixel 0 of the nearest swath (IW1, EW1) and row 0 the earliest line 0; the other swaths
     start at ``mosaic_offsets``.
 
-    Parameters
-    ----------
-    sources : sequence of Path or Annotation
-        Annotations of swaths of one product.
-    orbit, atmosphere, bistatic
-        As of `RangeDoppler.from_annotation`; no full bistatic correction, which jumps between swaths.
-
-    Raises
-    ------
-    InputError
-        A GRD, swaths that are not of one product, or the full bistatic correction.
+    The rest is as of `RangeDoppler.from_annotation`. InputError for a GRD, swaths that are not of one product, or the
+    full bistatic correction, which jumps between swaths.
     """
     swaths = [s if isinstance(s, Annotation) else read_annotation(s) for s in sources]
     if bistatic == "full":
@@ -84,16 +74,9 @@ def mosaic(
 
 
 def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
-    """Where the stitched frames of the swaths of one SLC product begin in the frame of their mosaic.
+    """Where the stitched frames of the swaths of one SLC product begin in that of their mosaic: col, row (S, 2) [px].
 
-    Returns
-    -------
-    offsets : (S, 2), col, row [px]: whole numbers to within 1e-3 in products since 2016
-
-    Raises
-    ------
-    InputError
-        A GRD, or swaths that are not of one product.
+    Whole numbers to within 1e-3 in products since 2016. InputError for a GRD, or swaths that are not of one product.
     """
     if not swaths:
         raise InputError("a mosaic of no swaths: give the annotations of IW1, IW2 and IW3")
@@ -130,20 +113,15 @@ def open_product(
 
     Parameters
     ----------
-    path : str or Path
-        A ``.SAFE`` folder, its ``manifest.safe``, a ``.zip`` of it, or one annotation XML.
-    swath : str, optional
-        "iw1", "s3", ..., or "mosaic" for all of them; may be left out where there is one.
-    polarisation : str, optional
-        "vv", "vh", "hh" or "hv"; the geometry is the same, the first one is taken if left out.
-    orbit, burst, atmosphere, bistatic
-        As of `RangeDoppler.from_annotation`.
+    path : str or Path, a ``.SAFE`` folder, its ``manifest.safe``, a ``.zip`` of it, or one annotation XML
+    swath : str, optional, "iw1", "s3", ..., or "mosaic" for all of them; may be left out where there is one
+    polarisation : str, optional, "vv", "vh", "hh" or "hv"; the geometry is the same
+    orbit, burst, atmosphere, bistatic : as of `RangeDoppler.from_annotation`
 
     Raises
     ------
     InputError
-        No such swath or polarisation, or a choice that does not go with the product; the message lists
-        what there is.
+        No such swath or polarisation, or a choice that does not go with the product.
     RpcFormatError
         Not a Sentinel-1 product.
     """
@@ -185,17 +163,11 @@ class _File:
         if self.member is None:
             return read_annotation(self.path)
         member, name = self.member, PurePosixPath(self.member).name
-        data = _from_zip(self.path, name, lambda archive: _content(archive, member))
+        data = _from_zip(self.path, name, lambda archive: archive.open(member).read(MAX_XML + 1))
         return read_annotation(data, name=name)
 
 
-def _content(archive: zipfile.ZipFile, member: str) -> bytes:
-    with archive.open(member) as file:
-        return file.read(MAX_XML + 1)
-
-
 def _from_zip(path: Path, what: str, use: Callable[[zipfile.ZipFile], T]) -> T:
-    """What `use` gets out of a zip file."""
     try:
         with opened(path, PRODUCT) as file, zipfile.ZipFile(file) as archive:
             return use(archive)
@@ -227,7 +199,6 @@ def _named(path: Path, member: str | None) -> _File | None:
 
 
 def _choose(path: Path, polarisation: str | None) -> dict[str, _File]:
-    """Swath -> annotation, of one polarisation."""
     files = _annotations(path)
     if not files:
         raise RpcFormatError(f"{path}: no Sentinel-1 annotation (annotation/s1?-*.xml) in it")

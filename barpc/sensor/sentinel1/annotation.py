@@ -33,137 +33,80 @@ _TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?
 
 @dataclass(frozen=True, eq=False)
 class StateVectors:
-    """Earth-fixed orbit state vectors.
+    """Earth-fixed orbit state vectors."""
 
-    Parameters
-    ----------
-    time : (N,), datetime64[ns], UTC
-    position, velocity : (N, 3), ECEF [m, m/s]
-    source : str, where they come from, for messages: "Auxiliary", "Downlink", or the orbit file
-    """
-
-    time: TimeArray
-    position: Array
-    velocity: Array
-    source: str
+    time: TimeArray  # (N,): datetime64[ns], UTC
+    position: Array  # (N, 3): ECEF [m]
+    velocity: Array  # (N, 3): ECEF [m/s]
+    source: str  # where they come from, for messages: "Auxiliary", "Downlink", or the orbit file
 
 
 @dataclass(frozen=True, eq=False)
 class Burst:
-    """One burst of a TOPS swath.
+    """One burst of a TOPS swath."""
 
-    Parameters
-    ----------
-    time : datetime64[ns], zero-Doppler time of the burst's first line (`azimuthTime`)
-    first_valid, last_valid : (L,), first and last valid sample of every line; -1 where a line is not valid
-    """
-
-    time: np.datetime64
-    first_valid: npt.NDArray[np.int64]
-    last_valid: npt.NDArray[np.int64]
+    time: np.datetime64  # zero-Doppler time of the burst's first line (`azimuthTime`)
+    first_valid: npt.NDArray[np.int64]  # (L,): first valid sample of every line; -1: the line is not valid
+    last_valid: npt.NDArray[np.int64]  # (L,): the last one
 
 
 @dataclass(frozen=True)
 class BurstRows:
-    """Where a burst stands in the stitched frame.
+    """Where a burst stands in the stitched frame."""
 
-    Parameters
-    ----------
-    first_line : int, of the burst in the measurement file
-    first_row : int, frame row of that line
-    start, stop : int, frame rows [start, stop) that are taken from this burst
-    offset : float, what rounding the burst's time to a row left [rows]: 1e-3, up to 0.15 before 2016
-    """
-
-    first_line: int
-    first_row: int
-    start: int
-    stop: int
-    offset: float
+    first_line: int  # of the burst in the measurement file
+    first_row: int  # frame row of that line
+    start: int  # the first frame row that is taken from this burst
+    stop: int  # the row behind the last one
+    offset: float  # what rounding the burst's time to a row left [rows]: 1e-3, up to 0.15 before 2016
 
 
 @dataclass(frozen=True, eq=False)
 class GroundRange:
-    """Slant range to ground range, as polynomials listed in time (`coordinateConversion`).
+    """Slant range to ground range, as polynomials listed in time (`coordinateConversion`)."""
 
-    Parameters
-    ----------
-    time : (M,), datetime64[ns]
-    slant_origin : (M,), `sr0` [m]
-    ground_from_slant, slant_from_ground : (M, K), ascending powers of (slant - sr0), of (ground - gr0) [m]
-    """
-
-    time: TimeArray
-    slant_origin: Array
-    ground_from_slant: Array
-    slant_from_ground: Array
+    time: TimeArray  # (M,): datetime64[ns]
+    slant_origin: Array  # (M,): `sr0` [m]
+    ground_from_slant: Array  # (M, K): ascending powers of (slant - sr0) [m]
+    slant_from_ground: Array  # (M, K): of (ground - gr0) [m]
 
 
 @dataclass(frozen=True, eq=False)
 class GridPoints:
-    """The product's own geolocation grid.
+    """The product's own geolocation grid."""
 
-    Parameters
-    ----------
-    time : (G,), azimuth time, datetime64[ns]
-    range_time : (G,), two-way slant range time [s]
-    image : (G, 2), the annotation's (pixel, line)
-    ground : (G, 3), lon, lat [deg], alt [m]
-    """
-
-    time: TimeArray
-    range_time: Array
-    image: Array
-    ground: Array
+    time: TimeArray  # (G,): azimuth time, datetime64[ns]
+    range_time: Array  # (G,): two-way slant range time [s]
+    image: Array  # (G, 2): the annotation's (pixel, line)
+    ground: Array  # (G, 3): lon, lat [deg], alt [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Annotation:
-    """One annotation file: one swath of an SLC, or a GRD.
+    """One annotation file: one swath of an SLC, or a GRD."""
 
-    Parameters
-    ----------
-    name : str, the file, for messages
-    mission, product_type, mode, swath, polarisation : str
-        Upper case: S1A; SLC or GRD; IW, EW, S1 .. S6, WV; IW1, EW3, S4, IW (GRD); VV ...
-    states : StateVectors
-    first_line_time, last_line_time : datetime64[ns]
-    azimuth_time_interval : float, between lines [s]
-    slant_range_time : float, two-way, of the first sample [s]
-    range_sampling_rate : float [Hz]
-    range_pixel_spacing : float [m]; ground range in a GRD
-    samples, lines : int, size of the measurement file
-    lines_per_burst : int, 0 where there are no bursts
-    bursts : tuple of Burst
-    ground_range : GroundRange or None, of a GRD
-    grid : GridPoints
-    rank : int, pulses on their way between sending and receiving
-    pulse_interval : float [s]
-    bistatic_applied : bool, whether the processor corrected the bistatic delay, at mid range
-    """
-
-    name: str
-    mission: str
-    product_type: str
-    mode: str
-    swath: str
-    polarisation: str
+    name: str  # the file, for messages
+    mission: str  # S1A; all in upper case
+    product_type: str  # SLC or GRD
+    mode: str  # IW, EW, S1 .. S6, WV
+    swath: str  # IW1, EW3, S4, IW (GRD)
+    polarisation: str  # VV ...
     states: StateVectors
     first_line_time: np.datetime64
     last_line_time: np.datetime64
-    azimuth_time_interval: float
-    slant_range_time: float
-    range_sampling_rate: float
-    range_pixel_spacing: float
-    samples: int
-    lines: int
-    lines_per_burst: int
+    azimuth_time_interval: float  # between lines [s]
+    slant_range_time: float  # two-way, of the first sample [s]
+    range_sampling_rate: float  # [Hz]
+    range_pixel_spacing: float  # [m]; ground range in a GRD
+    samples: int  # of a line of the measurement file
+    lines: int  # of the measurement file
+    lines_per_burst: int  # 0 where there are no bursts
     bursts: tuple[Burst, ...]
-    ground_range: GroundRange | None
+    ground_range: GroundRange | None  # of a GRD
     grid: GridPoints
-    rank: int
-    pulse_interval: float
-    bistatic_applied: bool
+    rank: int  # pulses on their way between sending and receiving
+    pulse_interval: float  # [s]
+    bistatic_applied: bool  # whether the processor corrected the bistatic delay, at mid range
 
     @property
     def kind(self) -> str:
@@ -186,10 +129,7 @@ class Annotation:
 def burst_rows(annotation: Annotation) -> list[BurstRows]:
     """Where the bursts of a TOPS SLC swath stand in the stitched frame; overlaps are cut at their middle.
 
-    Raises
-    ------
-    RpcFormatError
-        Bursts out of order, or one without a valid line.
+    RpcFormatError for bursts out of order, or one without a valid line.
     """
     since = [seconds(b.time, annotation.first_line_time) for b in annotation.bursts]
     exact = [float(time / annotation.azimuth_time_interval) for time in since]
@@ -207,17 +147,9 @@ def burst_rows(annotation: Annotation) -> list[BurstRows]:
 
 
 def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation:
-    """Read a Sentinel-1 product annotation.
+    """Read a Sentinel-1 product annotation (``annotation/s1a-iw1-slc-vv-....xml``), called `name` in messages.
 
-    Parameters
-    ----------
-    source : bytes or Path, ``annotation/s1a-iw1-slc-vv-....xml`` of a product
-    name : str, optional, what to call it in messages
-
-    Raises
-    ------
-    RpcFormatError
-        Not a Sentinel-1 annotation, or a field that the geometry needs is missing or not a number.
+    RpcFormatError where it is none, or a field that the geometry needs is missing or not a number.
     """
     name = name or (source.name if isinstance(source, Path) else "annotation")
     root = parse_xml(source, name=str(source) if isinstance(source, Path) else name)
@@ -258,10 +190,7 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
 def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
     """The state vectors of a precise or restituted orbit file (``S1A_OPER_AUX_POEORB_....EOF``) around an image.
 
-    Raises
-    ------
-    RpcFormatError
-        Not an orbit file, another satellite's, or no vector near that time.
+    RpcFormatError where it is no orbit file, another satellite's, or without a vector near that time.
     """
     mission, start, stop = annotation.mission, annotation.first_line_time, annotation.last_line_time
     root = parse_xml(path, strip_namespaces=True)

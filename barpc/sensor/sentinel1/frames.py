@@ -18,12 +18,10 @@ from barpc.frozen import Frozen
 from barpc.geodesy import Array, enu_basis, up
 from barpc.sensor.sentinel1.annotation import Annotation, seconds
 
-SPEED_OF_LIGHT = 299792458.0
-"""In vacuum [m/s]."""
+SPEED_OF_LIGHT = 299792458.0  # in vacuum [m/s]
 
 _INVERSION_STEPS = 8
-Bistatic = Literal["annotated", "full"]
-"""Which bistatic correction; see `bistatic_constant`."""
+Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`
 _RAD = np.pi / 180.0
 _SPREAD = 1e-5  # s: what lines and azimuth times of a grid may scatter
 _ZENITH = (2.41, -1.0 / 3411.0, 1.0 / 8.55e7)  # m, per m, per m^2 of altitude
@@ -31,18 +29,11 @@ _ZENITH = (2.41, -1.0 / 3411.0, 1.0 / 8.55e7)  # m, per m, per m^2 of altitude
 
 @dataclass(frozen=True, eq=False)
 class SlantFrame(Frozen):
-    """The frame of an SLC: columns at a constant interval of slant range time.
+    """The frame of an SLC: columns at a constant interval of slant range time."""
 
-    Parameters
-    ----------
-    first_range_time : float, two-way slant range time of column 0 [s]
-    sampling_rate : float, columns a second of two-way time [Hz]
-    interval : float, azimuth time between rows [s]
-    """
-
-    first_range_time: float
-    sampling_rate: float
-    interval: float
+    first_range_time: float  # two-way slant range time of column 0 [s]
+    sampling_rate: float  # columns a second of two-way time [Hz]
+    interval: float  # azimuth time between rows [s]
 
     def image(self, times: Array) -> tuple[Array, Array]:
         """Image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
@@ -63,23 +54,14 @@ class GroundFrame(Frozen):
 
     Ground range is a polynomial of slant range, whose coefficients and origin are interpolated linearly
     between the times they are listed for (Sentinel-1 Product Specification, "coordinate conversion").
-
-    Parameters
-    ----------
-    interval : float, azimuth time between rows [s]
-    spacing : float, ground range between columns [m]
-    listed : (M,), times of the polynomials [s from the epoch], ascending
-    origin : (M,), slant range origins [m]
-    coeffs : (M, K), ascending powers of (slant range - origin) [m]
-    slope : float, slant range a ground range at mid swath, roughly: where the inversion starts
     """
 
-    interval: float
-    spacing: float
-    listed: Array
-    origin: Array
-    coeffs: Array
-    slope: float
+    interval: float  # azimuth time between rows [s]
+    spacing: float  # ground range between columns [m]
+    listed: Array  # (M,): times of the polynomials [s from the epoch], ascending
+    origin: Array  # (M,): slant range origins [m]
+    coeffs: Array  # (M, K): ascending powers of (slant range - origin) [m]
+    slope: float  # slant range a ground range at mid swath, roughly: where the inversion starts
 
     def image(self, times: Array) -> tuple[Array, Array]:
         """Image points (2, N) [px] of times (2, N) [s], and d(col, row)/d(times) (2, 2, N)."""
@@ -133,19 +115,13 @@ Frame = SlantFrame | GroundFrame
 class Delays:
     """Which delays are added to the geometric times.
 
-    Parameters
-    ----------
-    atmosphere : bool
-        Path delay of the atmosphere, (2.41 - h/3411 + h^2/8.55e7) m / cos(incidence), one way, h the
-        altitude [m] (Jehle et al., "Estimation of Atmospheric Path Delays in TerraSAR-X Data using Models
-        vs. Measurements", Sensors 2008): 0.8 to 1.6 px in range.
-    bistatic : float, optional
-        Constant b [s] of the bistatic correction of azimuth time, b - tau/2 with tau the two-way slant
-        range time; None for none.
+    That of the path through the atmosphere, one way, is (2.41 - h/3411 + h^2/8.55e7) m / cos(incidence), h the altitude
+    [m] (Jehle et al., "Estimation of Atmospheric Path Delays in TerraSAR-X Data using Models vs. Measurements", Sensors
+    2008): 0.8 to 1.6 px in range. The bistatic correction of azimuth time is b - tau/2, tau the slant range time.
     """
 
     atmosphere: bool = False
-    bistatic: float | None = None
+    bistatic: float | None = None  # b [s]; None for no correction
 
     def __bool__(self) -> bool:
         return self.atmosphere or self.bistatic is not None
@@ -187,21 +163,12 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
     middle of the whole product (IW2, EW3), which shows in its geolocation grid: the time of a grid line
     less the grid's azimuth time is b - tau/2 to 2 us, with b half the two-way time of that range.
 
-    Parameters
-    ----------
-    annotation : Annotation, one swath, or a GRD
-    form : "annotated" or "full"
-        "annotated": that constant, so that the model meets the lines of the product's own grid: 0.04 to
-        0.14 line in an SLC, to 0.19 in a GRD (Schubert et al., "Sentinel-1A Product Geolocation Accuracy:
-        Commissioning Phase Results", Remote Sensing 2015). "full": also the pulses on their way, rank
-        times pulse interval, for one SLC swath: to 0.26 line (Gisinger et al., "Recent Findings on the
-        Sentinel-1 Geolocation Accuracy Using the Australian Corner Reflector Array", IGARSS 2018).
-
-    Raises
-    ------
-    InputError
-        The processor did not correct the bistatic delay, the grid does not tell how, or "full" is asked
-        for a GRD.
+    "annotated": that constant, so that the model meets the lines of the product's own grid: 0.04 to 0.14 line in an
+    SLC, to 0.19 in a GRD (Schubert et al., "Sentinel-1A Product Geolocation Accuracy: Commissioning Phase Results",
+    Remote Sensing 2015). "full": also the pulses on their way, rank times pulse interval, for one SLC swath: to 0.26
+    line (Gisinger et al., "Recent Findings on the Sentinel-1 Geolocation Accuracy Using the Australian Corner Reflector
+    Array", IGARSS 2018). InputError where the processor did not correct it, the grid does not tell how, or "full" is
+    asked for a GRD.
     """
     if not annotation.bistatic_applied:
         raise InputError(

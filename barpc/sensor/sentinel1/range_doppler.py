@@ -1,8 +1,7 @@
 """The Range-Doppler model: a ground point is seen when the satellite passes it at zero Doppler.
 
-The satellite's orbit is O(t) with velocity V(t). The azimuth time t of a ground point X is the zero of
-E(t) = V(t) . (X - O(t)); its two-way slant range time is tau = 2 |X - O(t)| / c. A frame turns (t, tau)
-into (col, row).
+The satellite's orbit is O(t) with velocity V(t). The azimuth time t of a ground point X is the zero of E(t) = V(t) .
+(X - O(t)); its two-way slant range time is tau = 2 |X - O(t)| / c. A frame turns (t, tau) into (col, row).
 """
 
 from __future__ import annotations
@@ -45,12 +44,10 @@ from barpc.sensor.sentinel1.frames import (
     bistatic_constant,
 )
 
-CHUNK = 8192
-"""Points worked on at a time."""
+CHUNK = 8192  # points worked on at a time
 RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
-NO_DELAYS = Delays()
-"""Pure geometry."""
+NO_DELAYS = Delays()  # pure geometry
 
 _GRID_TOLERANCE = 5.0  # px and lines: a grid farther off does not belong to the orbit
 _STEPS = 12  # at most; three are enough near the image
@@ -66,19 +63,13 @@ class RangeDoppler(Frozen):
 
     Parameters
     ----------
-    orbit : Curve
-        Position of the satellite [m], ECEF; its time counts from `epoch`.
-    epoch : datetime64[ns]
-        Zero-Doppler time (UTC) of row 0.
-    frame : SlantFrame or GroundFrame
-        (azimuth time, slant range time) to (col, row).
+    orbit : Curve, position of the satellite [m], ECEF; its time counts from `epoch`
+    epoch : datetime64[ns], Zero-Doppler time (UTC) of row 0
+    frame : SlantFrame or GroundFrame, (azimuth time, slant range time) to (col, row)
     size : (width, height) [px]
-    alt_range : (low, high)
-        Altitudes that the image is used for [m above the ellipsoid].
-    look : "right" or "left"
-        Side of the track; a point on the other side projects to NaN.
-    delays : Delays
-        Smooth corrections between geometry and annotated times; none by default.
+    alt_range : (low, high), altitudes that the image is used for [m above the ellipsoid]
+    look : "right" or "left", side of the track; a point on the other side projects to NaN
+    delays : Delays, smooth corrections between geometry and annotated times; none by default
     """
 
     orbit: Curve
@@ -113,41 +104,28 @@ class RangeDoppler(Frozen):
 
         Parameters
         ----------
-        source : Path or Annotation
-            The annotation XML.
-        burst : int, optional
-            The model of this burst alone, from 0; row 0 is its first line.
-        orbit : Path, optional
-            Precise orbit file (``.EOF``) to use in place of the annotated state vectors.
-        atmosphere : bool
-            Add the path delay of the atmosphere (see `Delays`).
-        bistatic : "annotated" or "full", optional
-            Add a bistatic correction (see `bistatic_constant`).
+        source : Path or Annotation, the annotation XML
+        burst : int, optional, the model of this burst alone, from 0; row 0 is its first line
+        orbit : Path, optional, precise orbit file (``.EOF``) to use in place of the annotated state vectors
+        atmosphere : bool, add the path delay of the atmosphere (see `Delays`)
+        bistatic : "annotated" or "full", optional, add a bistatic correction (see `bistatic_constant`)
 
         Raises
         ------
         RpcError
-            Not a Sentinel-1 annotation (an `RpcFormatError`), or an orbit that cannot be used.
+            Not a Sentinel-1 annotation (an `RpcFormatError`), or an orbit that cannot be used. A geolocation grid that
+            does not belong to the orbit is a BarpcWarning; only its range of heights is used then.
         InputError
             No such burst, or a correction that this product does not take.
-
-        Warns
-        -----
-        BarpcWarning
-            The geolocation grid does not belong to the orbit; it is not used but for its range of heights.
         """
         annotation = source if isinstance(source, Annotation) else read_annotation(source)
         epoch, lines = extent(annotation, burst)
         return build([annotation], epoch, (annotation.samples, lines), orbit, atmosphere, bistatic)
 
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
-        """Times at which ground points (..., 3) are seen: pure geometry, without `delays`.
+        """Zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points (..., 3).
 
-        Returns
-        -------
-        azimuth_time : (...)
-            Zero-Doppler time [s from `epoch`]; NaN off the orbit's time span or on the other side.
-        range_time : (...), two-way slant range time [s]
+        Pure geometry, without `delays`; NaN off the orbit's time span or on the other side.
         """
         azimuth_time, range_time = pointwise(
             lambda part: self._geometry(ecef_from_ground(part)).times, CHUNK, [(), ()], ground
@@ -157,17 +135,13 @@ class RangeDoppler(Frozen):
     def incidence(self, ground: Array) -> Array:
         """Angles (...) [deg] between the ellipsoid's normal and the beam at ground points (..., 3).
 
-        Not those of `barpc.sensor.geometry.view_angles`, which follows the ground points of one pixel over
-        altitude: for a radar they lie on a circle about the track, at a right angle to the beam. NaN where
-        `azimuth_range` is.
+        Not those of `barpc.sensor.geometry.view_angles`, which follows the ground points of one pixel over altitude:
+        for a radar they lie on a circle about the track, at a right angle to the beam. NaN where `azimuth_range` is.
         """
         return pointwise(self._incidence, CHUNK, [()], ground)[0]
 
     def project(self, ground: Array) -> Array:
-        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m].
-
-        NaN off the orbit's time span or on the other side of the track.
-        """
+        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN where `azimuth_range` is."""
         return pointwise(self._project, CHUNK, [(2,)], ground)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
@@ -178,9 +152,8 @@ class RangeDoppler(Frozen):
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
 
-        On the circle of zero Doppler and given slant range, Newton on the look angle until the point has the
-        altitude. Longitudes run on across the antimeridian; NaN off the orbit's time span or where the range does
-        not reach.
+        On the circle of zero Doppler and given slant range, Newton on the look angle until the point has the altitude.
+        Longitudes run on across the antimeridian; NaN off the orbit's time span or where the range does not reach.
         """
         ground = pointwise(lambda part, alt: [self._localize(part.T, alt)], CHUNK, [(3,)], image, alt)[0]
         with np.errstate(all="ignore"):
@@ -189,13 +162,11 @@ class RangeDoppler(Frozen):
 
     @cached_property
     def _middle(self) -> float:
-        """Longitude of the middle of the image [deg]."""
         image = 0.5 * np.array(self.size, dtype=np.float64)[:, None]
         lon = float(self._localize(image, np.array([np.mean(self.alt_range)]))[0, 0])
         return lon if np.isfinite(lon) else 0.0
 
     def _geometry(self, ecef: Array) -> _Seen:
-        """Zero-Doppler geometry of ECEF points (N, 3)."""
         point = ecef.T
         low, high = self.orbit.span
         time = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan)
@@ -223,13 +194,11 @@ class RangeDoppler(Frozen):
         return right if self.look == "right" else -right
 
     def _incidence(self, ground: Array) -> list[Array]:
-        """`incidence` of points (N, 3)."""
         seen = self._geometry(ecef_from_ground(ground))
         cosine = _dot(up(ground), seen.sight)
         return [np.where(np.isnan(seen.times[0]), np.nan, np.rad2deg(np.arccos(cosine)))]
 
     def _project(self, ground: Array) -> list[Array]:
-        """`project` of points (N, 3)."""
         seen = self._geometry(ecef_from_ground(ground))
         times = seen.times
         if self.delays:
@@ -239,7 +208,6 @@ class RangeDoppler(Frozen):
         return [image.T]
 
     def _jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """`project_jacobian` of points (N, 3)."""
         seen = self._geometry(ecef_from_ground(ground))
         by_ecef = np.stack([seen.time_by_ecef.T, seen.sight.T * (-2.0 / SPEED_OF_LIGHT)])  # (2, N, 3)
         ecef_by_ground = ecef_from_ground_jacobian(ground)
@@ -256,7 +224,6 @@ class RangeDoppler(Frozen):
         return image.T, jacobian
 
     def _localize(self, image: Array, alt: Array) -> Array:
-        """`localize` of image points (2, N)."""
         measured = times = self.frame.times(image)
         ground, sight = self._on_circle(times, alt)
         for _ in range(3 if self.delays else 0):  # delays change by 1e-5 of a step: three rounds are exact
@@ -314,7 +281,6 @@ class _Seen:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Scalar products (N,) of vectors (3, N)."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
@@ -362,12 +328,7 @@ def build(
 
 
 def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
-    """The model against a product's own geolocation grid (of one swath of a mosaic).
-
-    Returns
-    -------
-    residuals : (G, 2), range [samples of `range_sampling_rate`], azimuth [lines]: model - grid, geometry only
-    """
+    """Model - a swath's own geolocation grid, geometry only: range [samples], azimuth [lines], (G, 2)."""
     grid = annotation.grid
     azimuth_time, range_time = model.azimuth_range(grid.ground)
     samples = (range_time - grid.range_time) * annotation.range_sampling_rate
@@ -376,7 +337,6 @@ def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
 
 
 def _orbit(annotation: Annotation, file: Path | None, epoch: np.datetime64) -> Orbit:
-    """The orbit over the image, its times counted from `epoch`."""
     states = annotation.states if file is None else read_orbit_file(file, annotation)
     start, stop = (float(seconds(t, epoch)) for t in (annotation.first_line_time, annotation.last_line_time))
     return fit_orbit(seconds(states.time, epoch), states.position, states.velocity, (start, stop))
