@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -223,9 +224,8 @@ def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
             raise click.UsageError(f"--rpc-format {name}: not a format that is written")
     for path in (*images, folder):
         plain_path(path.absolute())
-    stems = [image.stem for image in images]
-    twins = sorted({stem for stem in stems if stems.count(stem) > 1})
-    if twins:
+    stems = Counter(image.stem for image in images)
+    if twins := sorted(stem for stem, count in stems.items() if count > 1):
         raise InputError(f"several images named {twins[0]}: apply them one folder at a time")
     if any(image.resolve().parent == folder.resolve() for image in images):
         raise InputError(f"{folder}: the folder of the images; choose a new one")

@@ -300,9 +300,8 @@ def convergence(pairs: Sequence[PairEntry]) -> str:
     for low, up, words in ((0.0, 5.0, "weak heights"), (5.0, 35.0, "good"), (35.0, 180.0, "hard to match")):
         if low < x.high:
             left, right = x(low), x(min(up, x.high))
-            parts.append(
-                tag("rect", x=left, y=30, width=right - left, height=160, class_=f"zone {words.split()[0]}")
-            )
+            zone = f"zone {words.split()[0]}"
+            parts.append(tag("rect", x=left, y=30, width=right - left, height=160, class_=zone))
             if right - left > 6.6 * len(words):
                 parts.append(label((left + right) / 2, 26, words, "middle"))
     parts += x_axis(x, 30, 190, "convergence angle [deg]")
@@ -438,9 +437,7 @@ class Stack:
 def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
     """Images whose middles stand nearer than their numbers are wide."""
     stacks: list[Stack] = []
-    for k, outline in enumerate(outlines):
-        if not outline:
-            continue
+    for k, outline in ((k, outline) for k, outline in enumerate(outlines) if outline):
         place = plane(np.concatenate([ring[:-1] for ring in outline])).mean(axis=0)
         near = next((stack for stack in stacks if np.hypot(*(stack.place - place)) < _APART), None)
         if near is None:
@@ -474,10 +471,9 @@ def _graticule(plane: Plane) -> tuple[list[str], list[str]]:
     for lon in round_ticks(plane.lon - reach[0], plane.lon + reach[0], 4):
         x, _ = plane(np.array([lon, plane.lat]))
         if 50 < x < right - 40:
+            words = _degrees((lon + 180.0) % 360.0 - 180.0, "EW")
             lines.append(line(x, 4, x, bottom, "grid"))
-            texts.append(
-                label(x, bottom - 4, _degrees((lon + 180.0) % 360.0 - 180.0, "EW"), "middle", "degrees")
-            )
+            texts.append(label(x, bottom - 4, words, "middle", "degrees"))
     for lat in round_ticks(plane.lat - reach[1], plane.lat + reach[1], 4):
         _, y = plane(np.array([plane.lon, lat]))
         if 16 < y < bottom - 20:

@@ -47,6 +47,7 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
     a, b = ({view.name: view for view in run.views} for run in runs)
     if not a.keys() & b.keys():
         raise InputError(f"{folder_a} and {folder_b}: the runs have no image in common")
+    given = [flat_options(run.options or {}) for run in runs]
     comparison = {
         "a": str(folder_a),
         "b": str(folder_b),
@@ -54,7 +55,11 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
         "pairs": _pairs(*runs),
         "only_a": [name for name in a if name not in b],
         "only_b": [name for name in b if name not in a],
-        "options": _options(*runs),
+        "options": [
+            {"option": key, "values": [one.get(key) for one in given]}
+            for key in given[0] | given[1]
+            if given[0].get(key) != given[1].get(key) and key not in _NO_EFFECT
+        ],
         "versions": [run.barpc for run in runs],
     }
     found: dict[str, Any] = plain({**comparison, "lines": _lines(comparison)})
@@ -113,12 +118,6 @@ def _pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:
     return rows
 
 
-def _options(*runs: Summary) -> list[dict[str, Any]]:
-    a, b = (flat_options(run.options or {}) for run in runs)
-    changed = [key for key in {**a, **b} if a.get(key) != b.get(key) and key not in _NO_EFFECT]
-    return [{"option": key, "values": [a.get(key), b.get(key)]} for key in changed]
-
-
 def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     """Nested options as one level, names joined by dots.
 
@@ -148,8 +147,7 @@ def _lines(comparison: Mapping[str, Any]) -> list[str]:
             f"Their RPCs differ by up to {most['rpc_difference_px']:.3g} px ({most['name']}), "
             f"by {bend:.3g} px once the mean shift of each image is taken away."
         )
-    for key, run in (("only_a", "A"), ("only_b", "B")):
-        if comparison[key]:
-            lines.append(f"In {run} alone: {', '.join(comparison[key])}.")
+    alone = {run: comparison[f"only_{run.lower()}"] for run in "AB"}
+    lines += [f"In {run} alone: {', '.join(names)}." for run, names in alone.items() if names]
     options = comparison["options"]
     return lines + [f"Option {o['option']}: {o['values'][0]} in A, {o['values'][1]} in B." for o in options]

@@ -28,6 +28,7 @@ from barpc.report.summary import (
     Summary,
     ViewEntry,
     largest,
+    listed,
     metres,
 )
 from barpc.report.tables import RunFiles, read_summary, read_tables
@@ -143,12 +144,7 @@ def _bonds(files: RunFiles) -> str:
     partners = np.bincount(np.array(links, dtype=np.int64).ravel(), minlength=len(views))
     lonely = [view.name for view, n in zip(views, partners, strict=True) if n == 1]
     answer = f"By tie points they fall into {groups} groups." if groups > 1 else "All images hang together."
-    return answer + f" Tied to one other image only: {_some(lonely)}." * bool(lonely and len(views) > 2)
-
-
-def _some(names: Sequence[str], most: int = 6) -> str:
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+    return answer + f" Tied to one other image only: {listed(lonely, 6)}." * bool(lonely and len(views) > 2)
 
 
 def _errors(files: RunFiles) -> Section | None:
@@ -189,7 +185,7 @@ def _randomness(files: RunFiles) -> Section | None:
     marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
     answer = "Mostly: in no image do residuals point the same way in more than half of the cells."
     if marked:
-        answer = f"Not in {_some(marked)}: in most of their cells the residuals point the same way."
+        answer = f"Not in {listed(marked, 6)}: in most of their cells the residuals point the same way."
         usual = " Small ones are usual (attitude jitter, relief); where they matter, the verdict says so."
         answer += usual * adjusted
     answer += (

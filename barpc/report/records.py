@@ -200,9 +200,8 @@ class Table:
     @property
     def kinds(self) -> list[str]:
         """How each column is set: "text" on the left, "number" on the right."""
-        first = self.rows[0] if self.rows else []
-        kinds = ["number" if cell.kind == "number" else "text" for cell in first]
-        return kinds or ["text"] * len(self.columns)
+        first = self.rows[0] if self.rows else [Cell("", "", "name")] * len(self.columns)
+        return ["number" if cell.kind == "number" else "text" for cell in first]
 
     @property
     def texts(self) -> list[list[str]]:

@@ -128,6 +128,11 @@ def largest(values: Sequence[float | None] | None) -> float | None:
     return None if not values or None in values else max(value for value in values if value is not None)
 
 
+def listed(names: Sequence[str], most: int = 10) -> str:
+    """Names in a sentence."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def median(values: Iterable[float | None]) -> float:
     """The median of the finite numbers; NaN without any."""
     found = np.array(list(values), dtype=np.float64)
@@ -595,17 +600,15 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
     """The correction of a view, at the ground point (3,) in the middle of its image."""
     sensor, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
     correction, covariance = adjustment.corrections[i], adjustment.covariance.view(i)
-    unknowns = adjustment.params[i].tolist()
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    common = (model, adjustment.params[i].tolist(), sigma)
     if not isinstance(correction, Correction):
         shift, slope = correction.shift.tolist(), correction.slope.tolist()
-        return CorrectionEntry(model, unknowns, sigma, None, None, shift_px=shift, slope=slope)
+        return CorrectionEntry(*common, None, None, shift_px=shift, slope=slope)
     assert isinstance(sensor, Corrected)
     moved, uncertain = shift_in_image(sensor, covariance, model, middle)
     return CorrectionEntry(
-        model,
-        unknowns,
-        sigma,
+        *common,
         moved.tolist(),
         uncertain.tolist(),
         rotation_urad=(correction.rotation * 1e6).tolist(),

@@ -12,7 +12,7 @@ from barpc.ba import Adjustment, check_residuals
 from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import Run
-from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, measure, median, metres
+from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
 FEW_OBSERVATIONS = 30  # A view with fewer is called weakly tied, unless control points hold it
@@ -31,7 +31,6 @@ _ALL_WELL = {
     "check": "The cameras of all {} images agree",
     "match": "All {} images are tied together",
 }
-_LISTED = 10  # names in a sentence
 
 
 def view_status(view: ViewEntry, run: Run) -> dict[str, str]:
@@ -86,7 +85,7 @@ def _oddity(name: str, adjustment: Adjustment) -> str:
     i, prior, smooth = adjustment.names.index(name), adjustment.prior, adjustment.smooth
     if prior.odd[i]:
         others = [adjustment.names[j] for j in np.flatnonzero(prior.odd) if j != i]
-        either = f" (or that of {_listed(others)}: the tie points cannot tell)" if others else ""
+        either = f" (or that of {listed(others)}: the tie points cannot tell)" if others else ""
         return (
             f"its RPC is {prior.scale[i]:.0f} times farther off than stated, beside the other images{either}: check "
             "that it belongs to this image"
@@ -188,15 +187,14 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
 
 
 def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
-    text = _ALL_WELL[run.kind].format(num)
-    if bad or look:
-        parts = []
-        if bad:
-            word = "not adjusted" if run.kind == "adjust" else "not usable"
-            parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
-        if look:
-            parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
-        text = f"{', '.join(parts)[0].upper()}{', '.join(parts)[1:]} (of {num + len(run.left_out)})"
+    text, parts = _ALL_WELL[run.kind].format(num), []
+    if bad:
+        word = "not adjusted" if run.kind == "adjust" else "not usable"
+        parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
+    if look:
+        parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
+    if parts:
+        text = f"{', '.join(parts)} (of {num + len(run.left_out)})"
     return f"{text}; {more} a look." if more else f"{text}."
 
 
@@ -204,20 +202,13 @@ def _control_reasons(run: Run) -> list[str]:
     """Ground points that were cut, and images that their files name and that are not there."""
     out = []
     if run.gcps is not None and run.adjustment is not None and not run.adjustment.gcp_inlier.all():
-        cut = np.unique(run.gcps.point[~run.adjustment.gcp_inlier])
-        names = _listed([run.gcps.names[i] for i in cut])
-        out.append(
-            f"The adjustment rejected observations of {len(cut)} GCPs: {names}: check their coordinates."
-        )
+        cut = [run.gcps.names[i] for i in np.unique(run.gcps.point[~run.adjustment.gcp_inlier])]
+        rejected = f"The adjustment rejected observations of {len(cut)} GCPs: {listed(cut)}"
+        out.append(f"{rejected}: check their coordinates.")
     for points, what in ((run.gcps, "GCPs"), (run.check_points, "Check points")):
         if points is not None and points.strangers:
-            out.append(f"{what} name images that are not in this run: {_listed(points.strangers)}.")
+            out.append(f"{what} name images that are not in this run: {listed(points.strangers)}.")
     return out
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return f"{', '.join(names[:_LISTED])}{more}"
 
 
 def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
