@@ -35,8 +35,7 @@ from barpc.sensor.geometry import image_grid
 from barpc.vrt import Vrt, read_vrt
 from barpc.workspace import own_files
 
-TOLERANCE = 1e-6
-"""Largest difference [px] between a file and its model that passes."""
+TOLERANCE = 1e-6  # Largest difference [px] between a file and its model that passes
 
 Projection = Callable[[Array], Array]
 """Ground points (N, 3) [deg, deg, m] -> image points (N, 2) [px], centre of the first pixel = (0, 0)."""
@@ -46,12 +45,7 @@ Projection = Callable[[Array], Array]
 class Reading:
     """What one of `CONSUMERS` makes of one file.
 
-    Parameters
-    ----------
-    max_error : float
-        Largest distance to the model over the grid [px]; NaN where it was not read.
-    note : str
-        Why it was not read; empty otherwise.
+    `max_error`: largest distance to the model over the grid [px], NaN where it was not read; `note`: why it was not.
     """
 
     path: Path
@@ -94,11 +88,9 @@ def refuse_hiding(folder: Path, names: Sequence[str], inputs: Collection[Path]) 
     own = own_files(folder) if folder.is_dir() else set()
     given = {path.resolve() for path in inputs}
     for path, image, _ in hidden_by(folder / name for name in names):
-        is_input = image.resolve() in given
-        if is_input or not (image.name in own or os.path.lexists(path)):
-            raise OutputError(
-                f"{path}: would be read in place of the RPC of {'the input ' * is_input}{image}; give another -o"
-            )
+        known = "the input " * (image.resolve() in given)
+        if known or not (image.name in own or os.path.lexists(path)):
+            raise OutputError(f"{path}: would be read in place of the RPC of {known}{image}; give another -o")
 
 
 def verify(
@@ -111,11 +103,7 @@ def verify(
     paths : sequence of path
         Files written for one image: rasters, text files, ``.geom``, JSON.
     model : SensorModel
-        What they should hold.
-    size : (width, height)
-        [px].
-    alt_range : (low, high)
-        [m above the ellipsoid].
+        What they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above the ellipsoid].
 
     Returns
     -------
@@ -133,27 +121,25 @@ def verify(
     return [
         _reading(path, name, CONSUMERS[name].open, ground, image)
         for path in map(Path, paths)
-        for name in (*_others(path), "barpc")
+        for name, installed in (*_readers(path).items(), ("barpc", True))
+        if installed
     ]
 
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
     """A sentence for each kind of these files that no installed tool but barpc reads."""
-    kinds = {Path(path).suffix: path for path in paths if not _others(Path(path))}
+    kinds = {path.suffix: path for path in map(Path, paths) if not any(_readers(path).values())}
     return [
-        f"{path}: only barpc itself has read it ({kind}: {' and '.join(_readers(Path(path))) or 'no other tool'} "
-        "would, and is not installed)"
+        f"{path}: only barpc itself has read it ({kind}: {' and '.join(_readers(path)) or 'no other tool'} would, and "
+        "is not installed)"
         for kind, path in kinds.items()
     ]
 
 
-def _readers(path: Path) -> tuple[str, ...]:
+def _readers(path: Path) -> dict[str, bool]:
+    """The tools besides barpc that read a file, and whether they are installed."""
     row = row_of(path)
-    return () if row is None else row.consumers
-
-
-def _others(path: Path) -> list[str]:
-    return [name for name in _readers(path) if CONSUMERS[name].installed]
+    return {} if row is None else {name: CONSUMERS[name].installed for name in row.consumers}
 
 
 def _reading(
@@ -248,15 +234,10 @@ def _rpcm(path: Path) -> Projection:
     rpcm = import_module("rpcm.rpc_model")
     if path.suffix == ".json":
         model = rpcm.RPCModel(json.loads(path.read_text())["rpc"], dict_format="rpcm")
-    elif isinstance(row_of(path), Carrier):
-        model = rpcm.rpc_from_geotiff(str(path))
     else:
-        model = rpcm.rpc_from_rpc_file(str(path))
-
-    def project(ground: Array) -> Array:
-        return np.column_stack(model.projection(*ground.T))
-
-    return project
+        carrier = isinstance(row_of(path), Carrier)
+        model = (rpcm.rpc_from_geotiff if carrier else rpcm.rpc_from_rpc_file)(str(path))
+    return lambda ground: np.column_stack(model.projection(*ground.T))
 
 
 def _shareloc(path: Path) -> Projection:
@@ -270,13 +251,8 @@ def _shareloc(path: Path) -> Projection:
 
 
 def _orthority(path: Path) -> Projection:
-    factory = import_module("orthority.factory").RpcCameras
-    camera = factory.from_images((str(path),)).get(path.name)
-
-    def project(ground: Array) -> Array:
-        return np.asarray(camera.world_to_pixel(ground.T).T)
-
-    return project
+    camera = import_module("orthority.factory").RpcCameras.from_images((str(path),)).get(path.name)
+    return lambda ground: np.asarray(camera.world_to_pixel(ground.T).T)
 
 
 def _keywords(path: Path) -> Projection:
@@ -285,11 +261,12 @@ def _keywords(path: Path) -> Projection:
     if pairs["type"].strip() != "ossimRpcModel" or pairs["polynomial_format"].strip() != "B":
         raise OutputError("type or polynomial_format is not what OSSIM expects")
     axes, sets = ("line", "samp", "lat", "long", "height"), ("line_num", "line_den", "samp_num", "samp_den")
-    keys = [f"{axis}_{part}" for axis in axes for part in ("off", "scale")]
-    coefficients = {
-        f"{name}_coeff": [float(pairs[f"{name}_coeff_{i:02d}"]) for i in range(20)] for name in sets
+    values: dict[str, Any] = {
+        key: float(pairs[key]) for axis in axes for key in (f"{axis}_off", f"{axis}_scale")
     }
-    return _transformer(rasterio.rpc.RPC(**{key: float(pairs[key]) for key in keys}, **coefficients))
+    for key in (f"{name}_coeff" for name in sets):
+        values[key] = [float(pairs[f"{key}_{i:02d}"]) for i in range(20)]
+    return _transformer(rasterio.rpc.RPC(**values))
 
 
 CONSUMERS: dict[str, Consumer] = {

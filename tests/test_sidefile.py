@@ -219,7 +219,7 @@ DIRECT = {
     "workspace.py": "barpc's own source, images' fingerprints, the state",
     "pipeline/executor.py": "arrays that the caller has put down for its workers",
     "cameras.py": "no file: a row of the table of openers",
-    "report/load.py": "the schema, which is part of the package",
+    "report/tables.py": "the schema, which is part of the package",
     "cli/main.py": "the null device",
 }
 """Modules that may open a file for reading by themselves, and what they open."""

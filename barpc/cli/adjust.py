@@ -1,4 +1,4 @@
-"""`barpc adjust`, `match` and `check`: runs of the pipeline."""
+"""`barpc adjust`, `match` and `check`: runs of the pipeline; `report`: their pages and differences."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import click
 
 from barpc.cli.options import ADJUSTMENT, MATCH, RUN, TIE, image_paths, run_options, with_flags
 from barpc.cli.progress import executor_for, progress_bars
-from barpc.cli.tables import print_summary
-from barpc.cli.terminal import echo, tell_gate
+from barpc.cli.terminal import echo, print_comparison, print_summary, tell_gate
 
 if TYPE_CHECKING:
     from barpc.pipeline import AdjustResult
@@ -86,6 +85,38 @@ def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, 
     if against is not None:
         return _compare(image_paths(images, flags["image_list"]), Path(against), flags["as_json"])
     return _run(obj, pipeline.check, images, flags)
+
+
+@click.command("report")
+@click.argument("run_dir", metavar="RUN_DIR")
+@click.argument("other", required=False, metavar="[OTHER_RUN]")
+@click.option("--json", "as_json", is_flag=True, help="Print the comparison of two runs as JSON on stdout.")
+def report(run_dir: str, other: str | None, as_json: bool) -> int:
+    r"""Make report.html of a finished run again, from its summary.json and tables; or compare two runs.
+
+    Two finished runs of the same images are compared on the terminal: errors, cameras, options.
+
+    \b
+    Examples:
+      barpc report adjusted
+      barpc report adjusted adjusted_with_drift
+      barpc report --json monday tuesday
+    """
+    if other is None:
+        if as_json:
+            raise click.UsageError("--json goes with two runs; the summary.json of one is there already")
+        from barpc.report.page import remake_report
+
+        echo(remake_report(run_dir))
+        return 0
+    from barpc.report.compare import compare_runs
+
+    comparison = compare_runs(run_dir, other)
+    if as_json:
+        echo(json.dumps(comparison, indent=1))
+    else:
+        print_comparison(comparison)
+    return 0
 
 
 def _run(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -90,12 +91,9 @@ def convert(
     if len(files) != 2 or rpcs or carrier:
         raise click.UsageError("give SOURCE and TARGET, or images and -o DIR (with it: --rpc, --images)")
     source, target = files
-    camera = open_camera(source)
-    check_target(
-        target, [split_spec(source)[0], camera.path], overwrite, None if window or bbox else camera.rpc
-    )
-    image = split_spec(source)[0]
-    if window or bbox:
+    camera, image, cut = open_camera(source), split_spec(source)[0], bool(window or bbox)
+    check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
+    if cut:
         window = _window(camera, window, bbox, alt)
         write_crop(camera.rpc, image, target, window, overwrite=overwrite)
         text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
@@ -142,23 +140,21 @@ def check_target(
 
 def _window(camera: Camera, window: Window | None, bbox: Box | None, alt: float | None) -> Window:
     """The window, or the pixels that a box on the ground covers, cut to the image."""
-    if (window is None) == (bbox is None):
-        raise click.UsageError("give either --window or --bbox")
-    if bbox is None:
-        assert window is not None
+    if bbox is None and window is not None:
         return window
+    if bbox is None or window is not None:
+        raise click.UsageError("give either --window or --bbox")
     west, south, east, north = bbox
     east += 360.0 * (east < west)  # a box across the antimeridian
     alt = camera.altitude if alt is None else alt
     t = (image_border((1, 1), 16) + 0.5) * [east - west, north - south] + [west, south]
     image = camera.model.project(np.column_stack([t, np.full(len(t), alt)]))
-    width, height = camera.extent
     low = np.maximum(np.floor(image.min(axis=0) + 0.5), 0)
-    high = np.minimum(np.ceil(image.max(axis=0) + 0.5), [width, height])
+    high = np.minimum(np.ceil(image.max(axis=0) + 0.5), camera.extent)
     if not (np.isfinite(image).all() and (high > low).all()):
         raise click.UsageError(f"--bbox {bbox} does not meet {camera.path} at {alt:g} m")
-    col, row = (int(v) for v in low)
-    return col, row, int(high[0]) - col, int(high[1]) - row
+    (col, row), (width, height) = low.astype(int).tolist(), (high - low).astype(int).tolist()
+    return col, row, width, height
 
 
 # --- a folder ---------------------------------------------------------------------------------------------
@@ -205,13 +201,13 @@ def _hand_off(
 
 
 def _tell(readings: list[Reading], as_json: bool) -> None:
-    if not as_json:
-        for r in readings:
-            echo(f"{r.path}: {r.consumer} {r.note or f'{r.max_error:.1e} px'}")
-        return
-    keys = ("path", "consumer", "max_px", "note")
     rows = [(str(r.path), r.consumer, None if r.note else r.max_error, r.note) for r in readings]
-    echo(json.dumps([dict(zip(keys, row, strict=True)) for row in rows]))
+    if as_json:
+        keys = ("path", "consumer", "max_px", "note")
+        echo(json.dumps([dict(zip(keys, row, strict=True)) for row in rows]))
+        return
+    for path, consumer, error, note in rows:
+        echo(f"{path}: {consumer} {note or f'{error:.1e} px'}")
 
 
 def _shadow_reasons(image: Path, written: list[Path]) -> list[str]:
@@ -228,9 +224,8 @@ def _check(images: list[Path], folder: Path, formats: list[str]) -> None:
             raise click.UsageError(f"--rpc-format {name}: not a format that is written")
     for path in (*images, folder):
         plain_path(path.absolute())
-    stems = [image.stem for image in images]
-    twins = sorted({stem for stem in stems if stems.count(stem) > 1})
-    if twins:
+    stems = Counter(image.stem for image in images)
+    if twins := sorted(stem for stem, count in stems.items() if count > 1):
         raise InputError(f"several images named {twins[0]}: apply them one folder at a time")
     if any(image.resolve().parent == folder.resolve() for image in images):
         raise InputError(f"{folder}: the folder of the images; choose a new one")

@@ -132,8 +132,9 @@ def _describe(camera: Camera, alt: float | None, at: tuple[float, ...] | None) -
 def _box(rpc: RPC) -> dict[str, Any]:
     """What an RPC alone states: its box on the ground, its accuracy, and how near to a pole it comes there."""
     low, high = rpc.ground_offset - np.abs(rpc.ground_scale), rpc.ground_offset + np.abs(rpc.ground_scale)
+    lon, lat, _ = np.stack([low, high], axis=1).tolist()
     return {
-        "domain": {"lon_deg": [float(low[0]), float(high[0])], "lat_deg": [float(low[1]), float(high[1])]},
+        "domain": {"lon_deg": lon, "lat_deg": lat},
         "err_bias_m": rpc.err_bias,
         "err_rand_m": rpc.err_rand,
         "smallest_denominator": smallest_denominator(rpc, low, high),
@@ -163,15 +164,11 @@ def _geometry(
 
 
 def _text(value: Any) -> str:
-    if value is None:
-        return "unknown"
-    if isinstance(value, float):
-        return f"{value:.6g}"
     if isinstance(value, dict):
         return ", ".join(f"{key} {_text(v)}" for key, v in value.items())
     if isinstance(value, list):
-        return " .. ".join(_text(v) for v in value) if value else "none"
-    return str(value)
+        return " .. ".join(map(_text, value)) or "none"
+    return "unknown" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 # --- the installation -------------------------------------------------------------------------------------
@@ -187,13 +184,6 @@ _REQUIRED = [
     "fastjsonschema",
 ]
 _OPTIONAL = {"jinja2": "report", "distributed": "cluster"}
-
-
-def _version(package: str, missing: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return missing
 
 
 def _fit_an_rpc() -> str:
@@ -240,9 +230,12 @@ _CHECKS: dict[str, Callable[[], str]] = {
 def _examine(as_json: bool) -> int:
     """Print the versions of what barpc stands on, try each part once, and give the exit code."""
     versions = {"barpc": __version__, "python": platform.python_version()}
-    versions |= {name: _version(name, "MISSING") for name in _REQUIRED}
-    for name, extra in _OPTIONAL.items():
-        versions[name] = _version(name, f"not installed (pip install 'barpc[{extra}]')")
+    missing = {name: f"not installed (pip install 'barpc[{extra}]')" for name, extra in _OPTIONAL.items()}
+    for name in (*_REQUIRED, *_OPTIONAL):
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = missing.get(name, "MISSING")
     results = {}
     for name, check in _CHECKS.items():
         try:

@@ -42,8 +42,7 @@ COMMANDS = {
 }
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
 _MODULES = {
-    "match": "adjust",
-    "check": "adjust",
+    **dict.fromkeys(("match", "check", "report"), "adjust"),
     **dict.fromkeys(("project", "localize", "triangulate"), "points"),
 }
 
@@ -89,11 +88,11 @@ def _in_file(flag: str) -> str:
     from barpc.options import Options, RunOptions, declared
 
     name = flag[2:].replace("-", "_")
-    tables: dict[str, type[Options]] = {"": RunOptions}
-    for table, one in declared(RunOptions).items():
-        if isinstance(one.default, Options):
-            tables[f"[{table}] "] = type(one.default)
-    places = [table for table, record in tables.items() if name in declared(record)]
+    tables: dict[str, Options] = {"": RunOptions()}
+    tables |= {
+        f"[{k}] ": one.default for k, one in declared(RunOptions).items() if isinstance(one.default, Options)
+    }
+    places = [table for table, options in tables.items() if name in declared(type(options))]
     return f"{places[0]}{name} of a file given with --options" if places else ""
 
 
@@ -210,17 +209,15 @@ def _told(error: BaseException) -> tuple[int, str]:
         context = getattr(error, "ctx", None)
         where = context.command_path if context is not None else "barpc"
         return error.exit_code, f"{error.format_message()} (see '{where} --help')"
+    text = f"unexpected {type(error).__name__}: {error}; this is a bug: please report what --debug shows"
     if isinstance(error, BarpcError):
-        return EXIT_FAILED, str(error)
-    if isinstance(error, MemoryError):
-        return EXIT_FAILED, (
-            "out of memory; what was finished is kept: run the same command again, with a smaller -j or [tie] tile"
-        )
-    if isinstance(error, OSError) and error.strerror:
-        return EXIT_FAILED, f"{error.filename or 'the system'}: {error.strerror}"
-    return EXIT_FAILED, (
-        f"unexpected {type(error).__name__}: {error}; this is a bug: please report what --debug shows"
-    )
+        text = str(error)
+    elif isinstance(error, MemoryError):
+        kept = "what was finished is kept: run the same command again, with a smaller -j or [tie] tile"
+        text = f"out of memory; {kept}"
+    elif isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename or 'the system'}: {error.strerror}"
+    return EXIT_FAILED, text
 
 
 @contextmanager
@@ -237,12 +234,7 @@ def _interruptible() -> Iterator[None]:
 
 
 def _log_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: object = None,
-    line: str | None = None,
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object, **__: object
 ) -> None:
     """A warning as one line of the log: barpc's own always, those of libraries with -v."""
     text = " ".join(str(message).split())

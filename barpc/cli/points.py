@@ -166,16 +166,16 @@ def _table(lines: Iterable[str], file: str, names: Sequence[str], fill: float | 
         if -1 in columns[: -1 if fill is not None else None]:
             raise InputError(f"{file}: columns {', '.join(names)} expected, found {', '.join(header)}")
     points = np.empty((len(rows), len(names)))
+    if fill is not None:
+        points[:, -1] = fill
     for i, row in enumerate(rows):
-        texts = [row[column] if 0 <= column < len(row) else None for column in columns]
-        if fill is not None and texts[-1] is None:
-            texts[-1] = str(fill)
-        for j, text in enumerate(texts):
-            if text is None:
+        for j, column in enumerate(columns):
+            if 0 <= column < len(row):
+                if not _is_number(row[column]):
+                    raise InputError(f"{file}: point {i + 1}: {row[column]!r} is no number")
+                points[i, j] = float(row[column])
+            elif fill is None or j < len(names) - 1:
                 raise InputError(f"{file}: point {i + 1} has {len(row)} columns, expected {', '.join(names)}")
-            if not _is_number(text):
-                raise InputError(f"{file}: point {i + 1}: {text!r} is no number")
-            points[i, j] = float(text)
     return points
 
 
@@ -194,14 +194,13 @@ def _is_number(text: str) -> bool:
 
 def _print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_json: bool) -> None:
     """A table of points as CSV with a header, or as a JSON list of objects (null for NaN)."""
+    rows = [list(zip(row, digits, strict=True)) for row in values.tolist()]
     if as_json:
-        rounded = [[round(v, d) for v, d in zip(row, digits, strict=True)] for row in values.tolist()]
-        plain = [[v if np.isfinite(v) else None for v in row] for row in rounded]
+        plain = [[round(v, d) if np.isfinite(v) else None for v, d in row] for row in rows]
         echo(json.dumps([dict(zip(names, row, strict=True)) for row in plain]))
         return
-    echo(",".join(names))
-    for row in values.tolist():
-        echo(",".join(f"{v:.{d}f}" for v, d in zip(row, digits, strict=True)))
+    for line in (names, *([f"{v:.{d}f}" for v, d in row] for row in rows)):
+        echo(",".join(line))
 
 
 def _tell_failures(points: Array, what: str) -> int:

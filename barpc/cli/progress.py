@@ -10,13 +10,13 @@ import threading
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 import click
 
 from barpc.cli.terminal import THREADS
-from barpc.errors import visible
+from barpc.errors import InputError, visible
 
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
@@ -32,6 +32,11 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
         return
     bars: dict[str, ProgressBar[int]] = {}
 
+    def finish() -> None:
+        for bar in bars.values():
+            bar.render_finish()
+        bars.clear()
+
     def show(stage: str, done: int, total: int) -> None:
         if stage not in bars:
             finish()
@@ -39,11 +44,6 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
             bars[stage] = click.progressbar(length=total, label=label, show_pos=True, file=sys.stderr)
         bars[stage].length = total
         bars[stage].update(done - bars[stage].pos)
-
-    def finish() -> None:
-        for bar in bars.values():
-            bar.render_finish()
-        bars.clear()
 
     try:
         yield show
@@ -54,17 +54,18 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 @contextmanager
 def executor_for(jobs: int | str) -> Iterator[Executor | None]:
     """The executor of a run: None works in this process."""
-    if jobs == 1:
-        yield None
-        return
-    with _cluster(jobs) if isinstance(jobs, str) else _processes(jobs) as executor:
+    with (
+        nullcontext()
+        if jobs == 1
+        else _cluster(jobs)
+        if isinstance(jobs, str)
+        else _processes(jobs) as executor
+    ):
         yield executor
 
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
-    from barpc.errors import InputError
-
     try:
         from distributed import Client
     except ImportError as error:

@@ -1,17 +1,31 @@
-"""The one door to the terminal: whatever names, files and errors hold, no control character leaves it."""
+"""The one door to the terminal: whatever names, files and errors hold, no control character leaves it.
+
+A table takes the room there is: heads in one line, then heads broken over lines, then the first column folded,
+then one block a row. No column and no unit is ever dropped; in a pipe a row is always one line.
+"""
 
 from __future__ import annotations
 
 import logging
-from typing import Any
+import shutil
+import sys
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from barpc.errors import visible
 
+if TYPE_CHECKING:
+    from barpc.report import Summary
+
 EXIT_GATE = 3
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _REASONS = 5  # in the line that says why a run does not pass
+GAP = "  "
+NARROWEST = 12  # The first column of a table is not folded below so many characters
+_COLORS = {"good": "green", "look": "yellow", "bad": "red"}
 
 as_json = click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
 
@@ -43,3 +57,108 @@ class Formatter(logging.Formatter):
     def formatException(self, ei: Any) -> str:
         """A traceback."""
         return visible(super().formatException(ei))
+
+
+def print_summary(summary: Summary) -> None:
+    """The verdict, a table of views and a table of pairs, on stdout."""
+    from barpc.report.records import table
+    from barpc.report.summary import PairEntry, ViewEntry
+
+    width = output_width()
+    errors = "Reprojection error of the tie points"
+    offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
+    for shown in (
+        table("views", errors, summary.views, ViewEntry, ViewEntry.TERMINAL, summary.adjusted),
+        table("pairs", offsets, summary.pairs, PairEntry, PairEntry.TERMINAL, summary.adjusted),
+    ):
+        if shown.rows:
+            _echo_table(shown.caption, shown.texts, width)
+    echo(summary.headline, bold=True, fg=_COLORS[summary.status])
+    _echo_lines(summary.verdict, width)
+    if summary.out_dir:
+        echo(f"Written to {summary.out_dir}")
+
+
+def print_comparison(comparison: Mapping[str, Any]) -> None:
+    """Two runs side by side, on stdout."""
+    width = output_width()
+    echo(f"A: {comparison['a']}\nB: {comparison['b']}\n")
+    heads = ["image", "points A", "points B", "error A [px]", "error B [px]", "RPCs differ [px]"]
+    views = [[*heads, "without shift [px]"]]
+    for view in comparison["views"]:
+        numbers = [*map(str, view["num_observations"]), *map(_number, view["rmse"])]
+        differences = [view["rpc_difference_px"], view["rpc_difference_without_shift_px"]]
+        numbers += ["-" if value is None else f"{value:.2g}" for value in differences]
+        views.append([view["name"], *numbers])
+    _echo_table("Reprojection error (RMS) and RPC files", views, width)
+    pairs = [["pair", "matches A", "matches B", "offset A [px]", "offset B [px]"]]
+    for pair in comparison["pairs"]:
+        numbers = [*map(str, pair["num_matches"]), *map(_number, pair["epipolar_rms"])]
+        pairs.append([f"{pair['a']} - {pair['b']}", *numbers])
+    if len(pairs) > 1:
+        _echo_table("Epipolar offset (RMS)", pairs, width)
+    _echo_lines(comparison["lines"], width)
+
+
+def output_width() -> int | None:
+    """Columns of the terminal that stdout is; None for a pipe or a file, where lines have no end."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+
+
+def layout(table: Sequence[Sequence[str]], width: int | None) -> list[str]:
+    r"""Lines of a table whose first row are the heads and whose first column is text, the others numbers.
+
+    The table has `width` columns on the terminal; None: any number.
+
+    Examples
+    --------
+    >>> print("\n".join(layout([["image", "error [px]"], ["a", "0.5"]], None)))
+    image  error [px]
+    a             0.5
+    >>> print("\n".join(layout([["image", "error [px]"], ["a", "0.5"]], 13)))
+           error
+    image   [px]
+    a        0.5
+    >>> print("\n".join(layout([["image", "error [px]"], ["a_long_long_name", "0.5"]], 14)))
+    a_long_long_name
+      error [px]: 0.5
+    """
+    heads, rows = table[0], table[1:]
+    numbers = [max(map(len, column)) for column in zip(*table, strict=True)]
+    if width is None or sum(numbers) + len(GAP) * (len(heads) - 1) <= width:
+        return [_line(row, numbers) for row in table]
+    narrow = [max(map(len, [*head.split(), *column])) for head, *column in zip(*table, strict=True)]
+    room = width - sum(narrow[1:]) - len(GAP) * (len(heads) - 1)
+    if room < min(narrow[0], NARROWEST):
+        cells = ((f"  {head}: {cell}" for head, cell in zip(heads[1:], row[1:], strict=True)) for row in rows)
+        return [line for row, block in zip(rows, cells, strict=True) for line in (row[0], *block)]
+    widths = [min(narrow[0], room), *narrow[1:]]
+    broken = [textwrap.wrap(head, size) for head, size in zip(heads, widths, strict=True)]
+    depth = max(map(len, broken))
+    lines = [
+        _line(row, widths)
+        for row in zip(*([""] * (depth - len(head)) + head for head in broken), strict=True)
+    ]
+    for row in rows:
+        first, *folded = textwrap.wrap(row[0], widths[0]) or [""]
+        lines += [_line([first, *row[1:]], widths), *folded]
+    return lines
+
+
+def _line(row: Sequence[str], widths: Sequence[int]) -> str:
+    numbers = (cell.rjust(size) for cell, size in zip(row[1:], widths[1:], strict=True))
+    return GAP.join([row[0].ljust(widths[0]), *numbers]).rstrip()
+
+
+def _echo_table(title: str, table: Sequence[Sequence[str]], width: int | None) -> None:
+    echo("\n".join([title] if width is None else textwrap.wrap(title, width)), bold=True)
+    echo("\n".join(layout(table, width)) + "\n")
+
+
+def _echo_lines(lines: Sequence[str], width: int | None) -> None:
+    for line in lines:
+        echo(line if width is None else textwrap.fill(line, width, break_on_hyphens=False))
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from barpc.errors import BarpcError, InputError
-from barpc.report.load import read_summary
 from barpc.report.records import plain
-from barpc.report.summary import Summary, ViewEntry
+from barpc.report.summary import Summary, ViewEntry, median
+from barpc.report.tables import read_summary
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import image_grid
 from barpc.sensor.rpc import RPC
 
 _NODES = 7
-_NO_EFFECT = ("overwrite", "keep_going")
-"""Options that do not change a finished run."""
+_NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finished run
 
 
 def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
@@ -32,10 +32,10 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
     Returns
     -------
     comparison : dict
-        ``views`` in both, by name: errors, and ``rpc_difference_px``, the largest distance between where the
-        two runs' RPC files put the same ground points, as a whole and with each image's mean shift taken away
-        (null where one wrote none); ``pairs`` in both; ``only_a``, ``only_b``: images of one run alone;
-        ``options`` that differ; ``lines``: sentences.
+        ``views`` in both: errors, and ``rpc_difference_px``, the largest distance between where the two runs' RPC
+        files put the same ground points, as a whole and without each image's mean shift (null where one wrote none);
+        ``pairs`` in both; ``only_a``, ``only_b``: images of one run alone; ``options`` that differ; ``lines``:
+        sentences.
 
     Raises
     ------
@@ -47,6 +47,7 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
     a, b = ({view.name: view for view in run.views} for run in runs)
     if not a.keys() & b.keys():
         raise InputError(f"{folder_a} and {folder_b}: the runs have no image in common")
+    given = [flat_options(run.options or {}) for run in runs]
     comparison = {
         "a": str(folder_a),
         "b": str(folder_b),
@@ -54,7 +55,11 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
         "pairs": _pairs(*runs),
         "only_a": [name for name in a if name not in b],
         "only_b": [name for name in b if name not in a],
-        "options": _options(*runs),
+        "options": [
+            {"option": key, "values": [one.get(key) for one in given]}
+            for key in given[0] | given[1]
+            if given[0].get(key) != given[1].get(key) and key not in _NO_EFFECT
+        ],
         "versions": [run.barpc for run in runs],
     }
     found: dict[str, Any] = plain({**comparison, "lines": _lines(comparison)})
@@ -76,7 +81,7 @@ def _view(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]) -> dic
 def _rpc_difference(
     folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]
 ) -> tuple[float | None, float | None]:
-    first, second = (_written_rpc(folder, view) for folder, view in zip(folders, views, strict=True))
+    first, second = map(_written_rpc, folders, views)
     if first is None or second is None:
         return None, None
     with np.errstate(all="ignore"):  # where the second has no value there is no difference
@@ -90,10 +95,7 @@ def _rpc_difference(
 
 
 def _written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
-    """The RPC that a run wrote for a view, from the first of its files that can be read.
-
-    Only what lies in the folder itself is opened, whatever the summary names.
-    """
+    """The first RPC that can be read of those that a run wrote for a view, in its own folder, whatever it names."""
     for name in view.outputs:
         try:
             path = (folder / name).resolve()
@@ -106,22 +108,14 @@ def _written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
 
 def _pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:
     of_b = {(pair.a, pair.b): pair for pair in run_b.pairs}
-    both = [(pair, of_b[pair.a, pair.b]) for pair in run_a.pairs if (pair.a, pair.b) in of_b]
-    return [
-        {
-            "a": pairs[0].a,
-            "b": pairs[0].b,
-            "num_matches": [pair.num_matches for pair in pairs],
-            "epipolar_rms": [pair.offset_rms[pair.epipolar_after is not None] for pair in pairs],
-        }
-        for pairs in both
-    ]
-
-
-def _options(*runs: Summary) -> list[dict[str, Any]]:
-    a, b = (flat_options(run.options or {}) for run in runs)
-    changed = [key for key in {**a, **b} if a.get(key) != b.get(key) and key not in _NO_EFFECT]
-    return [{"option": key, "values": [a.get(key), b.get(key)]} for key in changed]
+    rows = []
+    for pair in run_a.pairs:
+        if (pair.a, pair.b) in of_b:
+            both = (pair, of_b[pair.a, pair.b])
+            rms = [one.offset_rms[one.epipolar_after is not None] for one in both]
+            matches = [one.num_matches for one in both]
+            rows.append({"a": pair.a, "b": pair.b, "num_matches": matches, "epipolar_rms": rms})
+    return rows
 
 
 def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]:
@@ -143,22 +137,17 @@ def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]
 
 def _lines(comparison: Mapping[str, Any]) -> list[str]:
     views = comparison["views"]
-    rmse = np.array([view["rmse"] for view in views], dtype=np.float64)
-    a, b = (
-        float(np.median(column[np.isfinite(column)])) if np.isfinite(column).any() else np.nan
-        for column in rmse.T
-    )
+    a, b = (median([view["rmse"][k] for view in views]) for k in (0, 1))
     lines = [f"{len(views)} images in both: their tie points agree to {a:.3f} px in A, {b:.3f} px in B."]
     moved = [view for view in views if view["rpc_difference_px"] is not None]
     if moved:
-        most = max(moved, key=lambda view: view["rpc_difference_px"])
+        most = max(moved, key=itemgetter("rpc_difference_px"))
         bend = max(view["rpc_difference_without_shift_px"] for view in moved)
         lines.append(
             f"Their RPCs differ by up to {most['rpc_difference_px']:.3g} px ({most['name']}), "
             f"by {bend:.3g} px once the mean shift of each image is taken away."
         )
-    for key, run in (("only_a", "A"), ("only_b", "B")):
-        if comparison[key]:
-            lines.append(f"In {run} alone: {', '.join(comparison[key])}.")
+    alone = {run: comparison[f"only_{run.lower()}"] for run in "AB"}
+    lines += [f"In {run} alone: {', '.join(names)}." for run, names in alone.items() if names]
     options = comparison["options"]
     return lines + [f"Option {o['option']}: {o['values'][0]} in A, {o['values'][1]} in B." for o in options]

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from barpc.errors import BarpcError, visible
+from barpc.geodesy import Array
 from barpc.report import charts
-from barpc.report.charts import MAX_ROWS, numbered
+from barpc.report.charts import MAX_ROWS, ground_map, numbered, residual_panels
 from barpc.report.compare import flat_options
-from barpc.report.load import RunFiles, read_summary, read_tables
-from barpc.report.maps import ground_map, residual_panels
 from barpc.report.records import Cell, Table, cell_of, table
 from barpc.report.summary import (
     STATUS_WORDS,
@@ -29,8 +28,10 @@ from barpc.report.summary import (
     Summary,
     ViewEntry,
     largest,
+    listed,
     metres,
 )
+from barpc.report.tables import RunFiles, read_summary, read_tables
 from barpc.report.verdict import GOOD
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
@@ -54,12 +55,9 @@ def report_html(summary: Summary, folder: Path | str) -> str:
     import jinja2
 
     files = read_tables(summary, Path(folder))
+    loader, undefined = jinja2.PackageLoader("barpc.report", ""), jinja2.StrictUndefined
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("barpc.report", ""),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=undefined, trim_blocks=True, lstrip_blocks=True
     )
     shown = [section for make in SECTIONS if (section := make(files)) is not None]
     template = environment.get_template("template.html.j2")
@@ -88,16 +86,15 @@ def remake_report(folder: Path | str) -> Path:
     return folder / NAME
 
 
-Pictures = Sequence[tuple[str, str]]
-"""SVG texts with their captions."""
+Pictures = Sequence[tuple[str, str]]  # SVG texts with their captions
 
 
 @dataclass(frozen=True)
 class Section:
     """A question and its answer, with what shows it.
 
-    `panels` are small maps; `folds` are words and more of them that open on demand; `bars` are words, a value as text
-    and a length in percent; `half`: half the width of a desk's screen is enough.
+    `panels`: small maps; `folds`: words and more of them that open on demand; `bars`: words, a value as text and a
+    length in percent; `half`: half the width of a desk's screen is enough.
     """
 
     key: str
@@ -119,8 +116,8 @@ def _images(files: RunFiles) -> Section:
         answer += " What to do about the others stands in the verdict above."
     caption = "Images: reprojection error (RMS) of the tie points that count"
     shown = table("images", caption, views, ViewEntry, ViewEntry.PAGE, files.summary.adjusted)
-    numbers = [cell_of(k + 1) for k in range(len(views))]
-    return Section("images", "Which images can I use?", answer, tables=[shown.numbered(numbers)])
+    shown = shown.numbered([cell_of(k + 1) for k in range(len(views))])
+    return Section("images", "Which images can I use?", answer, tables=[shown])
 
 
 def _map(files: RunFiles) -> Section | None:
@@ -143,20 +140,11 @@ def _map(files: RunFiles) -> Section | None:
 def _bonds(files: RunFiles) -> str:
     views, number = files.summary.views, files.number
     links = [(number[pair.a], number[pair.b]) for pair in files.summary.pairs]
-    groups = connected_groups(len(views), links)
+    groups = len(connected_groups(len(views), links))
     partners = np.bincount(np.array(links, dtype=np.int64).ravel(), minlength=len(views))
     lonely = [view.name for view, n in zip(views, partners, strict=True) if n == 1]
-    answer = "All images hang together."
-    if len(groups) > 1:
-        answer = f"By tie points they fall into {len(groups)} groups."
-    if lonely and len(views) > 2:
-        answer += f" Tied to one other image only: {_some(lonely)}."
-    return answer
-
-
-def _some(names: Sequence[str], most: int = 6) -> str:
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+    answer = f"By tie points they fall into {groups} groups." if groups > 1 else "All images hang together."
+    return answer + f" Tied to one other image only: {listed(lonely, 6)}." * bool(lonely and len(views) > 2)
 
 
 def _errors(files: RunFiles) -> Section | None:
@@ -165,10 +153,8 @@ def _errors(files: RunFiles) -> Section | None:
     if not any((norm > 0).any() for norm in norms):
         return None
     labels = numbered([view.name for view in views])
-    rows = [
-        charts.Row(text, view.name, view.rmse_before, view.rmse_after)
-        for text, view in zip(labels, views, strict=True)
-    ]
+    named = zip(labels, views, strict=True)
+    rows = [charts.Row(text, view.name, view.rmse_before, view.rmse_after) for text, view in named]
     axis = "root mean square reprojection error [px], logarithmic"
     shown = [
         (charts.histogram(*norms), "All observations that count; each curve is drawn to its own peak."),
@@ -177,9 +163,9 @@ def _errors(files: RunFiles) -> Section | None:
     if not files.summary.adjusted:
         answer = f"Half of the observations lie within {np.median(norms[0]):.3f} px of where their cameras put them."
         return Section("errors", "How large are the errors?", answer, shown)
-    medians = [float(np.median(norm)) for norm in norms]
+    before, after = map(np.median, norms)
     answer = (
-        f"The median reprojection error went from {medians[0]:.3f} px to {medians[1]:.3f} px."
+        f"The median reprojection error went from {before:.3f} px to {after:.3f} px."
         " These are the points the adjustment was made of: it shows agreement, not accuracy on the ground."
     )
     return Section("errors", "Did the adjustment help?", answer, shown)
@@ -194,21 +180,18 @@ def _which(rows: Sequence[Any], what: str, by: str) -> str:
 def _randomness(files: RunFiles) -> Section | None:
     if not len(files.observations.view):
         return None
-    views, adjusted = files.summary.views, files.summary.adjusted
+    views, adjusted, folds = files.summary.views, files.summary.adjusted, []
     panels, shares, key = residual_panels(views, files.observations, "after" if adjusted else "before")
     marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
     answer = "Mostly: in no image do residuals point the same way in more than half of the cells."
     if marked:
-        answer = f"Not in {_some(marked)}: in most of their cells the residuals point the same way."
-        if adjusted:
-            answer += (
-                " Small ones are usual (attitude jitter, relief); where they matter, the verdict says so."
-            )
+        answer = f"Not in {listed(marked, 6)}: in most of their cells the residuals point the same way."
+        usual = " Small ones are usual (attitude jitter, relief); where they matter, the verdict says so."
+        answer += usual * adjusted
     answer += (
         " A cell is darker where its error is larger; thin lines are single residuals; a bold arrow is the mean of a"
         f" cell that is larger than chance allows. {key}"
     )
-    folds = []
     if adjusted:
         before, _, key = residual_panels(views, files.observations, "before")
         folds.append((f"Before the adjustment. {key}", before))
@@ -220,10 +203,8 @@ def _pairs(files: RunFiles) -> Section | None:
     if not pairs:
         return None
     ends = [(number[pair.a] + 1, number[pair.b] + 1) for pair in pairs]
-    rows = [
-        charts.Row(f"{a} - {b}", f"{pair.a} - {pair.b}", *pair.offset_rms)
-        for (a, b), pair in zip(ends, pairs, strict=True)
-    ]
+    numbered_pairs = zip(ends, pairs, strict=True)
+    rows = [charts.Row(f"{a} - {b}", f"{p.a} - {p.b}", *p.offset_rms) for (a, b), p in numbered_pairs]
     answer = (
         f"The epipolar offset, which no height explains, is {max(row.last for row in rows):.3f} px (RMS) in the worst"
         " pair; stereo matching along epipolar lines wants it well below 0.5 px."
@@ -285,13 +266,10 @@ def _gauge(files: RunFiles) -> Section | None:
     answer = "Images fix each other, not their place on the Earth. What is left open, one sigma, the weakest first."
     if scene.num_held_in_height:
         answer += f" {scene.num_held_in_height} tie points seen under too small an angle were held in height."
-    tables = []
-    if gcps:
-        tables.append(
-            table("gcps", "Ground control: adjusted minus given place", gcps, GcpEntry, GcpEntry.PAGE)
-        )
-    else:
+    if not gcps:
         answer += " Ground control points (--gcp) are what helps where it matters."
+    caption = "Ground control: adjusted minus given place"
+    tables = [table("gcps", caption, gcps, GcpEntry, GcpEntry.PAGE)] if gcps else []
     return Section("gauge", "What can the images not tell?", answer, bars=bars, tables=tables, half=True)
 
 
@@ -299,20 +277,24 @@ def _check_points(files: RunFiles) -> Section | None:
     points = files.summary.check_points
     if not points:
         return None
-    image = np.array([r for point in points for r in point.seen]).reshape(-1, 2)
-    missed = [point.residual_enu_m for point in points if None not in point.residual_enu_m]
-    ground = np.array(missed, dtype=np.float64).reshape(-1, 3)
+    image = [r for point in points for r in point.seen]
+    ground = [point.residual_enu_m for point in points if None not in point.residual_enu_m]
     parts = []
-    if len(image):
-        parts.append(f"{np.sqrt((image**2).sum(axis=1).mean()):.2f} px in the images")
-    if len(ground):
-        rms = ", ".join(metres(value) for value in np.sqrt((ground**2).mean(axis=0)))
-        parts.append(f"{rms} east, north, up on the ground")
+    if image:
+        parts.append(f"{np.hypot(*_rms(image)):.2f} px in the images")
+    if ground:
+        parts.append(f"{', '.join(map(metres, _rms(ground)))} east, north, up on the ground")
     found = " and ".join(parts) or "nothing: no camera sees them"
     answer = f"{len(points)} check points, which the adjustment did not see, are met to {found} (RMS)."
     caption = "Check points: found minus given place"
     tables = [table("check-points", caption, points, CheckPointEntry, CheckPointEntry.PAGE)]
     return Section("accuracy", "How accurate is it on the ground?", answer, tables=tables)
+
+
+def _rms(rows: Any) -> Array:
+    """Root mean square of each column."""
+    found: Array = np.sqrt((np.array(rows, dtype=np.float64) ** 2).mean(axis=0))
+    return found
 
 
 def _files(files: RunFiles) -> Section | None:
@@ -332,9 +314,9 @@ def _files(files: RunFiles) -> Section | None:
     if not tables:
         return None
     worst = largest([value for view in views for value in (view.fit.max_px if view.fit else (None,))])
-    answer = "Not known for every image."
-    if worst is not None:
-        answer = f"Yes, to {worst:.1e} px at worst, on check points over each image and its altitudes."
+    answer = f"Yes, to {worst or 0.0:.1e} px at worst, on check points over each image and its altitudes."
+    if worst is None:
+        answer = "Not known for every image."
     answer += (
         " Every file was reopened and compared before it counted as written. Give other tools these files, never the"
         " old image alone."
@@ -348,22 +330,19 @@ def _reading(found: float | str | None) -> Cell:
 
 
 def _run(files: RunFiles) -> Section:
-    summary = files.summary
-    tracks, stages = summary.tracks, summary.stages
-    answer = (
-        f"{len(summary.views)} images, {tracks.num_tracks} tie points, {tracks.num_observations} observations"
-    )
-    answer += f", {sum(stage.seconds for stage in stages):.1f} s." if stages else "."
+    summary, stages, tracks = files.summary, files.summary.stages, files.summary.tracks
+    counts = f"{tracks.num_tracks} tie points, {tracks.num_observations} observations"
+    seconds = f", {sum(stage.seconds for stage in stages):.1f} s" if stages else ""
+    answer = f"{len(summary.views)} images, {counts}{seconds}."
     if not summary.tables.complete:
         answer += f" Tables and charts hold {summary.tables.num_written_tracks} tie points, evenly taken."
     longest = max([stage.seconds for stage in stages], default=1.0) or 1.0
     bars = [(s.stage, f"{s.seconds:.2f} s", 100 * s.seconds / longest) for s in stages]
-    options = [
-        [cell_of(key), cell_of(str(value))] for key, value in flat_options(summary.options or {}).items()
-    ]
+    options = flat_options(summary.options or {})
+    rows = [[cell_of(key), cell_of(str(value))] for key, value in options.items()]
     tables = [
         table("stages", "Stages of the run", stages, StageEntry, StageEntry.PAGE, folded=True),
-        Table("options", "Options of the run", ["option", "value"], options, folded=True),
+        Table("options", "Options of the run", ["option", "value"], rows, folded=True),
     ]
     return Section("run", "How was this made, and how long did it take?", answer, bars=bars, tables=tables)
 

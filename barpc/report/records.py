@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
-from operator import attrgetter
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -25,8 +24,7 @@ from typing import (
 
 import numpy as np
 
-Number = float | None
-"""A number; None (null) stands for what is not finite."""
+Number = float | None  # A number; None (null) stands for what is not finite
 _WORDS = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
 
 
@@ -52,10 +50,8 @@ def said(
         How its numbers are written there; empty for whole numbers and names.
     adjusted : bool
         Whether only an adjustment has it: other runs leave its column out.
-    default
-        None for an optional value.
-    **schema
-        More words of its JSON schema.
+    default, **schema
+        None for an optional value; more words of its JSON schema.
     """
     end = f" [{unit}]" if unit else ""
     heads = tuple(f"{words}{end}" for words in ((head,) if isinstance(head, str) else head))
@@ -82,17 +78,13 @@ class Record:
         """The record of what a file holds, checked before; what it does not know is passed over."""
         readers = _readers(cls)  # type: ignore[arg-type]  # a class can be hashed
         known = ((key, value, readers[key]) for key, value in found.items() if key in readers)
-        return cls(
-            **{key: read(value) if read and value is not None else value for key, value, read in known}
-        )
+        return cls(**{key: read(item) if read and item is not None else item for key, item, read in known})
 
     @classmethod
     def json_schema(cls) -> dict[str, Any]:
         """Its JSON schema."""
         hints = get_type_hints(cls, include_extras=True)
-        words = {
-            field.name: {**schema_of(hints[field.name]), **field.metadata["schema"]} for field in fields(cls)
-        }
+        words = {one.name: {**schema_of(hints[one.name]), **one.metadata["schema"]} for one in fields(cls)}
         return {
             "type": "object",
             "properties": words,
@@ -121,15 +113,20 @@ def _reader(kind: Any) -> Callable[[Any], Any] | None:
 
 def schema_of(kind: Any) -> dict[str, Any]:
     """The JSON schema of a type."""
-    if get_origin(kind) is Annotated:
-        first, words = get_args(kind)
-        return {**schema_of(first), **words}
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return {**schema_of(parts[0]), **parts[1]}
+    if origin is Literal:
+        return {"enum": list(parts)}
+    if origin is Mapping:
+        return {"type": "object", "additionalProperties": schema_of(parts[1])}
+    if origin is tuple:
+        fixed = {} if parts[-1] is Ellipsis else {"minItems": len(parts), "maxItems": len(parts)}
+        return {"type": "array", **fixed, "items": schema_of(parts[0])}
+    if origin is not None:
+        return _either(parts)
     if isinstance(kind, type) and issubclass(kind, Record):
         return kind.json_schema()
-    return _COMPOSED[get_origin(kind)](get_args(kind)) if get_origin(kind) else _single(kind)
-
-
-def _single(kind: Any) -> dict[str, Any]:
     return {} if kind is Any else {"type": _WORDS[kind]}
 
 
@@ -142,47 +139,26 @@ def _either(parts: Sequence[Any]) -> dict[str, Any]:
     return {**rest[0], "type": [rest[0]["type"], *simple]} if rest else {"type": simple}
 
 
-def _array(items: Sequence[Any]) -> dict[str, Any]:
-    fixed = {} if items[-1] is Ellipsis else {"minItems": len(items), "maxItems": len(items)}
-    return {"type": "array", **fixed, "items": schema_of(items[0])}
-
-
-_COMPOSED: dict[Any, Any] = {
-    Union: _either,
-    UnionType: _either,
-    tuple: _array,
-    Mapping: lambda parts: {"type": "object", "additionalProperties": schema_of(parts[1])},
-    Literal: lambda values: {"enum": list(values)},
-}
-
-
 def plain(value: Any) -> Any:
     """A value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
     if is_dataclass(value) and not isinstance(value, type):
+        unset = {f.name for f in fields(value) if f.default is None and isinstance(value, Record)}
         held = {f.name: getattr(value, f.name) for f in fields(value) if f.name[0] != "_"}
-        if isinstance(value, Record):
-            unset = {f.name for f in fields(value) if f.default is None}
-            held = {key: item for key, item in held.items() if item is not None or key not in unset}
-        return plain(held)
+        return plain({key: item for key, item in held.items() if item is not None or key not in unset})
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist())
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
     if isinstance(value, float):
         return value if np.isfinite(value) else None
-    if value is None or isinstance(value, (bool, int, str)):
-        return value
-    return str(value)
+    return value if value is None or isinstance(value, (bool, int, str)) else str(value)
 
 
 # --- tables -----------------------------------------------------------------------------------------------
 
-MAX_TABLE_ROWS = 1000
-"""A table of the page shows so many rows; the files beside it have all."""
+MAX_TABLE_ROWS = 1000  # A table of the page shows so many rows; the files beside it have all
 
 
 @dataclass(frozen=True)
@@ -224,9 +200,8 @@ class Table:
     @property
     def kinds(self) -> list[str]:
         """How each column is set: "text" on the left, "number" on the right."""
-        first = self.rows[0] if self.rows else []
-        kinds = ["number" if cell.kind == "number" else "text" for cell in first]
-        return kinds or ["text"] * len(self.columns)
+        first = self.rows[0] if self.rows else [Cell("", "", "name")] * len(self.columns)
+        return ["number" if cell.kind == "number" else "text" for cell in first]
 
     @property
     def texts(self) -> list[list[str]]:
@@ -281,8 +256,7 @@ def column_of(kind: Any, path: str) -> Column:
         parts = (hint, *get_args(hint))
         kind = next((part for part in parts if isinstance(part, type) and issubclass(part, Record)), kind)
     heads, form, adjusted = declared.metadata["column"]
-    value = partial(value_of, path=path) if "." in path else attrgetter(path)
-    return Column(heads, value, form, adjusted)
+    return Column(heads, partial(value_of, path=path), form, adjusted)
 
 
 def value_of(record: Any, path: str) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -37,25 +38,10 @@ class PairTies:
 class Run:
     """Everything that a run found out.
 
-    Parameters
-    ----------
-    kind : {"adjust", "check", "match"}
-        Whether cameras were adjusted, looked at, or only tied.
-    sources : tuple of Camera
-        Where the views' RPCs came from; empty for views that were not read from files.
-    matched : tuple of PairReport
-        Pairs that were matched; empty for tie points from a file.
-    adjustment, centers, fits
-        Of an adjustment that went so far.
-    written : tuple of mapping
-        Per view: output name to what each consumer that reopened it found: the largest difference to P_BA
-        [px], or why it does not read the file.
-    left_out : tuple of (str, str)
-        Files that were left out, and why.
-    stages : sequence of mapping
-        Seconds and peak memory of the stages so far.
-    check_points : GroundPoints or None
-        Ground points that stayed out of the adjustment.
+    `sources`: where the views' RPCs came from (empty: not from files); `matched`: pairs that were matched (empty: tie
+    points from a file); `adjustment`, `centers`, `fits`: of an adjustment that went so far; `written`, per view: file,
+    consumer that reopened it, largest difference to P_BA [px] or why it does not read it; `left_out`: files, and why;
+    `stages`: their seconds and peak memory so far; `check_points` stayed out of the adjustment.
     """
 
     kind: Literal["adjust", "check", "match"]
@@ -113,15 +99,10 @@ class Run:
                     found.setdefault(name, f"{other}, moved by {col:.0f} columns and {row:.0f} rows")
         return found
 
-    @property
-    def start_altitude(self) -> float:
-        """Where triangulation starts [m]."""
-        return middle_altitude(self.views)
-
     @cached_property
     def ties_before(self) -> Triangulation:
         """The tie points through the delivered cameras."""
-        return triangulate_tracks(self.tracks, self.before, self.start_altitude, self.keep)
+        return triangulate_tracks(self.tracks, self.before, middle_altitude(self.views), self.keep)
 
     @cached_property
     def altitudes_before(self) -> Array:
@@ -133,7 +114,7 @@ class Run:
         """The tie points through the new cameras; None for a check."""
         if self.after is None:
             return None
-        return triangulate_tracks(self.tracks, self.after, self.start_altitude, self.keep)
+        return triangulate_tracks(self.tracks, self.after, middle_altitude(self.views), self.keep)
 
     @cached_property
     def ground(self) -> Array:
@@ -150,7 +131,7 @@ class Run:
     def altitude(self) -> float:
         """Altitude of the scene [m]: the median of its tie points; without any, where they would start."""
         alt = self.ground[np.isfinite(self.ground).all(axis=1), 2]
-        return float(np.median(alt)) if len(alt) else self.start_altitude
+        return float(np.median(alt)) if len(alt) else middle_altitude(self.views)
 
 
 def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
@@ -158,23 +139,18 @@ def pair_ties(tracks: Tracks, keep: BoolArray | None = None) -> list[PairTies]:
     rows = np.arange(len(tracks)) if keep is None else np.flatnonzero(keep)
     rows = rows[np.lexsort((tracks.view[rows], tracks.point[rows]))]
     point = tracks.point[rows]
-    found_a, found_b = [], []
+    found = [np.empty((2, 0), dtype=np.int64)]
     for step in range(1, int(np.bincount(point).max(initial=1))):
         together = point[step:] == point[:-step]
-        found_a.append(rows[:-step][together])
-        found_b.append(rows[step:][together])
-    if not found_a:
-        return []
-    a, b = np.concatenate(found_a), np.concatenate(found_b)
-    num = int(tracks.view.max()) + 1
-    code = tracks.view[a] * num + tracks.view[b]
-    order = np.lexsort((a, code))
-    a, b, code = a[order], b[order], code[order]
-    starts = np.flatnonzero(np.diff(code, prepend=-1))
-    ends = np.append(starts[1:], len(code))
+        found.append(np.stack([rows[:-step][together], rows[step:][together]]))
+    a, b = np.concatenate(found, axis=1)
+    views = np.stack([tracks.view[a], tracks.view[b]])
+    order = np.lexsort((a, *views[::-1]))
+    a, b, views = a[order], b[order], views[:, order]
+    starts = np.flatnonzero((np.diff(views, axis=1, prepend=-1) != 0).any(axis=0))
     return [
-        PairTies((int(code[s] // num), int(code[s] % num)), a[s:e], b[s:e])
-        for s, e in zip(starts, ends, strict=True)
+        PairTies((int(views[0, s]), int(views[1, s])), a[s:e], b[s:e])
+        for s, e in pairwise([*starts.tolist(), len(a)])
     ]
 
 

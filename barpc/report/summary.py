@@ -7,7 +7,7 @@ columns of a table there, it stands in that, too.
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version as package_version
 from operator import attrgetter
 from typing import Annotated, Any, ClassVar, Literal
@@ -33,12 +33,9 @@ from barpc.sensor.geometry import (
 from barpc.tie import PairReport
 from barpc.tie.epipolar import robust_spread
 
-SCHEMA = 2
-"""Version of summary.json."""
-MAX_PER_PAIR = 1000
-"""Matches of a pair that its epipolar offset is measured on, evenly taken."""
-CELLS = 8
-"""Cells of an image from left to right and from top to bottom."""
+SCHEMA = 2  # Version of summary.json
+MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken
+CELLS = 8  # Cells of an image from left to right and from top to bottom
 
 STATUS_WORDS = {
     "adjusted": "adjusted",
@@ -131,6 +128,18 @@ def largest(values: Sequence[float | None] | None) -> float | None:
     return None if not values or None in values else max(value for value in values if value is not None)
 
 
+def listed(names: Sequence[str], most: int = 10) -> str:
+    """Names in a sentence."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def median(values: Iterable[float | None]) -> float:
+    """The median of the finite numbers; NaN without any."""
+    found = np.array(list(values), dtype=np.float64)
+    found = found[np.isfinite(found)]
+    return float(np.median(found)) if len(found) else float("nan")
+
+
 def _percent(share: float | None) -> float | None:
     return None if share is None else 100 * share
 
@@ -141,7 +150,7 @@ def _verdict(view: ViewEntry) -> Cell:
 
 def _rejected(view: ViewEntry) -> float | None:
     every = view.num_observations + view.num_rejected
-    return 100 * view.num_rejected / every if every else None
+    return _percent(view.num_rejected / every) if every else None
 
 
 def _kilometres(view: ViewEntry) -> float | None:
@@ -562,48 +571,44 @@ def _pair(run: Run, ties: PairTies, reports: Mapping[tuple[str, str], PairReport
 def _pair_geometry(a: SensorModel, b: SensorModel, at: Array) -> tuple[float, float, float]:
     """Medians over ground points (n, 3): convergence angle [deg], B/H, height of a pixel of the finer image [m]."""
     if not len(at):
-        return float("nan"), float("nan"), float("nan")
+        return (float("nan"),) * 3
     base = base_to_height(a, b, at)
     finer = np.minimum(ground_sample_distance(a, at)[1], ground_sample_distance(b, at)[1])
     with np.errstate(divide="ignore"):
-        height = float(np.median(finer / base))
-    return float(np.median(convergence_angle(a, b, at))), float(np.median(base)), height
+        medians = np.median([convergence_angle(a, b, at), base, finer / base], axis=1)
+    return tuple(medians.tolist())
 
 
 def _pair_offset(run: Run, ties: PairTies, sensors: Sequence[SensorModel], alt: Array) -> OffsetEntry | None:
     """The epipolar offset of a pair's matches.
 
-    The tracks' altitudes (P,) [m] through these cameras are so near to where the pair's own rays pass each other
-    that two steps from there arrive.
+    The tracks' altitudes (P,) [m] through these cameras are so near to where the pair's own rays pass each other that
+    two steps from there arrive.
     """
     pick = np.linspace(0, len(ties.a) - 1, min(len(ties.a), MAX_PER_PAIR)).astype(np.int64)
-    start = alt[run.tracks.point[ties.a[pick]]]
-    pick, start = pick[np.isfinite(start)], start[np.isfinite(start)]
-    i, j = ties.views
-    image_a, image_b = run.tracks.xy[ties.a[pick]], run.tracks.xy[ties.b[pick]]
-    offset, _ = epipolar_offset(sensors[i], sensors[j], image_a, image_b, start, steps=2)
+    pick = pick[np.isfinite(alt[run.tracks.point[ties.a[pick]]])]
+    (i, j), (a, b), xy = ties.views, (ties.a[pick], ties.b[pick]), run.tracks.xy
+    offset, _ = epipolar_offset(sensors[i], sensors[j], xy[a], xy[b], alt[run.tracks.point[a]], steps=2)
     offset = offset[np.isfinite(offset)]
     if not len(offset):
         return None
-    median, rms = float(np.median(offset)), float(np.sqrt((offset**2).mean()))
-    return OffsetEntry(median, robust_spread(offset, median), rms, len(offset))
+    center, rms = float(np.median(offset)), float(np.sqrt((offset**2).mean()))
+    return OffsetEntry(center, robust_spread(offset, center), rms, len(offset))
 
 
 def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
     """The correction of a view, at the ground point (3,) in the middle of its image."""
     sensor, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
     correction, covariance = adjustment.corrections[i], adjustment.covariance.view(i)
-    unknowns = adjustment.params[i].tolist()
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    common = (model, adjustment.params[i].tolist(), sigma)
     if not isinstance(correction, Correction):
         shift, slope = correction.shift.tolist(), correction.slope.tolist()
-        return CorrectionEntry(model, unknowns, sigma, None, None, shift_px=shift, slope=slope)
+        return CorrectionEntry(*common, None, None, shift_px=shift, slope=slope)
     assert isinstance(sensor, Corrected)
     moved, uncertain = shift_in_image(sensor, covariance, model, middle)
     return CorrectionEntry(
-        model,
-        unknowns,
-        sigma,
+        *common,
         moved.tolist(),
         uncertain.tolist(),
         rotation_urad=(correction.rotation * 1e6).tolist(),
@@ -624,7 +629,9 @@ def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: A
     covariance : (q, q)
         Of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the middle row.
     unknowns : str
-        Which there are: "rotation", "translation", "rotation+translation".
+        "rotation", "translation" or "rotation+translation".
+    ground : (3,)
+        lon, lat [deg], alt [m].
 
     Returns
     -------
@@ -687,9 +694,8 @@ def _gcps(run: Run) -> tuple[GcpEntry, ...]:
     if points is None:
         return ()
     left = np.full_like(points.sigma, np.nan) if run.adjustment is None else run.adjustment.gcp_residuals
-    rows = zip(
-        points.names, *(table.tolist() for table in (points.lonlatalt, points.sigma, left)), strict=True
-    )
+    columns = (table.tolist() for table in (points.lonlatalt, points.sigma, left))
+    rows = zip(points.names, *columns, strict=True)
     return tuple(
         GcpEntry(name, lon, lat, alt, sigma, residual) for name, (lon, lat, alt), sigma, residual in rows
     )
@@ -702,10 +708,10 @@ def _check_points(run: Run) -> tuple[CheckPointEntry, ...]:
         return ()
     left = check_residuals(run.before if run.after is None else run.after, points)
     seen = [SeenEntry(run.views[i].name, r) for i, r in zip(points.view, left.image.tolist(), strict=True)]
-    rows = zip(points.names, points.lonlatalt.tolist(), left.ground.tolist(), strict=True)
+    seen_of = [
+        tuple(seen[row] for row in np.flatnonzero(points.point == i)) for i in range(len(points.names))
+    ]
+    rows = zip(points.names, points.lonlatalt.tolist(), left.ground.tolist(), seen_of, strict=True)
     return tuple(
-        CheckPointEntry(
-            name, lon, lat, alt, miss, tuple(seen[row] for row in np.flatnonzero(points.point == i))
-        )
-        for i, (name, (lon, lat, alt), miss) in enumerate(rows)
+        CheckPointEntry(name, lon, lat, alt, miss, found) for name, (lon, lat, alt), miss, found in rows
     )

@@ -1,4 +1,4 @@
-"""Machine outputs: residuals, pairs, outlines and tie points of a run as CSV, GeoJSON and PLY.
+"""The files of a run, written and read back: residuals, pairs, outlines and tie points as CSV, GeoJSON and PLY.
 
 Residual tables carry the column names of ASP's ``bundle_adjust``. Every file is a function of the run alone:
 the same run gives the same bytes.
@@ -6,19 +6,28 @@ the same run gives the same bytes.
 
 from __future__ import annotations
 
+import csv
+import io
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from barpc import __version__
+from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.geojson import collection, feature
-from barpc.pointio.names import cell
+from barpc.pointio.names import cell, from_cell
 from barpc.report.records import value_of
 from barpc.report.run import Run
-from barpc.report.summary import PairEntry, Summary, ViewEntry
+from barpc.report.summary import SCHEMA, PairEntry, Summary, ViewEntry, published_schema
+from barpc.scene import BoolArray, IntArray
 from barpc.sensor.geometry import footprint
+from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
 
 RESIDUALS = ("lon", "lat", "height_above_datum", "mean_residual", "num_observations", "mean_residual_before")
 """Columns of residuals.csv, properties of residuals.geojson; one row a track. Heights: above the ellipsoid."""
@@ -26,6 +35,7 @@ RESIDUALS = ("lon", "lat", "height_above_datum", "mean_residual", "num_observati
 OBSERVATIONS = ("view", "track", "col", "row", "col_before", "row_before", "col_after", "row_after", "used")
 """Columns of observations.csv, one row an observation: residuals are projected - observed [px]."""
 
+_FAR = 1e12  # px, deg and m: no number of a table comes near
 _NUMBERS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
 
 
@@ -43,25 +53,25 @@ def _per_track(run: Run) -> Array:
 
 def _residual_rows(run: Run, empty: str) -> Iterable[list[str]]:
     for lon, lat, alt, mean, count, before in _per_track(run).tolist():
-        yield [
-            f"{lon:.9f}", f"{lat:.9f}", f"{alt:.4f}", f"{mean:.4f}", f"{count:.0f}", _number(before, 4, empty)
-        ]  # fmt: skip
+        row = [f"{lon:.9f}", f"{lat:.9f}", f"{alt:.4f}", f"{mean:.4f}", f"{count:.0f}"]
+        yield [*row, _number(before, 4, empty)]
 
 
-def _residuals_csv(run: Run, _: Summary) -> str:
-    return "".join(",".join(row) + "\n" for row in (RESIDUALS, *_residual_rows(run, "")))
+def _residuals_csv(run: Run, _: Summary) -> bytes:
+    return "".join(",".join(row) + "\n" for row in (RESIDUALS, *_residual_rows(run, ""))).encode()
 
 
-def _residuals_geojson(run: Run, _: Summary) -> str:
+def _residuals_geojson(run: Run, _: Summary) -> bytes:
     features = []
     for row in _residual_rows(run, "null"):
         place = f'{{"type": "Point", "coordinates": [{", ".join(row[:3])}]}}'
         properties = ", ".join(f'"{name}": {value}' for name, value in zip(RESIDUALS, row, strict=True))
         features.append(f'{{"type": "Feature", "geometry": {place}, "properties": {{{properties}}}}}')
-    return '{"type": "FeatureCollection", "features": [\n' + ",\n".join(features) + "\n]}\n"
+    text = ",\n".join(features)
+    return f'{{"type": "FeatureCollection", "features": [\n{text}\n]}}\n'.encode()
 
 
-def _observations_csv(run: Run, _: Summary) -> str:
+def _observations_csv(run: Run, _: Summary) -> bytes:
     tracks, wanted = run.tracks, np.zeros(run.tracks.num_points, dtype=bool)
     wanted[run.written_tracks] = True
     rows = np.flatnonzero(wanted[tracks.point])
@@ -75,33 +85,33 @@ def _observations_csv(run: Run, _: Summary) -> str:
     for view, track, row, used, full in zip(*(column.tolist() for column in columns), strict=True):
         text = _NUMBERS(*row) if full else ",".join(_number(value, 4) for value in row)
         lines.append(f"{names[view]},{track},{text},{used:d}")
-    return "\n".join(lines) + "\n"
+    return ("\n".join(lines) + "\n").encode()
 
 
-def _pairs_csv(_: Run, summary: Summary) -> str:
+def _pairs_csv(_: Run, summary: Summary) -> bytes:
     lines = [[path.replace(".", "_") + "_px" * ("." in path) for path in PairEntry.CSV.split()]]
     lines += [[_cell(value_of(pair, path)) for path in PairEntry.CSV.split()] for pair in summary.pairs]
-    return "".join(",".join(line) + "\n" for line in lines)
+    return "".join(",".join(line) + "\n" for line in lines).encode()
 
 
 def _cell(value: str | float | None) -> str:
-    return (
-        cell(value) if isinstance(value, str) else str(value) if isinstance(value, int) else _number(value, 5)
-    )
+    if isinstance(value, str):
+        return cell(value)
+    return str(value) if isinstance(value, int) else _number(value, 5)
 
 
 def _number(value: float | None, digits: int, empty: str = "") -> str:
     return empty if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
 
 
-def _footprints(run: Run, summary: Summary) -> str:
+def _footprints(run: Run, summary: Summary) -> bytes:
     """Every image at the scene's altitude, through the adjusted cameras, or the cameras as they are for a check."""
     features = []
     for view, sensor, entry in zip(run.views, run.after or run.before, summary.views, strict=True):
         ring = np.round(footprint(sensor, view.size, run.altitude), 9)
         properties = {key: getattr(entry, key) for key in ViewEntry.FOOTPRINT.split()}
         features.append(feature(ring, **properties, altitude_m=summary.altitude_m))
-    return json.dumps(collection(features)) + "\n"
+    return (json.dumps(collection(features)) + "\n").encode()
 
 
 def _points_ply(run: Run, _: Summary) -> bytes:
@@ -113,14 +123,13 @@ def _points_ply(run: Run, _: Summary) -> bytes:
     local = (ecef_from_ground(rows[:, :3]) - ecef_from_ground(origin)) @ enu_basis(origin).T
     kind = np.dtype([(n, "<f8") for n in "xyz"] + [("mean_residual", "<f4"), ("num_observations", "<i4")])
     records = np.empty(len(rows), dtype=kind)
-    for k, name in enumerate("xyz"):
-        records[name] = local[:, k]
-    records["mean_residual"], records["num_observations"] = rows[:, 3], rows[:, 4]
+    for name, values in zip(kind.names or (), [*local.T, rows[:, 3], rows[:, 4]], strict=True):
+        records[name] = values
+    place = f"lon {origin[0]:.9f} lat {origin[1]:.9f} alt {origin[2]:.4f} (WGS84, above the ellipsoid)"
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment barpc {__version__}: x east, y north, z up [m] of lon {origin[0]:.9f} lat {origin[1]:.9f}"
-        f" alt {origin[2]:.4f} (WGS84, above the ellipsoid)",
+        f"comment barpc {__version__}: x east, y north, z up [m] of {place}",
         f"element vertex {len(rows)}",
         *(f"property double {name}" for name in "xyz"),
         "property float mean_residual",
@@ -130,16 +139,165 @@ def _points_ply(run: Run, _: Summary) -> bytes:
     return ("\n".join(header) + "\n").encode() + records.tobytes()
 
 
-def _encoded(made: Callable[[Run, Summary], str]) -> Callable[[Run, Summary], bytes]:
-    return lambda run, summary: made(run, summary).encode()
-
-
 TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
-    "residuals.csv": _encoded(_residuals_csv),
-    "residuals.geojson": _encoded(_residuals_geojson),
-    "observations.csv": _encoded(_observations_csv),
-    "pairs.csv": _encoded(_pairs_csv),
-    "footprints.geojson": _encoded(_footprints),
+    "residuals.csv": _residuals_csv,
+    "residuals.geojson": _residuals_geojson,
+    "observations.csv": _observations_csv,
+    "pairs.csv": _pairs_csv,
+    "footprints.geojson": _footprints,
     "points.ply": _points_ply,
 }
 """File name -> its bytes, of a run and its summary."""
+
+
+# --- read back --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """observations.csv: index of the view (K,), col, row (K, 2) [px], whether it was kept (K,).
+
+    `before`, `after` (K, 2): projected - observed [px]; NaN where there is none.
+    """
+
+    view: IntArray
+    xy: Array
+    before: Array
+    after: Array
+    used: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class RunFiles:
+    """What lies in the folder of a run.
+
+    `points` (n, 4): lon, lat [deg], altitude [m], mean residual [px] of the tie points; `outlines`: the rings (m, 2) of
+    every view's footprint, lon, lat [deg], closed, cut at the antimeridian.
+    """
+
+    summary: Summary
+    observations: Observations
+    points: Array
+    outlines: Sequence[Sequence[Array]]
+
+    @property
+    def number(self) -> dict[str, int]:
+        """Name of an image -> its index."""
+        return {view.name: k for k, view in enumerate(self.summary.views)}
+
+
+def read_summary(folder: Path) -> Summary:
+    """summary.json of a run folder.
+
+    Raises
+    ------
+    InputError
+        There is none, it does not parse, or another release's schema.
+    """
+    path = folder / "summary.json"
+    if not path.exists():
+        raise InputError(f"{folder}: no summary.json, so no finished run")
+    found = read_json(path, SUMMARY)
+    version = found.get("schema") if isinstance(found, dict) else None
+    if version != SCHEMA:
+        raise InputError(f"{path}: schema {version!r}, this release reads {SCHEMA}: run the adjustment again")
+    try:
+        _validate()(found)
+        summary = Summary.read(found)
+        names = {view.name for view in summary.views}
+        if len(names) < len(summary.views):
+            raise ValueError("two images have one name")
+        for pair in summary.pairs:
+            if pair.a == pair.b or not {pair.a, pair.b} <= names:
+                raise ValueError(f"no pair of its images is {pair.a} - {pair.b}")
+    except ValueError as error:  # fastjsonschema's own are some
+        why = str(error).replace("data", "summary", 1) if str(error).startswith("data") else str(error)
+        raise InputError(f"{path}: damaged, {why}: run the adjustment again") from None
+    return summary
+
+
+@cache
+def _validate() -> Callable[[Any], Any]:
+    import fastjsonschema
+
+    found: Callable[[Any], Any] = fastjsonschema.compile(published_schema())
+    return found
+
+
+def read_tables(summary: Summary, folder: Path) -> RunFiles:
+    """The tables of a run folder, beside a summary that is at hand.
+
+    Raises
+    ------
+    InputError
+        A table is missing or damaged; the message names it.
+    """
+    names = [view.name for view in summary.views]
+    outlines = _read(folder / "footprints.geojson", GEOJSON, _outlines)
+    if len(outlines) != len(names):
+        raise InputError(f"{folder / 'footprints.geojson'}: {len(outlines)} outlines of {len(names)} images")
+    observations = _read(folder / "observations.csv", TABLE, lambda text: _observations(text, names))
+    return RunFiles(summary, observations, _read(folder / "residuals.csv", TABLE, _points), outlines)
+
+
+def _read(path: Path, kind: Kind, parse: Any) -> Any:
+    text = read_text(path, kind)
+    try:
+        return parse(text)
+    except (ValueError, LookupError, TypeError, AttributeError, StopIteration, csv.Error) as error:
+        raise InputError(f"{path}: damaged ({error!r}); run the adjustment again") from error
+
+
+def _columns(text: str, header: Sequence[str]) -> list[list[str]]:
+    rows = csv.reader(io.StringIO(text, newline=""))
+    if tuple(next(rows)) != tuple(header):
+        raise ValueError(f"its columns are not {', '.join(header)}")
+    columns = [list(column) for column in zip(*rows, strict=True)]
+    if columns and len(columns) != len(header):
+        raise ValueError(f"rows of {len(columns)} cells")
+    return columns or [[] for _ in header]
+
+
+def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
+    """Columns (n, len(columns)) of numbers, of which only those after the first `known` may be empty (NaN)."""
+    table = np.array([[float(cell or "nan") for cell in column] for column in columns], dtype=np.float64).T
+    if np.isnan(table[:, :known]).any() or (np.abs(table) > _FAR).any():
+        raise ValueError("a number is missing or absurdly large")
+    return table
+
+
+def _observations(text: str, names: Sequence[str]) -> Observations:
+    columns = _columns(text, OBSERVATIONS)
+    index = {name: i for i, name in enumerate(names)}
+    view = np.array([index[from_cell(name)] for name in columns[0]], dtype=np.int64)
+    numbers = _floats(columns[2:8], 2)
+    used = np.array([cell == "1" for cell in columns[8]], dtype=bool)
+    return Observations(view, numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
+
+
+def _points(text: str) -> Array:
+    return _in_degrees(_floats(_columns(text, RESIDUALS)[:4], 3))
+
+
+def _in_degrees(places: Array) -> Array:
+    if not (np.abs(places[:, :2]) <= (540.0, 90.0)).all():
+        raise ValueError("a place is no longitude and latitude")
+    return places
+
+
+def _outlines(text: str) -> list[list[Array]]:
+    outlines = []
+    for item in parse_json(text)["features"]:
+        geometry = item["geometry"] or {"type": "MultiPolygon", "coordinates": []}
+        parts = geometry["coordinates"]
+        parts = [parts] if geometry["type"] == "Polygon" else parts
+        outlines.append([_ring(part[0]) for part in parts])
+    return outlines
+
+
+def _ring(positions: Any) -> Array:
+    """A closed outline (m, 2) [deg]."""
+    ring = np.array(positions, dtype=np.float64)
+    if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 4:
+        raise ValueError(f"an outline of shape {ring.shape}")
+    return _in_degrees(ring)

@@ -12,25 +12,17 @@ from barpc.ba import Adjustment, check_residuals
 from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import Run
-from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, measure, metres
+from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
 
-GOOD_RMSE = 0.5
-"""A view whose tie points are left with more than this [px] is called doubtful."""
-FEW_OBSERVATIONS = 30
-"""A view with fewer is called weakly tied, unless control points hold it."""
-ENOUGH_GCPS = 3
-"""Control points that hold a view without any tie point."""
-MANY_REJECTED = 0.3
-"""A view that lost a larger share of its observations is called doubtful."""
+GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
+FEW_OBSERVATIONS = 30  # A view with fewer is called weakly tied, unless control points hold it
+ENOUGH_GCPS = 3  # Control points that hold a view without any tie point
+MANY_REJECTED = 0.3  # A view that lost a larger share of its observations is called doubtful
 
-SMOOTH_LEFT = 0.06
-"""A view whose residuals hold more than this [px] that is no scatter is called doubtful."""
-PRIOR_WIDENED = 2.0
-"""Cameras that are farther off than stated by more than this factor need a look."""
-NOISE_LIMIT = 2.5
-"""Tie points that scatter by more than so many times what the matcher states need a look."""
-MOVED = 3.0
-"""A scene that moved by more than so many of its own standard deviations needs a look."""
+SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
+PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
+NOISE_LIMIT = 2.5  # Tie points that scatter by more than so many times what the matcher states need a look
+MOVED = 3.0  # A scene that moved by more than so many of its own standard deviations needs a look
 
 GOOD = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
 """Kind of a run -> the status of a view without reservation."""
@@ -39,71 +31,61 @@ _ALL_WELL = {
     "check": "The cameras of all {} images agree",
     "match": "All {} images are tied together",
 }
-_LISTED = 10  # names in a sentence
 
 
 def view_status(view: ViewEntry, run: Run) -> dict[str, str]:
     """The verdict on a view: a word of `STATUS_WORDS`, and what to do (empty when all is well)."""
-    for status, advice in (_failure(view, run), _weakness(view), _doubt(view, run)):
-        if advice:
+    for status, reason in (("failed", _failure), ("weak", _weakness), ("doubtful", _doubt)):
+        if advice := reason(view, run):
             return {"status": status, "advice": advice}
     return {"status": GOOD[run.kind], "advice": ""}
 
 
-def _failure(view: ViewEntry, run: Run) -> tuple[str, str]:
+def _failure(view: ViewEntry, run: Run) -> str:
     tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
     if run.adjustment is not None and view.name in run.adjustment.left_out:
-        return "failed", "not tied to the other images: its camera was left as it was"
+        return "not tied to the other images: its camera was left as it was"
     if view.fit is not None and not max(map(_known, view.fit.max_px)) <= tolerance:
-        return (
-            "failed",
-            f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range",
-        )
-    return "failed", ""
+        return f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range"
+    return ""
 
 
-def _weakness(view: ViewEntry) -> tuple[str, str]:
+def _weakness(view: ViewEntry, _: Run) -> str:
     few = view.num_observations
     if few >= FEW_OBSERVATIONS or view.num_gcps >= ENOUGH_GCPS:
-        return "weak", ""
-    return "weak", f"{f'only {few}' if few else 'no'} tie points: check overlap, clouds and dates"
+        return ""
+    return f"{f'only {few}' if few else 'no'} tie points: check overlap, clouds and dates"
 
 
-def _doubt(view: ViewEntry, run: Run) -> tuple[str, str]:
+def _doubt(view: ViewEntry, run: Run) -> str:
     if run.kind == "match":  # how well cameras agree is not what was asked
-        return "doubtful", ""
+        return ""
     if view.name in run.copies:
-        return "doubtful", f"shows the same pixels as {run.copies[view.name]}: give each image once"
-    if run.adjustment is not None and (odd := _oddity(view.name, run.adjustment)):
-        return "doubtful", odd
-    if run.adjustment is not None and (left := _left(view.name, run.adjustment)):
-        return "doubtful", left
+        return f"shows the same pixels as {run.copies[view.name]}: give each image once"
+    if run.adjustment is not None:
+        found = _oddity(view.name, run.adjustment) or _left(view.name, run.adjustment)
+        if found:
+            return found
     error = _known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
     if not error <= GOOD_RMSE and view.num_observations:
         if run.kind == "check":
-            return "doubtful", f"tie points disagree by {error:.2f} px: adjust the cameras"
-        return (
-            "doubtful",
-            f"tie points are left with {error:.2f} px: look for wrong matches and moving things",
-        )
+            return f"tie points disagree by {error:.2f} px: adjust the cameras"
+        return f"tie points are left with {error:.2f} px: look for wrong matches and moving things"
     lost = view.num_rejected / max(view.num_rejected + view.num_observations, 1)
     if lost > MANY_REJECTED:
         return (
-            "doubtful",
             f"{100 * lost:.0f} % of its tie points were rejected, scattered around what is smooth: look for clouds, "
-            "water, change",
+            "water, change"
         )
-    return "doubtful", ""
+    return ""
 
 
 def _oddity(name: str, adjustment: Adjustment) -> str:
     """What is wrong with a view beside the others: its RPC, or something smooth that no correction follows."""
     i, prior, smooth = adjustment.names.index(name), adjustment.prior, adjustment.smooth
     if prior.odd[i]:
-        others = [
-            other for other, odd in zip(adjustment.names, prior.odd, strict=True) if odd and other != name
-        ]
-        either = f" (or that of {_listed(others)}: the tie points cannot tell)" if others else ""
+        others = [adjustment.names[j] for j in np.flatnonzero(prior.odd) if j != i]
+        either = f" (or that of {listed(others)}: the tie points cannot tell)" if others else ""
         return (
             f"its RPC is {prior.scale[i]:.0f} times farther off than stated, beside the other images{either}: check "
             "that it belongs to this image"
@@ -113,9 +95,8 @@ def _oddity(name: str, adjustment: Adjustment) -> str:
         why = "attitude jitter, optics, or steps between detectors, which one RPC does not follow"
         if adjustment.options.drift == 0:
             why = "a drift was not allowed (--drift 0)"
-        return (
-            f"an error of {max(smooth.rms[i], smooth.shared[i]):.2f} px that changes {along} is left: {why}"
-        )
+        size = max(smooth.rms[i], smooth.shared[i])
+        return f"an error of {size:.2f} px that changes {along} is left: {why}"
     return ""
 
 
@@ -144,10 +125,10 @@ def _block_reasons(run: Run) -> list[str]:
             "what is known of the scene's place with them."
         )
     if (in_space := run.adjustment.in_space_rms) is not None:
-        tilts = ", ".join(metres(s) for s in run.adjustment.gauge.motion_sigma[3:5])
+        tilts = _lengths(run.adjustment.gauge.motion_sigma[3:5])
         out.append(
             f"Rotations and translations leave {in_space:.2f} px of tie points that took no part; an affine in each "
-            f"image leaves {_median(run.adjustment.held_out_rms):.2f} px and was taken: images that were turned, "
+            f"image leaves {median(run.adjustment.held_out_rms):.2f} px and was taken: images that were turned, "
             "resampled or cropped otherwise than their RPCs say, or RPCs of other images. Its tilts are known to "
             f"{tilts} (east, north) only."
         )
@@ -193,35 +174,27 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
     reasons = [f"{view.name}: {STATUS_WORDS[view.status]}: {view.advice}." for view in bad + look]
     reasons += [f"{path} was left out: {reason}" for path, reason in run.left_out]
     whole, points = _block_reasons(run), _control_reasons(run)
-    control = whole + points
-    lines = {"adjust": _adjusted_lines, "check": _checked_lines, "match": _matched_lines}[run.kind](
-        run, views
-    )
+    reasons += whole + points
+    words = {"adjust": _adjusted_lines, "check": _checked_lines, "match": _matched_lines}[run.kind]
     num_bad = len(bad) + len(run.left_out)
+    more = "the block needs" if whole else "ground points need" * bool(points)
     return {
-        "status": "bad" if num_bad else "look" if look or control else "good",
-        "headline": _headline(
-            run,
-            len(views),
-            num_bad,
-            len(look),
-            "the block needs" if whole else "ground points need" * bool(points),
-        ),
-        "lines": lines + reasons + control,
-        "reasons": reasons + control,
+        "status": "bad" if num_bad else "look" if reasons else "good",
+        "headline": _headline(run, len(views), num_bad, len(look), more),
+        "lines": words(run, views) + reasons,
+        "reasons": reasons,
     }
 
 
 def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
-    text = _ALL_WELL[run.kind].format(num)
-    if bad or look:
-        parts = []
-        if bad:
-            word = "not adjusted" if run.kind == "adjust" else "not usable"
-            parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
-        if look:
-            parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
-        text = f"{', '.join(parts)[0].upper()}{', '.join(parts)[1:]} (of {num + len(run.left_out)})"
+    text, parts = _ALL_WELL[run.kind].format(num), []
+    if bad:
+        word = "not adjusted" if run.kind == "adjust" else "not usable"
+        parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
+    if look:
+        parts.append(f"{look} {'needs' if look == 1 else 'need'} a look")
+    if parts:
+        text = f"{', '.join(parts)} (of {num + len(run.left_out)})"
     return f"{text}; {more} a look." if more else f"{text}."
 
 
@@ -229,73 +202,56 @@ def _control_reasons(run: Run) -> list[str]:
     """Ground points that were cut, and images that their files name and that are not there."""
     out = []
     if run.gcps is not None and run.adjustment is not None and not run.adjustment.gcp_inlier.all():
-        cut = np.unique(run.gcps.point[~run.adjustment.gcp_inlier])
-        names = _listed([run.gcps.names[i] for i in cut])
-        out.append(
-            f"The adjustment rejected observations of {len(cut)} GCPs: {names}: check their coordinates."
-        )
+        cut = [run.gcps.names[i] for i in np.unique(run.gcps.point[~run.adjustment.gcp_inlier])]
+        rejected = f"The adjustment rejected observations of {len(cut)} GCPs: {listed(cut)}"
+        out.append(f"{rejected}: check their coordinates.")
     for points, what in ((run.gcps, "GCPs"), (run.check_points, "Check points")):
         if points is not None and points.strangers:
-            out.append(f"{what} name images that are not in this run: {_listed(points.strangers)}.")
+            out.append(f"{what} name images that are not in this run: {listed(points.strangers)}.")
     return out
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return f"{', '.join(names[:_LISTED])}{more}"
 
 
 def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     assert run.adjustment is not None
-    before, after = (
-        _median([view.rmse_before for view in views]),
-        _median([view.rmse_after for view in views]),
-    )
-    gauge = run.adjustment.gauge
+    before, after = (median([getattr(view, key) for view in views]) for key in ("rmse_before", "rmse_after"))
+    gauge, prior = run.adjustment.gauge, run.adjustment.prior
     lines = [f"Tie points of {len(views)} images agree to {after:.3f} px (before: {before:.3f} px)."]
     if not len(run.tracks):
         lines = ["There are no tie points: the cameras are held by control points alone."]
-    drift = run.adjustment.cameras.unknowns.drift
-    if run.adjustment.prior.drift_sigma:
-        sizes = ", ".join(metres(s) for s in run.adjustment.prior.drift_sigma)
-        lines.append(
-            f"Rotations change along the rows (drift of degree {drift}; {sizes} at the first and last row)."
-        )
+    drift = f"drift of degree {run.adjustment.cameras.unknowns.drift}"
+    if prior.drift_sigma:
+        sizes = f"{_lengths(prior.drift_sigma)} at the first and last row"
+        lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
     lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
-    known = ", ".join(metres(s) for s in gauge.sigma)
+    known = f"its place is known to {_lengths(gauge.sigma)} (east, north, up; one sigma)"
     if run.gcps is None:
-        lines.append(
-            f"Without ground control its place is known to {known} (east, north, up; one sigma) only."
-        )
+        lines.append(f"Without ground control {known} only.")
     else:
-        lines.append(
-            f"With {len(run.gcps.names)} GCPs its place is known to {known} (east, north, up; one sigma)."
-        )
+        lines.append(f"With {len(run.gcps.names)} GCPs {known}.")
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()
         seen = f"{np.hypot(*image):.2f} px in the images"
         if np.isfinite(ground).all():
-            seen += f" and {', '.join(metres(r) for r in ground)} on the ground (east, north, up)"
+            seen += f" and {_lengths(ground)} on the ground (east, north, up)"
         lines.append(f"{len(run.check_points.names)} check points, not used above, are met to {seen} (RMS).")
     return lines
+
+
+def _lengths(values: Iterable[float]) -> str:
+    return ", ".join(map(metres, values))
 
 
 def _enu(shift: Array) -> str:
     return ", ".join(f"{s:+.2f} m {word}" for s, word in zip(shift, ("east", "north", "up"), strict=True))
 
 
-def _checked_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
-    rmse = _median([view.rmse_before for view in views])
+def _checked_lines(_: Run, views: Sequence[ViewEntry]) -> list[str]:
+    rmse = median([view.rmse_before for view in views])
     return [f"Tie points of {len(views)} images agree to {rmse:.3f} px as the cameras are."]
 
 
 def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     return [f"{run.tracks.num_points} tie points of {len(views)} images, {len(run.tracks)} observations."]
-
-
-def _median(values: Iterable[float | None]) -> float:
-    finite = [value for value in values if value is not None and np.isfinite(value)]
-    return float(np.median(finite)) if finite else float("nan")
 
 
 def _known(value: float | None) -> float:

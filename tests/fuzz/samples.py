@@ -21,7 +21,7 @@ from barpc.ba.incremental import apply_prior
 from barpc.ba.priors import CameraPrior
 from barpc.cli.options import image_paths
 from barpc.cli.points import read_points
-from barpc.cli.tables import print_comparison
+from barpc.cli.terminal import print_comparison
 from barpc.dem import Dem
 from barpc.errors import RpcError
 from barpc.frozen import from_arrays, load_npz, to_arrays
@@ -30,8 +30,8 @@ from barpc.pipeline.inputs import read_pairs
 from barpc.pointio.ground import read_correspondences, read_gcps
 from barpc.pointio.matches import read_matches
 from barpc.report.compare import compare_runs
-from barpc.report.load import read_summary
 from barpc.report.page import report_html
+from barpc.report.tables import read_summary
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.text import decode

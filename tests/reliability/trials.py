@@ -27,7 +27,7 @@ import rasterio
 from rasterio.windows import Window
 
 import barpc.cli.adjust  # (imported before the forks)
-import barpc.cli.tables
+import barpc.cli.terminal
 import barpc.pipeline  # noqa: F401
 from barpc.cli import main as barpc_main
 from barpc.workspace import code_version

@@ -16,8 +16,8 @@ from click.testing import CliRunner
 from barpc.cli.main import cli
 from barpc.errors import InputError
 from barpc.report.compare import compare_runs
-from barpc.report.load import read_summary
 from barpc.report.page import remake_report, report_html
+from barpc.report.tables import read_summary
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
 

@@ -11,10 +11,11 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.report import Run
-from barpc.report.load import read_summary
 from barpc.report.records import Number, plain, said, table
 from barpc.report.run import pair_ties, triangulate_tracks
 from barpc.report.summary import ViewEntry, published_schema, shift_in_image
+from barpc.report.tables import read_summary
+from barpc.scene import middle_altitude
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import epipolar_offset, view_angles
 from tests.report.conftest import summarize
@@ -123,7 +124,7 @@ def test_a_summary_read_from_its_file_is_the_one_that_was_written(block_run):
 def test_outliers_do_not_bend_the_points_that_errors_are_measured_at(block_run):
     run = block_run.run
     clean = run.tracks.select(run.keep)
-    alone = triangulate_tracks(clean, run.after, run.start_altitude, np.ones(len(clean), dtype=bool))
+    alone = triangulate_tracks(clean, run.after, middle_altitude(run.views), np.ones(len(clean), dtype=bool))
     kept = run.keep & np.isin(run.tracks.point, np.flatnonzero(np.bincount(run.tracks.point[run.keep]) >= 2))
     assert np.abs(run.ties_after.residuals[kept] - alone.residuals).max() < 1e-6
 

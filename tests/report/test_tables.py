@@ -11,9 +11,8 @@ import pytest
 from barpc.geodesy import ecef_from_ground, enu_basis
 from barpc.report import run as runs
 from barpc.report import summarize
-from barpc.report.load import read_tables
 from barpc.report.records import plain
-from barpc.report.tables import OBSERVATIONS, RESIDUALS, TABLES
+from barpc.report.tables import OBSERVATIONS, RESIDUALS, TABLES, read_tables
 
 
 def rows_of(path):

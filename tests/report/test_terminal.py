@@ -9,8 +9,8 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
-from barpc.cli import tables
-from barpc.cli.tables import layout, print_summary
+from barpc.cli import terminal
+from barpc.cli.terminal import layout, print_summary
 
 words = st.text("abcdef_", min_size=1, max_size=30)
 cells = st.text("0123456789.+-", min_size=1, max_size=12)
@@ -59,7 +59,7 @@ def shown(finished, width, monkeypatch):
     def command():
         print_summary(finished.record)
 
-    monkeypatch.setattr(tables, "output_width", lambda: width)
+    monkeypatch.setattr(terminal, "output_width", lambda: width)
     return CliRunner().invoke(command).output
 
 
