@@ -21,6 +21,7 @@ from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Observations, Outcome, revived, run_rounds
 from barpc.ba.smooth import Smooth
+from barpc.ba.snooping import ControlTest, control_test
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
@@ -131,6 +132,8 @@ class _Solution:
         Of the rounds.
     start, after : HeldOut
         What the tracks that took no part say before and after.
+    tested : ControlTest or None
+        Control points against the rest.
     """
 
     problem: Problem
@@ -140,6 +143,7 @@ class _Solution:
     outcome: Outcome
     start: HeldOut
     after: HeldOut
+    tested: ControlTest | None
 
     @property
     def final(self) -> State:
@@ -214,8 +218,40 @@ def _solve(
         )
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
         problem, outcome = bent, _rounds(bent, block, there, options, heights, outcome.inlier, outcome.noise)
+    tested = None
+    if gcps is not None:
+        outcome, heights, tested = _tested(problem, block, options, outcome, heights, gcps)
     after = measure(problem, outcome.minimum.state.params, outer)
-    return _Solution(problem, state, before, heights, outcome, start, after)
+    return _Solution(problem, state, before, heights, outcome, start, after, tested)
+
+
+def _tested(
+    problem: Problem,
+    block: Block,
+    options: AdjustOptions,
+    outcome: Outcome,
+    heights: Heights,
+    gcps: GroundPoints,
+) -> tuple[Outcome, Heights, ControlTest]:
+    """The block without the control points that the rest finds wrong, one at a time, the worst first."""
+    control = heights.control[0]
+    used = np.ones(len(gcps.names), dtype=bool)
+    while True:
+        final = outcome.minimum.state
+        covariance = outcome.minimum.covariance(problem.free)
+        tested = control_test(covariance, final.points, block.num_tracks, gcps, used)
+        culprit = tested.culprit()
+        if culprit is None:
+            return outcome, heights, tested
+        used = used & (np.arange(len(used)) != culprit)
+        heights = replace(heights, control=(control.select(used),))
+        let_go, points = heights.hold(problem, final.points), final.points.copy()
+        for _ in range(_FIRST_STEPS + 1):  # it stands between its place and its rays
+            projected = let_go.project_points(final.params, points)
+            moved = let_go.triangulate(points, projected, outcome.inlier / block.sigma)
+            points[block.num_tracks + culprit] = moved[block.num_tracks + culprit]
+        there = replace(final, points=points)
+        outcome = _rounds(problem, block, there, options, heights, outcome.inlier, outcome.noise)
 
 
 def _adjustment(
@@ -268,6 +304,7 @@ def _adjustment(
         held=found.heights.weak[: block.num_tracks],
         left_out=block.left_out,
         gcp_inlier=inlier[ties.stop :],
+        control=found.tested,
         gcp_residuals=_gcp_residuals(final.points[block.num_tracks :], gcps),
         seconds=time.process_time() - start,
         options=options,
@@ -307,7 +344,9 @@ def _rounds(
     half = np.column_stack([unknowns.col_scale, unknowns.row_scale])
     smooth = Smooth(problem.structure, problem.xy, middle, half)
     variances = Variances.of(problem.camera_prior, unknowns, options)
-    return run_rounds(problem, observations, state, options, block.use, use, heights.hold, variances, smooth)
+    return run_rounds(
+        problem, observations, state, options, block.use, use, heights.hold, variances, smooth, known_noise
+    )
 
 
 def make_problem(

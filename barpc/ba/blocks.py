@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
-from barpc.scene import GroundPoints, IntArray
+from barpc.scene import BoolArray, GroundPoints, IntArray
 
 Terrain = Callable[[Array, Array], Array]
 """lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN where it is unknown."""
@@ -113,6 +113,10 @@ class PointPrior:
         information: Array = np.einsum("qim,qin->mn", self.common, self.common)
         information += np.eye(len(information))
         return information
+
+    def select(self, keep: BoolArray) -> PointPrior:
+        """Some of its rows (Q,)."""
+        return PointPrior(self.index[keep], self.mean[keep], self.rows[keep], self.common[keep])
 
     def apart(self, points: Array) -> Array:
         """Whitened offsets (Q, 3) of points (P, 3) [m], the common errors still in them."""

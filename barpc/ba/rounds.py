@@ -86,6 +86,7 @@ class Observations:
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True
+        self.is_control = ~is_tie & self.has_prior[self.structure.point]  # tested point by point, not cut
 
     def freedom(self, counted: Array) -> Array:
         """Degrees of freedom (K,) of an observation once its point is estimated: 1/2 of two views', to 2.
@@ -124,6 +125,7 @@ class Observations:
 
         `fitted` further parameters have been taken out of the residuals.
         """
+        use = use & ~self.is_control
         whitened = residual[:, use] / self.sigma[use]
         seen = np.zeros(self.structure.num_points, dtype=bool)
         seen[self.structure.point[use]] = True
@@ -208,7 +210,8 @@ def run_rounds(
         if robust:
             scatter = _scatter(problem, observations, smooth, state, residual, counted)
             s = observations.squared(scatter, use.astype(np.float64))
-            kept = observations.tied(everything & (s <= (options.robust_threshold * noise) ** 2))
+            near = (s <= (options.robust_threshold * noise) ** 2) | observations.is_control
+            kept = observations.tied(everything & near)
         wanted = noise if options.estimate_noise else 1.0
         weight = observations.weight(kept, wanted, floor)
         found = minimise(
@@ -272,12 +275,12 @@ def _robust(
             break
         clean = noise < _AS_STATED and float((s[use] > (_CLEAN * noise) ** 2).mean()) < _FEW
         scale = 3.0 * noise if np.isinf(scale) or clean else max(3.0 * noise, _SHRINK * scale)
-        counted = use * loss(s / scale**2)[1]
+        counted = np.where(observations.is_control, use, use * loss(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual = problem.linearise(state.params, state.points).image - problem.xy  # into `projected`
         near = scale <= _NEAR * noise
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
-        counted = use * loss(s / scale**2)[1]
+        counted = np.where(observations.is_control, use, use * loss(s / scale**2)[1])
     return state, residual, counted, noise
 
 

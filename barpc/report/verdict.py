@@ -40,6 +40,11 @@ _ALL_WELL = {
     "match": "All {} images are tied together",
 }
 _LISTED = 10  # names in a sentence
+_CONTROL_WORDS = {
+    "rejected": "{} contradicted by the rest, not used: check coordinates, axes and image positions",
+    "contradicts": "{} off by more than 4 standard deviations, used all the same: the stated accuracies are too good, "
+    "or more than one is wrong",
+}
 
 
 def view_status(view: ViewEntry, run: Run) -> dict[str, str]:
@@ -228,16 +233,24 @@ def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
 def _control_reasons(run: Run) -> list[str]:
     """Ground points that were cut, and images that their files name and that are not there."""
     out = []
-    if run.gcps is not None and run.adjustment is not None and not run.adjustment.gcp_inlier.all():
-        cut = np.unique(run.gcps.point[~run.adjustment.gcp_inlier])
-        names = _listed([run.gcps.names[i] for i in cut])
-        out.append(
-            f"The adjustment rejected observations of {len(cut)} GCPs: {names}: check their coordinates."
-        )
+    tested = None if run.adjustment is None else run.adjustment.control
+    if run.gcps is not None and tested is not None:
+        for status, words in _CONTROL_WORDS.items():
+            names = [
+                f"{name} ({metres(float(np.linalg.norm(tested.residual[g])))}, w = {tested.w[g]:.1f})"
+                for g, name in enumerate(run.gcps.names)
+                if tested.status(g) == status
+            ]
+            if names:
+                out.append(f"{words.format(_count(len(names), 'GCP'))}: {_listed(names)}.")
     for points, what in ((run.gcps, "GCPs"), (run.check_points, "Check points")):
         if points is not None and points.strangers:
             out.append(f"{what} name images that are not in this run: {_listed(points.strangers)}.")
     return out
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -268,8 +281,11 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
             f"Without ground control its place is known to {known} (east, north, up; one sigma) only."
         )
     else:
+        is_seen = np.bincount(run.gcps.point, minlength=len(run.gcps.names)) > 0
+        tested = run.adjustment.control
+        held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
         lines.append(
-            f"With {len(run.gcps.names)} GCPs its place is known to {known} (east, north, up; one sigma)."
+            f"With {_count(held, 'GCP')} its place is known to {known} (east, north, up; one sigma)."
         )
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()
