@@ -19,6 +19,7 @@ from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Outcome, Rounds, revived
+from barpc.ba.snooping import ControlTest, control_test
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
@@ -105,6 +106,7 @@ class _Solution:
     outcome: Outcome  # of the rounds
     start: HeldOut  # what the tracks that took no part say before
     after: HeldOut  # and after
+    tested: ControlTest | None  # control points against the rest
 
     @property
     def final(self) -> State:
@@ -197,8 +199,35 @@ def _solve(
         there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
         problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
+    tested = None
+    if block.gcps.names:
+        outcome, heights, tested = _tested(problem, block, options, outcome, heights)
     after = measure(problem, outcome.minimum.state.params, outer)
-    return _Solution(problem, state, before, heights, outcome, start, after)
+    return _Solution(problem, state, before, heights, outcome, start, after, tested)
+
+
+def _tested(
+    problem: Problem, block: Block, options: AdjustOptions, outcome: Outcome, heights: Heights
+) -> tuple[Outcome, Heights, ControlTest]:
+    """The block without the control points that the rest finds wrong, one at a time, the worst first."""
+    control, used = heights.control[0], np.ones(len(block.gcps.names), dtype=bool)
+    while True:
+        final = outcome.minimum.state
+        covariance = outcome.minimum.covariance(problem.free)
+        tested = control_test(covariance, final.points, block.num_tracks, block.gcps, used)
+        culprit = tested.culprit()
+        if culprit is None:
+            return outcome, heights, tested
+        used = used & (np.arange(len(used)) != culprit)
+        heights = replace(heights, control=(control.select(used),))
+        let_go, points = heights.hold(problem, final.points), final.points.copy()
+        for _ in range(_FIRST_STEPS + 1):  # it stands between its place and its rays
+            projected = let_go.project_points(final.params, points)
+            moved = let_go.triangulate(points, projected, outcome.inlier / block.sigma)
+            points[block.num_tracks + culprit] = moved[block.num_tracks + culprit]
+        there = replace(final, points=points)
+        again = Rounds(problem, block, there, options, heights, outcome.inlier, outcome.noise)
+        outcome = again.run()
 
 
 def _adjustment(
@@ -245,6 +274,7 @@ def _adjustment(
         held=found.heights.weak[: block.num_tracks],
         left_out=block.left_out,
         gcp_inlier=inlier[ties.stop :],
+        control=found.tested,
         gcp_residuals=enu_offsets(final.points[block.num_tracks :], block.gcps.lonlatalt),
         seconds=time.process_time() - start,
         options=options,

@@ -12,7 +12,7 @@ import numpy as np
 
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
-from barpc.scene import IntArray, View
+from barpc.scene import BoolArray, IntArray, View
 from barpc.sensor.rpc import RPC
 
 DEFAULT_ACCURACY = 5.0  # m, horizontal, of a camera that does not state its own (Pleiades: CE90 8.5 m = 4 m)
@@ -85,6 +85,10 @@ class PointPrior:
         information: Array = np.einsum("qim,qin->mn", self.common, self.common)
         information += np.eye(len(information))
         return information
+
+    def select(self, keep: BoolArray) -> PointPrior:
+        """Some of its rows (Q,)."""
+        return PointPrior(self.index[keep], self.mean[keep], self.rows[keep], self.common[keep])
 
     def apart(self, points: Array) -> Array:
         """Whitened offsets (Q, 3) of points (P, 3) [m], the common errors still in them."""

@@ -11,6 +11,7 @@ from barpc.ba.consensus import TwoGroups
 from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import GaugeReport
 from barpc.ba.smooth import SmoothTest
+from barpc.ba.snooping import ControlTest
 from barpc.ba.variances import PriorTest
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.options import AdjustOptions
@@ -73,6 +74,8 @@ class Adjustment:
         Tracks held in height because their rays meet under too small an angle.
     left_out : tuple of str
         Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
+    control : ControlTest or None
+        Ground control points against each other and the cameras.
     gcp_inlier : (M,)
         Observations of GCPs that were kept.
     gcp_residuals : (G, 3)
@@ -107,6 +110,7 @@ class Adjustment:
     two_groups: tuple[TwoGroups, ...]
     held: BoolArray
     left_out: tuple[str, ...]
+    control: ControlTest | None
     gcp_inlier: BoolArray
     gcp_residuals: Array
     seconds: float

@@ -69,6 +69,7 @@ class Rounds:
         options: AdjustOptions,
         heights: Heights,
         use: BoolArray,
+        known_noise: float | None = None,
     ) -> None:
         unknowns = problem.cameras.unknowns
         projected = problem.linearise(state.params, state.points)
@@ -84,12 +85,13 @@ class Rounds:
         self.use = self.observations.tied(use & self.everything)
         self.counted = self.use.astype(np.float64)
         self.projected: Projected | None = projected  # of the state, until the first pass moves it
-        self.passes, self.noise = 0, 1.0
+        self.passes, self.noise = 0, 1.0 if known_noise is None else known_noise
+        self.is_chosen = known_noise is not None  # rounds have ended near here: nothing robust comes first
         self.misfit: Array | float = 0.0
 
     def run(self) -> Outcome:
         """Go on until nothing changes."""
-        if self.robust:
+        if self.robust and not self.is_chosen:
             self._search()
         while True:
             outcome = self._cut_and_solve()
@@ -136,7 +138,7 @@ class Rounds:
         if self.robust:
             s = self.observations.squared(self._scatter(), self.use.astype(np.float64))
             near = s <= (self.options.robust_threshold * self.noise) ** 2
-            self.use = self.observations.tied(self.everything & near)
+            self.use = self.observations.tied(self.everything & (near | self.observations.is_control))
 
     def _solve(self) -> Minimum:
         """Least squares of what is used; a second pass follows the first robust one always, and is exact."""
@@ -206,12 +208,12 @@ def _robust(
             break
         clean = noise < _AS_STATED and float((s[use] > (_CLEAN * noise) ** 2).mean()) < _FEW
         scale = 3.0 * noise if np.isinf(scale) or clean else max(3.0 * noise, _SHRINK * scale)
-        counted = use * loss(s / scale**2)[1]
+        counted = np.where(observations.is_control, use, use * loss(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual = problem.linearise(state.params, state.points).image - problem.xy  # into `projected`
         near = scale <= _NEAR * noise
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
-        counted = use * loss(s / scale**2)[1]
+        counted = np.where(observations.is_control, use, use * loss(s / scale**2)[1])
     return state, residual, counted, noise
 
 

@@ -70,6 +70,7 @@ class Observations:
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True
+        self.is_control = ~is_tie & self.has_prior[self.structure.point]  # tested point by point, not cut
 
     def freedom(self, counted: Array) -> Array:
         """Degrees of freedom (K,) of an observation once its point is estimated: 1/2 of two views', to 2.
@@ -108,6 +109,7 @@ class Observations:
 
         `fitted` further parameters have been taken out of the residuals.
         """
+        use = use & ~self.is_control
         whitened = residual[:, use] / self.sigma[use]
         seen = np.zeros(self.structure.num_points, dtype=bool)
         seen[self.structure.point[use]] = True

@@ -362,10 +362,26 @@ class GcpEntry(KnownPoint):
     """A ground control point."""
 
     OWN: ClassVar = {"GCP": Column("GCP", lambda point: point.name)}
-    PAGE: ClassVar = "GCP residual_enu_m sigma_m"
+    PAGE: ClassVar = "GCP status residual_enu_m w sigma_m"
 
     sigma_m: tuple[float, float, float] = said("Stated", "m", "sigma east, north, up", ".2g")
-    residual_enu_m: Vector = said(_MISS, "m", ("east", "north", "up"), "+.3f")
+    residual_enu_m: Vector = said(
+        "What all the others say of it minus its given place, east, north, up; null where nothing tells",
+        "m",
+        ("east", "north", "up"),
+        "+.3f",
+    )
+    used: bool = said("Whether it holds the block", default=True)
+    status: Literal["used", "contradicts", "rejected", "not seen"] = said(
+        "used; contradicts: used, and off by more than 4 standard deviations; rejected: not used for that",
+        head="verdict",
+        default="used",
+    )
+    images: tuple[str, ...] = said("Views that show it", default=())
+    w: Number = said(
+        "Largest component of the residual over its standard deviation", "", "w", ".1f", default=None
+    )
+    redundancy: Number = said("How far the others can tell, 0 to 1", default=None)
 
 
 class SeenEntry(Record):
@@ -693,12 +709,29 @@ def _gcps(run: Run) -> tuple[GcpEntry, ...]:
     points = run.gcps
     if points is None:
         return ()
-    left = np.full_like(points.sigma, np.nan) if run.adjustment is None else run.adjustment.gcp_residuals
-    columns = (table.tolist() for table in (points.lonlatalt, points.sigma, left))
-    rows = zip(points.names, *columns, strict=True)
-    return tuple(
-        GcpEntry(name, lon, lat, alt, sigma, residual) for name, (lon, lat, alt), sigma, residual in rows
-    )
+    tested = None if run.adjustment is None else run.adjustment.control
+    left = np.full_like(points.sigma, np.nan) if tested is None else tested.residual
+    entries = []
+    places, sigmas = points.lonlatalt.tolist(), points.sigma.tolist()
+    for g, (name, (lon, lat, alt), sigma) in enumerate(zip(points.names, places, sigmas, strict=True)):
+        images = tuple(run.views[i].name for i in points.view[points.point == g])
+        status = "not seen" if not images else "used" if tested is None else tested.status(g)
+        entries.append(
+            GcpEntry(
+                name,
+                lon,
+                lat,
+                alt,
+                sigma,
+                left[g].tolist(),
+                used=status in ("used", "contradicts"),
+                status=status,  # type: ignore[arg-type]  # one of these words
+                images=images,
+                w=None if tested is None else tested.w[g],
+                redundancy=None if tested is None else tested.redundancy[g],
+            )
+        )
+    return tuple(entries)
 
 
 def _check_points(run: Run) -> tuple[CheckPointEntry, ...]:

@@ -31,6 +31,11 @@ _ALL_WELL = {
     "check": "The cameras of all {} images agree",
     "match": "All {} images are tied together",
 }
+_CONTROL_WORDS = {
+    "rejected": "{} contradicted by the rest, not used: check coordinates, axes and image positions",
+    "contradicts": "{} off by more than 4 standard deviations, used all the same: the stated accuracies are too good, "
+    "or more than one is wrong",
+}
 
 
 def view_status(view: ViewEntry, run: Run) -> dict[str, str]:
@@ -201,14 +206,24 @@ def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
 def _control_reasons(run: Run) -> list[str]:
     """Ground points that were cut, and images that their files name and that are not there."""
     out = []
-    if run.gcps is not None and run.adjustment is not None and not run.adjustment.gcp_inlier.all():
-        cut = [run.gcps.names[i] for i in np.unique(run.gcps.point[~run.adjustment.gcp_inlier])]
-        rejected = f"The adjustment rejected observations of {len(cut)} GCPs: {listed(cut)}"
-        out.append(f"{rejected}: check their coordinates.")
+    tested = None if run.adjustment is None else run.adjustment.control
+    if run.gcps is not None and tested is not None:
+        for status, words in _CONTROL_WORDS.items():
+            names = [
+                f"{name} ({metres(float(np.linalg.norm(tested.residual[g])))}, w = {tested.w[g]:.1f})"
+                for g, name in enumerate(run.gcps.names)
+                if tested.status(g) == status
+            ]
+            if names:
+                out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.")
     for points, what in ((run.gcps, "GCPs"), (run.check_points, "Check points")):
         if points is not None and points.strangers:
             out.append(f"{what} name images that are not in this run: {listed(points.strangers)}.")
     return out
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
@@ -227,7 +242,10 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     if run.gcps is None:
         lines.append(f"Without ground control {known} only.")
     else:
-        lines.append(f"With {len(run.gcps.names)} GCPs {known}.")
+        is_seen = np.bincount(run.gcps.point, minlength=len(run.gcps.names)) > 0
+        tested = run.adjustment.control
+        held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
+        lines.append(f"With {_count(held, 'GCP')} {known}.")
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()
         seen = f"{np.hypot(*image):.2f} px in the images"

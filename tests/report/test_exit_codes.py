@@ -42,9 +42,15 @@ def test_a_file_that_was_left_out_never_passes(kind, block_run):
 
 
 def rejected(run):
-    keep = np.ones(len(run.gcps.point), dtype=bool)
-    keep[run.gcps.point == 2] = False
-    return replace(run, adjustment=replace(run.adjustment, gcp_inlier=keep))
+    tested = run.adjustment.control
+    used = np.arange(len(tested.used)) != 2
+    return replace(run, adjustment=replace(run.adjustment, control=replace(tested, used=used)))
+
+
+def contradicted(run):
+    tested = run.adjustment.control
+    w = np.where(np.arange(len(tested.w)) == 2, 4.5, tested.w)
+    return replace(run, adjustment=replace(run.adjustment, control=replace(tested, w=w)))
 
 
 def gcps_of_strangers(run):
@@ -57,7 +63,12 @@ def check_points_of_strangers(run):
 
 @pytest.mark.parametrize(
     ("change", "word"),
-    [(rejected, "rejected"), (gcps_of_strangers, "unknown.tif"), (check_points_of_strangers, "unknown.tif")],
+    [
+        (rejected, "not used"),
+        (contradicted, "w = 4.5"),
+        (gcps_of_strangers, "unknown.tif"),
+        (check_points_of_strangers, "unknown.tif"),
+    ],
 )
 def test_ground_points_with_a_reservation_need_a_look(change, word, block_run):
     summary = summarize(change(block_run.run))

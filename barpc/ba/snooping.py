@@ -1,0 +1,95 @@
+"""Control points tested against each other and the cameras: data snooping (Baarda 1968).
+
+A control point that is used pulls its own residual towards zero, the more the less there is beside it. With Q_l the
+covariance stated of its place and Q_x that of the adjusted point, the residual v = adjusted - given has the covariance
+Q_v = Q_l - Q_x, and what all the others predict of it is off by Q_l Q_v^-1 v: leave-one-out without leaving one out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barpc.ba.covariance import Covariance
+from barpc.ba.heldout import enu_offsets
+from barpc.geodesy import Array, enu_basis
+from barpc.scene import BoolArray, GroundPoints
+
+CRITICAL = 4.0
+"""A normalised residual that is larger is no chance: 6e-5 for a component, a thousandth for five points."""
+_PART = 3  # of so many points one may be wrong, or the stated accuracies are
+_LEAST = 1e-6  # redundancy of a point that nothing else tells about
+
+
+@dataclass(frozen=True, eq=False)
+class ControlTest:
+    """Ground control points against each other and the cameras.
+
+    Parameters
+    ----------
+    used : (G,)
+        Points that hold the block; the others were found wrong.
+    residual : (G, 3)
+        What all the others say of a point minus its given place, east, north, up [m]; NaN where nothing tells.
+    w : (G,)
+        Its largest component over its standard deviation.
+    redundancy : (G,)
+        How far the others could tell: 0 not at all, 1 as if the point were not used.
+    """
+
+    used: BoolArray
+    residual: Array
+    w: Array
+    redundancy: Array
+
+    def culprit(self) -> int | None:
+        """The point that is most clearly wrong; None where none is, or where too many would be."""
+        told = np.isfinite(self.w)
+        count, w = int(told.sum()), np.where(self.used & told, self.w, 0.0)
+        if count < _PART or (told & ~self.used).sum() >= count // _PART or w.max() <= CRITICAL:
+            return None
+        return int(w.argmax())
+
+    def status(self, point: int) -> str:
+        """What became of a point, in a word."""
+        if not self.used[point]:
+            return "rejected"
+        return "contradicts" if self.w[point] > CRITICAL else "used"
+
+
+def control_test(
+    covariance: Covariance, points: Array, first: int, gcps: GroundPoints, used: BoolArray
+) -> ControlTest:
+    """The test at a solution.
+
+    Parameters
+    ----------
+    covariance : Covariance
+        Of the solution.
+    points : (P, 3)
+        Adjusted, ECEF [m]; those from `first` on are the GCPs.
+    first : int
+        Number of tracks.
+    gcps : GroundPoints
+        As given.
+    used : (G,)
+        Whose place was held.
+    """
+    count = len(gcps.names)
+    seen = np.bincount(gcps.point, minlength=count)
+    enu = enu_basis(gcps.lonlatalt)
+    offset = enu_offsets(points[first:], gcps.lonlatalt)
+    adjusted = enu @ covariance.points(first + np.arange(count)) @ np.swapaxes(enu, 1, 2)
+    residual, w, redundancy = np.full((count, 3), np.nan), np.full(count, np.nan), np.zeros(count)
+    for g in range(count):
+        stated = np.diag(gcps.sigma[g] ** 2)
+        if seen[g] == 0 or (not used[g] and seen[g] < 2):
+            continue
+        left = stated - adjusted[g] if used[g] else stated + adjusted[g]
+        redundancy[g] = min(float((np.diag(left) / np.diag(stated)).mean()), 1.0)
+        if np.linalg.eigvalsh(left / np.outer(gcps.sigma[g], gcps.sigma[g])).min() < _LEAST:
+            continue
+        residual[g] = stated @ np.linalg.solve(left, offset[g]) if used[g] else offset[g]
+        w[g] = np.abs(offset[g] / np.sqrt(np.diag(left))).max()
+    return ControlTest(used, residual, w, redundancy)
