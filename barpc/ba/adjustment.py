@@ -201,33 +201,39 @@ def _solve(
         problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
     tested = None
     if block.gcps.names:
-        outcome, heights, tested = _tested(problem, block, options, outcome, heights)
+        outcome, heights, tested = _tested(problem, block, options, outcome, heights, state)
     after = measure(problem, outcome.minimum.state.params, outer)
     return _Solution(problem, state, before, heights, outcome, start, after, tested)
 
 
 def _tested(
-    problem: Problem, block: Block, options: AdjustOptions, outcome: Outcome, heights: Heights
+    problem: Problem, block: Block, options: AdjustOptions, outcome: Outcome, heights: Heights, start: State
 ) -> tuple[Outcome, Heights, ControlTest]:
-    """The block without the control points that the rest finds wrong, one at a time, the worst first."""
-    control, used = heights.control[0], np.ones(len(block.gcps.names), dtype=bool)
+    """The block without the control points that the rounds cut, then without those that the rest finds wrong, one at a
+    time and the worst first; each time solved from the start, as a gross error takes good tie points with it.
+    """
+    control, start = heights.control[0], replace(start, params=problem.camera_prior.mean)
+    points, weight = start.points.copy(), block.use / block.sigma
+    of_points = np.arange(block.num_tracks, block.num_points)
+    cut = np.isin(of_points, block.point[block.use & ~outcome.inlier])
+    used = np.ones(len(cut), dtype=bool)
     while True:
-        final = outcome.minimum.state
+        if cut.any():
+            used = used & ~cut
+            heights = replace(heights, control=(control.select(used),))
+            let_go = heights.hold(problem, points)
+            for _ in range(_FIRST_STEPS + 1):  # where their rays see them
+                moved = let_go.triangulate(points, let_go.project_points(start.params, points), weight)
+                points[of_points[cut]] = moved[of_points[cut]]
+            there = replace(start, points=points.copy())
+            outcome = Rounds(problem, block, there, options, heights, block.use).run()
         covariance = outcome.minimum.covariance(problem.free)
-        tested = control_test(covariance, final.points, block.num_tracks, block.gcps, used)
+        final = outcome.minimum.state.points
+        tested = control_test(covariance, final, block.num_tracks, block.gcps, used)
         culprit = tested.culprit()
         if culprit is None:
             return outcome, heights, tested
-        used = used & (np.arange(len(used)) != culprit)
-        heights = replace(heights, control=(control.select(used),))
-        let_go, points = heights.hold(problem, final.points), final.points.copy()
-        for _ in range(_FIRST_STEPS + 1):  # it stands between its place and its rays
-            projected = let_go.project_points(final.params, points)
-            moved = let_go.triangulate(points, projected, outcome.inlier / block.sigma)
-            points[block.num_tracks + culprit] = moved[block.num_tracks + culprit]
-        there = replace(final, points=points)
-        again = Rounds(problem, block, there, options, heights, outcome.inlier, outcome.noise)
-        outcome = again.run()
+        cut = np.arange(len(used)) == culprit
 
 
 def _adjustment(

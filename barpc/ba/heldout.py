@@ -1,7 +1,7 @@
 """What takes no part in the solve, and measures it: known check points, and tie points that are kept out.
 
-Survivors of a rejection agree because the others were cut. A tenth of the tracks, evenly over pairs and images, is
-kept out before; triangulated by the adjusted cameras they tell what those are worth, wrong matches and all, so their
+Survivors of a rejection agree because the others were cut. A tenth of the tracks, drawn from all alike, is kept out
+before; triangulated by the adjusted cameras they tell what those are worth, wrong matches and all, so their
 figures are medians.
 """
 
@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from barpc.ba.block import Block
 from barpc.ba.problem import Problem
-from barpc.ba.structure import counting_sort, make_structure
+from barpc.ba.structure import make_structure
 from barpc.ba.weights import MEDIAN, Observations, geman_mcclure
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
@@ -22,9 +23,10 @@ from barpc.scene import BoolArray, GroundPoints, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
 
-_EVERY = 10
+_SHARE = 0.1
+_STEPS_A_PIXEL = 4.0  # so coarse that rounding draws hardly another track
+_ODD = np.uint64(0x9E3779B97F4A7C15)
 _LEAST = 100  # observations of a view, or its tracks are all needed
-_CELLS = 8  # a side of an image
 _STEPS = 5
 _WIDE = 4.0  # sigmas
 _FEW = 20  # observations of a view that tell nothing by themselves
@@ -57,19 +59,26 @@ def _mean_square(values: Array) -> float:
 
 
 def keep_out(block: Block) -> BoolArray:
-    """Observations (K,) of about every tenth track, evenly over pairs of views and their images."""
+    """Observations (K,) of about every tenth track.
+
+    They are drawn by their image positions alone, so that neither the order of rows nor the names of views matter.
+    """
     few = np.bincount(block.view[block.use], minlength=len(block.views)) < _LEAST
     needed = np.bincount(block.point[few[block.view] | ~block.use], minlength=block.num_points)
-    by_point, bounds = counting_sort(block.point, block.num_points)
-    is_track = np.arange(block.num_points) < block.num_tracks
-    tracks = np.flatnonzero((np.diff(bounds) >= 2) & (needed == 0) & is_track)
-    first, last = (by_point[bounds[tracks + n] - n] for n in (0, 1))
-    size = np.array([view.size for view in block.views], dtype=np.float64)
-    cell = np.floor(block.xy[:, first] / size[block.view[first]].T * _CELLS)
-    order = np.lexsort((tracks, *cell, block.view[last], block.view[first]))
-    chosen = np.zeros(block.num_points, dtype=bool)
-    chosen[tracks[order[_EVERY // 2 :: _EVERY]]] = True
+    count = np.bincount(block.point, minlength=block.num_points)
+    drawn = np.zeros(block.num_points, dtype=np.uint64)
+    col, row = np.rint(block.xy * _STEPS_A_PIXEL).astype(np.int64).astype(np.uint64)
+    np.add.at(drawn, block.point, _scrambled(col * _ODD + row))
+    chosen = _scrambled(drawn) < np.uint64(_SHARE * 2.0**64)
+    chosen &= (count >= 2) & (needed == 0) & (np.arange(block.num_points) < block.num_tracks)
     return chosen[block.point]
+
+
+def _scrambled(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """Numbers as if drawn at random (the finalizer of SplitMix64, Steele et al. 2014)."""
+    numbers = (numbers ^ (numbers >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    numbers = (numbers ^ (numbers >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return numbers ^ (numbers >> np.uint64(31))
 
 
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:

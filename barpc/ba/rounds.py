@@ -69,7 +69,6 @@ class Rounds:
         options: AdjustOptions,
         heights: Heights,
         use: BoolArray,
-        known_noise: float | None = None,
     ) -> None:
         unknowns = problem.cameras.unknowns
         projected = problem.linearise(state.params, state.points)
@@ -85,13 +84,12 @@ class Rounds:
         self.use = self.observations.tied(use & self.everything)
         self.counted = self.use.astype(np.float64)
         self.projected: Projected | None = projected  # of the state, until the first pass moves it
-        self.passes, self.noise = 0, 1.0 if known_noise is None else known_noise
-        self.is_chosen = known_noise is not None  # rounds have ended near here: nothing robust comes first
+        self.passes, self.noise = 0, 1.0
         self.misfit: Array | float = 0.0
 
     def run(self) -> Outcome:
         """Go on until nothing changes."""
-        if self.robust and not self.is_chosen:
+        if self.robust:
             self._search()
         while True:
             outcome = self._cut_and_solve()
@@ -138,7 +136,7 @@ class Rounds:
         if self.robust:
             s = self.observations.squared(self._scatter(), self.use.astype(np.float64))
             near = s <= (self.options.robust_threshold * self.noise) ** 2
-            self.use = self.observations.tied(self.everything & (near | self.observations.is_control))
+            self.use = self.observations.tied(self.everything & (near | self.observations.is_spared(s)))
 
     def _solve(self) -> Minimum:
         """Least squares of what is used; a second pass follows the first robust one always, and is exact."""
@@ -208,13 +206,18 @@ def _robust(
             break
         clean = noise < _AS_STATED and float((s[use] > (_CLEAN * noise) ** 2).mean()) < _FEW
         scale = 3.0 * noise if np.isinf(scale) or clean else max(3.0 * noise, _SHRINK * scale)
-        counted = np.where(observations.is_control, use, use * loss(s / scale**2)[1])
+        counted = _counted(observations, use, s, loss(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual = problem.linearise(state.params, state.points).image - problem.xy  # into `projected`
         near = scale <= _NEAR * noise
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
-        counted = np.where(observations.is_control, use, use * loss(s / scale**2)[1])
+        counted = _counted(observations, use, s, loss(s / scale**2)[1])
     return state, residual, counted, noise
+
+
+def _counted(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:
+    """How much each observation counts (K,)."""
+    return np.where(observations.is_spared(squared), use.astype(np.float64), use * by_loss)
 
 
 def revived(

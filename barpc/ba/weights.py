@@ -19,6 +19,7 @@ from barpc.scene import BoolArray
 MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
 _LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
 _LEAST_FREEDOM = 20
+_GROSS = 100.0  # sigmas: a control point of another place would take the block with it
 
 Loss = Callable[[Array], tuple[Array, Array]]
 """s (...) -> rho(s), rho'(s); rho(0) = 0, rho'(0) = 1."""
@@ -70,7 +71,13 @@ class Observations:
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True
-        self.is_control = ~is_tie & self.has_prior[self.structure.point]  # tested point by point, not cut
+        self.is_control = (
+            ~is_tie & self.has_prior[self.structure.point]
+        )  # whose noise is tested point by point
+
+    def is_spared(self, squared: Array) -> BoolArray:
+        """Observations (K,) of control points: they are tested point by point at the end, unless grossly wrong."""
+        return np.asarray(self.is_control & (squared < _GROSS**2))
 
     def freedom(self, counted: Array) -> Array:
         """Degrees of freedom (K,) of an observation once its point is estimated: 1/2 of two views', to 2.

@@ -32,7 +32,7 @@ _ALL_WELL = {
     "match": "All {} images are tied together",
 }
 _CONTROL_WORDS = {
-    "rejected": "{} contradicted by the rest, not used: check coordinates, axes and image positions",
+    "rejected": "{} rejected, contradicted by the rest: check coordinates, axes and image positions",
     "contradicts": "{} off by more than 4 standard deviations, used all the same: the stated accuracies are too good, "
     "or more than one is wrong",
 }
@@ -245,7 +245,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         is_seen = np.bincount(run.gcps.point, minlength=len(run.gcps.names)) > 0
         tested = run.adjustment.control
         held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
-        lines.append(f"With {_count(held, 'GCP')} {known}.")
+        lines.append(f"With {_count(held, 'GCP')} {known}{'' if held else ' only'}.")
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()
         seen = f"{np.hypot(*image):.2f} px in the images"

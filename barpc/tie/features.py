@@ -63,6 +63,8 @@ class Sift:
     def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
         """Keypoints for which `keep(xy, scale, response)` is true; only those are described."""
         found = self._sift.detect(picture, None)
+        if not found:  # OpenCV fails where there is nothing to describe
+            return join([])
         kept = np.flatnonzero(keep(*_table(found)))
         described, raw = self._sift.compute(picture, [found[i] for i in kept])
         if raw is None:

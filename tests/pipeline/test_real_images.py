@@ -93,7 +93,7 @@ def test_an_image_that_was_turned_or_resampled_is_met_all_the_same(shared_data, 
     result, _ = triplet
     found = adjust_tracks(SPOILT[name](list(result.run.views)), result.tracks)
     cameras = dict(zip(found.names, found.sensors, strict=True))
-    assert found.held_out_rms.max() < 0.10
+    assert found.held_out_rms.max() < 0.12
     for pair in PAIRS:
         points = check_points(shared_data, *pair)
         median, spread = epipolar(*(cameras[n] for n in pair), points)

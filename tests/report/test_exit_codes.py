@@ -64,7 +64,7 @@ def check_points_of_strangers(run):
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        (rejected, "not used"),
+        (rejected, "1 GCP rejected"),
         (contradicted, "w = 4.5"),
         (gcps_of_strangers, "unknown.tif"),
         (check_points_of_strangers, "unknown.tif"),
