@@ -34,6 +34,7 @@ _MUCH_LOST = 0.85  # of a view's observations are to be left
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
 _MANY_KEPT = 0.99  # of the observations: the others do not tell in a mean
 _BETTER = 0.8  # of the noise
+_WORTH = 0.004  # px that an affine must take away: it leaves the tilts of the scene open
 _CLEARLY_BETTER = 0.9  # the same, where the drift that was learnt is no drift
 _MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
@@ -164,7 +165,8 @@ def _choose_model(
     skew = found.is_skew
     if skew or found.has_trend:
         in_image = _solve(block, outer, replace(options, model="affine"), dem, None, None)
-        if in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error:
+        better = in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error
+        if better and in_image.after.whole_rms < found.after.whole_rms - _WORTH:
             return in_image, found.after.whole_rms
     return found, None
 

@@ -132,8 +132,8 @@ def _block_reasons(run: Run) -> list[str]:
     if (in_space := run.adjustment.in_space_rms) is not None:
         tilts = _lengths(run.adjustment.gauge.motion_sigma[3:5])
         out.append(
-            f"Rotations and translations leave {in_space:.2f} px of tie points that took no part; an affine in each "
-            f"image leaves {median(run.adjustment.held_out_rms):.2f} px and was taken: images that were turned, "
+            f"Rotations and translations leave {in_space:.3f} px of tie points that took no part; an affine in each "
+            f"image leaves {median(run.adjustment.held_out_rms):.3f} px and was taken: images that were turned, "
             "resampled or cropped otherwise than their RPCs say, or RPCs of other images. Its tilts are known to "
             f"{tilts} (east, north) only."
         )

@@ -94,7 +94,7 @@ def scattered(adjustment):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (in_the_image, ("leave 0.95 px", "affine", "turned, resampled or cropped", "tilts")),
+        (in_the_image, ("leave 0.950 px", "affine", "turned, resampled or cropped", "tilts")),
         (between_two_groups, ("{1} and {4} fall into two groups", "31 %", "0.42 px", "two solutions")),
         (scattered, ("scatter 2.6 times",)),
     ],
