@@ -51,6 +51,8 @@ def two_groups(
             continue
         z = offset[start:stop] - offset[start:stop].mean()
         square = (z**2).mean()
+        if not square > 0.0:
+            continue
         if ((z**3).mean() ** 2 / square**3 + 1.0) < _BIMODAL * (z**4).mean() / square**2:
             continue
         share, apart, gain = _mixture(z)

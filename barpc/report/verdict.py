@@ -211,6 +211,8 @@ def _control_reasons(run: Run) -> list[str]:
         for status, words in _CONTROL_WORDS.items():
             names = [
                 f"{name} ({metres(float(np.linalg.norm(tested.residual[g])))}, w = {tested.w[g]:.1f})"
+                if np.isfinite(tested.w[g])
+                else f"{name} (too few images show it to tell by how much)"
                 for g, name in enumerate(run.gcps.names)
                 if tested.status(g) == status
             ]

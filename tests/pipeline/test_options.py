@@ -216,7 +216,10 @@ def test_every_option_has_a_row() -> None:
 
 @pytest.mark.parametrize("name", ROWS)
 def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene: Path) -> None:
-    ROWS[name](run, tmp_path, scene)
+    before = {path.name: path.read_bytes() for path in scene.iterdir() if path.is_file()}
+    ROWS[name](run, tmp_path, scene)  # asserts what the option does
+    after = {path.name: path.read_bytes() for path in scene.iterdir() if path.is_file()}
+    assert {name: after.get(name) for name in before} == before  # and none of them touches an input
 
 
 @pytest.mark.parametrize(

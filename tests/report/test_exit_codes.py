@@ -47,6 +47,15 @@ def rejected(run):
     return replace(run, adjustment=replace(run.adjustment, control=replace(tested, used=used)))
 
 
+def rejected_unseen(run):
+    run = rejected(run)
+    tested = run.adjustment.control
+    nothing = np.where(tested.used, tested.w, np.nan)
+    residual = np.where(tested.used[:, None], tested.residual, np.nan)
+    changed = replace(tested, w=nothing, residual=residual)
+    return replace(run, adjustment=replace(run.adjustment, control=changed))
+
+
 def contradicted(run):
     tested = run.adjustment.control
     w = np.where(np.arange(len(tested.w)) == 2, 4.5, tested.w)
@@ -65,6 +74,7 @@ def check_points_of_strangers(run):
     ("change", "word"),
     [
         (rejected, "1 GCP rejected"),
+        (rejected_unseen, "too few images"),
         (contradicted, "w = 4.5"),
         (gcps_of_strangers, "unknown.tif"),
         (check_points_of_strangers, "unknown.tif"),
