@@ -268,7 +268,7 @@ def _candidates(
 def _best(pairs: Sequence[Pair], num_views: int, neighbours: int) -> list[Pair]:
     """The best partners of every view, and the best tree that connects all views, ascending."""
     ranked = sorted(pairs, key=lambda pair: (-pair.score, pair.views))
-    ends = tuple(np.array([pair.views for pair in ranked]).T)
+    ends = tuple(np.array([pair.views for pair in ranked], dtype=np.int32).T)  # of csgraph, always
     rank = np.arange(1, len(ranked) + 1)
     tree = minimum_spanning_tree(coo_array((rank, ends), shape=(num_views, num_views))).data
     chosen, taken = [], np.zeros(num_views, dtype=int)
