@@ -185,9 +185,9 @@ def _solve(
     """
     problem = make_problem(block, options, centers, prior)
     state, heights = _start(problem, block, options, dem)
-    before = problem.residuals(state.params, state.points)
     start = measure(problem, state.params, outer)
-    outcome = Rounds(problem, block, state, options, heights, block.use).run()
+    rounds = Rounds(problem, block, state, options, heights, block.use)
+    before, outcome = rounds.residual, rounds.run()
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
         agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)

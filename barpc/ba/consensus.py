@@ -11,11 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 
 from barpc.ba.cameras import Projected
 from barpc.ba.structure import Structure
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
+from barpc.sensor.curve import cross
 
 _TRIALS = 150
 _LEAST = 30  # matches of a pair that is looked at
@@ -45,19 +47,18 @@ def two_groups(
     rows = np.flatnonzero(use[structure.first] & use[structure.second])
     offset = _across(residual, projected.by_point, structure.first[rows], structure.second[rows])
     bounds = np.searchsorted(rows, structure.pair_bounds)
+    count = np.diff(bounds)
+    by_pair = sp.csr_array((np.ones(len(rows)), np.arange(len(rows)), bounds), (len(count), len(rows)))
     found = []
-    for pair, start, stop in zip(structure.pair_view.tolist(), bounds[:-1], bounds[1:], strict=True):
-        if stop - start < _GROUPED:
-            continue
-        z = offset[start:stop] - offset[start:stop].mean()
-        square = (z**2).mean()
-        if not square > 0.0:
-            continue
-        if ((z**3).mean() ** 2 / square**3 + 1.0) < _BIMODAL * (z**4).mean() / square**2:
-            continue
-        share, apart, gain = _mixture(z)
+    with np.errstate(all="ignore"):
+        z = offset - np.repeat(by_pair @ offset / count, count)
+        square, cube, fourth = (by_pair @ z**power / count for power in (2, 3, 4))
+        maybe = (cube**2 / square**3 + 1.0) >= _BIMODAL * fourth / square**2
+    for pair in np.flatnonzero(maybe & (count >= _GROUPED)):
+        share, apart, gain = _mixture(z[bounds[pair] : bounds[pair + 1]])
         if share > _SMALLER and gain > _EVIDENT:
-            found.append(TwoGroups((pair[0], pair[1]), share, apart))
+            first, second = structure.pair_view[pair].tolist()
+            found.append(TwoGroups((first, second), share, apart))
     return tuple(found)
 
 
@@ -117,15 +118,13 @@ def agreeing(
 
 def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
     """Offset across the epipolar line (Q,) [px]: what no move of the point takes away from two observations."""
-    rows = np.concatenate([by_point[:, :, first], by_point[:, :, second]])  # (4, 3, Q)
-    four = np.concatenate([residual[:, first], residual[:, second]])
-    normal = np.empty_like(four)
-    for i in range(4):
-        a, b, c = (rows[k] for k in range(4) if k != i)
-        normal[i] = (-1) ** i * (a * np.cross(b, c, axis=0)).sum(axis=0)
-    size = np.linalg.norm(normal, axis=0)
+    one, two = by_point.take(first, axis=2), by_point.take(second, axis=2)
+    rays = cross(one[0], one[1]), cross(two[0], two[1])  # of a ray only the other's image moves
+    of_first, of_second = (one * rays[1]).sum(axis=1), (two * rays[0]).sum(axis=1)
+    normal = np.stack([of_first[1], -of_first[0], of_second[1], -of_second[0]])
+    four = np.concatenate([residual.take(first, axis=1), residual.take(second, axis=1)])
     with np.errstate(all="ignore"):
-        offset: Array = np.sqrt(2.0) * (normal * four).sum(axis=0) / size
+        offset: Array = np.sqrt(2.0) * (normal * four).sum(axis=0) / np.linalg.norm(normal, axis=0)
     return offset
 
 

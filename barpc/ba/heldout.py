@@ -27,7 +27,7 @@ _SHARE = 0.1
 _STEPS_A_PIXEL = 4.0  # so coarse that rounding draws hardly another track
 _ODD = np.uint64(0x9E3779B97F4A7C15)
 _LEAST = 100  # observations of a view, or its tracks are all needed
-_STEPS = 5
+_ROBUST_STEPS = 3
 _WIDE = 4.0  # sigmas
 _FEW = 20  # observations of a view that tell nothing by themselves
 
@@ -93,13 +93,15 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
         point_prior=None,
     )
     observations = Observations(part, block.sigma, 0.0, np.ones(len(point), dtype=bool))
-    points, counted = block.first_points()[index], np.ones(len(point))
-    for step in range(_STEPS):
-        projected = part.project_points(params, points)
-        if step > 1:  # of three views that do not agree two may
-            wide = (_WIDE * block.sigma) ** 2
-            counted = geman_mcclure(((projected.image - block.xy) ** 2).sum(axis=0) / wide)[1]
-        points = part.triangulate(points, projected, np.sqrt(counted) / block.sigma)
+    first, counted = block.first_points()[index], np.ones(len(point))
+    first = part.triangulate(first, part.project_points(params, first), 1.0 / block.sigma)
+    projected = part.project_points(params, first)  # near the end: from here it is linear
+    points = part.triangulate(first, projected, 1.0 / block.sigma)
+    for _ in range(_ROBUST_STEPS):  # of three views that do not agree two may
+        residual = projected.image - block.xy
+        residual += (projected.by_point * part.structure.of_points(points - first)).sum(axis=1)
+        counted = geman_mcclure((residual**2).sum(axis=0) / (_WIDE * block.sigma) ** 2)[1]
+        points = part.triangulate(first, projected, np.sqrt(counted) / block.sigma)
     residual = part.residuals(params, points)
     squared = observations.squared(residual, counted)
     expected = block.sigma**2 * observations.freedom(counted)

@@ -133,14 +133,11 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
     upper = la.cholesky(prior.information() - flat.T @ flat)
     place = np.full(structure.num_points, -1)
     place[index] = np.arange(len(index))
-    at = place[structure.point]
-    rows = np.flatnonzero(at >= 0)
-    products = np.zeros((len(at), m * cross.shape[2]))
-    products[rows] = (np.swapaxes(whitened[at[rows]], 1, 2) @ cross[rows]).reshape(
-        len(rows), products.shape[1]
-    )
-    sums = structure.sum_views(products.T).reshape(structure.num_views, m, -1)
-    by_camera = -sums.swapaxes(0, 1).reshape(m, -1)
+    rows = np.flatnonzero(place[structure.point] >= 0)
+    products = np.swapaxes(whitened[place[structure.point[rows]]], 1, 2) @ cross[rows]
+    by_view = np.arange(len(rows)), np.searchsorted(rows, structure.bounds)
+    sums = sp.csr_array((np.ones(len(rows)), *by_view)) @ products.reshape(len(rows), -1)
+    by_camera = -sums.reshape(-1, m, cross.shape[2]).swapaxes(0, 1).reshape(m, -1)
     gradient = -np.einsum("qim,iq->m", whitened, half[:, index])
     return Common(
         index,

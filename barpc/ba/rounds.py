@@ -11,7 +11,7 @@ from barpc.ba.block import Block
 from barpc.ba.cameras import Projected
 from barpc.ba.ground import Heights
 from barpc.ba.problem import Problem
-from barpc.ba.smooth import Smooth, SmoothTest
+from barpc.ba.smooth import TERMS, Fit, Smooth, SmoothTest
 from barpc.ba.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
 from barpc.ba.variances import PriorTest, Variances, same_prior
 from barpc.ba.weights import LOSSES, MEDIAN, Observations
@@ -103,7 +103,7 @@ class Rounds:
         self.state, self.residual, self.counted, self.noise = _robust(
             start, self.observations, self.state, self.projected, self.use, self.options, self.smooth
         )
-        self.misfit = self.smooth.test(self.residual, self.use, neighbours=False).rms
+        self.misfit = self.smooth.test(self.residual, self.use).rms
 
     def _cut_and_solve(self) -> Outcome | None:
         """One pass; the outcome where it is the last."""
@@ -117,14 +117,14 @@ class Rounds:
         self._cut()
         found = self._solve()
         prior, tested = self.variances.learnt(self.problem, found)
-        self._estimate_noise()
+        smooth = self._estimate_noise()
         numbers = self.passes, self.use.sum(), len(self.use), self.noise
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
         settled &= same_prior(prior, self.problem.camera_prior, _SAME_PRIOR)
         if self.passes > MAX_PASSES or (settled and (same or not self.robust)):
-            smooth = self.smooth.test(self.residual, self.use)
+            smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             return Outcome(
                 self.problem, found, self.residual, self.use, self.noise, self.passes, tested, smooth
             )
@@ -152,23 +152,26 @@ class Rounds:
         self.counted = self.use.astype(np.float64)
         return replace(found, state=self.state)
 
-    def _estimate_noise(self) -> None:
+    def _estimate_noise(self) -> SmoothTest:
         """The noise, and what no camera can follow, by the residuals of the observations in use."""
+        fit = self.smooth.fit(self.residual, self.counted)
+        tested = self.smooth.test(self.residual, self.use, fit)
         if self.robust:
-            fitted = self.smooth.parameters(self.counted)
-            self.noise = self.observations.noise(self._scatter(), self.use, self.problem, fitted)
-            self.misfit = self.smooth.test(self.residual, self.use, neighbours=False).rms
+            fitted = 2 * TERMS * len(fit)
+            self.noise = self.observations.noise(self._scatter(fit), self.use, self.problem, fitted)
+            self.misfit = tested.rms
         else:
             self.noise = self.observations.noise(self.residual, self.use, self.problem)
+        return tested
 
-    def _scatter(self) -> Array:
+    def _scatter(self, fit: Fit | None = None) -> Array:
         """Residuals (2, K) [px] without the smooth parts of all views that see a point.
 
         A point shares what one of its views is wrong by among all of them, and relief moves the rows of the views
         against each other: so the smooth parts are found view by view and the points follow, until they stand.
         """
         residual, counted, sigma = self.residual, self.counted, self.observations.sigma
-        part = self.smooth.part(residual, counted)
+        part = self.smooth.part(residual, counted, fit)
         size = float(np.sqrt((counted * (part / sigma) ** 2).sum() / max(counted.sum(), 1.0)))
         if size < _SMOOTH_SEEN:
             return residual - part

@@ -8,7 +8,7 @@ fitted by weighted least squares, and the scatter around it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -19,10 +19,13 @@ from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
+Fit = dict[int, tuple[slice, Array]]
+"""View -> where its observations are, coefficients (2, TERMS) of their smooth part."""
+
 SPLINES = 14
 """Cubic B-splines over the rows of an image: what changes over a tenth of it, or more slowly, is smooth."""
 
-_TERMS = SPLINES + 4  # and col, col^2, col^3, row col
+TERMS = SPLINES + 4  # and col, col^2, col^3, row col
 _PER_TERM = 10  # observations a term, or the view is left as it is
 _SIGMAS = 5.0  # a mean product of neighbours that is smaller may be chance
 _RIDGE = 1e-6  # of a term's own weight
@@ -58,47 +61,48 @@ class Smooth:
         self.structure = structure
         col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
         self._place = xy
-        self._basis = np.empty((_TERMS, xy.shape[1]))
+        self._basis = np.empty((TERMS, xy.shape[1]))
         self._basis[:SPLINES] = _bsplines(row)
         self._basis[SPLINES:] = col, col**2, col**3, row * col
 
-    def part(self, residual: Array, weight: Array) -> Array:
+    def part(self, residual: Array, weight: Array, fit: Fit | None = None) -> Array:
         """The smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
 
         Zero for views with too few observations that count.
         """
         out = np.zeros_like(residual)
-        for _, rows in self._views(weight):
-            out[:, rows] = self._coefficients(rows, residual, weight) @ self._basis[:, rows]
+        for rows, coefficients in (self.fit(residual, weight) if fit is None else fit).values():
+            out[:, rows] = coefficients @ self._basis[:, rows]
         return out
 
-    def parameters(self, weight: Array) -> int:
-        """How many coefficients `part` fits."""
-        return 2 * _TERMS * sum(1 for _ in self._views(weight))
+    def test(self, residual: Array, use: BoolArray, fit: Fit | None = None) -> SmoothTest:
+        """Whether the residuals (2, K) [px] of the observations in use hold more than scatter.
 
-    def test(self, residual: Array, use: BoolArray, neighbours: bool = True) -> SmoothTest:
-        """Whether the residuals (2, K) [px] of the observations in use hold more than scatter; without `neighbours`
-        what is too fine for the smooth part is not looked for.
+        What is too fine for the smooth part is not looked for.
         """
         n = self.structure.num_views
-        rms, significance, by_row, shared = np.zeros(n), np.ones(n), np.full(n, np.nan), np.zeros(n)
+        rms, significance, by_row = np.zeros(n), np.ones(n), np.full(n, np.nan)
         weight = use.astype(np.float64)
         residual = np.where(use, residual, 0.0)
-        for v, rows in self._views(weight):
+        for v, (rows, coefficients) in (self.fit(residual, weight) if fit is None else fit).items():
             count = 2 * float(weight[rows].sum())
-            coefficients = self._coefficients(rows, residual, weight)
             smooth = (coefficients @ self._basis[:, rows]) * weight[rows]
             explained = float((smooth**2).sum())
             left = float((residual[:, rows] ** 2).sum()) - explained
-            terms = 2.0 * _TERMS
+            terms = 2.0 * TERMS
             scatter = max(left / (count - terms), 1e-30)
             significance[v] = float(f_distribution.sf(explained / terms / scatter, terms, count - terms))
             rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / (0.5 * count))
             along = (coefficients[:, :SPLINES] @ self._basis[:SPLINES, rows]) * weight[rows]
             by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)
-            if neighbours:
-                shared[v] = self._shared(rows, residual, use)
-        return SmoothTest(rms, significance, by_row, shared)
+        return SmoothTest(rms, significance, by_row, np.zeros(n))
+
+    def test_neighbours(self, tested: SmoothTest, residual: Array, use: BoolArray) -> SmoothTest:
+        """The same test with what neighbours share, of views in which something was fitted."""
+        shared = np.zeros_like(tested.rms)
+        for v in np.flatnonzero(np.isfinite(tested.by_row)):
+            shared[v] = self._shared(slice(*self.structure.bounds[v : v + 2]), residual, use)
+        return replace(tested, shared=shared)
 
     def _shared(self, rows: slice, residual: Array, use: BoolArray) -> float:
         """Root of the mean product of neighbours' residuals [px], along the rows or the columns."""
@@ -111,12 +115,15 @@ class Smooth:
                 most = max(most, float(np.sqrt(product.mean())))
         return most
 
-    def _views(self, weight: Array) -> list[tuple[int, slice]]:
-        """Views with enough observations, and where theirs are."""
+    def fit(self, residual: Array, weight: Array) -> Fit:
+        """What `part` is made of, for views with enough observations that count."""
         bounds = self.structure.bounds
         counts = self.structure.sum_views(weight[None])[:, 0]
-        enough = np.flatnonzero(counts >= _PER_TERM * _TERMS)
-        return [(int(v), slice(int(bounds[v]), int(bounds[v + 1]))) for v in enough]
+        found = {}
+        for v in np.flatnonzero(counts >= _PER_TERM * TERMS).tolist():
+            rows = slice(int(bounds[v]), int(bounds[v + 1]))
+            found[v] = rows, self._coefficients(rows, residual, weight)
+        return found
 
     def _coefficients(self, rows: slice, residual: Array, weight: Array) -> Array:
         """Coefficients (2, terms) of one view."""
@@ -124,7 +131,7 @@ class Smooth:
         weighted = basis * weight[rows]
         matrix = weighted @ basis.T
         diagonal = np.diag(matrix)
-        matrix[np.diag_indices(_TERMS)] += _RIDGE * (diagonal + diagonal.mean())
+        matrix[np.diag_indices(TERMS)] += _RIDGE * (diagonal + diagonal.mean())
         matrix[:SPLINES, :SPLINES] += _BEND * diagonal[:SPLINES].mean() * _BENDING
         with np.errstate(invalid="ignore"):
             target = np.where(weight[rows] > 0, residual[:, rows], 0.0)

@@ -60,10 +60,8 @@ class Motion:
         self._drift = None if drift is None else Turn(drift)
         self._matrix = rotation_matrix(rotation)
         count = np.diff(bounds)
-        self._lever = _by_view(
-            self._matrix, ecef - np.repeat((translation + center).T, count, axis=1), bounds
-        )
-        self._turned = self._lever if self._drift is None else self._drift.forth(self._lever)
+        lever = _by_view(self._matrix, ecef - np.repeat((translation + center).T, count, axis=1), bounds)
+        self._turned = lever if self._drift is None else self._drift.forth(lever)
         self.ecef = self._turned + np.repeat(center.T, count, axis=1)
 
     def derivatives(self, by_moved: Array) -> tuple[Array, Array, Array]:
@@ -73,11 +71,11 @@ class Motion:
         """
         back = by_moved if self._drift is None else self._drift.back(by_moved)
         by_point = _by_view(self._matrix.swapaxes(1, 2), back, self._bounds)
+        by_turn = cross(self._turned, by_moved)
+        before, by_drift = (by_turn, by_turn) if self._drift is None else self._drift.back_and_rate(by_turn)
         left = rotation_left_jacobian(self._rotation).swapaxes(1, 2)
-        by_rotation = _by_view(left, cross(self._lever, back), self._bounds)
-        if self._drift is None:
-            return by_point, by_rotation, by_rotation
-        return by_point, by_rotation, self._drift.rate(cross(self._turned, by_moved))
+        by_rotation = _by_view(left, before, self._bounds)
+        return by_point, by_rotation, by_rotation if self._drift is None else by_drift
 
 
 def _by_view(matrices: Array, rows: Array, bounds: IntArray) -> Array:

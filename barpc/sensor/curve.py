@@ -250,6 +250,12 @@ class Turn:
         bent = cross(self._w, v)
         return np.asarray(v - self._a * bent + self._b * cross(self._w, bent))
 
+    def back_and_rate(self, v: Array) -> tuple[Array, Array]:
+        """`back` and `rate` of the same vectors."""
+        bent = cross(self._w, v)
+        twice = cross(self._w, bent)
+        return v - self._a * bent + self._b * twice, v - self._b * bent + self._c * twice
+
     def rate(self, v: Array) -> Array:
         """The right Jacobian times v: exp([w + v]x) is exp([w]x) exp([rate]x) to first order in v (..., 3, N)."""
         bent = cross(self._w, v)
