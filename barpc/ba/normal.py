@@ -106,9 +106,9 @@ def reduce_normal(
     sums = structure.sum_points(point_products(by_point, residual))
     lower = cholesky3(sums[:6] + point_matrix)
     half = solve_lower(lower, sums[6:] + point_gradient)
-    cross, slope = _eliminate(structure, residual, by_point, by_unknown, lower, half)
-    gradient = camera_gradient + structure.sum_views(slope)
-    diagonal = _diagonal_blocks(structure, by_unknown, cross)
+    cross = _eliminate(structure, by_point, by_unknown, lower)
+    diagonal, gradient = _of_views(structure, residual, by_unknown, cross, half)
+    gradient += camera_gradient
     diagonal[:, np.arange(q), np.arange(q)] += camera_diagonal
     matrix, slope_all = _assemble(structure, diagonal, _pair_blocks(structure, cross)), gradient.ravel()
     gain = float((half**2).sum())
@@ -192,22 +192,18 @@ def solve_transposed(lower: Array, rhs: Array) -> Array:
     return np.stack([(rhs[0] - l10 * y - l20 * z) / l00, y, z])
 
 
-def _eliminate(
-    structure: Structure, residual: Array, by_point: Array, by_unknown: Array, lower: Array, half: Array
-) -> tuple[Array, Array]:
-    """Y (K, 3, q), and what every observation adds to the gradient, B^T r - Y^T h, (q, K)."""
+def _eliminate(structure: Structure, by_point: Array, by_unknown: Array, lower: Array) -> Array:
+    """Y (K, 3, q)."""
     q, count = by_unknown.shape[1:]
-    cross, slope = np.empty((count, 3, q)), np.empty((q, count))
+    cross = np.empty((count, 3, q))
     for part in parts(count, CHUNK):
         point = structure.point[part]
         whitened = _whiten(by_point[..., part], lower.take(point, axis=1, mode="clip"))
-        unknown, r = by_unknown[..., part], residual[:, part]
+        unknown = by_unknown[..., part]
         rows = whitened[0, :, None] * unknown[0]
         rows += whitened[1, :, None] * unknown[1]
         cross[part] = rows.reshape(3 * q, -1).T.reshape(-1, 3, q)
-        rows *= half.take(point, axis=1, mode="clip")[:, None]
-        np.subtract(unknown[0] * r[0] + unknown[1] * r[1], rows.sum(axis=0), out=slope[:, part])
-    return cross, slope
+    return cross
 
 
 def _whiten(by_point: Array, lower: Array) -> Array:
@@ -220,15 +216,20 @@ def _whiten(by_point: Array, lower: Array) -> Array:
     return out
 
 
-def _diagonal_blocks(structure: Structure, by_unknown: Array, cross: Array) -> Array:
-    """(N, q, q): sum B^T B - sum Y^T Y of every view."""
+def _of_views(
+    structure: Structure, residual: Array, by_unknown: Array, cross: Array, half: Array
+) -> tuple[Array, Array]:
+    """sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of every view."""
     q = cross.shape[2]
-    out = np.empty((structure.num_views, q, q))
+    matrix, gradient = np.empty((structure.num_views, q, q)), np.empty((structure.num_views, q))
+    of_points = np.ascontiguousarray(half.T)
     for v, (start, stop) in enumerate(zip(structure.bounds[:-1], structure.bounds[1:], strict=True)):
-        col, row = by_unknown[..., start:stop]
+        (col, row), r = by_unknown[..., start:stop], residual[:, start:stop]
         pulled = cross[start:stop].reshape(-1, q)
-        np.subtract(col @ col.T + row @ row.T, pulled.T @ pulled, out=out[v])
-    return out
+        h = of_points.take(structure.point[start:stop], axis=0, mode="clip").ravel()
+        np.subtract(col @ col.T + row @ row.T, pulled.T @ pulled, out=matrix[v])
+        gradient[v] = col @ r[0] + row @ r[1] - h @ pulled
+    return matrix, gradient
 
 
 def _pair_blocks(structure: Structure, cross: Array) -> Array:
