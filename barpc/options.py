@@ -236,7 +236,7 @@ class AdjustOptions(Options):
     sigma_attitude: float | None = option(
         None,
         """Prior standard deviation of the rotation, on the ground (angle x distance). Without: the accuracy that
-        the RPC states where it is usable, else 5 m.""",
+        the RPC states where it is usable, else 7.5 m.""",
         unit="m",
         above=0,
     )

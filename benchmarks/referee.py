@@ -29,7 +29,7 @@ Magnitudes (one axis, one sigma):
 ::
 
     python -m benchmarks.referee                       # the table of the default, medians over seeds
-    python -m benchmarks.referee --seeds 5 --only drift --option adjust.drift=1
+    python -m benchmarks.referee --seeds 5 --only drift --option drift=1
     python -m benchmarks.referee --run                 # the whole command: what was said as well
 """
 

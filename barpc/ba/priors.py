@@ -15,7 +15,7 @@ from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.sensor.rpc import RPC
 
-DEFAULT_ACCURACY = 5.0  # m, horizontal, of a camera that does not state its own (Pleiades: CE90 8.5 m = 4 m)
+DEFAULT_ACCURACY = 7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
 DRIFT_SIGMA = 0.2  # m, at a view's first and last row: 0.3 microradian from 700 km, as good platforms have it
 USABLE_ACCURACY = 0.1  # m: less is stated in pixels of a fit (as Airbus does), not in metres of geolocation
 IMAGE_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image
@@ -100,7 +100,7 @@ class PointPrior:
 
 
 def stated_accuracy(view: View) -> float:
-    """Horizontal accuracy of a view as delivered [m]: what its RPC states where usable, else 5 m."""
+    """Horizontal accuracy of a view as delivered [m]: what its RPC states where usable, else 7.5 m."""
     stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
     return stated if stated is not None and stated > USABLE_ACCURACY else DEFAULT_ACCURACY
 

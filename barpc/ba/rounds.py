@@ -79,7 +79,7 @@ class Rounds:
         is_tie = block.point < block.num_tracks
         self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie)
         self.smooth = Smooth(problem.structure, problem.xy, unknowns)
-        self.variances = Variances.of(problem.camera_prior, unknowns, options)
+        self.variances = Variances.of(problem.camera_prior, unknowns, options, bool(block.gcps.names))
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = self.use.astype(np.float64)

@@ -35,6 +35,8 @@ _GROSS = 16.0  # times the variance stated: a view whose corrections are smaller
 _FREE = 100.0  # times its prior: a view whose camera may be anywhere
 _SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
+_UNEXPECTED = 1e-3  # drifts less probable than this are another platform's, and what was given counts for nothing
+_LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
 _ITERATIONS = 10
 _STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
 _SMALL = 400  # unknowns up to which every view is tried and the covariance's diagonal is exact
@@ -94,12 +96,13 @@ class Variances:
     unknowns: Unknowns  # which unknown is what
     learn_constant: bool  # whether the constants' standard deviations may change
     learn_drift: bool
+    cautious: bool  # rather too wide than too narrow: no control holds the scene
 
     @classmethod
-    def of(cls, given: CameraPrior, unknowns: Unknowns, options: AdjustOptions) -> Variances:
-        """What the options leave to be learnt."""
+    def of(cls, given: CameraPrior, unknowns: Unknowns, options: AdjustOptions, control: bool) -> Variances:
+        """What the options leave to be learnt, with control points or without."""
         geometric = unknowns.geometric and options.learn_priors
-        return cls(given, unknowns, geometric, geometric and options.sigma_drift is None)
+        return cls(given, unknowns, geometric, geometric and options.sigma_drift is None, not control)
 
     @property
     def constants(self) -> int:
@@ -190,6 +193,8 @@ class Variances:
         n = len(params)
         total, freedom = self._squares(params, known)
         factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
+        if self.cautious:
+            factor = max(factor, _possible(total.sum(), freedom.sum()))
         odd = np.zeros(n, dtype=bool)
         with np.errstate(all="ignore"):
             gross = bool((total > _GROSS * freedom)[freedom > _LEAST].any())
@@ -244,8 +249,15 @@ class Variances:
         factors = np.ones(self._degrees)
         for degree in range(self._degrees):
             total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
-            factors[degree] = np.sqrt((_STRENGTH + total) / (_STRENGTH + freedom))
-        return factors
+            factors[degree] = (_STRENGTH + total) / (_STRENGTH + freedom)
+            if self.cautious and freedom > _LEAST and chi2.sf(total, freedom) < _UNEXPECTED:
+                factors[degree] = max(factors[degree], _possible(total, freedom))
+        return np.sqrt(factors)
+
+
+def _possible(total: float, freedom: float) -> float:
+    """A variance, in units of the one given, that still makes such a sum of squares likely enough."""
+    return float(total / chi2.ppf(_LOW, freedom))
 
 
 def same_prior(a: CameraPrior, b: CameraPrior, share: float) -> bool:

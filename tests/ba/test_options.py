@@ -274,7 +274,7 @@ def test_prior_sigmas_stand_at_their_unknowns(dirty):
 
 
 @pytest.mark.parametrize(
-    ("stated", "taken"), [(None, 5.0), (0.1, 5.0), (0.11, 0.11), (8.0, 8.0), (0.02, 5.0)]
+    ("stated", "taken"), [(None, 7.5), (0.1, 7.5), (0.11, 0.11), (8.0, 8.0), (0.02, 7.5)]
 )
 def test_a_camera_is_as_accurate_as_it_states_in_metres(dirty, stated, taken):
     view = dirty.views[0]
