@@ -86,7 +86,7 @@ def test_the_triplet_agrees_and_stays_where_it_was(shared_data, triplet):
     for offset in _offsets(shared_data, found, "phr_triplet_north", TRIPLET):
         assert abs(np.median(offset)) <= 0.03
     shift = _shift(triplet, found, checks)
-    # metres, from detector points: 0.45 up, of which 86 are not known; a metre is what is trusted
+    # metres, from detector points: 0.45 up, where 67 are not known; a metre is what is trusted
     assert np.abs(shift).max() <= 0.5
     assert np.abs(shift[:2]).max() <= 0.15
     assert (np.abs(shift) < found.gauge.sigma).all()
