@@ -219,7 +219,7 @@ def _whiten(by_point: Array, lower: Array) -> Array:
 def _of_views(
     structure: Structure, residual: Array, by_unknown: Array, cross: Array, half: Array
 ) -> tuple[Array, Array]:
-    """sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of every view."""
+    """Sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of every view."""
     q = cross.shape[2]
     matrix, gradient = np.empty((structure.num_views, q, q)), np.empty((structure.num_views, q))
     of_points = np.ascontiguousarray(half.T)

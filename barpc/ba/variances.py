@@ -35,7 +35,9 @@ _GROSS = 16.0  # times the variance stated: a view whose corrections are smaller
 _FREE = 100.0  # times its prior: a view whose camera may be anywhere
 _SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
-_UNEXPECTED = 1e-3  # drifts less probable than this are another platform's, and what was given counts for nothing
+_UNEXPECTED = (
+    1e-3  # drifts less probable than this are another platform's, and what was given counts for nothing
+)
 _LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
 _ITERATIONS = 10
 _STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,6 @@ from barpc.options import FitOptions, Nodes
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprint
 
-_SLAB = 8192  # check points handed out at a time, about
 _SAMPLES = 400  # of a DEM along each side of the image
 _RANGES = (("longitude", -360.0, 720.0), ("latitude", -90.0, 90.0), ("altitude", -12e3, 100e3))
 _ONE_ALTITUDE = 1e-3  # metres
@@ -98,22 +97,6 @@ def _ground_box(
         raise FitError("the model has no footprint over this altitude range")
     lon, lat = wrap_longitude(ring[:, 0], ring[0, 0]), ring[:, 1]
     return (float(lon.min()), float(lon.max())), (float(lat.min()), float(lat.max()))
-
-
-def check_points(ground: Array) -> Iterator[Array]:
-    """Middles (M, 3) of consecutive control points (n_x, n_y, n_alt, 3), the finite ones, some thousands at a time.
-
-    Strictly inside the box, and never used by the fit.
-    """
-    step = max(1, _SLAB // max(1, (ground.shape[1] - 1) * (ground.shape[2] - 1)))
-    for start in range(0, ground.shape[0] - 1, step):
-        middle = ground[start : start + step + 1]
-        for axis in range(3):
-            head = middle[(slice(None),) * axis + (slice(None, -1),)]
-            tail = middle[(slice(None),) * axis + (slice(1, None),)]
-            middle = 0.5 * (head + tail)
-        flat = middle.reshape(-1, 3)
-        yield flat[np.isfinite(flat).all(axis=1)]
 
 
 def extent(points: Array) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
-from barpc.fit.points import check_points, control_points, extent, numbers, screened, widened
+from barpc.fit.points import control_points, extent, numbers, screened, widened
 from barpc.fit.solve import Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
@@ -19,7 +19,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
-_CHUNK = 8192
+_CHUNK = 8192  # points, check points too, worked on at a time, about
 _LOOPS = 4096  # round trips that a table of points is tried on, about
 _BEYOND = 1.25  # the box and 25 %
 
@@ -106,6 +106,22 @@ class Errors:
     def rmse(self) -> Array:
         """Root mean square (2,) [px]."""
         return np.asarray(np.sqrt(self.squares / self.count)) if self.count else np.full(2, np.nan)
+
+
+def check_points(ground: Array) -> Iterator[Array]:
+    """Middles (M, 3) of consecutive control points (n_x, n_y, n_alt, 3), the finite ones, some thousands at a time.
+
+    Strictly inside the box, and never used by the fit.
+    """
+    step = max(1, _CHUNK // max(1, (ground.shape[1] - 1) * (ground.shape[2] - 1)))
+    for start in range(0, ground.shape[0] - 1, step):
+        middle = ground[start : start + step + 1]
+        for axis in range(3):
+            head = middle[(slice(None),) * axis + (slice(None, -1),)]
+            tail = middle[(slice(None),) * axis + (slice(1, None),)]
+            middle = 0.5 * (head + tail)
+        flat = middle.reshape(-1, 3)
+        yield flat[np.isfinite(flat).all(axis=1)]
 
 
 def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:

@@ -66,7 +66,9 @@ def test_the_drift_is_learnt_as_large_as_it_is():
              for name in ("no drift", "drift 1", "drift 3")}  # fmt: skip
     quiet, one, three = (float(np.median(sizes[name])) for name in sizes)
     assert quiet < 0.25
-    assert 0.25 < one < 1.8  # 0.7 m is flown, of which half is seen; what is not expected is taken rather too wide
+    assert (
+        0.25 < one < 1.8
+    )  # 0.7 m is flown, of which half is seen; what is not expected is taken rather too wide
     assert 1.5 < three < 6.0
 
 

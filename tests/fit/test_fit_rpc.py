@@ -11,8 +11,9 @@ import pytest
 
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
-from barpc.fit.points import check_points, control_points
+from barpc.fit.points import control_points
 from barpc.fit.precision import PRECISIONS
+from barpc.fit.rpc import check_points
 from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.rpc import RPC

@@ -14,7 +14,6 @@ from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import rpc as fit_module
 from barpc.fit.points import (
     _check_order,
-    check_points,
     control_points,
     screened,
     spaced,
@@ -23,6 +22,7 @@ from barpc.fit.points import (
 )
 from barpc.fit.rpc import (
     Errors,
+    check_points,
     coverage,
     relative_weight,
     roundtrip,
@@ -408,7 +408,7 @@ def test_check_points_of_large_grids_are_all_middles(monkeypatch: pytest.MonkeyP
     ground = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     middles = np.stack(np.meshgrid(*(a[:-1] + 0.5 for a in axes), indexing="ij"), axis=-1).reshape(-1, 3)
     for slab in (8192, 24, 1):
-        monkeypatch.setattr("barpc.fit.points._SLAB", slab)
+        monkeypatch.setattr("barpc.fit.rpc._CHUNK", slab)
         np.testing.assert_array_equal(np.concatenate(list(check_points(ground))), middles)
     ground[0, 0, 0] = np.nan
     assert len(np.concatenate(list(check_points(ground)))) == len(middles) - 1
