@@ -157,7 +157,7 @@ def test_what_is_said_is_true(name, status, word):
 def weak_pair(angle, seed):
     """Two views whose rays meet under `angle` [deg], flown with the errors that the priors state."""
     pitch = (-0.44 * angle, 0.44 * angle)
-    errors = Errors(attitude=7.2e-6, position=5.0)
+    errors = Errors(attitude=10.8e-6, position=7.5)
     return make(Case("weak pair", errors, pitch=pitch, roll=0.0, tracks=600, seed=seed), hills)
 
 
