@@ -1,0 +1,158 @@
+"""Tracks that are kept out: drawn as if at random, always the same, and what they say of the cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions
+from barpc.ba.adjustment import make_problem
+from barpc.ba.block import Block, join
+from barpc.ba.heldout import HeldOut, _scrambled, keep_out, measure
+from barpc.ba.snooping import CRITICAL, ControlTest
+from barpc.geodesy import ecef_from_ground
+from barpc.simulate import simulate_block
+from tests.ba.conftest import centers_of
+from tests.constants import chosen
+
+OPTIONS = AdjustOptions(drift=0)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return simulate_block(4, 1500, seed=9, num_gcps=3)
+
+
+def block_of(made, gcps=None, keep=None) -> Block:
+    tracks = made.tracks if keep is None else made.tracks.select(keep)
+    with chosen(AdjustOptions, min_observations=1):
+        return join(made.views, tracks, gcps, OPTIONS)
+
+
+def test_numbers_are_scrambled_as_splitmix_does_it() -> None:
+    """The first outputs of SplitMix64 from the seed 0 (Vigna's reference code)."""
+    odd = np.uint64(0x9E3779B97F4A7C15)
+    with np.errstate(over="ignore"):
+        found = _scrambled(np.arange(1, 4, dtype=np.uint64) * odd)
+    assert [hex(int(x)) for x in found] == ["0xe220a8397b1dcdaf", "0x6e789e6aa1b965f4", "0x6c45d188009454f"]
+
+
+def test_about_a_tenth_is_kept_out_everywhere_in_the_image(made) -> None:
+    block = block_of(made)
+    out = keep_out(block)
+    assert out.mean() == pytest.approx(0.1, abs=0.025)
+    for axis in (0, 1):
+        half = block.xy[axis] > np.median(block.xy[axis])
+        assert abs(out[half].mean() - out[~half].mean()) < 0.04
+    assert len(np.unique(block.point[out])) * 1.0 == len(set(block.point[out]) - set(block.point[~out]))
+
+
+def test_what_rounding_does_to_positions_draws_hardly_another_track(made) -> None:
+    block = block_of(made)
+    rng = np.random.default_rng(0)
+    out = keep_out(block)
+    near, far = (
+        keep_out(replace(block, xy=block.xy + rng.normal(0, size, block.xy.shape))) for size in (1e-9, 1.0)
+    )
+    assert (near == out).all()
+    assert (far != out).mean() > 0.1
+
+
+def test_what_a_small_view_needs_and_what_holds_the_place_is_never_drawn(made) -> None:
+    mine = np.flatnonzero(made.tracks.view == 2)
+    for count, needed in ((99, True), (110, False)):
+        keep = np.ones(len(made.tracks), dtype=bool)
+        keep[mine[count:]] = False
+        block = block_of(made, keep=keep)
+        out = keep_out(block)
+        left = np.bincount(block.view, minlength=4)[2]
+        assert (left < 100) == needed
+        assert out[block.view == 2].any() != needed
+        assert out[block.view != 2].any()
+    block = block_of(made, made.gcps)
+    moved = (replace(block, xy=block.xy + step) for step in range(40))
+    assert not any(keep_out(each)[block.point >= block.num_tracks].any() for each in moved)
+
+
+def test_a_track_with_an_observation_that_is_not_used_is_never_drawn(made) -> None:
+    block = block_of(made)
+    out = keep_out(block)
+    one = np.flatnonzero(out)[0]
+    use = block.use.copy()
+    use[one] = False
+    again = keep_out(replace(block, use=use))
+    assert not again[block.point == block.point[one]].any()
+    assert (again == out)[block.point != block.point[one]].all()
+
+
+def test_what_is_kept_out_is_measured_by_its_own_points(made) -> None:
+    """With the truth's cameras: white noise of 0.1 px a coordinate, of which a triangulation keeps a half to a third."""
+    block = block_of(made)
+    problem = make_problem(block, OPTIONS, centers_of(made), None)
+    exact = np.array(
+        [np.r_[c.rotation * d, c.translation]
+         for c, d in zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)]
+    )  # fmt: skip
+    found = measure(problem, exact, block)
+    assert found.noise.mean() == pytest.approx(1.0, abs=0.12)  # medians, of two views' tracks and of more
+    assert (np.abs(found.noise - 1.0) < 0.3).all()
+    np.testing.assert_allclose(found.error, np.sqrt((found.noise**2).mean()))
+    np.testing.assert_allclose(found.whole_rms, np.sqrt((found.rms**2).mean()))
+    true = np.sqrt((found.residual**2).sum(axis=0).mean())
+    assert found.whole_rms == pytest.approx(true, rel=0.1)
+    error = np.linalg.norm(found.points - ecef_from_ground(made.truth.ground), axis=1)
+    assert np.median(error) < 1.0
+    np.testing.assert_array_equal(found.index, np.arange(block.num_points))
+    # one observation in ten 30 px off: the medians and two of three views stand
+    rng = np.random.default_rng(1)
+    wrong = rng.random(len(block.view)) < 0.05
+    spoilt = measure(problem, exact, replace(block, xy=block.xy + 30.0 * wrong))
+    assert (spoilt.noise < 1.6).all()
+    three = (np.bincount(block.point)[block.point] >= 3) & (np.bincount(block.point, wrong)[block.point] == 1)
+    assert np.median(np.abs(spoilt.residual[0, three & wrong])) == pytest.approx(30.0, abs=1.0)
+    assert np.median(np.abs(spoilt.residual[0, three & ~wrong])) < 0.5
+
+
+def test_a_view_of_fewer_than_twenty_says_nothing(made) -> None:
+    tracks = made.tracks
+    for count in (19, 20):
+        keep = np.ones(len(tracks), dtype=bool)
+        keep[np.flatnonzero(tracks.view == 1)[count:]] = False
+        block = block_of(made, keep=keep)
+        problem = make_problem(block, OPTIONS, centers_of(made), None)
+        found = measure(problem, np.zeros((4, 6)), block)
+        left = int((block.view == 1).sum())
+        assert np.isnan(found.noise[1]) == (left < 20)
+        assert np.isfinite(found.noise[[0, 2, 3]]).all()
+        assert np.isfinite(found.error)
+    assert np.isnan(HeldOut(np.zeros((2, 0)), np.zeros(0, int), np.zeros((0, 3)), *np.full((2, 4), np.nan)).error)
+
+
+# --- control points ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("w", "used", "culprit"),
+    [
+        ([1.0, 4.2, 0.5], [1, 1, 1], 1),
+        ([1.0, 3.9, 0.5], [1, 1, 1], None),
+        ([9.0, 8.0], [1, 1], None),  # of two none can be named
+        ([9.0, 8.0, np.nan], [1, 1, 1], None),  # nor of two that tell
+        ([9.0, 8.0, 7.0, 1.0, 1.0], [1, 1, 0, 1, 1], None),  # of five one may be wrong
+        ([9.0, 8.0, 70.0, 1.0, 1.0, 1.0], [1, 1, 0, 1, 1, 1], 0),  # of six two
+        ([9.0, 8.0, 70.0, np.nan, 1.0, 1.0], [1, 1, 0, 1, 1, 1], None),
+        ([9.0, 12.0, np.nan, 1.0], [1, 1, 0, 1], 1),  # one that nothing tells about does not count among them
+    ],
+)  # fmt: skip
+def test_the_worst_of_enough_control_points_is_the_culprit(w, used, culprit) -> None:
+    n = len(w)
+    tested = ControlTest(np.array(used, dtype=bool), np.zeros((n, 3)), np.array(w), np.ones(n))
+    assert tested.culprit() == culprit
+
+
+def test_a_control_point_that_contradicts_is_said_to() -> None:
+    assert CRITICAL == pytest.approx(4.0)
+    tested = ControlTest(np.array([True, True, False]), np.zeros((3, 3)), np.array([3.9, 4.1, 9.0]), np.ones(3))
+    assert [tested.status(g) for g in range(3)] == ["used", "contradicts", "rejected"]

@@ -1,0 +1,145 @@
+"""The rounds: what they do to clean and to dirty blocks, and that they end where nothing changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks, adjustment, rounds
+from barpc.ba.rounds import _median
+from barpc.simulate import Block, simulate_block
+from tests.ba.conftest import centers_of, solve
+
+CALM = {"drift": 0, "learn_priors": False, "hold_out": False}
+
+
+@pytest.fixture(scope="module")
+def clean() -> Block:
+    return simulate_block(3, 150, seed=5)
+
+
+def seen(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> list[tuple[Any, ...]]:
+    """The arguments of every call of a module's function from now on."""
+    calls, function = [], getattr(module, name)
+
+    def watched(*given: Any) -> Any:
+        calls.append(given)
+        return function(*given)
+
+    monkeypatch.setattr(module, name, watched)
+    return calls
+
+
+def moved_together(block: Block, view: int, share: float, by: float) -> Block:
+    """A share of the observations of a view moved by the same amount [px] along the columns."""
+    tracks, xy = block.tracks, block.tracks.xy.copy()
+    mine = np.flatnonzero(tracks.view == view)
+    xy[mine[: round(share * len(mine))], 0] += by
+    return replace(block, tracks=replace(tracks, xy=xy))
+
+
+def test_a_clean_block_is_solved_twice_and_nothing_is_looked_at_again(clean, monkeypatch) -> None:
+    again = seen(monkeypatch, rounds, "revived"), seen(monkeypatch, adjustment, "agreeing")
+    solves = seen(monkeypatch, rounds, "minimise")
+    found = solve(clean, **CALM)
+    assert found.status.startswith("2 passes of cutting")
+    assert again == ([], [])
+    coarse, exact = (given[4] for given in solves)
+    assert coarse > 1e-3  # the second pass follows always
+    assert exact <= 1e-6
+    assert [given[3] for given in solves] == ["sparse", "auto"]
+
+
+def test_least_squares_are_exact_at_once(clean, monkeypatch) -> None:
+    solves = seen(monkeypatch, rounds, "minimise")
+    found = solve(clean, **CALM, loss="linear", estimate_noise=False)
+    assert found.status.startswith("1 passes of cutting")
+    assert all(given[4] <= 1e-6 for given in solves)
+    assert found.inlier.all()
+    assert found.noise == pytest.approx(1.0, abs=0.1)
+
+
+def test_rounds_go_on_until_the_noise_stands(clean, monkeypatch) -> None:
+    tracks = replace(clean.tracks, sigma=np.full(len(clean.tracks), 0.02))  # five times the noise stated
+    options = {**CALM, "loss": "linear"}
+    told = solve(replace(clean, tracks=tracks), **options, estimate_noise=False)
+    found = solve(replace(clean, tracks=tracks), **options)
+    passes = [int(each.status.split()[0]) for each in (told, found)]
+    assert passes[0] == 1
+    assert 2 <= passes[1] <= 4
+    assert found.noise == pytest.approx(5.0, rel=0.1)
+    weights = seen(monkeypatch, rounds, "minimise")
+    solve(replace(clean, tracks=tracks), **options)
+    first, last = (given[2].mean() for given in (weights[0], weights[-1]))
+    assert first / last == pytest.approx(found.noise, rel=0.05)
+
+
+@pytest.mark.parametrize(("outliers", "looked"), [(0.05, True), (0.005, False)])
+def test_tracks_that_were_cut_are_looked_at_again_where_they_are_many(monkeypatch, outliers, looked) -> None:
+    again = seen(monkeypatch, rounds, "revived")
+    dirty = simulate_block(3, 400, seed=5, outliers=outliers)
+    found = solve(dirty, **CALM)
+    assert 0.995 - 3 * outliers < found.inlier.mean() < 1.0
+    # before every pass but the first
+    assert len(again) == (int(found.status.split()[0]) - 1 if looked else 0)
+
+
+def test_a_view_that_lost_much_is_solved_again_from_an_agreement(clean, monkeypatch) -> None:
+    again = seen(monkeypatch, adjustment, "agreeing")
+    for share, asked in ((0.10, 0), (0.20, 1)):
+        again.clear()
+        found = solve(moved_together(clean, 1, share, 40.0), **CALM)
+        assert len(again) == asked
+        assert found.inlier[clean.tracks.view == 1].mean() == pytest.approx(1 - share, abs=0.02)
+
+
+def test_a_median_counts_each_value_by_its_weight() -> None:
+    values = np.array([5.0, 1.0, 9.0, 3.0])
+    assert _median(values, np.ones(4)) == 3.0
+    assert _median(values, np.array([1.0, 1.0, 1.0, 0.5])) == 5.0
+    assert _median(values, np.array([0.0, 0.0, 1.0, 0.0])) == 9.0
+    assert _median(values, np.array([0.0, 3.0, 1.0, 1.0])) == 1.0
+    assert _median(values, np.zeros(4)) == 1.0  # as stated where nothing counts
+    assert _median(values[:0], values[:0]) == 1.0
+
+
+def test_points_that_were_cut_are_seen_where_the_cameras_see_them_now(clean) -> None:
+    """The truth's cameras; every third point 300 m away, and not in use."""
+    problem = adjustment.make_problem(
+        adjustment.join(clean.views, clean.tracks, None, AdjustOptions(drift=0)), AdjustOptions(drift=0),
+        centers_of(clean), None,
+    )  # fmt: skip
+    good = solve(clean, **CALM)
+    points = good.points.copy()
+    lost = np.arange(len(points)) % 3 == 0
+    points[lost] += 300.0
+    use = ~lost[problem.structure.point]
+    use[np.flatnonzero(~use)[0]] = True  # of this one, one observation was kept: it stays where it is
+    kept = problem.structure.point[np.flatnonzero(use & lost[problem.structure.point])[0]]
+    state = adjustment.State(good.params, points, 7.0, (9.0, 8.0))
+    residual = np.full(problem.xy.shape, 0.25)
+    again, left = rounds.revived(problem, state, residual, use, np.full(len(use), 10.0))
+    lost[kept] = False
+    np.testing.assert_array_equal(again.points[~lost], points[~lost])
+    np.testing.assert_allclose(again.points[lost], good.points[lost], atol=0.5)
+    assert (again.cost, again.history) == (7.0, (9.0, 8.0))
+    of_lost = lost[problem.structure.point]
+    assert (left[:, ~of_lost] == 0.25).all()
+    np.testing.assert_allclose(left[:, of_lost], problem.residuals(good.params, again.points)[:, of_lost])
+    assert np.abs(left[:, of_lost]).max() < 1.0
+
+
+def test_a_better_agreement_takes_the_place_of_a_compromise(clean) -> None:
+    """40 % of a view moved by 3 px: what most of its partners contradict is left out."""
+    dirty = moved_together(clean, 1, 0.4, 3.0)
+    options = AdjustOptions(noise_floor=0.0, min_convergence=0.01, drift=0)
+    found = adjust_tracks(dirty.views, dirty.tracks, options, centers=centers_of(dirty), hold_out=False)
+    wrong = dirty.tracks.xy[:, 0] != clean.tracks.xy[:, 0]
+    assert not found.inlier[wrong].any()
+    partner = np.isin(dirty.tracks.point, dirty.tracks.point[wrong])
+    assert found.inlier[~partner].mean() > 0.99
+    assert found.inlier[~wrong].mean() > 0.9
+    assert found.noise == pytest.approx(1.0, abs=0.15)
