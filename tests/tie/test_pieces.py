@@ -27,10 +27,10 @@ from barpc.tie.epipolar import (
 )
 from barpc.tie.features import detect_tile, join
 from barpc.tie.matcher import Matches, Prediction
-from barpc.tie.matching import MATCHERS, PairReport, _Search
+from barpc.tie.matching import MATCHERS, PairReport, _latest, _Search
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import sample_stretch, tiles
-from barpc.tie.register import Registration, _Links, _shared, references
+from barpc.tie.register import Registration, _at, _Links, _shared, references
 from barpc.tie.tracks import require_tracks, thin
 from tests.constants import CONSTANTS, chosen
 from tests.tie.conftest import Rendered, write_image
@@ -373,6 +373,34 @@ def test_the_reference_of_a_track_is_the_view_most_like_the_others() -> None:
     assert references(tracks, {(0, 2): 0.3, (1, 2): 0.4}, 3).tolist() == [2, 3, 5]
 
 
+@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize(
+    "spreads",
+    [
+        {(0, 1): 0.1, (0, 2): 0.5, (1, 2): 0.9, (1, 3): 0.9, (2, 3): 0.1},
+        {(0, 1): 0.9, (0, 2): 0.9, (1, 2): 1.0, (2, 3): 0.1},
+        {(0, 1): 0.1, (0, 2): 0.1, (1, 3): 0.7, (2, 3): 1.0, (1, 2): 0.9},
+        {(0, 1): 0.1, (0, 2): 0.1, (1, 3): 0.9, (2, 3): 0.5, (1, 2): 0.5},
+    ],
+)
+def test_a_pair_that_was_not_matched_is_twice_as_unlike_as_the_worst(spreads, scale) -> None:
+    def unlike(i: int, j: int) -> float:
+        return spreads.get((min(i, j), max(i, j)), 2 * max(spreads.values())) if i != j else 0.0
+
+    best = int(np.argmin([sum(unlike(i, j) for j in range(4)) for i in range(4)]))
+    found = references(_tracks(*((v, 0) for v in range(4))), {p: scale * x for p, x in spreads.items()}, 4)
+    assert found.tolist() == [best]
+
+
+def test_a_point_is_on_the_mask_where_its_nearest_pixel_is() -> None:
+    mask = np.zeros((4, 6), dtype=bool)
+    mask[0, 0] = mask[3, 5] = mask[0, 5] = mask[2, 3] = True
+    places = [[0, 0], [0.4, -0.4], [0, 1], [5, 3], [5.4, 3.4], [5, 0], [5, 2], [3, 2], [2, 3], [-0.6, 0], [0, -0.6],
+              [5.6, 3], [5, 3.6], [np.nan, 0]]  # fmt: skip
+    expected = [1, 1, 0, 1, 1, 1, 0, 1, 0, 0, 0, 0, 0, 0]
+    np.testing.assert_array_equal(_at(mask, np.array(places, dtype=float)), np.array(expected, dtype=bool))
+
+
 def test_the_variance_of_a_registration_is_shared_by_both_ends() -> None:
     tracks = _tracks((0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (0, 2), (2, 2))
     of_track = np.array([0, 3, 5])
@@ -471,6 +499,21 @@ def test_as_many_matches_are_trusted_as_the_bands_aside_allow(search, aside, sha
     assert len(found) == count
     assert control == pytest.approx(stated)
     assert matcher.asked == [0.0, -12.0, 12.0]  # twice the band's half width and six pixels more
+
+
+def test_where_the_same_points_lie_is_worked_out_once() -> None:
+    asked = []
+
+    def where(xy: np.ndarray) -> Any:
+        asked.append(xy)
+        return object()
+
+    remembered, xy = _latest(where), np.zeros((3, 2))
+    assert remembered(xy) is remembered(xy)
+    assert len(asked) == 1
+    other = xy.copy()
+    assert remembered(other) is not remembered(xy)  # other points, though they are equal
+    assert [given is xy for given in asked] == [True, False, True]
 
 
 class Wrong:

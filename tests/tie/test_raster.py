@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import ImageError
-from barpc.tie.raster import grow, levelled, read_pixels, sample_stretch
+from barpc.tie.raster import Stretch, grow, levelled, read_pixels, sample_stretch
 
 from .conftest import write_image
 
@@ -116,6 +116,54 @@ def test_an_image_of_one_pixel_has_no_stretch(tmp_path) -> None:
 
 def test_a_box_grows_up_to_the_border_of_the_image() -> None:
     assert grow((0, 10, 20, 20), 5, (100, 32)) == (0, 5, 25, 27)
+
+
+@pytest.mark.parametrize(
+    ("box", "grown"),
+    [
+        ((40, 10, 20, 12), (35, 5, 30, 22)),
+        ((90, 30, 20, 20), (85, 25, 15, 7)),
+        ((-9, -9, 4, 4), (0, 0, 1, 1)),  # beside the image: the pixel that is nearest
+        ((150, 50, 20, 20), (99, 31, 1, 1)),
+        ((150, -50, 20, 20), (99, 0, 1, 1)),
+    ],
+)
+def test_a_grown_box_is_cut_at_the_image_and_holds_a_pixel_at_least(box, grown) -> None:
+    assert grow(box, 5, (100, 32)) == grown
+
+
+@pytest.mark.parametrize("side", ["left", "right", "top", "bottom", "middle"])
+def test_the_stretch_sees_the_whole_image_up_to_its_last_pixels(tmp_path, side: str) -> None:
+    """Fifteen columns or rows of a large image, and nothing else, are bright."""
+    data = RNG.integers(100, 110, (900, 1100)).astype(np.uint16)
+    part = {
+        "left": np.s_[:, :15], "right": np.s_[:, -15:], "top": np.s_[:15], "bottom": np.s_[-15:],
+        "middle": np.s_[440:460],
+    }[side]  # fmt: skip
+    data[part] = 5000
+    stretch = sample_stretch(write_image(tmp_path / "a.tif", data))
+    assert stretch is not None
+    assert stretch.low == pytest.approx(100, abs=1)
+    assert stretch.high == 5000
+
+
+def test_the_stretch_is_that_of_the_usual_values_not_of_the_extreme_ones(tmp_path) -> None:
+    data = np.tile(np.arange(1000, 2000), (1000, 1)).astype(np.uint16)
+    stretch = sample_stretch(write_image(tmp_path / "a.tif", RNG.permuted(data, axis=1)))
+    assert stretch is not None
+    assert stretch.low == pytest.approx(1005, abs=1.5)
+    assert stretch.high == pytest.approx(1994, abs=1.5)
+    picture = stretch.apply(np.array([[900, 1005, 1499.5, 1994, 2100]], np.float32), np.ones((1, 5), bool))
+    np.testing.assert_allclose(picture[0].astype(int), [0, 0, 127, 255, 255], atol=1)
+
+
+def test_invalid_pixels_take_the_mean_of_the_valid_ones() -> None:
+    for dtype in (np.float32, np.float64):
+        pixels = np.array([[10.0, 0.0], [20.0, 0.0]], dtype)
+        valid = np.array([[True, False], [True, False]])
+        picture = Stretch(0.0, 51.0).apply(pixels, valid)
+        np.testing.assert_array_equal(picture, [[50, 75], [100, 75]])
+        assert not Stretch(0.0, 51.0).apply(pixels, ~valid & False).any()
 
 
 def test_a_window_of_one_value_is_level() -> None:
