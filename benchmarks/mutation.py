@@ -48,6 +48,14 @@ TESTS = {
 """Part of the core -> its tests."""
 SLOW = ("test_real_images.py", "test_simulated.py", "test_sentinel1_example.py")
 """Left out: full runs over images, minutes each."""
+LATE = {
+    f"test_{name}.py"
+    for name in (
+        "area", "matcher", "guided", "link", "real", "recovery", "referee", "sar_optical", "uncertainty",
+        "options", "snooping", "sentinel1", "fit_rpc", "solvers", "features", "pieces",
+    )
+}  # fmt: skip
+"""Run last, unless they are named after the module: many seconds each."""
 
 COMPARISONS = {
     ast.Lt: ("<", "<=", ">"), ast.LtE: ("<=", "<", ">="), ast.Gt: (">", ">=", "<"), ast.GtE: (">=", ">", "<="),
@@ -226,7 +234,7 @@ def caught(tree: Path, mutant: Mutant, limit: float) -> tuple[bool, str, float]:
 def _failing(tree: Path, part: str, stem: str, limit: float) -> tuple[bool, str, float]:
     """Run a part's tests in a forked process, those that are named after the module first."""
     found = (path for path in sorted(tree.glob(TESTS[part])) if path.name not in SLOW)
-    paths = sorted(found, key=lambda path: stem.removeprefix("_") not in path.name)
+    paths = sorted(found, key=lambda path: (stem.removeprefix("_") not in path.name, path.name in LATE))
     start, log = time.monotonic(), tree / "log.txt"
     child = multiprocessing.get_context("fork").Process(
         target=_tests, args=(tree, log, list(map(str, paths)))

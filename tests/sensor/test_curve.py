@@ -49,15 +49,29 @@ def test_a_turn_is_the_exponential_of_its_vector_and_has_its_jacobian(together: 
             many[:, column] = given
             # R(w + dw) = R(w) R(J(-w) dw)
             expected = series(size * way, 0), series(-size * way, 0), series(-size * way, 1)
-            for found, matrix in zip((turn.forth(many), turn.back(many), turn.rate(many)), expected, strict=True):
-                np.testing.assert_allclose(found[:, column], matrix @ given, rtol=0, atol=4e-16 * (2 + 10 * size))
+            for found, matrix in zip(
+                (turn.forth(many), turn.back(many), turn.rate(many)), expected, strict=True
+            ):
+                np.testing.assert_allclose(
+                    found[:, column], matrix @ given, rtol=0, atol=4e-16 * (2 + 10 * size)
+                )
     for size in SIZES[1:-1]:
-        np.testing.assert_allclose(rotation_left_jacobian(size * way), series(size * way, 1), rtol=0, atol=2e-15)
+        np.testing.assert_allclose(
+            rotation_left_jacobian(size * way), series(size * way, 1), rtol=0, atol=2e-15
+        )
 
 
 # --- orbits --------------------------------------------------------------------------------------------------
 
-ORBIT = np.array([[7.0e6, 1e5, -2e5], [-300.0, 7400.0, 900.0], [-3.9, -0.1, 0.2], [5e-5, -1.3e-3, -1e-4], [3e-7, 2e-9, 1e-8]])
+ORBIT = np.array(
+    [
+        [7.0e6, 1e5, -2e5],
+        [-300.0, 7400.0, 900.0],
+        [-3.9, -0.1, 0.2],
+        [5e-5, -1.3e-3, -1e-4],
+        [3e-7, 2e-9, 1e-8],
+    ]
+)
 
 
 def vectors(time: np.ndarray, sigma: tuple[float, float, float] = (0.0, 0.0, 0.0), seed: int = 0):
@@ -121,7 +135,13 @@ def test_state_vectors_near_the_image_take_part_and_no_others() -> None:
 
 @pytest.mark.parametrize(
     ("window", "ok"),
-    [((-0.9, 20.0), True), ((-1.1, 20.0), False), ((20.0, 60.9), True), ((20.0, 61.1), False), ((-0.9, 60.9), True)],
+    [
+        ((-0.9, 20.0), True),
+        ((-1.1, 20.0), False),
+        ((20.0, 60.9), True),
+        ((20.0, 61.1), False),
+        ((-0.9, 60.9), True),
+    ],
 )
 def test_an_orbit_is_believed_for_a_second_beyond_its_vectors(window, ok: bool) -> None:
     time = np.arange(0.0, 61.0, 10.0)
