@@ -184,11 +184,7 @@ def test_groups_are_listed_the_largest_first_five_views_of_five() -> None:
     assert chain((3,)).left_out == ()
     with pytest.raises(DisconnectedError) as caught:
         chain((5, 6, 2))
-    assert caught.value.groups == [
-        [f"v{v:02}" for v in range(5, 11)],
-        [f"v{v:02}" for v in range(5)],
-        ["v11", "v12"],
-    ]
+    assert [len(group) for group in caught.value.groups] == [6, 5, 2]
     text = "v05, v06, v07, v08, v09, ...; v00, v01, v02, v03, v04; v11, v12; add"
     assert f"fall into 3 groups without common tie points: {text}" in str(caught.value)
     with pytest.raises(DisconnectedError) as caught:

@@ -26,7 +26,7 @@ from barpc.tie.epipolar import (
     robust_spread,
 )
 from barpc.tie.features import detect_tile, join
-from barpc.tie.matcher import Matches, Prediction
+from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.matching import MATCHERS, PairReport, _latest, _Search
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import sample_stretch, tiles
@@ -499,6 +499,12 @@ def test_as_many_matches_are_trusted_as_the_bands_aside_allow(search, aside, sha
     assert len(found) == count
     assert control == pytest.approx(stated)
     assert matcher.asked == [0.0, -12.0, 12.0]  # twice the band's half width and six pixels more
+
+
+def test_no_matches_are_none_in_every_column() -> None:
+    assert [len(NO_MATCHES), len(NO_MATCHES.xy), len(NO_MATCHES.score), len(NO_MATCHES.index)] == [0] * 4
+    assert NO_MATCHES.index.shape == (0, 2)
+    assert np.isnan(NO_MATCHES.sigma) or NO_MATCHES.sigma >= 0
 
 
 def test_where_the_same_points_lie_is_worked_out_once() -> None:
