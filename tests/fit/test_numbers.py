@@ -1,0 +1,125 @@
+"""Points that cannot be: refused with what is wrong, from the first number beyond the range on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc.errors import FitError
+from barpc.fit.points import extent, numbers, screened, spaced, widened
+
+RNG = np.random.default_rng(0)
+GROUND = np.column_stack([RNG.uniform(5, 6, 60), RNG.uniform(43, 44, 60), RNG.uniform(0, 900, 60)])
+IMAGE = np.column_stack([(GROUND[:, 0] - 5) * 8e3, (44 - GROUND[:, 1]) * 11e3]) + RNG.uniform(0, 1, (60, 2))
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "name"),
+    [
+        (0, -360.0, None), (0, -360.1, "longitude"), (0, 720.0, None), (0, 720.1, "longitude"),
+        (1, -90.0, None), (1, -90.1, "latitude"), (1, 90.0, None), (1, 90.1, "latitude"),
+        (2, -12e3, None), (2, -12.1e3, "altitude"), (2, 100e3, None), (2, 100.1e3, "altitude"),
+    ],
+)  # fmt: skip
+def test_numbers_are_longitudes_latitudes_and_altitudes(column: int, value: float, name: str | None) -> None:
+    ground = GROUND.copy()
+    ground[7, column] = value
+    if name is None:
+        np.testing.assert_array_equal(numbers(ground, IMAGE)[0][:, 1:], ground[:, 1:])
+    else:
+        with pytest.raises(FitError, match=f"^points: {value:g} is not a {name}: are the columns swapped"):
+            numbers(ground, IMAGE)
+
+
+@pytest.mark.parametrize(
+    ("ground", "image"),
+    [
+        (GROUND[:, :2], IMAGE), (GROUND[0], IMAGE[0]), (GROUND, IMAGE[:59]), (GROUND, IMAGE[:, :1]),
+        (GROUND, np.column_stack([IMAGE, IMAGE[:, 0]])), (GROUND[None], IMAGE),
+    ],
+)  # fmt: skip
+def test_arrays_of_other_shapes_are_refused(ground: np.ndarray, image: np.ndarray) -> None:
+    with pytest.raises(FitError, match=r"expected \(N, 3\) and \(N, 2\)"):
+        numbers(ground, image)
+
+
+def test_the_first_point_that_is_not_finite_is_named() -> None:
+    for wrong in (np.nan, np.inf):
+        for array, column in ((0, 0), (0, 2), (1, 0), (1, 1)):
+            given = [GROUND.copy(), IMAGE.copy()]
+            given[array][[3, 9], column] = wrong
+            with pytest.raises(FitError, match=r"2 of 60 are not finite \(the first is point 3\)"):
+                numbers(*given)
+    with pytest.raises(FitError, match="none at all"):
+        numbers(GROUND[:0], IMAGE[:0])
+
+
+def test_longitudes_across_the_antimeridian_run_on() -> None:
+    ground = GROUND.copy()
+    ground[:, 0] = np.where(np.arange(60) % 2, 179.9, -179.9)
+    found = numbers(ground, IMAGE)[0]
+    assert np.ptp(found[:, 0]) == pytest.approx(0.2)
+    assert np.ptp(numbers(GROUND, IMAGE)[0][:, 0]) < 1.0
+    np.testing.assert_array_equal(numbers(GROUND, IMAGE)[0], GROUND)
+
+
+@pytest.mark.parametrize(("column", "name"), [(0, "lon"), (1, "lat"), (2, "col"), (3, "row")])
+@pytest.mark.parametrize("value", [0.0, 43.25, -1e4])
+def test_points_of_one_value_determine_no_image(column: int, name: str, value: float) -> None:
+    given = [GROUND.copy(), IMAGE.copy()]
+    value = min(max(value, -80.0), 80.0) if column < 2 else value
+    given[column // 2][:, column % 2] = value
+    with pytest.raises(FitError, match=f"^points: all have {name} {value:g}: they determine no image"):
+        screened(*given, allow_mirrored=False)
+
+
+def test_points_on_a_line_or_in_a_plane_are_refused_and_those_at_one_altitude_taken() -> None:
+    line = IMAGE.copy()
+    line[:, 1] = 3.0 * line[:, 0] + 7.0
+    with pytest.raises(FitError, match="in the image they lie on a line"):
+        screened(GROUND, line, allow_mirrored=True)
+    plane = GROUND.copy()
+    plane[:, 2] = 100.0 + 300.0 * (plane[:, 0] - 5.0) + 200.0 * (plane[:, 1] - 43.0)
+    with pytest.raises(FitError, match="on the ground they lie in a plane"):
+        screened(plane, IMAGE, allow_mirrored=False)
+    flat = GROUND.copy()
+    flat[:, 2] = 100.0
+    screened(flat, IMAGE, allow_mirrored=False)
+    flat[0, 2] += 5e-4  # half a millimetre is one altitude, too
+    screened(flat, IMAGE, allow_mirrored=False)
+    flat[0, 2] += 5.0  # one point above the others: nothing tells its slope in altitude
+    plane[0, 2] += 50.0
+    screened(plane, IMAGE, allow_mirrored=False)
+    steep = GROUND.copy()
+    steep[:, 1] = 43.0 + 0.5 * (steep[:, 0] - 5.0)
+    with pytest.raises(FitError, match="on the ground they lie in a plane"):
+        screened(steep, IMAGE, allow_mirrored=True)
+
+
+@pytest.mark.parametrize(("distinct", "ok"), [(39, False), (40, True)])
+def test_points_that_repeat_are_too_few(distinct: int, ok: bool) -> None:
+    rows = np.arange(60) % distinct
+    if ok:
+        assert len(screened(GROUND[rows], IMAGE[rows], allow_mirrored=False)[0]) == 60
+    else:
+        with pytest.raises(FitError, match="only 39 of 60 are distinct"):
+            screened(GROUND[rows], IMAGE[rows], allow_mirrored=False)
+
+
+def test_nodes_run_from_end_to_end() -> None:
+    for nodes in ("regular", "chebyshev"):
+        for low, high in ((-0.5, 99.5), (100.0, 300.0), (-7.0, -7.0), (1e6, 1e6 + 1)):
+            found = spaced(low, high, 7, nodes)
+            assert found[[0, 3, 6]] == pytest.approx([low, 0.5 * (low + high), high], abs=1e-9)
+            assert (np.diff(found) >= 0).all()
+    np.testing.assert_allclose(np.diff(spaced(0.0, 6.0, 7, "regular")), 1.0)
+    np.testing.assert_allclose(spaced(0.0, 2.0, 5, "chebyshev"), 1 - np.cos(np.pi * np.arange(5) / 4))
+
+
+def test_an_altitude_range_is_an_interval_of_a_hundred_metres_or_more() -> None:
+    assert widened((0.0, 900.0)) == (0.0, 900.0)
+    assert widened((10.0, 30.0)) == pytest.approx((-30.0, 70.0))
+    for wrong in ((1.0, 0.0), (np.nan, 1.0), (0.0, np.nan), (0.0, np.inf), (-np.inf, 0.0)):
+        with pytest.raises(FitError, match="is not an interval"):
+            widened(wrong)
+    np.testing.assert_array_equal(extent(GROUND), [GROUND.min(axis=0), GROUND.max(axis=0)])
