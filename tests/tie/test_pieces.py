@@ -592,6 +592,32 @@ def test_a_frames_linear_map_is_that_of_the_middle_of_the_points_that_are_seen(s
     assert np.isfinite(where.slope[3:]).all()
 
 
+def test_few_tracks_are_handed_back_as_they_are() -> None:
+    tracks = _tracks(*[(v, p) for p in range(30) for v in (0, 1)])
+    for most in (30, 31, 1000):
+        assert thin(tracks, [(1000, 800)] * 2, most) is tracks
+    assert thin(tracks, [(1000, 800)] * 2, 29).num_points == 29
+    none = tracks.select(tracks.point < 0)
+    assert thin(none, [(1000, 800)] * 2, 5) is none
+
+
+def test_every_place_has_its_four_before_one_has_five() -> None:
+    """A hundred tracks at one place of an image and six each at three others."""
+    place = np.array([[100.0, 100.0], [900.0, 100.0], [100.0, 900.0], [900.0, 900.0]])
+    of = np.repeat([0, 1, 2, 3], [100, 6, 6, 6])
+    xy = np.repeat(place[of], 2, axis=0)
+    tracks = Tracks(np.tile([0, 1], 118), np.repeat(np.arange(118), 2), xy, np.full(236, 0.1))
+
+    def kept(most: int) -> list[int]:
+        left = thin(tracks, [(1000, 1000)] * 2, most)
+        near = np.abs(left.xy[left.view == 0][:, None] - place).sum(axis=2).argmin(axis=1)
+        return np.bincount(near, minlength=4).tolist()
+
+    assert kept(16) == [4, 4, 4, 4]
+    assert kept(28) == [10, 6, 6, 6]
+    assert kept(100) == [16, 6, 6, 6]  # and none more than sixteen
+
+
 def test_cells_hold_the_first_quota_of_as_many_observations_as_are_kept(monkeypatch) -> None:
     seen = []
 
