@@ -161,3 +161,68 @@ def test_the_consumers_that_are_always_there_need_no_other_package():
         "barpc",
     }
     assert TOLERANCE <= 1e-6
+
+
+class Other:
+    """What stands for another tool's module: it says how it was asked, and answers with a camera of ours."""
+
+    def __init__(self, rpc: RPC) -> None:
+        self.rpc, self.asked = rpc, []
+
+    def __call__(self, *given: object, **named: object) -> Other:
+        self.asked.append((*given, *named.values()))
+        return self
+
+    def __getattr__(self, name: str) -> Other:
+        self.asked.append(name)
+        return self
+
+
+@pytest.mark.parametrize(
+    ("name", "reader"),
+    [("a.tif", "rpc_from_geotiff"), ("a_RPC.TXT", "rpc_from_rpc_file"), ("a.json", "RPCModel")],
+)
+def test_rpcm_is_asked_in_the_way_that_suits_the_file(name, reader, image, tmp_path, monkeypatch):
+    rpc = make_rpc()
+    path = write(rpc, image, tmp_path / "out", name)
+    rpcm = Other(rpc)
+    rpcm.projection = lambda lon, lat, alt: rpc.project(np.column_stack([lon, lat, alt])).T
+    monkeypatch.setattr("barpc.handoff.import_module", lambda module: {"rpcm.rpc_model": rpcm}[module])
+    project = CONSUMERS["rpcm"].open(path)
+    ground, _ = control_grid(rpc, SIZE, ALTITUDES)
+    np.testing.assert_array_equal(project(ground), rpc.project(ground))
+    assert rpcm.asked[0] == reader
+    content, *rest = rpcm.asked[1]
+    if name == "a.json":
+        assert rest == ["rpcm"]
+        assert content["col_offset"] == pytest.approx(rpc.image_offset[0])
+    else:
+        assert (content, rest) == (str(path), [])
+
+
+def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(monkeypatch, tmp_path):
+    rpc = make_rpc()
+    model = Other(rpc)
+
+    def inverse_loc(lon, lat, alt):
+        col, row = rpc.project(np.column_stack([lon, lat, alt])).T
+        return row + 0.5, col + 0.5, alt
+
+    model.inverse_loc = inverse_loc
+    monkeypatch.setattr("barpc.handoff.import_module", lambda _: model)
+    ground, _ = control_grid(rpc, SIZE, ALTITUDES)
+    found = CONSUMERS["shareloc"].open(tmp_path / "a.tif")(ground)
+    np.testing.assert_allclose(found, rpc.project(ground), atol=1e-9)
+    assert (str(tmp_path / "a.tif"),) in model.asked
+
+
+def test_orthority_counts_as_barpc_does(monkeypatch, tmp_path):
+    rpc = make_rpc()
+    model = Other(rpc)
+    model.world_to_pixel = lambda columns: rpc.project(columns.T).T
+    monkeypatch.setattr("barpc.handoff.import_module", lambda _: model)
+    ground, _ = control_grid(rpc, SIZE, ALTITUDES)
+    found = CONSUMERS["orthority"].open(tmp_path / "a.tif")(ground)
+    np.testing.assert_array_equal(found, rpc.project(ground))
+    assert ((str(tmp_path / "a.tif"),),) in model.asked
+    assert ("a.tif",) in model.asked

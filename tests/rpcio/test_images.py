@@ -180,6 +180,17 @@ def test_a_crop_has_the_window_s_pixels_and_sees_the_same_ground(rpc, tmp_path):
     np.testing.assert_allclose(found.project(grid(rpc)), rpc.project(grid(rpc)) - [37, 51], rtol=0, atol=1e-9)
 
 
+def test_a_crop_of_a_map_that_is_turned_and_sheared_stays_in_its_place(rpc, tmp_path):
+    placed = rasterio.Affine(1.1e-5, 3e-6, 5.0, -2e-6, -0.9e-5, 44.0)
+    image = write_image(tmp_path / "scene.tif", shape=(1, 90, 120), transform=placed, crs=4326)
+    for col, row in ((0, 0), (37, 0), (0, 51), (20, 30)):
+        write_crop(rpc, image, tmp_path / "crop.tif", (col, row, 30, 20), overwrite=True)
+        with open_raster(tmp_path / "crop.tif") as crop:
+            assert crop.crs == rasterio.crs.CRS.from_epsg(4326)
+            for x, y in ((0, 0), (29, 0), (0, 19), (13, 7)):
+                np.testing.assert_allclose(crop.transform @ (x, y), placed @ (col + x, row + y), rtol=1e-14)
+
+
 @pytest.mark.parametrize("window", [(-1, 0, 5, 5), (0, 0, 61, 5), (0, 39, 5, 2), (0, 0, 0, 5)])
 def test_a_window_outside_the_image_writes_nothing(window, rpc, image, tmp_path):
     with pytest.raises(ImageError, match="not inside the image of 60 x 40"):
