@@ -232,6 +232,31 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole(case):
     _assert_close(covariance.joint(np.array([1, 3])), inverse[np.ix_(pair, pair)], 1e-4)
 
 
+def test_the_whole_covariance_is_put_together_of_any_number_of_columns(case, monkeypatch):
+    matrix, _, _ = case.dense
+    size = case.params.size
+    for columns in (1, 5, size - 1, size, 1000):
+        monkeypatch.setattr("barpc.ba.covariance._COLUMNS", columns)
+        covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+        _assert_close(covariance.full, np.linalg.inv(matrix)[:size, :size], 1e-4)
+        np.testing.assert_array_equal(covariance.full, covariance.full.T)
+
+
+@pytest.mark.parametrize("small", [0, 2000])
+def test_blocks_of_views_are_the_same_whether_the_whole_is_kept_or_not(case, monkeypatch, small):
+    monkeypatch.setattr("barpc.ba.covariance._SMALL", small)
+    q = case.params.shape[1]
+    inverse = np.linalg.inv(case.dense[0])
+    fresh = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    places = np.r_[2 * q : 3 * q, 0:q]  # in the order asked for
+    for _ in range(2):
+        _assert_close(fresh.joint(np.array([2, 0])), inverse[np.ix_(places, places)], 1e-4)
+        _assert_close(fresh.view(2, 0), inverse[2 * q : 3 * q, :q], 1e-4)
+        _assert_close(fresh.view(0, 2), inverse[:q, 2 * q : 3 * q], 1e-4)
+        _assert_close(fresh.view(1), inverse[q : 2 * q, q : 2 * q], 1e-4)
+        assert fresh.full.shape == (4 * q, 4 * q)  # from now on
+
+
 def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(case):
     matrix, _, _ = case.dense
     size = case.params.size
