@@ -58,7 +58,9 @@ def test_the_iteration_knows_that_unknowns_have_sizes_of_their_own(monkeypatch):
     cg = linear.cg
     monkeypatch.setattr(linear, "cg", lambda *given, **options: cg(*given, callback=steps.append, **options))
     found = factor.solve(rhs)
-    np.testing.assert_allclose(found * scale[:, None], np.linalg.solve(dense, rhs) * scale[:, None], rtol=1e-6)
+    np.testing.assert_allclose(
+        found * scale[:, None], np.linalg.solve(dense, rhs) * scale[:, None], rtol=1e-6
+    )
     assert len(steps) < 2 * 60
     assert factor.solve(rhs[:, 0]).shape == (60,)
     hopeless = sp.csr_array(np.diag([1.0, -1.0, 2.0, -2.0]))  # no cost falls
@@ -88,7 +90,9 @@ def test_rows_taken_off_are_taken_off(monkeypatch):
         np.testing.assert_allclose(factor.solve(np.eye(40)), expected, atol=1e-9)
         np.testing.assert_allclose(factor.solve(np.ones(40)), expected @ np.ones(40), atol=1e-9)
     damped = linear.factorize(dense, 0.2, less).solve(np.eye(40))
-    np.testing.assert_allclose(damped, np.linalg.inv(dense + 0.2 * np.diag(dense.diagonal()) - less.T @ less), atol=1e-9)
+    np.testing.assert_allclose(
+        damped, np.linalg.inv(dense + 0.2 * np.diag(dense.diagonal()) - less.T @ less), atol=1e-9
+    )
 
 
 def test_nothing_is_solved_without_unknowns():

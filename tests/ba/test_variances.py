@@ -1,0 +1,310 @@
+"""What the block says about the priors of its cameras: piece by piece, by the formulas of the variance components."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from barpc.ba import Adjustment, AdjustOptions
+from barpc.ba.adjustment import make_problem
+from barpc.ba.block import join
+from barpc.ba.priors import CameraPrior
+from barpc.ba.solve import State, minimise
+from barpc.ba.unknowns import Unknowns
+from barpc.ba.variances import Variances, _Around, _posterior_variance, same_prior
+from barpc.geodesy import ecef_from_ground
+from barpc.simulate import Block, simulate_block
+from tests.ba.conftest import centers_of, solve
+
+
+def variances(
+    n: int, model: str = "rotation", drift: int = 0, sigma: float = 2.0, learn: bool = True
+) -> Variances:
+    """Priors of N views, the constants' with a standard deviation, drifts' with half of it."""
+    unknowns = Unknowns(model, drift, np.zeros((n, 3)), np.ones(n), np.zeros((2, n)), np.ones((2, n)))
+    constants = 3 * (unknowns.rotates + unknowns.translates)
+    sigmas = np.full((n, unknowns.size), sigma)
+    sigmas[:, constants:] = sigma / 2
+    return Variances(CameraPrior(np.full(sigmas.shape, 0.5), sigmas), unknowns, learn, learn)
+
+
+def params_of(v: Variances, totals: list[float]) -> np.ndarray:
+    """Constants whose squares over their variances have these sums, all in the first unknown of a view."""
+    params = v.given.mean.copy()
+    params[:, 0] += v.given.sigma[:, 0] * np.sqrt(totals)
+    return params
+
+
+def test_what_is_learnt_is_what_the_options_leave_open() -> None:
+    for model, options, learns in (
+        ("rotation", {}, (True, True)),
+        ("rotation", {"sigma_drift": 1.0}, (True, False)),
+        ("rotation", {"learn_priors": False}, (False, False)),
+        ("affine", {}, (False, False)),
+    ):
+        given = variances(2, model)
+        found = Variances.of(given.given, given.unknowns, AdjustOptions(**options))
+        assert (found.learn_constant, found.learn_drift) == learns
+    assert [variances(1, model, 1).constants for model in ("rotation", "rotation+translation")] == [3, 6]
+    assert variances(1, "affine").constants == 0
+
+
+def test_priors_are_widened_view_by_view_and_drifts_degree_by_degree() -> None:
+    v = variances(2, "rotation+translation", 2)
+    found = v._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0]))
+    np.testing.assert_array_equal(found.mean, v.given.mean)
+    np.testing.assert_allclose(found.sigma[:, :6], [[2.0] * 6, [6.0] * 6])
+    # a turn about a centre that flies on is a drift of a hundredth of it
+    np.testing.assert_allclose(found.sigma[:, 6:9], np.hypot(2.0, [[0.02] * 3, [0.06] * 3]))
+    np.testing.assert_allclose(found.sigma[:, 9:], 5.0)
+    told = replace(v, learn_drift=False)._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0]))
+    np.testing.assert_allclose(told.sigma[:, 6:9], 2.0)
+    search = v.for_search()
+    np.testing.assert_allclose(search.sigma[:, :6], 2.0)
+    np.testing.assert_allclose(search.sigma[:, 6:9], np.hypot(10.0, 0.02))
+    np.testing.assert_allclose(search.sigma[:, 9:], 10.0)
+
+
+def test_squares_and_freedom_are_those_of_the_unknowns_that_are_determined() -> None:
+    v = variances(2, "rotation", 1)
+    params = np.array([[2.5, 4.5, 0.5, 2.5, 0.5, 0.5], [0.5, 0.5, 0.5, 0.5, 3.5, 0.5]])
+    known = np.array([[1.0, 0.5, 0.25, 0.5, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.75, 0.0]])
+    total, freedom = v._squares(params, known)
+    np.testing.assert_allclose(total, [1.0 + 4.0, 0.0])
+    np.testing.assert_allclose(freedom, [1.75, 0.0])
+    np.testing.assert_allclose(v._squares(params, known, np.array([2.0, 1.0]))[0], [5.0 / 4, 0.0])
+    total, freedom = v._squares(params, known, part=v._drift_part(0))
+    np.testing.assert_allclose(total, [4.0, 9.0])
+    np.testing.assert_allclose(freedom, [1.5, 1.75])
+    # one that is not determined at all does not count, wherever it stands
+    params[1, 0] = 99.0
+    np.testing.assert_allclose(v._squares(params, known)[0], [5.0, 0.0])
+
+
+def test_drifts_are_as_large_as_they_show_with_the_given_ones_counting_for_four() -> None:
+    v = variances(2, "rotation", 2)
+    params, known = v.given.mean.copy(), np.ones((2, 9))
+    params[:, 3] += 3.0  # sigma 1: squares 9 and 9 of 6 degrees
+    params[0, 6] += 2.0
+    np.testing.assert_allclose(v._drift(params, known), np.sqrt([(4 + 18) / (4 + 6), (4 + 4) / (4 + 6)]))
+
+
+@pytest.mark.parametrize(("share", "large"), [(0.97, False), (1.03, True)])
+def test_corrections_are_too_large_where_chance_has_five_percent(share: float, large: bool) -> None:
+    v, n = variances(6), 6
+    known = np.ones((n, 3))
+    params = params_of(v, [share * chi2.isf(0.05, 18) / 6] * 6)
+    assert v._too_large(params, known, np.ones(n)) == large
+    assert not v._too_large(params, known, np.full(n, 1.1))
+    assert not v._too_large(params, 0.49 / 18 * known, np.ones(n))  # nothing is determined
+    assert v._too_large(params_of(v, [99.0] * 6), 0.51 / 18 * known, np.ones(n))
+
+
+MANY = SimpleNamespace(small=False)
+FEW = SimpleNamespace(small=True)
+
+
+def test_two_views_are_widened_together() -> None:
+    v = variances(2)
+    for around in (MANY, FEW):
+        scale, odd = v._widened(around, params_of(v, [18.0, 6.0]), np.ones((2, 3)), np.ones(0))
+        np.testing.assert_allclose(scale, np.sqrt((4 + 24) / (4 + 6)))
+        assert not odd.any()
+    scale, _ = v._widened(FEW, params_of(v, [1.0, 1.0]), np.ones((2, 3)), np.ones(0))
+    np.testing.assert_array_equal(scale, 1.0)  # and never narrowed
+
+
+def test_views_of_a_few_are_widened_together_unless_one_is_far_off() -> None:
+    v = variances(4)
+    # 16 times its freedom of 3 is 48: less is not called odd
+    scale, odd = v._widened(FEW, params_of(v, [47.0, 3.0, 3.0, 3.0]), np.ones((4, 3)), np.ones(0))
+    np.testing.assert_allclose(scale, np.sqrt((4 + 56) / (4 + 12)))
+    assert not odd.any()
+    with pytest.raises(AttributeError):  # beyond, the evidence is asked
+        v._widened(FEW, params_of(v, [49.0, 3.0, 3.0, 3.0]), np.ones((4, 3)), np.ones(0))
+
+
+@pytest.mark.parametrize(("usual", "wrong"), [(3.0, 300.0), (12.0, 900.0), (12.0, 14.0), (3.0, 11.0)])
+def test_of_many_views_one_that_stands_out_is_odd_and_the_others_as_they_mostly_are(usual, wrong) -> None:
+    n = 9
+    v = variances(n)
+    totals = [usual] * n
+    totals[4] = wrong
+    scale, odd = v._widened(MANY, params_of(v, totals), np.ones((n, 3)), np.ones(0))
+    factor = max((4 + usual / 3 * 27) / (4 + 27), 1.0)
+    stands_out = chi2.sf(wrong / factor, 3) < 0.05 / n
+    assert odd.tolist() == [stands_out and k == 4 for k in range(n)]
+    np.testing.assert_allclose(np.delete(scale, 4), np.sqrt(factor))
+    expected = max((4 * factor + wrong) / (4 + 3), factor) if stands_out else factor
+    assert scale[4] == pytest.approx(np.sqrt(expected))
+    assert stands_out == (wrong >= 300)
+
+
+def evidences(monkeypatch, v: Variances, alone: float, together: float) -> tuple[np.ndarray, np.ndarray]:
+    """Widened where one odd view, the first, has one evidence and all together have another."""
+    monkeypatch.setattr(
+        Variances, "_odd", lambda *_: (np.array([9.0, 1.0, 1.0]), np.array([True, False, False]), alone)
+    )
+    around = SimpleNamespace(small=True, under=lambda prior: (together, None, None))
+    return v._widened(around, params_of(v, [600.0, 3.0, 3.0]), np.ones((3, 3)), np.ones(0))
+
+
+def test_of_two_explanations_the_clearly_likelier_one_is_taken_and_else_both(monkeypatch) -> None:
+    v = variances(3)
+    common = np.sqrt((4 + 606) / (4 + 9))
+    scale, odd = evidences(monkeypatch, v, 2.4, 0.0)  # eleven times as likely
+    assert odd.tolist() == [True, False, False]
+    np.testing.assert_allclose(scale, [9.0, 1.0, 1.0])
+    for alone in (2.2, 0.0, -4.9):
+        scale, odd = evidences(monkeypatch, v, alone, 0.0)
+        assert not odd.any()
+        np.testing.assert_allclose(scale, [max(9.0, common), common, common])
+    scale, odd = evidences(monkeypatch, v, -5.1, 0.0)
+    assert not odd.any()
+    np.testing.assert_allclose(scale, common)
+
+
+def forward(
+    monkeypatch, gains: dict[tuple[int, ...], float], n: int = 6
+) -> tuple[list[int], np.ndarray, float]:
+    """Views that are odd by evidences of sets of views; every one of them wants its number plus two as a factor."""
+
+    def alone(
+        self: Variances, around: Any, wide: np.ndarray, scale: np.ndarray, v: int
+    ) -> tuple[float, float]:
+        chosen = tuple(sorted([*np.flatnonzero(scale != 1.0).tolist(), v]))
+        return gains.get(chosen, 0.0), v + 2.0
+
+    monkeypatch.setattr(Variances, "_alone", alone)
+    scale, odd, evidence = variances(n)._odd(None, np.ones(0))
+    return np.flatnonzero(odd).tolist(), scale, evidence
+
+
+def test_odd_views_are_added_as_long_as_each_makes_it_clearly_likelier(monkeypatch) -> None:
+    odd, scale, evidence = forward(monkeypatch, {(1,): 20.0, (1, 4): 25.1, (4,): 3.0})
+    assert (odd, evidence) == ([1, 4], 25.1)
+    np.testing.assert_array_equal(scale, [1, 3, 1, 1, 6, 1])
+    assert forward(monkeypatch, {(1,): 20.0, (1, 4): 24.9})[::2] == ([1], 20.0)
+    # no more than a third of the views
+    assert forward(monkeypatch, {(1,): 20.0, (1, 4): 40.0, (0, 1, 4): 90.0})[::2] == ([1, 4], 40.0)
+    assert forward(monkeypatch, {(0,): 20.0, (0, 1): 40.0}, 3)[0] == [0]
+
+
+def test_what_explains_as_well_as_the_best_is_odd_too(monkeypatch) -> None:
+    odd, scale, _ = forward(monkeypatch, {(1,): 20.0, (2,): 15.1, (3,): 14.9})
+    assert odd == [1, 2]
+    np.testing.assert_array_equal(scale, [1, 3, 4, 1, 1, 1])
+
+
+def test_priors_are_the_same_within_a_share_of_their_logarithms() -> None:
+    prior = CameraPrior(np.zeros((1, 3)), np.array([[1.0, 2.0, np.inf]]))
+    for factor, same in ((1.0, True), (1.21, True), (1 / 1.21, True), (1.23, False), (1 / 1.23, False)):
+        assert same_prior(prior, CameraPrior(prior.mean, prior.sigma * [[1.0, factor, 1.0]]), 0.2) == same
+    assert same_prior(prior, CameraPrior(prior.mean, np.array([[1.0, np.inf, np.inf]])), 0.2)
+
+
+@pytest.mark.parametrize(("n", "exact"), [(400, True), (402, False)])
+def test_posterior_variances_are_exact_for_small_blocks_and_probed_for_large_ones(
+    n: int, exact: bool
+) -> None:
+    rng = np.random.default_rng(0)
+    root = np.diag(np.linspace(1, 3, n)) + 0.02 * rng.normal(size=(n, n))
+    full = root @ root.T
+    covariance: Any = SimpleNamespace(free=np.ones(n, dtype=bool), full=full, solve=lambda b: full @ b)
+    found = _posterior_variance(covariance, (n // 2, 2))
+    true = np.diag(full).reshape(-1, 2)
+    np.testing.assert_allclose(found, true, rtol=1e-12 if exact else 0.6)
+    assert np.abs(found / true - 1).mean() < 0.15
+    assert abs((found / true).mean() - 1) < 0.03
+
+
+def test_what_is_determined_is_what_the_prior_alone_does_not_say() -> None:
+    v = variances(2)
+    full = np.diag([4.0, 2.0, 1.0, 0.0, 5.0, 4.0])
+    free = np.array([1, 1, 1, 0, 1, 1], dtype=bool)
+    covariance: Any = SimpleNamespace(free=free, full=full)
+    np.testing.assert_allclose(v._known(covariance, v.given), [[0.0, 0.5, 0.75], [0.0, 0.0, 0.0]])
+    loose = CameraPrior(v.given.mean, np.where(np.arange(3) == 1, np.inf, v.given.sigma))
+    np.testing.assert_allclose(v._known(covariance, loose), [[0.0, 0.0, 0.75], [0.0, 0.0, 0.0]])
+
+
+# --- on a block ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made() -> Block:
+    return simulate_block(3, 200, seed=5, attitude=5e-6)
+
+
+def test_the_problem_under_other_priors_is_the_one_solved_with_them(made) -> None:
+    """Unknowns, covariance and the ratio of the evidences, against minimising again."""
+    options = AdjustOptions(drift=0, sigma_attitude=3.5, sigma_position=1.0)
+    problem = make_problem(join(made.views, made.tracks, None, options), options, centers_of(made), None)
+    weight = np.full(len(problem.structure.view), 10.0)
+    state = State(np.zeros((3, 6)), ecef_from_ground(made.truth.ground))
+    found, other = [], CameraPrior(np.zeros((3, 6)), np.array([[9.0] * 6, [1.0] * 6, [2.0] * 3 + [5.0] * 3]))
+    for prior in (problem.camera_prior, other):
+        given = replace(problem, camera_prior=prior)
+        minimum = minimise(given, state, weight, "sparse", 1e-14)
+        matrix = minimum.reduced.plain(problem.free)
+        volume = np.linalg.slogdet(matrix)[1] + 2 * np.log(prior.sigma).sum()
+        found.append((minimum, -0.5 * (minimum.state.cost + volume), np.linalg.inv(matrix)))
+    around = _Around(problem, found[0][0])
+    (same, unmoved, _), (evidence, params, covariance) = (
+        around.under(problem.camera_prior),
+        around.under(other),
+    )
+    assert evidence - same == pytest.approx(found[1][1] - found[0][1], abs=0.02)
+    np.testing.assert_array_equal(unmoved, found[0][0].state.params)
+    np.testing.assert_allclose(params, found[1][0].state.params, atol=2e-3)
+    np.testing.assert_allclose(covariance.full, found[1][2], rtol=2e-3, atol=1e-3)
+    assert np.abs(params - unmoved).max() > 0.3
+
+
+def adjusted(block: Block, **options: Any) -> Adjustment:
+    return solve(block, drift=0, hold_out=False, **options)
+
+
+def test_priors_that_hold_have_a_ratio_of_one_and_stand() -> None:
+    ratio, freedom = [], []
+    for seed in range(8):
+        block = simulate_block(4, 150, seed=seed, attitude=5e-6)
+        prior = adjusted(block, sigma_attitude=3.47, sigma_position=1.0).prior
+        ratio.append(prior.ratio)
+        freedom.append(prior.freedom)
+        assert prior.scale.max() < 1.6
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.35)
+    # of 24 unknowns the scene's seven motions stay with the priors, of rotations and translations that look alike one
+    assert 6 < np.mean(freedom) < 14
+
+
+@pytest.mark.parametrize("wrong", [3.0, 10.0])
+def test_priors_that_are_too_narrow_are_widened_by_as_much(wrong: float) -> None:
+    scale = []
+    for seed in range(5):
+        block = simulate_block(4, 150, seed=seed, attitude=5e-6)
+        prior = adjusted(block, sigma_attitude=3.47 / wrong, sigma_position=1.0 / wrong).prior
+        assert prior.ratio == pytest.approx(wrong**2, rel=0.9)
+        assert not prior.odd.any()
+        scale.append(np.median(prior.scale))
+    assert 0.5 * wrong < np.median(scale) < 1.3 * wrong
+
+
+@pytest.mark.parametrize(("wrong", "by"), [(2, (200.0, -150.0)), (1, (0.0, 300.0))])
+def test_one_view_that_is_far_off_is_named_and_the_others_keep_their_priors(
+    wrong: int, by: tuple[float, float]
+) -> None:
+    for seed in range(3):
+        block = simulate_block(3, 150, seed=seed, attitude=5e-6)
+        views = list(block.views)
+        views[wrong] = replace(views[wrong], sensor=views[wrong].sensor.crop(*by))
+        prior = adjusted(replace(block, views=tuple(views)), sigma_attitude=3.47, sigma_position=1.0).prior
+        assert np.flatnonzero(prior.odd).tolist() == [wrong]
+        assert 20.0 < prior.scale[wrong] < 90.0  # 250 or 300 px of 0.7 m are 50 or 60 sigmas
+        np.testing.assert_array_equal(np.delete(prior.scale, wrong), 1.0)
+        assert 50.0 < prior.ratio < 400.0
