@@ -107,6 +107,23 @@ def test_points_are_found_on_the_sheet_of_the_centre_and_nowhere_else(slope, cur
         )
 
 
+@pytest.mark.parametrize(("curve", "quick"), [(0.2, True), (-0.2, True), (0.9, True), (0.95, False), (-0.95, False)])
+def test_a_fold_of_a_map_that_is_turned_is_where_its_determinant_vanishes(curve: float, quick: bool) -> None:
+    """(x + y + curve x^2, x - y): a fold at x = -1/curve."""
+    coeffs = np.zeros((4, 20))
+    coeffs[0, [1, 2, 7]], coeffs[2, [1, 2]] = [1.0, 1.0, curve], [1.0, -1.0]
+    coeffs[1::2, 0] = 1.0
+    turned = Rational(coeffs, np.full(2, 1e-9))
+    assert (turned._inverse is not None) == quick
+    at = np.array([[-0.99, -1.01, 0.5], [0.3, 0.3, -2.0], [0.0, 0.0, 0.0]])
+    at[0, :2] /= curve
+    assert turned._regular(at).tolist() == [True, False, True]
+    x = np.random.default_rng(5).uniform(-0.9, 0.9, (3, 100))
+    found, ok = turned.solve(turned.value(x), x[2])
+    assert ok.all()
+    np.testing.assert_allclose(found, x, atol=1e-7)
+
+
 def test_targets_that_the_map_never_reaches_are_not_ok() -> None:
     fold = make(curve=0.5)  # x + x^2 / 2 is never below -1/2
     target = np.array([[-0.4999, -0.52, np.nan, 0.1], [0.0, 0.0, 0.0, np.inf]])

@@ -180,6 +180,37 @@ def test_an_offset_of_0_to_360_is_the_same_camera():
     np.testing.assert_allclose(there.project(ground), here.project(ground), rtol=0, atol=2e-8)
 
 
+def plain(offset: tuple[float, float, float], scale: tuple[float, float, float]) -> RPC:
+    """Columns run east, rows south, a hundred pixels a scale: col = 100 L, row = -100 P."""
+    coeffs = np.zeros((4, 20))
+    coeffs[0, 1], coeffs[2, 2], coeffs[1::2, 0] = 1.0, -1.0, 1.0
+    return RPC(coeffs, offset, scale, [0.0, 0.0], [100.0, 100.0])
+
+
+@pytest.mark.parametrize(
+    ("offset", "scale", "image", "found"),
+    [
+        ((0.0, 0.0, 0.0), (160.0, 10.0, 100.0), (112.0, 0.0), True),  # 179.2 degrees east
+        ((0.0, 0.0, 0.0), (160.0, 10.0, 100.0), (113.0, 0.0), False),
+        ((20.0, 0.0, 0.0), (160.0, 10.0, 100.0), (-112.0, 0.0), True),  # half a turn counts from the offset
+        ((20.0, 0.0, 0.0), (160.0, 10.0, 100.0), (-113.0, 0.0), False),
+        ((0.0, 0.0, 0.0), (10.0, 75.0, 100.0), (0.0, -119.0), True),  # 89.25 degrees north
+        ((0.0, 0.0, 0.0), (10.0, 75.0, 100.0), (0.0, -121.0), False),
+        ((0.0, 80.0, 0.0), (10.0, 9.0, 100.0), (0.0, -110.0), True),
+        ((0.0, 80.0, 0.0), (10.0, 9.0, 100.0), (0.0, -112.0), False),
+        ((0.0, -80.0, 0.0), (10.0, 9.0, 100.0), (0.0, 112.0), False),
+        ((0.0, 80.0, 0.0), (10.0, -9.0, 100.0), (0.0, 112.0), False),
+        ((0.0, 0.0, 0.0), (-160.0, 10.0, 100.0), (113.0, 0.0), False),
+    ],
+)
+def test_ground_lies_within_half_a_turn_of_the_offset_and_between_the_poles(offset, scale, image, found):
+    rpc = plain(offset, scale)
+    ground = rpc.localize(np.array([image]), np.zeros(1))[0]
+    assert np.isfinite(ground).all() == found
+    if found:
+        np.testing.assert_allclose(ground[:2], np.array(offset[:2]) + np.array(scale[:2]) * image / [100, -100])
+
+
 def test_there_is_no_ground_beyond_a_pole():
     rpc = make_rpc(lat=89.95)
     image, alt = box(rpc, 1.0, 4000)

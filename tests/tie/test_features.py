@@ -79,6 +79,22 @@ def test_keypoints_stay_away_from_nodata(tmp_path, texture) -> None:
     assert not inside.any()
 
 
+@pytest.mark.parametrize("wide", [True, False])
+def test_keypoints_stay_away_from_nodata_at_the_far_end_of_a_strip(tmp_path, texture, wide: bool) -> None:
+    """A hole of ten pixels by a hundred beyond the length of the other side, in a strip across and in one along."""
+    holed = texture[:200].copy()
+    holed[50:150, 400:410] = 9
+    holed = holed if wide else np.ascontiguousarray(holed.T)
+    path = write_image(tmp_path / "a.tif", holed, nodata=9)
+    found = detect([view(path, holed.shape[::-1])])[0]
+    xy = found.xy if wide else found.xy[:, ::-1]
+    away = np.hypot(*np.maximum(np.abs(xy - [404.5, 99.5]) - [4.5, 49.5], 0.0).T)
+    assert (away >= np.maximum(3.0, found.scale) - 1.0).all()
+    assert (away < 12.0).sum() > 5  # and not farther than need be
+    free = np.abs(xy[:, 0] - 200) < 50
+    assert free.sum() > 50
+
+
 @pytest.mark.parametrize("data", [np.zeros((400, 500), np.uint16), np.full((400, 500), np.nan, np.float32)])
 def test_an_image_without_content_has_no_keypoints(tmp_path, data: np.ndarray) -> None:
     found = detect([view(write_image(tmp_path / "a.tif", data))])[0]
