@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,6 +109,31 @@ def test_maxar_xml_reads_in_a_namespace_too(rpc):
         "<lv1b:isd>", '<lv1b:isd xmlns:lv1b="http://x">'
     )
     assert parse(spaced.encode(), "memory") == (rpc, "xml")
+
+
+def test_maxar_xml_may_begin_with_its_rpb_and_say_nothing_of_errors(rpc):
+    text = FORMATS["xml"].write(rpc)
+    bare = text.replace("<isd>\n", "").replace("</isd>\n", "")
+    assert bare != text
+    assert parse(bare.encode(), "memory") == (rpc, "xml")
+    silent = re.sub(r".*<ERR(BIAS|RAND)>.*\n", "", text)
+    assert parse(silent.encode(), "memory") == (replace(rpc, err_bias=None, err_rand=None), "xml")
+    nameless = re.sub(r".*<SPECID>.*\n", "", text)
+    assert parse(nameless.encode(), "memory") == (rpc, "xml")
+    with pytest.raises(RpcFormatError, match="RPC00A order, only RPC00B"):
+        parse(text.replace("RPC00B", "RPC00A").encode(), "memory")
+    with pytest.raises(RpcFormatError, match="<LATSCALE> is missing or empty"):
+        parse(re.sub(r".*<LATSCALE>.*\n", "", text).encode(), "memory")
+
+
+def test_an_envi_header_may_leave_its_last_three_numbers_out(rpc):
+    text = envi(rpc)
+    less = re.sub(r",\s*0,\s*0,\s*1\s*}", "}", text)
+    assert less != text
+    assert parse(less.encode(), "memory")[0] == parse(text.encode(), "memory")[0]
+    for wrong, count in ((text.replace("}", ", 0}"), 94), (less.replace("}", ", 0}"), 91)):
+        with pytest.raises(RpcFormatError, match=f"rpc info has {count} numbers, expected 90 or 93"):
+            parse(wrong.encode(), "memory")
 
 
 @pytest.mark.parametrize(

@@ -164,6 +164,20 @@ def test_a_tile_of_a_dimap_product_has_its_origin_taken_off(rpc, tmp_path):
     assert "tile origin (4096, 4096)" in source.notes[0]
 
 
+@pytest.mark.parametrize(
+    ("tile", "origin"),
+    [("", (0, 0)), ("_R1C1", (0, 0)), ("_R1C2", (2048, 0)), ("_R2C1", (0, 4096)), ("_R3C2", (2048, 8192))],
+)
+def test_a_tile_counts_by_the_size_of_its_product_s_tiles(tile, origin, rpc, tmp_path):
+    image = write_image(tmp_path / f"IMG_scene{tile}.tif")
+    (tmp_path / "RPC_scene.XML").write_text(dimap_v2(rpc))
+    if origin != (0, 0):  # the first tile needs to know nothing of the others
+        (tmp_path / "DIM_scene.XML").write_text('<Dimap><NTILES_SIZE nrows="4096" ncols="2048"/></Dimap>')
+    source = read_rpc_source(image)
+    np.testing.assert_allclose(source.rpc.image_offset, rpc.image_offset - origin, rtol=0, atol=1e-9)
+    assert len(source.notes) == (origin != (0, 0))
+
+
 def test_an_alos_image_finds_its_text_by_the_scene_s_name(rpc, tmp_path):
     image = write_image(tmp_path / "IMG-01-ALPSM-O1B1.tif")
     (tmp_path / "RPC-ALPSM-O1B1.txt").write_text("1" * 1100)

@@ -208,7 +208,9 @@ def test_ground_lies_within_half_a_turn_of_the_offset_and_between_the_poles(offs
     ground = rpc.localize(np.array([image]), np.zeros(1))[0]
     assert np.isfinite(ground).all() == found
     if found:
-        np.testing.assert_allclose(ground[:2], np.array(offset[:2]) + np.array(scale[:2]) * image / [100, -100])
+        np.testing.assert_allclose(
+            ground[:2], np.array(offset[:2]) + np.array(scale[:2]) * image / [100, -100]
+        )
 
 
 def test_there_is_no_ground_beyond_a_pole():

@@ -1,0 +1,89 @@
+"""What is handed out of an adjustment, against its definition."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.ba import Adjustment, pair_heights
+from barpc.geodesy import enu_basis, ground_from_ecef
+from barpc.sensor.geometry import triangulate
+from barpc.simulate import Block, simulate_block
+from tests.ba.conftest import solve
+
+
+@pytest.fixture(scope="module")
+def made() -> Block:
+    return simulate_block(3, 120, seed=6)
+
+
+@pytest.fixture(scope="module")
+def found(made) -> Adjustment:
+    return solve(made, drift=0)
+
+
+def test_errors_of_a_view_are_those_of_its_kept_observations(made, found) -> None:
+    view = made.tracks.view
+    for before, residual in ((True, found.residuals_before), (False, found.residuals)):
+        expected = [np.sqrt((residual[found.inlier & (view == v)] ** 2).sum(axis=1).mean()) for v in range(3)]
+        np.testing.assert_allclose(found.rmse(before), expected)
+    assert (found.rmse(True) > 5 * found.rmse()).all()
+    np.testing.assert_array_equal(found.observations, [(found.inlier & (view == v)).sum() for v in range(3)])
+    none = replace(found, inlier=found.inlier & (view != 1))
+    assert np.isnan(none.rmse()).tolist() == [False, True, False]
+    np.testing.assert_array_equal(found.scene_shift, found.gauge.shift)
+
+
+def measured(block: Block, found: Adjustment, pair: tuple[int, int]) -> tuple[float, float, int]:
+    """Standard deviations of heights and of relative ones, by moving each unknown of two views by a little."""
+    tracks = block.tracks
+    kept = [np.unique(tracks.point[(tracks.view == v) & ~found.held_out]) for v in pair]
+    seen = np.intersect1d(*kept)
+    seen = seen[np.isfinite(found.points[seen, 0])]
+    ground = ground_from_ecef(found.points[seen])
+    unknowns, n, q = found.cameras.unknowns, len(seen), found.params.shape[1]
+    image = np.vstack([found.sensors[v].project(ground) for v in pair])
+    view, point = np.repeat([0, 1], n), np.tile(np.arange(n), 2)
+    up = enu_basis(ground)[:, 2]
+
+    def heights(params: np.ndarray) -> np.ndarray:
+        sensors = unknowns.corrected(params, block.views)
+        there = triangulate([sensors[v] for v in pair], view, point, image, alt=300.0).points
+        return ((there - found.points[seen]) * up).sum(axis=1)
+
+    columns = []
+    for v in sorted(pair):
+        for k in range(q):
+            step = np.zeros_like(found.params)
+            step[v, k] = 0.5
+            columns.append(heights(found.params + step) - heights(found.params - step))
+    by_camera = np.array(columns).T
+    covariance = found.covariance.joint(np.array(sorted(pair)))
+
+    def rms(rows: np.ndarray) -> float:
+        return float(np.sqrt(np.mean([row @ covariance @ row for row in rows])))
+
+    return rms(by_camera), rms(by_camera - by_camera.mean(axis=0)), n
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2), (2, 1)])
+def test_heights_of_a_pair_move_as_its_cameras_do(made, found, pair) -> None:
+    absolute, relative, count = measured(made, found, pair)
+    heights = pair_heights(found, *pair)
+    assert (heights.views, heights.count) == (pair, count)
+    assert heights.absolute == pytest.approx(absolute, rel=1e-3)
+    assert heights.relative == pytest.approx(relative, rel=1e-3)
+
+
+def test_heights_are_measured_at_some_of_many_points_and_at_none_of_none(made, found, monkeypatch) -> None:
+    whole = pair_heights(found, 0, 1)
+    monkeypatch.setattr("barpc.ba.result._SAMPLE", 20)
+    some = pair_heights(found, 0, 1)
+    assert 10 <= some.count <= 20
+    assert some.absolute == pytest.approx(whole.absolute, rel=0.05)
+    lost = replace(found, points=np.full_like(found.points, np.nan))
+    nothing = pair_heights(lost, 0, 1)
+    assert nothing.count == 0
+    assert np.isnan([nothing.absolute, nothing.relative]).all()
