@@ -1,0 +1,120 @@
+"""What a block leaves for the next one: written, read, refused where it is damaged, and put where it belongs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba.incremental import BlockPrior, apply_prior, block_prior
+from barpc.ba.priors import CameraPrior
+from barpc.errors import InputError
+from barpc.simulate import simulate_block
+from tests.ba.conftest import solve
+
+
+def prior_of(names: tuple[str, ...] = ("a", "c"), size: int = 3) -> BlockPrior:
+    rng = np.random.default_rng(0)
+    n = len(names)
+    root = rng.normal(size=(n * size, n * size))
+    return BlockPrior(
+        names,
+        "rotation",
+        0,
+        rng.normal(size=(n, size)),
+        root.T @ root + np.eye(n * size),
+        rng.normal(size=(n, 3)),
+    )
+
+
+def same(a: BlockPrior, b: BlockPrior) -> bool:
+    arrays = all(np.array_equal(getattr(a, x), getattr(b, x)) for x in ("params", "information", "center"))
+    return arrays and (a.names, a.model, a.drift) == (b.names, b.model, b.drift)
+
+
+def test_a_prior_is_read_as_it_was_written(tmp_path) -> None:
+    for prior in (prior_of(), prior_of(("one",)), replace(prior_of(), model="affine", drift=2)):
+        prior.save(tmp_path / "prior.npz")
+        assert same(BlockPrior.load(tmp_path / "prior.npz"), prior)
+
+
+def changed(name: str, change: Any) -> BlockPrior:
+    prior = prior_of()
+    return replace(prior, **{name: change(getattr(prior, name))})
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("names", lambda x: ("a", "a")),
+        ("names", lambda x: ("a",)),
+        ("names", lambda x: ("a", "b", "c")),
+        ("names", lambda x: ()),
+        ("params", lambda x: x[:, :2]),
+        ("params", lambda x: x[0]),
+        ("params", lambda x: np.float64(3.0)),
+        ("params", lambda x: x[:, :0]),
+        ("params", lambda x: np.where(x == x[1, 2], np.nan, x)),
+        ("params", lambda x: x.astype(np.float32)),
+        ("information", lambda x: x[:5, :5]),
+        ("information", lambda x: x[:5]),
+        ("information", lambda x: np.where(np.eye(6) * (np.arange(6) == 4), 0.0, x)),
+        ("information", lambda x: np.where(np.eye(6) * (np.arange(6) == 4), -1.0, x)),
+        ("information", lambda x: np.where(x == x[0, 1], np.inf, x)),
+        ("information", lambda x: x.astype(int)),
+        ("center", lambda x: x[:1]),
+        ("center", lambda x: x[:, :2]),
+        ("center", lambda x: np.where(x == x[0, 0], np.nan, x)),
+    ],
+)
+def test_arrays_that_do_not_go_together_are_refused(tmp_path, name: str, change: Any) -> None:
+    changed(name, change).save(tmp_path / "prior.npz")
+    with pytest.raises(InputError, match=r"prior\.npz: not the prior of an adjusted block"):
+        BlockPrior.load(tmp_path / "prior.npz")
+
+
+def test_a_prior_stands_at_its_views_wherever_they_are_now() -> None:
+    prior = prior_of(("c", "a"))
+    own = CameraPrior(np.full((4, 3), 7.0), np.arange(12.0).reshape(4, 3) + 1)
+    cameras, joint = apply_prior(prior, ("a", "b", "c", "d"), "rotation", 0, own)
+    np.testing.assert_array_equal(cameras.mean, [prior.params[1], [7.0] * 3, prior.params[0], [7.0] * 3])
+    np.testing.assert_array_equal(np.isinf(cameras.sigma).all(axis=1), [True, False, True, False])
+    np.testing.assert_array_equal(cameras.sigma[[1, 3]], own.sigma[[1, 3]])
+    assert joint.index.tolist() == [6, 7, 8, 0, 1, 2]
+    np.testing.assert_array_equal(joint.mean, prior.params.ravel())
+    np.testing.assert_allclose(joint.root.T @ joint.root, prior.information)
+    assert np.isfinite(own.sigma).all()  # what was given is not touched
+
+
+@pytest.mark.parametrize(
+    ("prior", "names", "model", "drift", "message"),
+    [
+        (prior_of(), ("a", "b"), "rotation", 0, "views of the earlier block are missing: c$"),
+        (prior_of(), ("a", "c"), "rotation", 1, "use the same"),
+        (prior_of(), ("a", "c"), "affine", 0, "use the same"),
+        (prior_of(size=4), ("a", "c"), "rotation", 0, "has 4 unknowns a view, not 3"),
+        (changed("information", lambda x: x - 2 * np.linalg.eigvalsh(x)[1] * np.eye(6)), ("a", "c"), "rotation", 0,
+         "information is damaged"),
+    ],
+)  # fmt: skip
+def test_a_prior_of_another_block_is_refused(prior, names, model, drift, message) -> None:
+    with pytest.raises(InputError, match=message):
+        apply_prior(
+            prior, names, model, drift, CameraPrior(np.zeros((len(names), 3)), np.ones((len(names), 3)))
+        )
+
+
+def test_a_block_leaves_what_it_knows_of_its_free_views() -> None:
+    made = simulate_block(3, 100, seed=5)
+    found = solve(made, drift=0, fixed=("view_0001",))
+    prior = block_prior(found)
+    assert prior.names == ("view_0000", "view_0002")
+    assert (prior.model, prior.drift) == ("rotation+translation", 0)
+    np.testing.assert_array_equal(prior.params, found.params[[0, 2]])
+    np.testing.assert_array_equal(prior.center, found.cameras.unknowns.center[[0, 2]])
+    free = np.r_[0:6, 12:18]
+    np.testing.assert_allclose(
+        np.linalg.inv(prior.information), found.covariance.full[np.ix_(free, free)], rtol=1e-5, atol=1e-9
+    )
