@@ -325,6 +325,19 @@ def test_an_affine_function_is_that_of_its_own_weights() -> None:
     assert np.abs(design.T @ (weight * residual)).max() < 1e-3 * np.abs(design.T @ np.abs(residual)).max()
 
 
+@pytest.mark.parametrize("scale", [0.02, 1.0, 1000.0])
+def test_an_affine_function_of_values_of_any_size_is_the_same(scale: float) -> None:
+    """A third is wrong by up to fifty standard deviations: from the median it takes several steps."""
+    rng = np.random.default_rng(6)
+    xy = rng.uniform(0, 5000, (400, 2))
+    values = 1e-3 * xy[:, 0] + rng.normal(0, 0.2, 400)
+    values[:130] += rng.uniform(0.5, 10, 130)
+    exact = robust_affine(xy, values, steps=100)
+    found = robust_affine(xy, scale * values)
+    np.testing.assert_allclose(found.coefficients / scale, exact.coefficients, atol=2e-3)
+    assert found.spread / scale == pytest.approx(exact.spread, rel=2e-3)
+
+
 def test_the_mad_is_a_standard_deviation_about_zero() -> None:
     assert robust_spread(np.array([-2.0, 1.0, 3.0])) == pytest.approx(1.4826 * 2.0)
     assert robust_spread(np.empty(0)) == 0.0
@@ -558,6 +571,78 @@ def test_the_correction_across_the_lines_is_one_by_the_place_in_the_first_view(s
     found = search(Wrong(along, 0.004 * places[:, 0])).offset()
     assert found is not None
     np.testing.assert_allclose(found.at(places).across, places[:, 1] + 0.004 * places[:, 0], atol=0.05)
+
+
+class Listed(Wrong):
+    """Errors across the lines as listed; it writes down what it is asked."""
+
+    def __init__(self, across: np.ndarray) -> None:
+        super().__init__(np.linspace(-8, 8, len(across)), across)
+        self.asked: list[tuple[float, int | None]] = []
+
+    def match(self, a: Any, b: Any, prediction: Prediction) -> Matches:
+        self.asked.append((prediction.half_width, prediction.probes))
+        return super().match(a, b, prediction)
+
+
+def spread_out(count: int, peak: int, at: float = 0.0, width: float = 20.0) -> np.ndarray:
+    """So many errors in a peak, the others evenly within the band, outside the peak's window."""
+    low, high = (at - 4.5, at + 4.5)
+    others = np.linspace(-width + 0.1, width - 0.1, 4 * count)
+    others = others[(others < low) | (others > high)]
+    return np.r_[np.full(peak, at), others[np.linspace(0, len(others) - 1, count).astype(int)]]
+
+
+@pytest.mark.parametrize(("peak", "found"), [(7, False), (8, True)])
+def test_a_peak_has_eight_matches_or_more(search, peak: int, found: bool) -> None:
+    assert (search(Listed(np.full(peak, 2.0)))._blind(20.0, 100) is not None) == found
+    # among others, which are too few to matter
+    assert (search(Listed(spread_out(3, peak)))._blind(60.0, 100) is not None) == found
+
+
+@pytest.mark.parametrize(
+    ("count", "peak", "width", "found"),
+    [(90, 32, 20.0, True), (90, 26, 20.0, False), (90, 17, 60.0, True), (90, 14, 60.0, False)],
+)
+def test_a_peak_stands_out_by_six_standard_deviations_of_chance(search, count, peak, width, found) -> None:
+    chance = count * 4.0 / (2 * width)
+    significance = (peak - chance) / np.sqrt(chance + 1)
+    assert found == (significance > 6.0)
+    assert abs(significance - 6.0) < 1.9
+    known = search(Listed(spread_out(count, peak, width=width)))._blind(width, 100)
+    assert (known is not None) == found
+    if known is not None:
+        assert known.share == pytest.approx(peak / (count + peak))
+        assert known.significance == pytest.approx(significance, rel=0.03)
+
+
+@pytest.mark.parametrize(("at", "found"), [(15.9, True), (16.1, False), (-15.9, True), (-16.1, False)])
+def test_a_peak_at_the_end_of_the_band_may_go_on_beyond_it(search, at: float, found: bool) -> None:
+    assert (search(Listed(np.full(50, at)))._blind(20.0, 100) is not None) == found
+
+
+def test_passes_grow_wider_until_one_is_clear(search) -> None:
+    clear = Listed(spread_out(70, 50))  # more than two fifths
+    assert search(clear).offset() is not None
+    assert clear.asked == [(20.0, 1500)]
+    unclear = Listed(spread_out(80, 50))
+    found = search(unclear).offset()
+    assert [width for width, _ in unclear.asked] == [20.0, 80.0, TieOptions().search]
+    assert [probes for _, probes in unclear.asked] == [1500, 2000, 3000]
+    assert found is not None
+    assert found.half_width == 3.0
+    none = Listed(spread_out(300, 5, width=TieOptions().search))
+    assert search(none).offset() is None
+    assert len(none.asked) == 3
+
+
+def test_the_most_significant_peak_decides_where_none_is_clear(search) -> None:
+    """Forty matches near the line among ninety, and ninety farther out among two hundred and sixty."""
+    across = np.r_[spread_out(90, 40, at=5.0), spread_out(260, 90, at=60.0, width=90.0)]
+    found = search(Listed(across)).offset()
+    assert found is not None
+    places = np.array([[500.0, 500.0]])
+    np.testing.assert_allclose(found.at(places).across, [560.0], atol=0.5)
 
 
 @pytest.mark.parametrize(("noise", "width"), [(0.01, 0.6), (0.3, 1.2), (2.0, 3.0)])
