@@ -77,12 +77,12 @@ def test_rounds_go_on_until_the_noise_stands(clean, monkeypatch) -> None:
     assert first / last == pytest.approx(found.noise, rel=0.05)
 
 
-@pytest.mark.parametrize(("outliers", "looked"), [(0.05, True), (0.005, False)])
+@pytest.mark.parametrize(("outliers", "looked"), [(0.05, True), (0.008, True), (0.004, False)])
 def test_tracks_that_were_cut_are_looked_at_again_where_they_are_many(monkeypatch, outliers, looked) -> None:
     again = seen(monkeypatch, rounds, "revived")
     dirty = simulate_block(3, 400, seed=5, outliers=outliers)
     found = solve(dirty, **CALM)
-    assert 0.995 - 3 * outliers < found.inlier.mean() < 1.0
+    assert 0.99 - 3 * outliers < found.inlier.mean() < 1.0
     # before every pass but the first
     assert len(again) == (int(found.status.split()[0]) - 1 if looked else 0)
 
@@ -97,11 +97,11 @@ def test_a_view_that_lost_much_is_solved_again_from_an_agreement(clean, monkeypa
 
 
 def test_a_median_counts_each_value_by_its_weight() -> None:
-    values = np.array([5.0, 1.0, 9.0, 3.0])
+    values = np.array([5.0, 2.0, 9.0, 3.0])
     assert _median(values, np.ones(4)) == 3.0
     assert _median(values, np.array([1.0, 1.0, 1.0, 0.5])) == 5.0
     assert _median(values, np.array([0.0, 0.0, 1.0, 0.0])) == 9.0
-    assert _median(values, np.array([0.0, 3.0, 1.0, 1.0])) == 1.0
+    assert _median(values, np.array([0.0, 3.0, 1.0, 1.0])) == 2.0
     assert _median(values, np.zeros(4)) == 1.0  # as stated where nothing counts
     assert _median(values[:0], values[:0]) == 1.0
 
