@@ -143,3 +143,36 @@ def test_a_better_agreement_takes_the_place_of_a_compromise(clean) -> None:
     assert found.inlier[~partner].mean() > 0.99
     assert found.inlier[~wrong].mean() > 0.9
     assert found.noise == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize(("wave", "settled"), [(0.0, False), (0.02, False), (0.06, True), (0.5, True)])
+def test_points_follow_what_is_smooth_where_it_is_seen(monkeypatch, wave: float, settled: bool) -> None:
+    """Of noise of 0.1 px: a smooth part of less than 0.3 sigmas is taken from each view by itself."""
+    made = simulate_block(3, 1500, seed=5, noise=0.0)
+    options = AdjustOptions(drift=0)
+    block = adjustment.join(
+        made.views, replace(made.tracks, sigma=np.full(len(made.tracks), 0.1)), None, options
+    )
+    problem = adjustment.make_problem(block, options, centers_of(made), None)
+    state, heights = adjustment._start(problem, block, options, None)
+    each = rounds.Rounds(problem, block, state, options, heights, block.use)
+    row = (block.xy[1] - 1e4) / 1e4
+    smooth = wave * np.sin(5 * row) * (block.view == 1)
+    noise = np.random.default_rng(0).normal(0, 0.02, block.xy.shape)
+    each.residual = noise + np.stack([smooth, smooth])
+    again = seen(monkeypatch, rounds.Problem, "settled_residual")
+    left = each._scatter()
+    assert bool(again) == settled
+    assert np.sqrt((left**2).mean()) < 0.025
+    if not settled:
+        assert np.abs(left - noise).mean() < 0.012
+
+
+def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
+    dirty = simulate_block(3, 400, seed=5, outliers=0.1)
+    passes = []
+    for share in (0.0, 0.2):
+        monkeypatch.setattr(rounds, "_SAME", share)
+        found = solve(dirty, **CALM, robust_threshold=1.2, estimate_noise=False)
+        passes.append(int(found.status.split()[0]))
+    assert passes == [6, 2]  # no more than six, and never less than two

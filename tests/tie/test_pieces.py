@@ -444,6 +444,93 @@ def test_sigmas_are_those_of_the_epipolar_lines_where_these_say_more(count, nois
     np.testing.assert_allclose(sigma, scaled, rtol=0.3 if scaled > 0.1 else 1e-12)
 
 
+def links_of(count: int, seen: int) -> _Links:
+    """Tracks in a row of `seen` like views, referred to the first."""
+    many = views(*(camera(0.0, lean=0.05 * v) for v in range(seen)))
+    xy = np.repeat(np.random.default_rng(5).integers(100, 900, (count, 2)).astype(float), seen, axis=0)
+    tracks = Tracks(
+        np.tile(np.arange(seen), count), np.repeat(np.arange(count), seen), xy, np.full(seen * count, 0.1)
+    )
+    rows = np.arange(seen * count)
+    other = rows[rows % seen > 0]
+    return _Links(many, tracks, other - other % seen, other)
+
+
+def test_links_that_disagree_in_altitude_with_all_their_neighbours_are_torn() -> None:
+    """Three views: two links a track, 20 px of half a segment. Two pixels of altitude apart, neither is believed."""
+    links = links_of(60, 3)
+    good, reach = np.ones(120, dtype=bool), np.full(120, 20.0)
+    altitude = np.repeat(np.random.default_rng(1).uniform(-0.5, 0.5, 60), 2)
+    assert not links._torn(good, altitude, reach).any()
+    wrong = altitude.copy()
+    wrong[[10, 41]] += 0.1
+    assert np.flatnonzero(links._torn(good, wrong, reach)).tolist() == [10, 11, 40, 41]
+    tolerated = altitude.copy()
+    tolerated[10] += 0.19 / 20.0  # a fifth of a pixel
+    assert not links._torn(good, tolerated, reach).any()
+    # an affine function of place is a camera's error
+    tilted = altitude.copy()
+    tilted[1::2] += 1e-3 * links.origin[1::2, 0] / 20.0 * 20.0
+    assert not links._torn(good, tilted, reach).any()
+    # short segments tell no altitude, nor do links that are out already
+    assert not links._torn(good, wrong, np.full(120, 4.9)).any()
+    assert links._torn(good, wrong, np.full(120, 5.1)).sum() == 4
+    good[11] = False
+    assert np.flatnonzero(links._torn(good, wrong, reach)).tolist() == [40, 41]
+
+
+def test_of_four_views_the_link_that_contradicts_two_neighbours_is_torn_alone() -> None:
+    links = links_of(60, 4)
+    altitude = np.repeat(np.random.default_rng(1).uniform(-0.5, 0.5, 60), 3)
+    altitude[30] += 0.2  # the first of its track: its neighbour agrees with the third
+    torn = links._torn(np.ones(180, dtype=bool), altitude, np.full(180, 20.0))
+    assert np.flatnonzero(torn).tolist() == [30]
+
+
+def test_what_is_verified_is_on_its_line_at_its_altitude_and_no_less_certain_than_others() -> None:
+    links = links_of(60, 3)
+    altitude = np.repeat(np.random.default_rng(1).uniform(-0.5, 0.5, 60), 2)
+    xy = np.empty((120, 2))
+    for group in links.groups():
+        where = frame(*links.of(group), links.origin[group])
+        xy[group] = where.place(altitude[group] * where.after)
+        assert 4.9 < np.median(where.after) < 40.0
+        aside = np.array([-where.axis[1], where.axis[0]])
+    found = Registration(xy, np.ones(120), np.full(120, 0.1), np.ones(120, dtype=bool))
+    every = np.ones(120, dtype=bool)
+    assert links.verified(found, every).all()
+    few = every.copy()
+    few[::3] = False
+    np.testing.assert_array_equal(links.verified(found, few), few)
+    off = Registration(xy.copy(), found.correlation, found.sigma.copy(), found.ok)
+    off.xy[20] += 0.15 * aside  # off its line
+    off.xy[51] += 3.0 * np.array([aside[1], -aside[0]])  # along it: at another altitude than its neighbour
+    off.sigma[80], off.sigma[90] = 0.21, 0.19  # of the median 0.1 twice is tolerated
+    left = links.verified(off, every)
+    assert np.flatnonzero(~left).tolist() == [20, 50, 51, 80]
+
+
+def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
+    links, seen = links_of(80, 3), []
+
+    def ordered(executor: Any, function: Any, tasks: Any, name: str, progress: Any) -> list[Registration]:
+        seen.extend(tasks)
+        return [Registration.none(task[3]) for task in tasks]
+
+    monkeypatch.setattr("barpc.tie.register.ordered", ordered)
+    found = links.register(TieOptions(tile=256), None, None)
+    assert len(found.xy) == 160
+    for _, band, origin, start, linear, patch in seen:
+        assert (np.ptp(np.floor(origin / 256), axis=0) == 0).all()
+        assert (band, patch) == (1, 21)
+        assert len(origin) == len(start) == len(linear)
+    assert sum(len(task[2]) for task in seen) == 160
+    assert len(seen) > 20
+    np.testing.assert_array_equal(
+        np.sort(found.xy, axis=0), np.sort(np.concatenate([t[3] for t in seen]), axis=0)
+    )
+
+
 def test_rows_aregrouped_by_equal_keys() -> None:
     a, b = np.array([1, 0, 1, 1, 0]), np.array([2, 5, 2, 1, 5])
     groups = grouped(a, b)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -186,6 +188,12 @@ def test_the_derivative_of_a_ramp_is_its_slope() -> None:
     assert template._weight.sum() == pytest.approx(1.0, rel=1e-5)
     middle, edge = template._weight[220], template._weight[210]
     assert edge / middle == pytest.approx(np.exp(-0.5 / 0.7**2), rel=1e-5)
+    weight = template._weight.reshape(21, 21) / middle
+    for other in (weight[0, 10], weight[20, 10], weight[10, 20]):
+        assert other == pytest.approx(edge / middle, rel=1e-5)
+    assert weight[0, 0] == pytest.approx(np.exp(-1.0 / 0.7**2), rel=1e-5)
+    np.testing.assert_allclose(weight, weight.T, rtol=1e-6)
+    np.testing.assert_allclose(weight, weight[::-1, ::-1], rtol=1e-6)
 
 
 @pytest.mark.parametrize(("detail", "flat"), [(0.0005, True), (0.003, False)])
@@ -199,3 +207,35 @@ def test_a_patch_is_flat_below_a_millionth_of_its_level(detail: float, flat: boo
     if not flat:
         assert deviation[0, 0] == pytest.approx(detail, rel=0.2)
         assert (patch**2 @ template._weight)[0] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_what_fails_at_a_border_is_tried_again_with_a_smaller_patch(texture) -> None:
+    """A patch of 21 needs ten pixels about it, one of 15 seven."""
+    points = np.array(
+        [[9.0, 200.0], [7.0, 200.0], [6.0, 200.0], [200.0, SIZE - 8.0], [200.0, SIZE - 7.0], [10.0, 10.0]]
+    )
+    found = run(texture, texture, points, points + 0.2, np.eye(2))
+    assert found.ok.tolist() == [True, True, False, True, False, True]
+    np.testing.assert_allclose(found.xy[found.ok], points[found.ok], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("apart", "sigma", "ok"),
+    [(0.45, 0.01, True), (0.55, 0.01, False), (0.55, 0.12, True), (0.65, 0.12, False)],
+)
+def test_a_patch_whose_inner_part_goes_elsewhere_is_not_ok(
+    texture, reference, monkeypatch, apart, sigma, ok
+) -> None:
+    """By more than half a pixel, and more than five standard deviations: it lies across a step of the ground."""
+    find = _Template.find
+
+    def found_apart(self, fine, reference, start, linear):
+        found = find(self, fine, reference, start, linear)
+        if self._half == 10:
+            return found
+        return replace(found, xy=found.xy + apart * np.array([0.6, -0.8]), sigma=np.full(len(start), sigma))
+
+    monkeypatch.setattr(_Template, "find", found_apart)
+    found = run(texture, texture, reference, reference + 0.2, np.eye(2))
+    assert found.ok.all() if ok else not found.ok.any()
+    np.testing.assert_allclose(found.xy, reference, atol=0.01)
