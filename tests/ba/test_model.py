@@ -14,7 +14,9 @@ from barpc.ba.adjustment import _Solution, make_problem
 from barpc.ba.block import join
 from barpc.ba.rounds import Outcome
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks
+from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve
 from tests.constants import chosen
@@ -164,6 +166,61 @@ def test_an_earlier_blocks_centres_are_kept_and_the_others_regressed(made) -> No
     found = make_problem(block, options, None, block_prior(first)).cameras.unknowns.center
     np.testing.assert_array_equal(found[:2], centers[:2] + 7.0)
     assert 0 < np.linalg.norm(found[2] - centers[2]) < 0.1 * 694e3
+
+
+# --- where it starts ----------------------------------------------------------------------------------------------
+
+
+def uneven(made: Block) -> Block:
+    """Observations of three sigmas, and noise to go with them."""
+    sigma = np.array([0.1, 0.5, 2.0])[np.arange(len(made.tracks)) % 3]
+    xy = made.tracks.xy + sigma[:, None] * np.random.default_rng(0).normal(size=made.tracks.xy.shape)
+    return replace(made, tracks=replace(made.tracks, xy=xy, sigma=sigma))
+
+
+def triangulated(sensors: Any, tracks: Tracks, xy: np.ndarray, sigma: np.ndarray | None) -> np.ndarray:
+    return triangulate(list(sensors), tracks.view, tracks.point, xy, sigma, alt=300.0).points
+
+
+def test_points_start_where_the_delivered_cameras_see_them_by_their_sigmas(made) -> None:
+    given = uneven(made)
+    options = AdjustOptions(drift=0)
+    block = join(given.views, given.tracks, None, options)
+    problem = make_problem(block, options, centers_of(made), None)
+    state, _ = adjustment._start(problem, block, options, None)
+    sensors = [view.sensor for view in given.views]
+    weighted, equal = (
+        triangulated(sensors, given.tracks, given.tracks.xy, s) for s in (given.tracks.sigma, None)
+    )
+    off = [np.linalg.norm(state.points - there, axis=1) for there in (weighted, equal)]
+    assert np.median(off[0]) < 0.02 < 0.3 < np.median(off[1])
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.5])
+def test_the_scenes_move_is_from_where_the_delivered_cameras_put_what_is_seen_now(made, kept: float) -> None:
+    """Where much was cut, what it was cut for is mended before: its places are those of the adjusted cameras."""
+    given = uneven(made)
+    options = AdjustOptions(drift=0)
+    block = join(given.views, given.tracks, None, options)
+    problem = make_problem(block, options, centers_of(made), None)
+    state, _ = adjustment._start(problem, block, options, None)
+    params = np.random.default_rng(1).normal(0, 3, (3, 6))
+    final = replace(state, params=params, points=state.points + 5.0)
+    inlier = np.arange(len(block.view)) < kept * len(block.view)
+    outcome: Any = SimpleNamespace(inlier=inlier, minimum=SimpleNamespace(state=final))
+    found = _Solution(problem, state, None, None, outcome, None, None, None).first_points(block)  # type: ignore[arg-type]
+    if kept == 1.0:
+        np.testing.assert_array_equal(found, state.points)
+        return
+    sensors = problem.cameras.unknowns.corrected(params, given.views)
+    ground = ground_from_ecef(final.points)
+    seen = np.array(
+        [sensors[v].project(ground[p]) for v, p in zip(given.tracks.view, given.tracks.point, strict=True)]
+    )
+    delivered = [view.sensor for view in given.views]
+    weighted, equal = (triangulated(delivered, given.tracks, seen, s) for s in (given.tracks.sigma, None))
+    off = [np.linalg.norm(found - there, axis=1) for there in (weighted, equal)]
+    assert np.median(off[0]) < 0.02 < 0.1 < np.median(off[1])
 
 
 # --- what is no block ---------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -34,6 +35,12 @@ def test_errors_of_a_view_are_those_of_its_kept_observations(made, found) -> Non
     none = replace(found, inlier=found.inlier & (view != 1))
     assert np.isnan(none.rmse()).tolist() == [False, True, False]
     np.testing.assert_array_equal(found.scene_shift, found.gauge.shift)
+
+
+def test_seconds_are_those_of_the_adjustment(made) -> None:
+    start = time.process_time()
+    found = solve(made, drift=0)
+    assert 0.0 < found.seconds <= time.process_time() - start
 
 
 def measured(block: Block, found: Adjustment, pair: tuple[int, int]) -> tuple[float, float, int]:

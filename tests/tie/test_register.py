@@ -84,6 +84,20 @@ def test_enough_is_read_about_a_place_for_the_patch_and_its_interpolation(textur
         np.testing.assert_allclose(alone.correlation[0], whole.correlation[k], atol=1e-5)
 
 
+@pytest.mark.parametrize("holed", [0, 1])
+def test_what_is_invalid_in_either_file_is_not_used(texture, tmp_path, holed: int) -> None:
+    files = []
+    for k in (0, 1):
+        image = np.rint(texture).astype(np.uint16)
+        if k == holed:
+            image[195:206, 195:206] = 65535
+        write_image(tmp_path / f"{k}.tif", image)
+        files.append((str(tmp_path / f"{k}.tif"), (SIZE, SIZE)))
+    places = np.array([[203.0, 198.0], [100.0, 120.0], [300.0, 200.0]])
+    found = register_places(tuple(files), 1, places, places + 0.3, np.broadcast_to(np.eye(2), (3, 2, 2)), 21)
+    assert found.ok.tolist() == [False, True, True]
+
+
 def test_gain_and_offset_between_the_images_do_not_matter(texture, reference) -> None:
     found = run(texture, 0.37 * texture + 210, reference, reference + 0.4, np.eye(2))
     assert found.ok.all()
