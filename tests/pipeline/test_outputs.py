@@ -13,8 +13,12 @@ from barpc import handoff
 from barpc.errors import OutputError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.handoff import CONSUMERS, Consumer, Reading, control_grid, difference, verify
+from barpc.options import RunOptions
 from barpc.pipeline import outputs
-from barpc.pipeline.outputs import REOPENED, file_names, refuse_shadows, write_view
+from barpc.pipeline.inputs import PRIOR
+from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, write_view
+from barpc.report.page import can_render
+from barpc.report.tables import TABLES
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
@@ -227,3 +231,49 @@ def test_json_is_what_rpcm_reads(tmp_path, view, fit) -> None:
     with Workspace(tmp_path / "out") as run:
         write_view(run, view, fit, make_rpc(), "none", ("json",))
     assert json.loads((tmp_path / "out" / "scene.rpc.json").read_text())["rpc"]
+
+
+def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None:
+    other = replace(view, name="b__c")
+    (tmp_path / "asp").mkdir()
+    for name in ("scene__b__c.txt", "b__c__scene.txt", "scene__x.txt", "scene_b__c.txt", "scene.txt"):
+        (tmp_path / "asp" / name).touch()
+    names = {
+        stop: output_names([view, other], RunOptions(stop_after=stop, rpc_formats=("rpb",)), tmp_path)
+        for stop in ("matching", "adjustment", "all")
+    }
+    common = [*TABLES, "summary.json"] + (["report.html"] if can_render() else [])
+    pairs = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"]
+    assert sorted(names["matching"]) == sorted([*common, "matches.csv", "matches.npz", *pairs])
+    assert sorted(names["adjustment"]) == sorted([*common, PRIOR])
+    files = ["scene.vrt", "scene.RPB", "b__c.vrt", "b__c.RPB"]
+    assert sorted(names["all"]) == sorted([*common, *files, PRIOR])
+    assert sorted(output_names([view], RunOptions(stop_after="matching"), tmp_path / "new")) == sorted(
+        [*common, "matches.csv", "matches.npz"]
+    )
+
+
+@pytest.mark.parametrize("page", [True, False])
+def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) -> None:
+    """Tables, the page where it can be drawn, and the summary, in this order."""
+    written = []
+    monkeypatch.setattr(
+        outputs, "TABLES", {"a.csv": lambda run, summary: b"1", "b.csv": lambda run, summary: b"2"}
+    )
+    monkeypatch.setattr(outputs, "can_render", lambda: page)
+    monkeypatch.setattr(outputs, "report_html", lambda summary, folder: f"<p>{summary} in {folder.name}</p>")
+    monkeypatch.setattr(outputs, "plain", lambda summary: {"of": summary})
+    for method in ("write_text", "output"):
+        real = getattr(Workspace, method)
+        watched = lambda self, name, *given, real=real: (written.append(name), real(self, name, *given))[1]  # noqa: E731
+        monkeypatch.setattr(Workspace, method, watched)
+    with Workspace(tmp_path / "out") as run:
+        outputs.write_tables(run, None, "what was found")  # type: ignore[arg-type]
+    names = ["a.csv", "b.csv", *(["report.html"] if page else []), "summary.json"]
+    assert list(dict.fromkeys(written)) == names
+    folder = tmp_path / "out"
+    assert [(folder / name).read_bytes() for name in names[:2]] == [b"1", b"2"]
+    if page:
+        assert (folder / "report.html").read_text() == "<p>what was found in out</p>"
+    assert json.loads((folder / "summary.json").read_text()) == {"of": "what was found"}
+    assert (folder / "summary.json").read_text().endswith("\n")

@@ -174,6 +174,15 @@ def test_both_dialects_of_json_are_read(rpc):
         assert parse(json.dumps(document).encode(), "memory") == (rpc, "json")
 
 
+def test_an_rpc_may_lie_three_objects_deep_in_json_and_no_deeper(rpc):
+    document = json.loads(FORMATS["json"].write(rpc))["rpc"]
+    for depth in range(4):
+        assert parse(json.dumps(document).encode(), "memory") == (rpc, "json"), depth
+        document = {"other": [1, 2], "inner": document}
+    with pytest.raises(RpcFormatError):
+        parse(json.dumps(document).encode(), "memory")
+
+
 def _fields(rpc):
     from barpc.rpcio.fields import fields_from_rpc
 
