@@ -48,14 +48,12 @@ TESTS = {
 """Part of the core -> its tests."""
 SLOW = ("test_real_images.py", "test_simulated.py", "test_sentinel1_example.py")
 """Left out: full runs over images, minutes each."""
-LATE = {
-    f"test_{name}.py"
-    for name in (
-        "area", "matcher", "guided", "link", "real", "recovery", "referee", "sar_optical", "uncertainty",
-        "options", "snooping", "sentinel1", "fit_rpc", "solvers", "features", "pieces",
-    )
-}  # fmt: skip
-"""Run last, unless they are named after the module: many seconds each."""
+LATE = (
+    "pieces", "features", "real", "sar_optical", "options", "fit_rpc", "solvers", "sentinel1", "guided", "link",
+    "snooping", "recovery", "area", "uncertainty", "matcher", "referee",
+)  # fmt: skip
+"""Tests that run last, in this order, unless they are named after the module: many seconds each."""
+
 
 COMPARISONS = {
     ast.Lt: ("<", "<=", ">"), ast.LtE: ("<=", "<", ">="), ast.Gt: (">", ">=", "<"), ast.GtE: (">=", ">", "<="),
@@ -235,7 +233,7 @@ def _failing(tree: Path, part: str, stem: str, limit: float) -> tuple[bool, str,
     """Run a part's tests in a forked process, those that are named after the module first."""
     every = sorted(path for pattern in TESTS[part].split() for path in tree.glob(pattern))
     found = (path for path in every if path.name not in SLOW)
-    paths = sorted(found, key=lambda path: (stem.removeprefix("_") not in path.name, path.name in LATE))
+    paths = sorted(found, key=lambda path: (stem.removeprefix("_") not in path.name, _late(path)))
     start, log = time.monotonic(), tree / "log.txt"
     child = multiprocessing.get_context("fork").Process(
         target=_tests, args=(tree, log, list(map(str, paths)))
@@ -247,6 +245,12 @@ def _failing(tree: Path, part: str, stem: str, limit: float) -> tuple[bool, str,
         return True, "too slow", limit
     named = [line for line in log.read_text().splitlines() if line.startswith(("FAILED", "ERROR"))]
     return child.exitcode != 0, named[0][:160] if named else "", time.monotonic() - start
+
+
+def _late(path: Path) -> int:
+    """Place among the files that run last; 0 for the others."""
+    name = path.stem.removeprefix("test_")
+    return LATE.index(name) + 1 if name in LATE else 0
 
 
 def _tests(tree: Path, log: Path, paths: list[str]) -> None:
