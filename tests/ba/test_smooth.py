@@ -121,8 +121,10 @@ def test_beyond_the_image_the_edge_goes_on() -> None:
 def test_a_view_needs_ten_observations_a_term() -> None:
     few, enough = 18 * 10 - 1, 18 * 10
     smooth = made((few, enough, 400))
-    assert smooth.parameters(np.ones(few + enough + 400)) == 2 * 2 * 18
-    assert smooth.parameters(np.r_[np.ones(few + enough), np.zeros(400)]) == 2 * 18
+    assert sorted(smooth.fit(np.ones((2, few + enough + 400)), np.ones(few + enough + 400))) == [1, 2]
+    assert sorted(
+        smooth.fit(np.ones((2, few + enough + 400)), np.r_[np.ones(few + enough), np.zeros(400)])
+    ) == [1]
     given = np.ones((2, few + enough + 400))
     part = smooth.part(given, given[0])
     assert not part[:, :few].any()
@@ -173,13 +175,13 @@ def test_the_significance_is_that_of_the_f_test() -> None:
     part = smooth.part(residual, np.ones(12000))
     explained, total = (smooth.structure.sum_views((x**2).sum(axis=0)[None])[:, 0] for x in (part, residual))
     value = (explained / 36) / ((total - explained) / (800 - 36))
-    found = smooth.test(residual, np.ones(12000, dtype=bool), neighbours=False)
+    found = smooth.test(residual, np.ones(12000, dtype=bool))
     np.testing.assert_allclose(found.significance, stats.f.sf(value, 36, 800 - 36), rtol=1e-6)
     assert found.significance[0] > 0.05
     assert found.significance[-1] < 1e-6
     noise_of_terms = 36 * (total - explained) / (800 - 36)
     np.testing.assert_allclose(found.rms, np.sqrt(np.maximum(explained - noise_of_terms, 0) / 400), atol=1e-9)
-    assert not found.shared.any()
+    assert not found.shared.any()  # what neighbours share is asked for by itself
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -191,10 +193,14 @@ def test_what_neighbours_share_is_found_though_it_is_no_smooth_function(axis: in
     mine = smooth.structure.view == 0
     residual = noise(smooth, 0.2)
     residual[1, mine] += 0.15 * step[mine]
-    found = smooth.test(residual, np.ones(8000, dtype=bool))
+    use = np.ones(8000, dtype=bool)
+    tested = smooth.test(residual, use)
+    found = smooth.test_neighbours(tested, residual, use)
+    np.testing.assert_array_equal(found.rms, tested.rms)
     assert found.shared[0] == pytest.approx(0.15, rel=0.15)
     assert found.shared[1] == 0.0
     for size, found in ((0.9, True), (3.0, False)):  # a mean product of 8 of its standard deviations, of 2
         faint = 0.15 * step * mine + noise(smooth, 0.3 * size)
-        shared = smooth.test(np.stack([0 * step, faint[1]]), np.ones(8000, dtype=bool)).shared
+        given = np.stack([0 * step, faint[1]])
+        shared = smooth.test_neighbours(smooth.test(given, use), given, use).shared
         assert (shared[0] > 0.0) == found  # else it may be chance
