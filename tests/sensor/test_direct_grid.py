@@ -90,6 +90,23 @@ def test_off_the_grid_points_are_nan(grid):
     assert np.isnan(jacobian).all()
 
 
+def test_the_grid_goes_on_for_a_cell_and_a_tenth_of_its_altitudes():
+    """Nodes every 500 columns and 1000 rows up to 4000, altitudes 0 to 1000: the last cell's end belongs to it."""
+    small = sampled(
+        np.arange(0.0, 4001.0, 500.0), np.arange(0.0, 4001.0, 1000.0), np.array([0.0, 500.0, 1000.0])
+    )
+    middle = np.array([2000.0, 2000.0, 500.0])
+    for axis, (low, high) in enumerate(((-500.0, 4500.0), (-1000.0, 5000.0), (-100.0, 1100.0))):
+        for value, known in ((low, True), (high, True), (low - 0.01, False), (high + 0.01, False)):
+            place = middle.copy()
+            place[axis] = value
+            ground = small.localize(place[:2], place[2])
+            assert np.isfinite(ground).all() == known, (axis, value)
+            if known:
+                there = PHYSICAL.localize(place[:2], place[2])
+                np.testing.assert_allclose(ground[:2], there[:2], atol=2e-8)
+
+
 def test_the_nodes_may_be_listed_in_any_order(grid):
     alt, row, col = np.meshgrid(grid.alts, grid.rows, grid.cols, indexing="ij")
     ground = np.concatenate([grid.lonlat, alt[..., None]], axis=-1).reshape(-1, 3)
