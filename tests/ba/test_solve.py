@@ -1,0 +1,135 @@
+"""Levenberg-Marquardt by script: what is damped, what is taken, and why it ends."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba import solve
+from barpc.ba.solve import Minimum, State, _settled
+from barpc.errors import AdjustError
+
+STATE = State(np.zeros((1, 2)), np.zeros((1, 3)), history=(7.0,))
+FACTOR = object()
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, costs: list[float], gains: list[float], tolerance: float = 1e-6
+) -> tuple[Minimum | str, list[float]]:
+    """The minimum, or the error's text, and the damping of every step; a gain of NaN: the matrix does not factorise.
+
+    Costs are those of the linearisations; the last of them and the last gain go on for ever.
+    """
+    dampings: list[float] = []
+    given = iter(costs)
+
+    def reduce(*_: Any) -> Any:
+        cost = next(given, costs[-1])
+        return SimpleNamespace(cost=cost, point_step=lambda step: np.ones((1, 3)))
+
+    def camera_step(problem: Any, reduced: Any, damping: float = 0.0) -> tuple[Any, float, Any]:
+        gain = gains[min(len(dampings), len(gains) - 1)]
+        dampings.append(damping)
+        if np.isnan(gain):
+            raise np.linalg.LinAlgError
+        return np.full((1, 2), 0.5), gain, FACTOR
+
+    monkeypatch.setattr(solve, "camera_step", camera_step)
+    problem: Any = SimpleNamespace(reduce=reduce)
+    try:
+        return solve._levenberg_marquardt(problem, STATE, np.ones(1), tolerance, None), dampings
+    except AdjustError as error:
+        return str(error), dampings
+
+
+def test_steps_are_taken_until_one_gains_too_little(monkeypatch) -> None:
+    found, dampings = run(monkeypatch, [100.0, 40.0, 30.0], [60.0, 10.0, 2.9e-5])
+    assert isinstance(found, Minimum)
+    assert dampings == [0.0] * 3
+    assert found.state.history == (7.0, 100.0, 40.0, 30.0)
+    np.testing.assert_allclose(found.state.params, 1.5)  # the last step is taken, too
+    np.testing.assert_allclose(found.state.points, 3.0)
+    assert found.state.cost == pytest.approx(30.0 - 2.9e-5)
+    assert found.factor is FACTOR
+    assert found.reduced.cost == 30.0
+    assert "4 evaluations in all: the next step gains too little" in found.status
+    _, dampings = run(monkeypatch, [100.0, 40.0, 30.0], [60.0, 10.0, 1e-2, 1e-9])
+    assert len(dampings) == 4
+
+
+@pytest.mark.parametrize(
+    ("gain", "before", "last"),
+    [
+        (9.9e-4, np.inf, True),  # of a cost of 1000, tolerance 1e-6
+        (1.1e-3, np.inf, False),
+        (3.1e-3, 10.0, True),  # leaves its square over the one before: a thousandth of what is tolerated
+        (3.3e-3, 10.0, False),
+        (0.099, 1e4, True),
+        (0.101, 1e4, False),
+        (0.0, 0.0, True),
+    ],
+)
+def test_a_step_is_the_last_where_what_it_leaves_does_not_matter(gain, before, last) -> None:
+    assert _settled(gain, before, 1000.0, 1e-6) == last
+
+
+def test_a_step_that_fails_is_damped_and_the_damping_let_go(monkeypatch) -> None:
+    costs = [100.0, 150.0, 140.0, 90.0, 80.0, 70.0, 60.0, 50.0]
+    found, dampings = run(monkeypatch, costs, [50.0] * 7 + [1e-9])
+    np.testing.assert_allclose(dampings, [0.0, 1e-6, 1e-5, 1e-6, 1e-7, 1e-8, 0.0, 0.0], rtol=1e-9, atol=1e-12)
+    assert isinstance(found, Minimum)
+    assert found.state.history == (7.0, 100.0, 90.0, 80.0, 70.0, 60.0, 50.0)
+    np.testing.assert_allclose(found.state.params, 0.5 * 6)  # of those that failed nothing stays
+
+
+def test_a_minimum_that_was_damped_has_no_factor_to_hand_on(monkeypatch) -> None:
+    found, _ = run(monkeypatch, [100.0, 150.0, 90.0], [50.0, 50.0, 1e-9])
+    assert isinstance(found, Minimum)
+    assert found.factor is None
+
+
+def test_a_matrix_that_does_not_factorise_is_damped_from_less(monkeypatch) -> None:
+    nan = float("nan")
+    found, dampings = run(monkeypatch, [100.0, 90.0], [nan, nan, nan, 1e-9])
+    np.testing.assert_allclose(dampings, [0.0, 1e-8, 1e-7, 1e-6])
+    assert isinstance(found, Minimum)
+
+
+@pytest.mark.parametrize(("gain", "ends"), [(0.9e-9, True), (1.1e-9, False)])
+def test_a_cost_that_rises_by_its_rounding_is_the_least(monkeypatch, gain: float, ends: bool) -> None:
+    found, dampings = run(monkeypatch, [1.0, 1.0 + 1e-9], [gain], 1e-12)
+    if ends:
+        assert isinstance(found, Minimum)
+        assert "what a step gains is lost in rounding" in found.status
+        assert dampings == [0.0]
+        assert not found.state.params.any()
+    else:
+        assert len(dampings) > 10
+
+
+@pytest.mark.parametrize(("gain", "lost"), [(0.9e-6, True), (1.1e-6, False)])
+def test_where_no_damping_however_strong_helps_it_ends(monkeypatch, gain: float, lost: bool) -> None:
+    found, dampings = run(monkeypatch, [1.0, 2.0], [gain], 1e-9)
+    assert max(dampings) == pytest.approx(1e8)
+    if lost:
+        assert isinstance(found, Minimum)
+        assert "lost in rounding" in found.status
+    else:
+        assert found == "no step lowers the cost 1: the solution is not usable"
+
+
+def test_a_cost_that_stands_is_no_failure_and_the_steps_are_counted(monkeypatch) -> None:
+    monkeypatch.setattr(solve, "MAX_STEPS", 5)
+    found, dampings = run(monkeypatch, [1.0, 1.0 + 5e-13], [0.5])
+    assert isinstance(found, Minimum)
+    assert dampings == [0.0] * 5
+    assert "the number of steps is used up" in found.status
+    assert len(found.state.history) == 7
+
+
+@pytest.mark.parametrize("cost", [np.nan, np.inf])
+def test_a_cost_that_is_not_finite_is_an_error(monkeypatch, cost: float) -> None:
+    assert "the cost is not finite" in str(run(monkeypatch, [cost], [1.0])[0])
