@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, normal, rounds
 from barpc.ba.adjustment import make_problem
@@ -15,7 +16,7 @@ from barpc.ba.block import join
 from barpc.ba.gauge import gauge_report
 from barpc.ba.ground import Heights, convergence_angles, ground_control
 from barpc.ba.problem import Problem
-from barpc.ba.solve import Minimum, State, camera_step, gauss_newton
+from barpc.ba.solve import Minimum, State, _Compressed, camera_step, gauss_newton
 from barpc.ba.weights import Observations
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
@@ -172,6 +173,30 @@ def test_one_step_is_the_gauss_newton_step_of_the_whole(case):
     assert projected.image.shape == (2, len(case.plain.view))
     _assert_close(moved.params - case.params, whole[:size].reshape(case.params.shape), 1e-4)
     assert moved.cost == pytest.approx(cost + gradient @ whole, rel=1e-5)
+
+
+def test_what_scipy_sees_has_the_cost_the_gradient_and_the_matrix_of_the_reduced_problem(case):
+    compressed = _Compressed(case.problem, _state(case), case.weight, None)
+    size = case.params.size
+    upper0 = la.cholesky(case.reduced.plain(np.ones(size, dtype=bool)))
+    for x in (np.zeros(size), np.random.default_rng(3).normal(0, 0.5, size)):
+        residual, jacobian = compressed.residual(x), compressed.jacobian(x)
+        assert (residual.shape, jacobian.shape) == ((size + 1,), (size + 1, size))
+        state = compressed.state
+        np.testing.assert_allclose(
+            (state.params - case.params).ravel(), np.linalg.solve(upper0, x), atol=1e-9
+        )
+        there = case.problem.reduce(state.params, state.points, case.weight)
+        assert state.cost == pytest.approx(there.cost, rel=1e-9)
+        assert residual @ residual == pytest.approx(there.cost - there.gain, rel=1e-9)
+        inverse = np.linalg.inv(upper0)
+        _assert_close(jacobian.T @ residual, inverse.T @ there.gradient, 1e-6)
+        matrix = there.plain(np.ones(size, dtype=bool))
+        _assert_close(jacobian.T @ jacobian, inverse.T @ matrix @ inverse, 1e-6)
+    evaluations = len(compressed.state.history)
+    assert evaluations == 2  # asked twice at one place, linearised once
+    compressed.at(x + 1e-3)
+    assert len(compressed.state.history) == 3
 
 
 def _state(case: Case) -> State:
