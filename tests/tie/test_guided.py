@@ -10,7 +10,7 @@ import pytest
 from barpc.tie import TieOptions
 from barpc.tie.epipolar import Frame
 from barpc.tie.features import Keypoints, Sift, bounded, detect_tile, join, quota
-from barpc.tie.guided import Guided
+from barpc.tie.guided import Guided, _Strips
 from barpc.tie.matcher import Matches, Prediction
 from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch, tiles
 from tests.constants import chosen
@@ -242,3 +242,30 @@ def test_zero_borders_of_five_pixels_are_invalid_and_smaller_ones_are_not(tmp_pa
 )
 def test_a_box_grows_on_every_side_up_to_the_border(box, grown) -> None:
     assert grow(box, 5, (100, 100)) == grown
+
+
+@pytest.mark.parametrize("slope", [0.4, -0.4, 0.02, 0.0])
+@pytest.mark.parametrize("reach", [(-150.0, 20.0), (-20.0, 150.0), (30.0, 150.0), (-150.0, -30.0)])
+def test_all_points_of_slanted_bands_are_looked_at_and_few_others(
+    slope: float, reach: tuple[float, float]
+) -> None:
+    """Bands that rise or fall by some strips along their length, to one side of the prediction or to both."""
+    rng = np.random.default_rng(0)
+    turned = rng.uniform(0, 2000, (4000, 2))
+    strips = _Strips(turned)
+    for _ in range(30):
+        rows = np.arange(5)
+        place = rng.uniform(300, 1700, 2) + rng.uniform(0, 30, (5, 2))
+        where = Frame(np.array([1.0, 0.0]), place[:, 0], place[:, 1], np.full(5, slope), np.full(5, reach[0]),
+                      np.full(5, reach[1]), np.eye(2))  # fmt: skip
+        du, dw = strips.apart(where, rows, np.arange(4000))
+        inside = (du >= reach[0]) & (du <= reach[1]) & (np.abs(dw) <= 3.0)
+        found = strips.near(where, 3.0, rows)
+        assert (np.diff(found) > 0).all()
+        assert np.isin(np.flatnonzero(inside.any(axis=0)), found).all()
+        # the box about the bands, a strip more on either side
+        u, w = turned[found].T
+        assert ((u >= (place[:, 0] + reach[0]).min()) & (u <= (place[:, 0] + reach[1]).max())).all()
+        tilt = 0.4 * 150.0 if slope in (0.4, -0.4) else 3.0
+        assert w.min(initial=1e9) > place[:, 1].min() - 3.0 - tilt - strips.height - 1
+        assert w.max(initial=-1e9) < place[:, 1].max() + 3.0 + tilt + strips.height + 1

@@ -84,6 +84,15 @@ def test_the_listed_pairs_only_are_chosen_where_a_list_is_given() -> None:
     assert [p.views for p in pairs] == [(0, 1), (1, 2)]
 
 
+def test_listed_pairs_are_tried_where_cameras_may_be_wrong_and_others_are_not() -> None:
+    """The third view lies 20 m beside the second one and 120 m beside the first."""
+    three = views(camera(0.0), camera(100 * METRE), camera(620 * METRE))
+    pairs = select_pairs(three, TieOptions(search=500), only=[(0, 1), (1, 2)])
+    assert [p.views for p in pairs] == [(0, 1), (1, 2)]
+    pairs = select_pairs(three, TieOptions(search=500))
+    assert [p.views for p in pairs] == [(0, 1), (0, 2), (1, 2)]
+
+
 def test_all_listed_pairs_are_chosen_however_many_partners_a_view_then_has() -> None:
     many = views(*(camera(10 * METRE * k) for k in range(6)))
     listed = [(0, k) for k in range(1, 6)] + [(1, 2)]
