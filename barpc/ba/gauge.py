@@ -108,6 +108,6 @@ def _modes(motion_covariance: Array) -> tuple[Mode, ...]:
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         motion = vector * np.sqrt(max(value, 0.0))
         largest = int(np.abs(motion).argmax())
-        motion = motion * (np.sign(motion[largest]) or 1.0)
+        motion = motion * np.sign(motion[largest])
         modes.append(Mode(float(np.linalg.norm(motion)), motion, MOTIONS[largest]))
     return tuple(modes)

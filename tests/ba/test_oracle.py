@@ -13,7 +13,7 @@ import scipy.linalg as la
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, normal, rounds
 from barpc.ba.adjustment import make_problem
 from barpc.ba.block import join
-from barpc.ba.gauge import gauge_report
+from barpc.ba.gauge import MOTIONS, _modes, gauge_report
 from barpc.ba.ground import Heights, convergence_angles, ground_control
 from barpc.ba.problem import Problem
 from barpc.ba.solve import Minimum, State, _Compressed, camera_step, gauss_newton
@@ -255,6 +255,24 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole(case):
         _assert_close(found, inverse[np.ix_(place, place)], 1e-4)
     pair = np.r_[q : 2 * q, 3 * q : 4 * q]
     _assert_close(covariance.joint(np.array([1, 3])), inverse[np.ix_(pair, pair)], 1e-4)
+
+
+def test_modes_are_the_principal_axes_the_weakest_first_and_upright():
+    root = np.random.default_rng(4).normal(size=(7, 7))
+    covariance = root @ root.T
+    modes = _modes(covariance)
+    values = np.linalg.eigvalsh(covariance)[::-1]
+    for value, mode in zip(values, modes, strict=True):
+        assert mode.sigma == pytest.approx(np.sqrt(value))
+        np.testing.assert_allclose(covariance @ mode.motion, value * mode.motion, atol=1e-9)
+        assert np.linalg.norm(mode.motion) == pytest.approx(mode.sigma)
+        largest = np.abs(mode.motion).argmax()
+        assert mode.motion[largest] > 0
+        assert mode.meaning == MOTIONS[largest]
+    still = _modes(np.zeros((7, 7)))  # nothing may move
+    assert [mode.sigma for mode in still] == [0.0] * 7
+    assert not any(mode.motion.any() for mode in still)
+    assert _modes(np.diag([0.0] * 6 + [-1e-18]))[-1].sigma == 0.0  # less than nothing is rounding
 
 
 def test_the_whole_covariance_is_put_together_of_any_number_of_columns(case, monkeypatch):
