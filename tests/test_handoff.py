@@ -24,7 +24,7 @@ from barpc.sensor.rpc import RPC
 from tests.rpcio.conftest import make_rpc, write_image
 
 SIZE, ALTITUDES = (2000, 1900), (30.0, 300.0)
-NAMES = ["a_RPC.TXT", "a.RPB", "a.geom", "a.XML", "a.json", "a.vrt", "a.tif"]
+NAMES = [f"a{row.suffixes[0]}" for name, row in {**WRITABLE, **CARRIERS}.items() if name != "nitf"]
 
 
 def write(rpc: RPC, image: Path, folder: Path, name: str) -> Path:
@@ -40,8 +40,8 @@ def image(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_file_is_read_by_another_tool_than_barpc_to_a_billionth_of_a_pixel(name, image, tmp_path):
-    if name.endswith(".json"):
-        pytest.importorskip("rpcm", reason="of the other tools only rpcm reads this format")
+    if not any(CONSUMERS[tool].installed for tool in row_of(name).consumers):
+        pytest.skip("none of the tools that read this format is installed")
     rpc = make_rpc()
     readings = verify([write(rpc, image, tmp_path / "out", name)], rpc, SIZE, ALTITUDES)
     assert {reading.consumer for reading in readings} > {"barpc"}

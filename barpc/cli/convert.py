@@ -48,7 +48,8 @@ Box = tuple[float, float, float, float]
     "--rpc-format",
     "formats",
     metavar="NAMES",
-    help=f"Of {', '.join(WRITABLE)}.  [default: TARGET's name; txt]",
+    help=f"Of {', '.join(f'{name} ({row.suffixes[0]})' for name, row in WRITABLE.items())}."
+    "  [default: TARGET's name; txt]",
 )
 @click.option("--window", type=(int, int, int, int), help="Cut out COL ROW WIDTH HEIGHT [px].")
 @click.option("--bbox", type=(float, float, float, float), help="Cut out WEST SOUTH EAST NORTH [deg].")
@@ -71,10 +72,10 @@ def convert(
 ) -> int:
     r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.
 
-    _RPC.TXT, .RPB, .geom, .XML (Maxar), .json (rpcm); .vrt, .tif and .ntf carry the image, too. With --window or
-    --bbox the GeoTIFF TARGET is a part of the image, with the RPC of exactly that part. With -o images get their RPCs,
-    or those of --rpc, in a new folder; every file is then opened as GDAL, rpcm and others do, and what lies beside an
-    image and would hide an RPC put into it is named. Images stay as they are.
+    TARGET ends as --rpc-format says (xml is Maxar's, json rpcm's); .vrt, .tif and .ntf carry the image, too. With
+    --window or --bbox the GeoTIFF TARGET is a part of the image, with the RPC of exactly that part. With -o images get
+    their RPCs, or those of --rpc, in a new folder; every file is then opened as GDAL, rpcm and others do, and what
+    lies beside an image and would hide an RPC put into it is named. Images stay as they are.
 
     \b
     Examples:

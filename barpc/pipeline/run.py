@@ -279,7 +279,7 @@ def _only(run: Run, names: frozenset[str]) -> Run:
 def _center(view: View) -> CameraCenter:
     center = camera_center(view.sensor, view.size, view.alt_range)
     if center.method == "nominal":
-        logger.warning("%s: its RPC does not tell the camera centre; a nominal one is used", view.name)
+        logger.warning("%s: its camera does not tell where it stands; a nominal centre is used", view.name)
     return center
 
 

@@ -161,8 +161,8 @@ def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrit
     Parameters
     ----------
     path : Path or str
-        Its name chooses the format: ``_RPC.TXT``, ``.RPB``, ``.geom``, ``.XML`` (Maxar), ``.json`` (rpcm). An RPC
-        goes into a raster by `write_rpc_vrt` or `write_rpc_copy`, never into the input.
+        Its name chooses the format, ``_RPC.TXT``, ``.RPB`` or another of the suffixes in `WRITABLE`. An RPC goes into
+        a raster by `write_rpc_vrt` or `write_rpc_copy`, never into the input.
     format : str, optional, a row of `FORMATS`, whatever the name
     overwrite : bool, replace an existing file
 
