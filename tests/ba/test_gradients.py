@@ -5,29 +5,26 @@ A right derivative proves nothing about the value that it belongs to: `test_reco
 
 from __future__ import annotations
 
+from inspect import isfunction
+from typing import get_args, get_type_hints
+
 import numpy as np
 import pytest
 
+from barpc.ba import ground as on_points
 from barpc.ba.cameras import Cameras
 from barpc.ba.ground import flat_heights, ground_control, terrain_heights
 from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.unknowns import make_unknowns
 from barpc.ba.weights import LOSSES
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.options import AUTO, Model
 from barpc.scene import GroundPoints, View
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import simulate_block
 
-MODELS = [
-    ("rotation+translation", 0),
-    ("rotation", 0),
-    ("translation", 0),
-    ("rotation+translation", 1),
-    ("rotation", 2),
-    ("shift", 0),
-    ("shift-drift", 0),
-    ("affine", 0),
-]
+MODELS = [(model, 0) for model in get_args(Model) if model != AUTO]
+MODELS += [("rotation+translation", 1), ("rotation", 2)]
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +48,7 @@ def ecef(views: tuple[View, ...]) -> np.ndarray:
 def _setup(views, model, drift, ecef, scale=5.0):
     """Cameras that see ten points each, at the rows where their corrected sensors see them."""
     unknowns, bounds = make_unknowns(views, model, drift), np.array([0, 10, 20, 30])
+    assert unknowns.size
     params = np.random.default_rng(3).normal(0, scale, (3, unknowns.size))
     ground = ground_from_ecef(ecef.T).reshape(3, 10, 3)
     sensors = unknowns.corrected(params, views)
@@ -113,18 +111,18 @@ def _point_priors():
         np.zeros(0),
     )
     return points, {
-        "gcp": ground_control(gcps, index),
-        "terrain": terrain_heights(
+        "ground_control": ground_control(gcps, index),
+        "terrain_heights": terrain_heights(
             points, index, lambda lon, lat: 100.0 + 800.0 * (lon - 5.4) + 300.0 * (lat - 43), 3.0, 0.0
         ),
-        "flat": flat_heights(points, index, 210.0, 20.0, 0.0),
-        "common": flat_heights(points, index, 210.0, 20.0, 7.0),
+        "flat_heights": flat_heights(points, index, 210.0, 20.0, 0.0),
+        "with a common error": flat_heights(points, index, 210.0, 20.0, 7.0),
     }
 
 
 def test_heights_with_a_common_error_cost_what_their_joint_normal_distribution_says():
     points, blocks = _point_priors()
-    block = blocks["common"]
+    block = blocks["with a common error"]
     ground = ground_from_ecef(points[[0, 2]])
     east_north = np.array(
         [-1.0, 1.0]
@@ -145,7 +143,15 @@ def test_heights_with_a_common_error_cost_what_their_joint_normal_distribution_s
             )
 
 
-@pytest.mark.parametrize("name", ["gcp", "terrain", "flat"])
+BLOCKS = [
+    name
+    for name, make in vars(on_points).items()
+    if isfunction(make) and name[0] != "_" and get_type_hints(make).get("return") is PointPrior
+]
+"""What makes a block of priors on points: each is tried, and stands in `_point_priors` by its name."""
+
+
+@pytest.mark.parametrize("name", BLOCKS)
 def test_priors_on_points_have_the_derivatives_of_central_differences(name):
     points, blocks = _point_priors()
     block = blocks[name]
@@ -161,7 +167,9 @@ def test_a_terrain_prior_measures_the_distance_along_the_vertical():
     points, blocks = _point_priors()
     ground = ground_from_ecef(points[[0, 2]])
     alt = 100.0 + 800.0 * (ground[:, 0] - 5.4) + 300.0 * (ground[:, 1] - 43)
-    np.testing.assert_allclose(blocks["terrain"].apart(points)[:, 0] * 3.0, ground[:, 2] - alt, atol=1e-6)
+    np.testing.assert_allclose(
+        blocks["terrain_heights"].apart(points)[:, 0] * 3.0, ground[:, 2] - alt, atol=1e-6
+    )
 
 
 def test_priors_on_cameras_have_the_derivatives_of_central_differences():
