@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ import barpc
 from barpc import cameras
 from barpc.cameras import OPENERS, Camera, Opener, open_camera
 from barpc.cli import main
+from barpc.cli.main import cli
 from barpc.errors import InputError
 from barpc.geodesy import (
     Array,
@@ -204,6 +206,12 @@ def test_a_choice_that_does_not_go_with_the_camera_names_the_file(choice, words,
     with pytest.raises(InputError, match=words) as error:
         open_camera(f"{tmp_path / 'a.RPB'},{choice}")
     assert "a.RPB" in str(error.value)
+
+
+def test_every_choice_of_every_kind_stands_in_the_help():
+    text = cli.get_command(click.Context(cli), "info").help
+    for choice in {"size", "camera", *(choice for opener in OPENERS.values() for choice in opener.choices)}:
+        assert f'",{choice}=' in text, choice
 
 
 # --- a run with cameras of one's own ------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from types import ModuleType
 import pytest
 
 import barpc
+from barpc.report.tables import TABLES
 from tests.docs.pages import DOCS, PAGES, ROOT, anchors, links
 
 
@@ -79,6 +80,11 @@ def test_the_page_of_the_summary_is_what_its_records_say():
     assert (
         "| `rmse_after` | number or null | The same through the new cameras; null for a check [px]. |" in page
     )
+
+
+def test_the_page_of_the_report_names_every_table_of_a_run():
+    text = (DOCS / "report.md").read_text(encoding="utf-8")
+    assert all(f"`{name}`" in text for name in TABLES)
 
 
 def test_every_page_of_the_navigation_exists_and_every_page_is_in_it():
