@@ -6,7 +6,7 @@ Frozen records of plain float64 arrays. `tie` makes tracks, `ba` reads them; nei
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -110,6 +110,7 @@ class GroundPoints(Frozen):
     xy : (M, 2), col, row [px]
     xy_sigma : (M,), standard deviation of each coordinate [px]
     strangers : tuple of str, images that their file names and that are none of the views
+    left_out : tuple of str, what was left out of their files and why, in sentences
     """
 
     names: tuple[str, ...]
@@ -120,6 +121,7 @@ class GroundPoints(Frozen):
     xy: Array
     xy_sigma: Array
     strangers: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         g = len(self.names)
@@ -134,6 +136,26 @@ class GroundPoints(Frozen):
             raise InputError("ground points: coordinates must be finite and sigmas positive")
         if m and (point.min() < 0 or point.max() >= g):
             raise InputError("ground points: an observation names a point that does not exist")
+
+    @classmethod
+    def none(cls) -> GroundPoints:
+        """No points."""
+        index, places = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        return cls((), places, places, index, index, np.zeros((0, 2)), np.zeros(0))
+
+    def select(self, keep: BoolArray) -> GroundPoints:
+        """The points of a mask (G,) with their observations."""
+        rows = keep[self.point]
+        return replace(
+            self,
+            names=tuple(name for name, kept in zip(self.names, keep, strict=True) if kept),
+            lonlatalt=self.lonlatalt[keep],
+            sigma=self.sigma[keep],
+            point=(np.cumsum(keep) - 1)[self.point[rows]],
+            view=self.view[rows],
+            xy=self.xy[rows],
+            xy_sigma=self.xy_sigma[rows],
+        )
 
 
 def middle_altitude(views: Sequence[View]) -> float:

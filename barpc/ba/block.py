@@ -19,9 +19,6 @@ from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, connect
 MIN_OBSERVATIONS = 4  # of a view, or it stops: six unknowns need three points, and one to check them
 _LISTED = 10  # views named in a message
 
-_NONE = np.zeros(0, dtype=np.int64)
-_NO_POINTS = GroundPoints((), np.zeros((0, 3)), np.zeros((0, 3)), _NONE, _NONE, np.zeros((0, 2)), np.zeros(0))
-
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
@@ -95,7 +92,7 @@ def join(
     """The block of tracks and GCPs; arguments and errors as in `barpc.ba.adjust_tracks`."""
     names = [view.name for view in views]
     _check_names(names, options)
-    gcps = _NO_POINTS if gcps is None else gcps
+    gcps = GroundPoints.none() if gcps is None else gcps
     view = np.concatenate([tracks.view, gcps.view])
     if len(view) and view.max() >= len(views):
         raise InputError(f"tracks name view {view.max()}, but there are {len(views)} views")

@@ -195,18 +195,4 @@ def split_points(points: GroundPoints, checks: Sequence[str]) -> tuple[GroundPoi
     if unknown:
         raise InputError(f"no ground point is named {', '.join(unknown[:10])}")
     is_check = np.isin(np.array(points.names, dtype=object), list(checks))
-    return _select(points, ~is_check), _select(points, is_check)
-
-
-def _select(points: GroundPoints, keep: BoolArray) -> GroundPoints:
-    rows = keep[points.point]
-    closed = np.cumsum(keep) - 1
-    return GroundPoints(
-        tuple(name for name, kept in zip(points.names, keep, strict=True) if kept),
-        points.lonlatalt[keep],
-        points.sigma[keep],
-        closed[points.point[rows]],
-        points.view[rows],
-        points.xy[rows],
-        points.xy_sigma[rows],
-    )
+    return points.select(~is_check), points.select(is_check)

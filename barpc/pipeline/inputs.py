@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,27 +13,15 @@ from barpc.ba import BlockPrior
 from barpc.dem import Dem
 from barpc.errors import InputError
 from barpc.options import RunOptions, declared
-from barpc.pointio.ground import read_gcps
+from barpc.pipeline.control import load_gcps
 from barpc.pointio.names import ViewNames
-from barpc.scene import BoolArray, GroundPoints, Tracks, View
+from barpc.scene import BoolArray, Tracks, View
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import read_names
 
+logger = logging.getLogger(__name__)
+
 PRIOR = "block.npz"  # the file in a run folder that a later run starts from
-
-
-def load_gcps(paths: Sequence[str], views: Sequence[str]) -> GroundPoints | None:
-    """Control points of several files, one after the other; None without files."""
-    parts = [read_gcps(path, views) for path in paths]
-    if not parts:
-        return None
-    starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
-    point = np.concatenate([part.point + start for part, start in zip(parts, starts, strict=True)])
-    columns = ("lonlatalt", "sigma", "view", "xy", "xy_sigma")
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
-    strangers = tuple(dict.fromkeys(name for part in parts for name in part.strangers))
-    names = tuple(name for part in parts for name in part.names)
-    return GroundPoints(names, point=point, **joined, strangers=strangers)
 
 
 def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None, BlockPrior | None]:
@@ -40,9 +29,10 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
 
     A file that cannot be used, those of ground points included, stops the run here (InputError), not after an hour.
     """
-    names = [view.name for view in views]
-    load_gcps(options.gcp, names)
-    load_gcps(options.check_points, names)
+    for paths in (options.gcp, options.check_points):
+        points = load_gcps(paths, views, options)
+        for line in () if points is None else points.left_out:
+            logger.warning("%s", line)
     dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
     if dem is not None:
         _require_cover(dem, str(options.dem), views)

@@ -18,8 +18,9 @@ from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.handoff import refuse_hiding, unverified
 from barpc.options import RunOptions
+from barpc.pipeline.control import load_gcps
 from barpc.pipeline.executor import CachingExecutor
-from barpc.pipeline.inputs import PRIOR, input_files, load_gcps, only_new, read_pairs, side_inputs
+from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import Image, image_path, load_views
 from barpc.pointio.matches import asp_text, read_matches, write_matches
@@ -210,7 +211,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     names = [view.name for view in run.views]
     if prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)))
-    gcps, checks = load_gcps(options.gcp, names), load_gcps(options.check_points, names)
+    gcps, checks = (load_gcps(paths, run.views, options) for paths in (options.gcp, options.check_points))
     centers = tuple(_center(view) for view in run.views)
     adjustment = adjust_tracks(
         run.views,

@@ -6,8 +6,9 @@ orthority mean them; GDAL leaves the meaning of its tags to the application. Alt
 
 from __future__ import annotations
 
+import csv
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 from barpc.errors import InputError
 from barpc.frozen import load_npz
 from barpc.geodesy import Array
-from barpc.pointio.names import ViewNames
+from barpc.pointio.names import ViewNames, from_cell
 from barpc.raster import driver_of, open_raster
 from barpc.scene import GroundPoints
 from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
@@ -30,7 +31,7 @@ IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px] where the 
 class _Point:
     """One GCP in one image: the files repeat the ground point for each of its images."""
 
-    name: str
+    name: str  # empty: called by its place among the points
     lonlatalt: tuple[float, float, float]
     sigma: tuple[float, float, float]
     view: int
@@ -39,7 +40,7 @@ class _Point:
 
 
 def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
-    """GCPs and where they are seen, of a `.gcp` file, a GeoJSON file, or an image with GCP tags.
+    """GCPs and where they are seen, of a CSV or `.gcp` file, a GeoJSON file, or an image with GCP tags.
 
     Observations in other images than the views called `names` are left out, and these named in `strangers`. InputError
     where the file does not parse, or holds no point of these views.
@@ -52,9 +53,10 @@ def read_gcps(path: Path | str, names: Sequence[str]) -> GroundPoints:
     elif driver_of(head) is not None or b"\0" in head:
         found = list(_read_tags(path, views))
     else:
-        found = list(_read_asp(path, views))
+        found = list((_read_csv if _names_columns(head) else _read_asp)(path, views))
     if not found:
-        raise InputError(f"{path}: no GCP of {', '.join(names[:10])}")
+        named = f"; it names {', '.join(list(views.strangers)[:10])}" if views.strangers else ""
+        raise InputError(f"{path}: no GCP of {', '.join(names[:10])}{named}")
     try:
         return replace(_assembled(found), strangers=tuple(views.strangers))
     except InputError as error:
@@ -81,17 +83,86 @@ def _read_asp(path: Path, views: ViewNames) -> Iterator[_Point]:
                     yield _Point(words[0], (lon, lat, alt), (east, north, up), view, (col, row), spread)
         except ValueError as error:
             raise InputError(
-                f"{path}, line {number}: expected 'id lat lon alt sx sy sz image col row scol srow ...' ({error})"
+                f"{path}, line {number}: expected 'id lat lon alt sx sy sz image col row scol srow ...', or a CSV that "
+                f"begins with its columns' names ({error})"
             ) from error
 
 
+def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
+    """A header of column names, then a line for each point and image; what is not stated of sigmas is the default."""
+    columns: dict[str, int] = {}
+    for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
+        if not raw.strip() or raw.lstrip().startswith("#"):
+            continue
+        if not columns:
+            delimiter = next((sign for sign in "\t;," if sign in raw), " ")
+            columns = _gcp_columns(path, _cells(raw, delimiter), views)
+            continue
+        try:
+            row = _cells(raw, delimiter)
+            cells = {name: row[i] for name, i in columns.items()}
+            image = cells.pop("image", "")
+            name = cells.pop("id", "")
+            if delimiter == ";":  # where numbers have decimal commas
+                cells = {key: cell.replace(",", ".") for key, cell in cells.items()}
+            point = _csv_point(name, {key: float(cell) for key, cell in cells.items() if cell})
+        except (ValueError, KeyError, IndexError, csv.Error) as error:
+            raise InputError(f"{path}, line {number}: expected {', '.join(columns)} ({error})") from error
+        view = views.find(image) if "image" in columns else 0
+        if view is not None:
+            yield replace(point, view=view)
+
+
+def _csv_point(name: str, of: Mapping[str, float]) -> _Point:
+    """The point of a line: its numbers by the names of `_COLUMNS` and `_SIGMAS`."""
+    every = of.get("sigma", GROUND_SIGMA)
+    level = of.get("sigma_xy", every)
+    sigma = (of.get("sigma_x", level), of.get("sigma_y", level), of.get("sigma_z", every))
+    pixels = [of[key] for key in ("sigma_px", "sigma_col", "sigma_row") if key in of] or [IMAGE_SIGMA]
+    return _Point(name, (of["lon"], of["lat"], of["alt"]), sigma, -1, (of["col"], of["row"]), max(pixels))
+
+
+def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str, int]:
+    """Column of each quantity; a file of one image need not name it."""
+    found = _header(words, {**_COLUMNS, **_NAMES, **_SIGMAS})
+    needed = [*_COLUMNS, "image"][: len(_COLUMNS) + (len(views.names) > 1)]
+    if missing := [name for name in needed if name not in found]:
+        raise InputError(f"{path}: no column {', '.join(missing)}; found {', '.join(words)}")
+    for i, word in enumerate(words):
+        if i not in found.values() and re.match("sigma|std|stdev|acc|err", word.lower()):
+            raise InputError(
+                f"{path}: column {word[:40]!r} is none that is read; accuracies are called {', '.join(_SIGMAS)}"
+            )
+    return found
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    return [from_cell(cell.strip()) for cell in row if delimiter != " " or cell]
+
+
+def _names_columns(head: bytes) -> bool:
+    """Whether a text begins with a line of column names."""
+    lines = head.decode("utf-8-sig", errors="replace").splitlines()
+    first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
+    words = _split(first)
+    return not any(_numbers([word]) for word in words[1:4]) and len(_header(words)) >= 2
+
+
 def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
-    """Features with a 3-D point and the properties `ji` (col, row), `filename` and, perhaps, `id`."""
-    for n, ((lon, lat, alt, col, row), properties) in enumerate(geojson_points(path, "filename"), 1):
+    """Features with a 3-D point and the properties `ji` (col, row), `filename` and, perhaps, `id` and sigmas."""
+    for (lon, lat, alt, col, row), properties in geojson_points(path, "filename"):
         view = views.find(str(properties["filename"]))
         if view is not None:
-            name = str(properties.get("id") or f"gcp_{n}")
-            yield _Point(name, (lon, lat, alt), (GROUND_SIGMA,) * 3, view, (col, row), IMAGE_SIGMA)
+            name = "" if properties.get("id") is None else str(properties["id"])
+            try:
+                east, north, up = (float(value) for value in properties.get("sigma_m", (GROUND_SIGMA,) * 3))
+                spread = float(properties.get("sigma_px", IMAGE_SIGMA))
+            except (TypeError, ValueError) as error:
+                raise InputError(
+                    f"{path}: sigma_m is [east, north, up], sigma_px a number ({error})"
+                ) from error
+            yield _Point(name, (lon, lat, alt), (east, north, up), view, (col, row), spread)
 
 
 def _read_tags(path: Path, views: ViewNames) -> Iterator[_Point]:
@@ -115,14 +186,16 @@ def _assembled(found: list[_Point]) -> GroundPoints:
         first.setdefault((point.name, point.lonlatalt), point)
     index = {key: i for i, key in enumerate(first)}
     points = list(first.values())
+    names = tuple(point.name or f"gcp_{n}" for n, point in enumerate(points, 1))
     numbers = np.array([point.lonlatalt for point in points])
-    wrong = ~(np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, 1]) <= 90.0))
+    wrong = ~(np.abs(numbers) <= (_TURNS, _TURNS, _FAR)).all(axis=1)  # NaN fails, too
     if wrong.any():
         raise InputError(
-            f"GCP {points[int(wrong.argmax())].name}: a coordinate is not finite, or its latitude beyond 90 degrees"
+            f"GCP {names[int(wrong.argmax())]}: a coordinate is not finite, or no longitude and latitude in degrees; "
+            "map coordinates are not read"
         )
     return GroundPoints(
-        names=tuple(point.name for point in points),
+        names=names,
         lonlatalt=numbers,
         sigma=np.array([point.sigma for point in points]),
         point=np.array([index[point.name, point.lonlatalt] for point in found]),
@@ -135,14 +208,31 @@ def _assembled(found: list[_Point]) -> GroundPoints:
 # --- correspondences --------------------------------------------------------------------------------------
 
 _FAR = 1e9  # px and m: no node comes near
+_TURNS = 540.0  # deg: longitudes are taken by whole turns
 
 _COLUMNS = {
     "lon": ("lon", "long", "longitude", "lng"),
     "lat": ("lat", "latitude"),
-    "alt": ("alt", "altitude", "height", "h", "z", "elevation", "height_above_datum"),
-    "col": ("col", "column", "samp", "sample", "pixel", "x"),
-    "row": ("row", "line", "y"),
+    "alt": ("alt", "altitude", "height", "h", "z", "elevation", "elev", "height_above_datum"),
+    "col": ("col", "column", "samp", "sample", "pixel", "px", "pixel_x", "image_x"),
+    "row": ("row", "line", "py", "pixel_y", "image_y"),
 }
+_NAMES = {
+    "id": ("id", "name", "gcp", "gcp_id", "point", "point_id", "label"),
+    "image": ("image", "file", "filename", "image_name", "img", "view"),
+}
+_SIGMAS = {
+    "sigma": ("sigma", "sigma_m", "accuracy"),  # east, north and up
+    "sigma_xy": ("sigma_xy", "sigma_en", "sigma_horizontal", "accuracy_xy"),
+    "sigma_x": ("sigma_x", "sigma_e", "sigma_east", "sigma_lon", "sx"),
+    "sigma_y": ("sigma_y", "sigma_n", "sigma_north", "sigma_lat", "sy"),
+    "sigma_z": ("sigma_z", "sigma_u", "sigma_up", "sigma_alt", "sigma_height", "sz", "accuracy_z"),
+    "sigma_px": ("sigma_px", "sigma_image", "sigma_pixel"),
+    "sigma_col": ("sigma_col", "scol"),
+    "sigma_row": ("sigma_row", "srow"),
+}
+_EITHER = ("lon", "lat"), ("col", "row")
+"""What x and y are: the pair that no other column is named for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,12 +299,16 @@ def _numbers(words: Sequence[str]) -> list[float] | None:
         return None
 
 
-def _header(words: Sequence[str]) -> dict[str, int]:
-    """Column of each quantity that a header names."""
-    lower = [re.sub(r"[\[(].*", "", word.lower()).strip() for word in words]
-    names = {**_COLUMNS, "sigma": ("sigma", "sigma_px")}
-    found = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
-    return {key: hits[0] for key, hits in found.items() if hits}
+def _header(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = None) -> dict[str, int]:
+    """Column of each quantity that a header names, by default of `_COLUMNS` and the points' sigma [px]."""
+    lower = [re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_") for word in words]
+    names = {**_COLUMNS, "sigma": ("sigma", "sigma_px")} if names is None else names
+    hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
+    found = {key: places[0] for key, places in hits.items() if places}
+    left = [pair for pair in _EITHER if not set(pair) & set(found)]
+    if len(left) == 1 and {"x", "y"} <= set(lower):
+        found |= dict(zip(left[0], (lower.index("x"), lower.index("y")), strict=True))
+    return found
 
 
 def _read_table(path: Path) -> Correspondences:
@@ -329,6 +423,6 @@ def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspon
     alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
     ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)
     ok = np.isfinite(ground).all(axis=1)
-    if (np.abs(ground[ok]) > (540.0, 90.0, _FAR)).any() or not (np.abs(image) <= _FAR).all():
+    if (np.abs(ground[ok]) > (_TURNS, 90.0, _FAR)).any() or not (np.abs(image) <= _FAR).all():
         raise InputError(f"{path}: a node of it is no longitude, latitude and altitude, or no image point")
     return Correspondences(ground[ok], image[ok])

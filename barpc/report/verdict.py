@@ -204,7 +204,7 @@ def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
 
 
 def _control_reasons(run: Run) -> list[str]:
-    """Ground points that were cut, and images that their files name and that are not there."""
+    """Ground points that were cut, and what was left out of their files."""
     out = []
     tested = None if run.adjustment is None else run.adjustment.control
     if run.gcps is not None and tested is not None:
@@ -218,10 +218,7 @@ def _control_reasons(run: Run) -> list[str]:
             ]
             if names:
                 out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.")
-    for points, what in ((run.gcps, "GCPs"), (run.check_points, "Check points")):
-        if points is not None and points.strangers:
-            out.append(f"{what} name images that are not in this run: {listed(points.strangers)}.")
-    return out
+    return out + [f"{line}." for p in (run.gcps, run.check_points) if p is not None for line in p.left_out]
 
 
 def _count(number: int, what: str) -> str:

@@ -100,8 +100,8 @@ def test_tags_in_a_map_projection_are_refused(tmp_path):
     [
         ("1 43 5 120 1 1 1 left.tif 1 2 1\n", "line 1"),
         ("1 43 5 120 1 1\n", "line 1"),
-        ("1 93 5 120 1 1 1 left.tif 1 2 1 1\n", "beyond 90"),
-        ("1 43 5 120 1 1 1 far.tif 1 2 1 1\n", "no GCP of left, right"),
+        ("1 4812345.6 512345.6 120 1 1 1 left.tif 1 2 1 1\n", "map coordinates are not read"),
+        ("1 43 5 120 1 1 1 far.tif 1 2 1 1\n", "no GCP of left, right; it names far.tif"),
         ("# nothing\n", "no GCP"),
         ('{"features": [{"properties": {}}]}', "not a GeoJSON"),
         ("{broken", "not a GeoJSON"),

@@ -63,11 +63,11 @@ def contradicted(run):
 
 
 def gcps_of_strangers(run):
-    return replace(run, gcps=replace(run.gcps, strangers=("unknown.tif",)))
+    return replace(run, gcps=replace(run.gcps, left_out=("a.csv: names unknown.tif",)))
 
 
 def check_points_of_strangers(run):
-    return replace(run, check_points=replace(run.gcps, strangers=("unknown.tif",)))
+    return replace(run, check_points=replace(run.gcps, left_out=("a.csv: names unknown.tif",)))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,123 @@
+"""Files of ground points against the cameras as delivered: what cannot be meant is said before any work starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from barpc.errors import InputError
+from barpc.geodesy import Array, ecef_from_ground
+from barpc.options import RunOptions
+from barpc.pointio.ground import read_gcps
+from barpc.scene import BoolArray, GroundPoints, View
+from barpc.sensor.geometry import ground_sample_distance
+
+_REACH = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
+_ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred
+_LISTED = 10
+
+_MISTAKES = {
+    "longitude and latitude are exchanged: GeoJSON and image tags give longitude first, .gcp files latitude, and a CSV "
+    "names its columns": ((1, 0), (1, 1)),
+    "the sign of a longitude or latitude is wrong: west and south are negative": (
+        (0, 1),
+        (-1, 1),
+        (1, -1),
+        (-1, -1),
+    ),
+}
+"""What people do to coordinates -> the columns that longitude and latitude are taken from, and their signs."""
+
+
+def load_gcps(paths: Sequence[str], views: Sequence[View], options: RunOptions) -> GroundPoints | None:
+    """Ground points of several files, one after the other; None without files.
+
+    Points that cannot be where they are said to be, images that are no views, and files that cannot be read are an
+    InputError, or with `keep_going` left out and named in `left_out`.
+    """
+    parts = [_load(path, views, options) for path in paths]
+    if not parts:
+        return None
+    starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
+    point = np.concatenate([part.point + start for part, start in zip(parts, starts, strict=True)])
+    columns = ("lonlatalt", "sigma", "view", "xy", "xy_sigma")
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
+    names = tuple(name for part in parts for name in part.names)
+    strangers = tuple(dict.fromkeys(name for part in parts for name in part.strangers))
+    left_out = tuple(line for part in parts for line in part.left_out)
+    return GroundPoints(names, point=point, **joined, strangers=strangers, left_out=left_out)
+
+
+def _load(path: str, views: Sequence[View], options: RunOptions) -> GroundPoints:
+    try:
+        points = read_gcps(path, [view.name for view in views])
+    except InputError as error:
+        if not options.keep_going:
+            raise
+        return replace(GroundPoints.none(), left_out=(f"{error}; the file is left out",))
+    out, keep = [], np.ones(len(points.names), dtype=bool)
+    for wrong, what in _implausible(points, views, options.tie.search):
+        names = [points.names[g] for g in np.flatnonzero(wrong & keep)]
+        if names:
+            many = f"{len(names)} of {len(keep)} points ({_listed(names)})"
+            out.append(f"{many if len(names) > 1 else f'point {names[0]}'}: {what}")
+        keep &= ~wrong
+    if points.strangers:
+        out.append(f"it names images that are not in this run: {_listed(points.strangers)}")
+    if out and not options.keep_going:
+        raise InputError(f"{path}: {out[0]}; correct it, or leave it out with --keep-going")
+    return replace(points.select(keep), left_out=tuple(f"{path}: {line}; left out" for line in out))
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more
+
+
+def _implausible(
+    points: GroundPoints, views: Sequence[View], search: float
+) -> Iterator[tuple[BoolArray, str]]:
+    """Points (G,) that cannot be meant, and why; the first reason is the one that counts."""
+    low, high = np.array([view.alt_range for view in views])[points.view].T
+    alt = points.lonlatalt[points.point, 2]
+    shown, pixel = _shown(points, views, np.clip(alt, low, high))
+    reach = np.maximum(_REACH, search * pixel)
+    away = _distance(points, shown, (0, 1), (1, 1))
+    far = _any(points, away > reach) | (np.abs(points.lonlatalt[:, 1]) > 90.0)
+    for what, (columns, *signs) in _MISTAKES.items():
+        near = [_distance(points, shown, columns, sign) <= reach for sign in signs]
+        mistaken = far & _any(points, np.asarray(np.any(near, axis=0)))
+        yield mistaken, what
+        far &= ~mistaken
+    most = np.max(away[far[points.point]], initial=0.0) / 1e3
+    yield far, f"as far as {most:,.0f} km from where the images show them, by their cameras"
+    wild = (alt < low - _ALT_REACH) | (alt > high + _ALT_REACH)
+    ends = f"{np.min(low, initial=np.inf):.0f} to {np.max(high, initial=-np.inf):.0f} m"
+    yield (
+        _any(points, wild),
+        f"altitudes far outside {ends}, where the cameras are used: metres above the ellipsoid are needed",
+    )
+
+
+def _any(points: GroundPoints, observed: BoolArray) -> BoolArray:
+    """Points (G,) of which any observation (M,) is so."""
+    return np.bincount(points.point, observed, minlength=len(points.names)) > 0
+
+
+def _shown(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Array, Array]:
+    """Where each image shows a point (M, 3), lon, lat [deg], alt [m], at altitudes (M,), and a pixel there (M,) [m]."""
+    ground, pixel = np.empty((len(alt), 3)), np.empty(len(alt))
+    for v in np.unique(points.view):
+        rows = points.view == v
+        ground[rows] = views[v].sensor.localize(points.xy[rows], alt[rows])
+        pixel[rows] = ground_sample_distance(views[v].sensor, ground[rows])[1]
+    return ground, np.nan_to_num(pixel)
+
+
+def _distance(points: GroundPoints, shown: Array, columns: tuple[int, int], signs: tuple[int, int]) -> Array:
+    """Metres (M,) from where images show points to where these are said to be, coordinates taken from `columns`."""
+    level = points.lonlatalt[points.point][:, columns] * signs
+    given = np.column_stack([level, shown[:, 2]])
+    return np.asarray(np.linalg.norm(ecef_from_ground(given) - ecef_from_ground(shown), axis=1))
