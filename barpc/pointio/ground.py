@@ -146,7 +146,7 @@ def _names_columns(head: bytes) -> bool:
     lines = head.decode("utf-8-sig", errors="replace").splitlines()
     first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
     words = _split(first)
-    return not any(_numbers([word]) for word in words[1:4]) and len(_header(words)) >= 2
+    return not any(_numbers([word]) for word in words[1:4]) and bool(_header(words))
 
 
 def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:

@@ -1,0 +1,220 @@
+"""Files of ground points: every syntax gives the same points, and what cannot be meant is said before any work."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.errors import InputError
+from barpc.options import RunOptions
+from barpc.pipeline.control import load_gcps
+from barpc.scene import GroundPoints, View
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.simulate import simulate_block
+
+BLOCK = simulate_block(3, 4, num_gcps=6, seed=3, lon=-58.4, lat=34.6)
+VIEWS = BLOCK.views
+POINTS = replace(
+    BLOCK.gcps, sigma=np.tile([0.1, 0.2, 0.3], (6, 1)), xy_sigma=np.full(len(BLOCK.gcps.view), 0.4)
+)
+
+
+def rows(points: GroundPoints):
+    """Name, place, sigma, image and position of each observation."""
+    for g, v, xy in zip(points.point, points.view, points.xy.tolist(), strict=True):
+        yield points.names[g], points.lonlatalt[g].tolist(), points.sigma[g].tolist(), VIEWS[v].name, xy
+
+
+def table(points: GroundPoints, head: str, sign: str = ",") -> str:
+    """A CSV with named columns."""
+    lines = [head.replace(",", sign)]
+    for name, (lon, lat, alt), sigma, image, (col, row) in rows(points):
+        known = {
+            "id": name,
+            "lon": lon,
+            "lat": lat,
+            "alt": alt,
+            "image": image + ".tif",
+            "col": col,
+            "row": row,
+        }
+        known |= {"e": sigma[0], "n": sigma[1], "u": sigma[2], "px": 0.4, "": "remark"}
+        order = [MEANING.get(word.strip().lower(), "") for word in head.split(",")]
+        lines.append(sign.join(str(known[key]) for key in order))
+    return "\n".join(lines) + "\n"
+
+
+MEANING = {
+    **dict.fromkeys(("id", "gcp_id", "name"), "id"), **dict.fromkeys(("lon", "longitude [deg]"), "lon"),
+    **dict.fromkeys(("lat", "latitude [deg]"), "lat"), **dict.fromkeys(("h", "z", "elevation"), "alt"),
+    **dict.fromkeys(("image", "filename"), "image"), **dict.fromkeys(("col", "sample", "px"), "col"),
+    **dict.fromkeys(("row", "line", "py"), "row"), **dict.fromkeys(("sigma_e", "sigma_x", "sigma east"), "e"),
+    **dict.fromkeys(("sigma_n", "sigma_y", "sigma north"), "n"), "sigma_px": "px", "sigma_col": "px",
+    **dict.fromkeys(("sigma_u", "sigma_z", "sigma up"), "u"), "x": "lon", "y": "lat",
+}  # fmt: skip
+
+
+def asp(points: GroundPoints) -> str:
+    """A `.gcp` file as bundle_adjust's manual has it: id lat lon height, sigmas, then every image."""
+    lines = {}
+    for name, (lon, lat, alt), (e, n, u), image, (col, row) in rows(points):
+        lines.setdefault(name, f"{name} {lat!r} {lon!r} {alt!r} {e} {n} {u}")
+        lines[name] += f" /some/where/{image}.tif {col!r} {row!r} 0.4 0.4"
+    return "# WKT: GEOGCS[...]\n" + "\n".join(lines.values()) + "\n"
+
+
+def geojson(points: GroundPoints, **more) -> str:
+    """As orthority's manual has it: a feature an observation, file name with or without its ending."""
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"filename": image, "ji": xy, "id": name, "info": None, **more},
+            "geometry": {"type": "Point", "coordinates": place},
+        }
+        for name, place, _, image, xy in rows(points)
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features})
+
+
+FULL = "id,lon,lat,h,image,col,row,sigma_e,sigma_n,sigma_u,sigma_px"
+SURVEY = "Filename,PX,PY,gcp_id,X,Y,Z,remark,sigma_x,sigma_y,sigma_z,sigma_col"
+WORDS = (
+    "name,Latitude [deg],Longitude [deg],Elevation,image,sample,line,sigma east,sigma north,sigma up,sigma_px"
+)
+TEXTS = {
+    "a.gcp": asp(POINTS),
+    "a.geojson": geojson(POINTS, sigma_m=[0.1, 0.2, 0.3], sigma_px=0.4),
+    "a.csv": table(POINTS, FULL),
+    "b.csv": "# surveyed\n" + table(POINTS, SURVEY),
+    "c.txt": table(POINTS, WORDS, "\t"),
+    "d.csv": table(POINTS, FULL, ";").replace(".", ",").replace(",tif", ".tif"),
+}
+
+
+def load(path, text: str, **options) -> GroundPoints:
+    path.write_text(text)
+    found = load_gcps([str(path)], VIEWS, RunOptions(**options))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_every_syntax_gives_the_same_points(tmp_path, name):
+    found = load(tmp_path / name, TEXTS[name])
+    assert found.names == POINTS.names
+    assert found.left_out == ()
+    order = np.lexsort((found.view, found.point))
+    for field in ("lonlatalt", "sigma"):
+        np.testing.assert_array_equal(getattr(found, field), getattr(POINTS, field))
+    for field in ("point", "view", "xy", "xy_sigma"):
+        np.testing.assert_array_equal(getattr(found, field)[order], getattr(POINTS, field))
+
+
+def test_without_names_points_are_told_apart_by_their_places(tmp_path):
+    found = load(tmp_path / "a.csv", table(POINTS, "lon,lat,h,image,col,row"))
+    assert found.names == tuple(f"gcp_{n}" for n in range(1, 7))
+    assert len(found.view) == len(POINTS.view)
+
+
+@pytest.mark.parametrize(
+    ("head", "says"),
+    [
+        ("id,lon,lat,image,col,row", "no column alt"),
+        ("id,lon,lat,h,col,row", "no column image"),
+        ("id,x,y,z,image", "no column"),
+        ("id,lon,lat,h,image,col,row,sigma_elephant", "'sigma_elephant' is none that is read"),
+    ],
+)
+def test_a_table_that_lacks_a_column_says_which(tmp_path, head, says):
+    with pytest.raises(InputError, match=says):
+        load(tmp_path / "a.csv", table(POINTS, head))
+
+
+def moved(which: list[int], change) -> GroundPoints:
+    place = POINTS.lonlatalt.copy()
+    place[which] = [change(*row) for row in place[which]]
+    return replace(POINTS, lonlatalt=place)
+
+
+def exchanged(lon, lat, alt):
+    return lat, lon, alt
+
+
+FAULTS = {
+    "all exchanged": (list(range(6)), exchanged, "6 of 6 points .*longitude and latitude are exchanged"),
+    "most exchanged": ([0, 1, 3, 5], exchanged, "4 of 6 points .gcp_000, gcp_001, gcp_003, gcp_005.: longitude and"),
+    "one exchanged": ([2], exchanged, "point gcp_002: longitude and latitude are exchanged"),
+    "a sign": ([4], lambda lon, lat, alt: (-lon, lat, alt), "point gcp_004: the sign of a longitude"),
+    "another place": ([1], lambda lon, lat, alt: (lon, lat + 0.02, alt), "point gcp_001: as far as 2 km"),
+    "too high": ([3], lambda lon, lat, alt: (lon, lat, alt + 3000.0), "point gcp_003: altitudes far outside"),
+    "too low": ([5], lambda lon, lat, alt: (lon, lat, alt - 3000.0), "point gcp_005: altitudes far outside"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("write", [asp, geojson], ids=["gcp", "geojson"])
+def test_what_cannot_be_meant_is_named_and_refused_or_left_out(tmp_path, fault, write):
+    which, change, says = FAULTS[fault]
+    text = write(moved(which, change))
+    with pytest.raises(InputError, match=says) as error:
+        load(tmp_path / "p.txt", text)
+    assert "p.txt" in str(error.value)
+    assert "\n" not in str(error.value)
+    found = load(tmp_path / "p.txt", text, keep_going=True)
+    assert found.names == tuple(name for g, name in enumerate(POINTS.names) if g not in which)
+    assert set(found.point.tolist()) == set(range(6 - len(which)))
+    (line,) = found.left_out
+    assert POINTS.names[which[0]] in line
+
+
+def test_latitudes_beyond_the_pole_are_recognised_as_longitudes(tmp_path):
+    block = simulate_block(2, 4, num_gcps=5, seed=3, lon=139.7, lat=35.7)
+    path = tmp_path / "p.csv"
+    lines = ["lon,lat,alt,image,col,row"]
+    for g, v, (col, row) in zip(block.gcps.point, block.gcps.view, block.gcps.xy, strict=True):
+        lon, lat, alt = block.gcps.lonlatalt[g]
+        lines.append(f"{lat},{lon},{alt},{block.views[v].name},{col},{row}")
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"5 of 5 points .*exchanged"):
+        load_gcps([str(path)], block.views, RunOptions())
+
+
+def test_cameras_that_are_hundreds_of_metres_off_and_heights_above_the_geoid_are_no_fault(tmp_path):
+    move = Correction(np.zeros(3), np.array([300.0, -250.0, 200.0]), np.array([7e6, 0.0, 0.0]))
+    off = [View(v.name, v.path, v.size, Corrected(v.sensor, move), v.alt_range) for v in VIEWS]
+    path = tmp_path / "p.gcp"
+    path.write_text(asp(moved(list(range(6)), lambda lon, lat, alt: (lon, lat, alt - 100.0))))
+    found = load_gcps([str(path)], off, RunOptions())
+    assert found is not None
+    assert found.names == POINTS.names
+
+
+@pytest.mark.parametrize("only", [False, True])
+def test_images_that_are_not_in_the_run_are_refused_or_left_out(tmp_path, only):
+    text = asp(POINTS)
+    if only:
+        for view in VIEWS:
+            text = text.replace(f"/{view.name}.tif", f"/else_{view.name}.tif")
+    else:
+        text = text.replace(f"/{VIEWS[1].name}.tif", "/else.tif")
+    with pytest.raises(InputError, match="else"):
+        load(tmp_path / "p.gcp", text)
+    found = load(tmp_path / "p.gcp", text, keep_going=True)
+    assert len(found.left_out) == 1
+    assert "else" in found.left_out[0]
+    assert len(found.view) == (0 if only else (POINTS.view != 1).sum())
+
+
+def test_of_a_file_of_one_image_no_image_is_asked(tmp_path):
+    one = POINTS.select(np.bincount(POINTS.point[POINTS.view == 0], minlength=6) > 0)
+    one = replace(
+        one, **{name: getattr(one, name)[one.view == 0] for name in ("point", "view", "xy", "xy_sigma")}
+    )
+    path = tmp_path / "p.csv"
+    path.write_text(table(one, "id,lon,lat,h,col,row"))
+    found = load_gcps([str(path)], VIEWS[:1], RunOptions())
+    assert found is not None
+    np.testing.assert_array_equal(found.xy, one.xy)
