@@ -11,6 +11,7 @@ import numpy as np
 from barpc.ba.block import Block, join
 from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import agreeing, two_groups
+from barpc.ba.datum import datum_shares
 from barpc.ba.gauge import gauge_report
 from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control
 from barpc.ba.heldout import HeldOut, enu_offsets, keep_out, measure
@@ -255,6 +256,8 @@ def _adjustment(
         (block.in_order(inside.T) + outer.in_order(outside.residual.T))[ties]
         for inside, outside in ((found.before, found.start), (outcome.residual, found.after))
     )
+    gauge = gauge_report(covariance, final.points, found.first_points(block), seen)
+    is_gcp = np.arange(block.num_points) >= block.num_tracks
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
     return Adjustment(
         names=block.names,
@@ -274,7 +277,8 @@ def _adjustment(
         status=status,
         cameras=cameras,
         covariance=covariance,
-        gauge=gauge_report(covariance, final.points, found.first_points(block), seen),
+        gauge=gauge,
+        datum=datum_shares(covariance, gauge.by_unknown, outcome.problem, final, outcome.weight, is_gcp),
         prior=outcome.prior,
         smooth=outcome.smooth,
         in_space_rms=in_space,

@@ -6,7 +6,7 @@ best-fitting tilts, turn and scale are linear in dp: seven numbers with a covari
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg as la
@@ -42,6 +42,7 @@ class GaugeReport:
     modes: tuple[Mode, ...]  # the weakest first
     # RMS distance of the points from their middle [m]: where tilts, turn and scale are measured
     radius: float
+    by_unknown: Array = field(repr=False)  # (7, N q) the motions by the unknowns of the cameras
 
 
 def gauge_report(covariance: Covariance, points: Array, before: Array, use: BoolArray) -> GaugeReport:
@@ -57,7 +58,7 @@ def gauge_report(covariance: Covariance, points: Array, before: Array, use: Bool
     by_unknown, own = _motion_by_unknowns(covariance, local / radius, enu, use, use.sum() / len(index))
     motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
-    return GaugeReport(enu @ shift_of_all, sigma[:3], sigma, _modes(motion_covariance), radius)
+    return GaugeReport(enu @ shift_of_all, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown)
 
 
 def _motion_by_unknowns(

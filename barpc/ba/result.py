@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -61,6 +62,8 @@ class Adjustment:
         Of the corrections, of points, of relative heights.
     gauge : GaugeReport
         Shift of the scene, what it is known to, the weakest modes.
+    datum : mapping
+        Source (`barpc.ba.datum.SOURCES`) -> its share (7,) in what is known of the scene's `MOTIONS`.
     prior : PriorTest
         How the corrections compare with the priors given, and what the priors became.
     smooth : SmoothTest
@@ -104,6 +107,7 @@ class Adjustment:
     cameras: Cameras
     covariance: Covariance
     gauge: GaugeReport
+    datum: Mapping[str, Array]
     prior: PriorTest
     smooth: SmoothTest
     in_space_rms: float | None

@@ -47,6 +47,7 @@ class Outcome:
     problem: Problem  # with the priors on points as they ended
     minimum: Minimum  # unknowns, points, the last linearisation
     residual: Array  # (2, K) projected - observed [px]
+    weight: Array  # (K,) 1 / sigma of the observations, as solved last [1/px]
     inlier: BoolArray  # (K,) observations in the final solve
     noise: float  # observed over stated standard deviation
     passes: int  # rounds of cutting
@@ -86,6 +87,7 @@ class Rounds:
         self.projected: Projected | None = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0
         self.misfit: Array | float = 0.0
+        self.weight = self.counted
 
     def run(self) -> Outcome:
         """Go on until nothing changes."""
@@ -126,7 +128,15 @@ class Rounds:
         if self.passes > MAX_PASSES or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             return Outcome(
-                self.problem, found, self.residual, self.use, self.noise, self.passes, tested, smooth
+                self.problem,
+                found,
+                self.residual,
+                self.weight,
+                self.use,
+                self.noise,
+                self.passes,
+                tested,
+                smooth,
             )
         self.problem = replace(self.problem, camera_prior=prior)
         return None
@@ -143,7 +153,7 @@ class Rounds:
         solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
         tolerance = TOLERANCE if self.passes > 1 or not self.robust else _FIRST_TOLERANCE
         noise = self.noise if self.options.estimate_noise else 1.0
-        weight = self.observations.weight(self.use, noise, self.misfit)
+        self.weight = weight = self.observations.weight(self.use, noise, self.misfit)
         found = minimise(self.problem, self.state, weight, solver, tolerance, self.projected)
         state, self.projected = found.state, None
         self.residual = self.problem.residuals(state.params, state.points)

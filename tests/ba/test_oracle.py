@@ -13,6 +13,7 @@ import scipy.linalg as la
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, normal, rounds
 from barpc.ba.adjustment import make_problem
 from barpc.ba.block import join
+from barpc.ba.datum import datum_shares
 from barpc.ba.gauge import MOTIONS, _modes, gauge_report
 from barpc.ba.ground import Heights, convergence_angles, ground_control
 from barpc.ba.problem import Problem
@@ -540,3 +541,51 @@ def test_weak_tracks_are_held_to_the_altitude_of_the_others(strong, spread, alt,
     np.testing.assert_allclose(prior.apart(points)[:, 0] * sigma, altitudes[-2:] - alt, atol=1e-6)
     assert not prior.residual(points)[:, 1:].any()
     assert replace(heights, weak=np.zeros(strong + 2, dtype=bool))._held(points) is None
+
+
+@pytest.mark.parametrize("fixed", [(), (1,)])
+def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fixed):
+    case = make_case(1, tuple(f"view_{v:04d}" for v in fixed))
+    free = np.append(case.problem.free, np.ones(case.points.size, dtype=bool))
+    matrix, _, _ = case.dense
+    matrix = matrix[np.ix_(free, free)]
+    jacobian = case.plain.jacobian(case.params, case.points)[:, free]
+    size = int(case.problem.free.sum())
+    use = np.ones(12, dtype=bool)
+    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    report = gauge_report(covariance, case.points, case.points, use)
+    is_gcp = np.arange(12) >= 10
+    found = datum_shares(covariance, report.by_unknown, case.problem, _state(case), case.weight, is_gcp)
+
+    middle = case.points.mean(axis=0)
+    enu = enu_of(*ground_of(middle)[:2])
+    e, n = ((case.points - middle) @ enu.T).T[:2] / report.radius
+    zero, one = np.zeros(12), np.ones(12)
+    moves = [[one, zero, zero], [zero, one, zero], [zero, zero, one], [zero, zero, e], [zero, zero, n]]
+    moves = np.array([*moves, [-n, e, zero], [e, n, zero]]).transpose(0, 2, 1).reshape(7, -1).T
+    by_points = np.linalg.pinv(moves) @ np.kron(np.eye(12), enu)
+    follow = -np.linalg.solve(matrix[size:, size:], matrix[size:, :size])
+    by_camera = by_points @ follow
+    left = matrix[:size, :size] + matrix[:size, size:] @ follow
+    cheapest = np.linalg.solve(left, by_camera.T)
+    cheapest /= np.sqrt((by_camera.T * cheapest).sum(axis=0))
+    paid = (jacobian @ np.vstack([cheapest, follow @ cheapest])) ** 2
+    view, point = np.repeat(case.plain.view, 2), np.repeat(case.plain.point, 2)
+    seen, ends = len(view), np.cumsum([len(view), case.params.size, 6, 3])
+    of_gcps = point >= 10
+    kept = np.isin(view, fixed)
+    expected = {
+        "ties": paid[:seen][~of_gcps & ~kept].sum(axis=0),
+        "fixed_views": paid[:seen][~of_gcps & kept].sum(axis=0),
+        "cameras": paid[ends[0] : ends[1]].sum(axis=0),
+        "gcps": paid[:seen][of_gcps].sum(axis=0) + paid[ends[1] : ends[2]].sum(axis=0),
+        "heights": paid[ends[2] : ends[3]].sum(axis=0),
+        "earlier_run": np.zeros(7),
+    }
+    assert set(found) == set(expected)
+    for source, share in expected.items():
+        np.testing.assert_allclose(found[source], share, atol=1e-4, err_msg=source)
+    np.testing.assert_allclose(sum(found.values()), 1.0, rtol=1e-6)
+    assert found["fixed_views" if fixed else "cameras"].max() > 0.01
+    assert found["heights"][2] > 0.001
+    assert found["gcps"][:3].max() > 0.05

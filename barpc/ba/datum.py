@@ -1,0 +1,94 @@
+"""What holds the scene: how much of what is known of its place, tilts, turn and scale comes from where.
+
+Of all changes of cameras and points that move the scene by one standard deviation in one of its motions, the most
+probable one raises the cost by 1. What each source pays of that is its share of what is known of the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from barpc.ba.covariance import Covariance
+from barpc.ba.normal import Reduced
+from barpc.ba.problem import Problem
+from barpc.ba.solve import State
+from barpc.geodesy import Array
+from barpc.scene import BoolArray
+
+SOURCES = ("ties", "cameras", "earlier_run", "fixed_views", "gcps", "heights")
+"""Tie points; the priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; DEM or assumed
+altitudes, with what these are wrong by together."""
+
+
+def datum_shares(
+    covariance: Covariance,
+    by_unknown: Array,
+    problem: Problem,
+    state: State,
+    weight: Array,
+    is_gcp: BoolArray,
+) -> Mapping[str, Array]:
+    """Share (7,) of each source in what is known of the scene's motions; NaN for one that no free camera tells of.
+
+    Parameters
+    ----------
+    covariance : Covariance, at the solution
+    by_unknown : (7, N q), motions by the unknowns of the cameras
+    problem, state, weight : as solved last, and 1 / sigma of every observation (K,)
+    is_gcp : (P,), points that are no tracks
+    """
+    moves = covariance.solve(by_unknown.T)
+    variance = np.einsum("mn,nm->m", by_unknown, moves)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        unknowns = (moves / np.sqrt(variance)).reshape(problem.structure.num_views, -1, len(variance))
+    reduced = _at_rest(covariance.reduced)
+    points = np.stack([reduced.point_step(unknowns[..., m]) for m in range(len(variance))], axis=-1)
+    paid = dict(zip(SOURCES, np.zeros((len(SOURCES), len(variance))), strict=True))
+    paid["cameras"] += np.einsum("nqm->m", (problem.camera_prior.jacobian()[..., None] * unknowns) ** 2)
+    if (joint := problem.joint_prior) is not None:
+        flat = unknowns.reshape(-1, len(variance))[joint.index]
+        paid["earlier_run"] += ((joint.jacobian() @ flat) ** 2).sum(axis=0)
+    held = np.zeros(len(is_gcp), dtype=bool)
+    if (prior := problem.point_prior) is not None:
+        held[prior.index] = is_gcp[prior.index]
+        shared = np.zeros((prior.common.shape[2], len(variance)))
+        if reduced.common is not None:
+            flat = unknowns.reshape(-1, len(variance))
+            shared = np.stack([reduced.common.step(flat[:, m]) for m in range(len(variance))], axis=-1)
+        left = prior.rows @ points[prior.index] - prior.common @ shared
+        paid["gcps"] += (left[is_gcp[prior.index]] ** 2).sum(axis=(0, 1))
+        paid["heights"] += (left[~is_gcp[prior.index]] ** 2).sum(axis=(0, 1)) + (shared**2).sum(axis=0)
+    _observations(paid, problem, state, weight, unknowns, points, held)
+    return paid
+
+
+def _at_rest(reduced: Reduced) -> Reduced:
+    """The linearisation as if it stood at its minimum: steps are those of the cameras alone."""
+    common = reduced.common
+    if common is not None:
+        common = replace(common, half=np.zeros_like(common.half))
+    return replace(reduced, half=np.zeros_like(reduced.half), common=common)
+
+
+def _observations(
+    paid: Mapping[str, Array],
+    problem: Problem,
+    state: State,
+    weight: Array,
+    unknowns: Array,
+    points: Array,
+    held: BoolArray,
+) -> None:
+    """Add what the observations pay: those of GCPs, of tie points in fixed views, and in the others."""
+    structure, projected = problem.structure, problem.linearise(state.params, state.points)
+    is_free = problem.free[:: len(problem.free) // structure.num_views]  # views are free or fixed as a whole
+    for v, part in enumerate(map(slice, structure.bounds[:-1], structure.bounds[1:])):
+        at = structure.point[part]
+        change = np.einsum("cqk,qm->ckm", projected.by_unknown[..., part], unknowns[v])
+        change += np.einsum("cxk,kxm->ckm", projected.by_point[..., part], points[at])
+        cost = ((change * weight[part, None]) ** 2).sum(axis=0)
+        paid["gcps"][:] += cost[held[at]].sum(axis=0)
+        paid["ties" if is_free[v] else "fixed_views"][:] += cost[~held[at]].sum(axis=0)
