@@ -378,7 +378,7 @@ class RunOptions(Options):
         "Tie points only inside polygons in lon/lat (GeoJSON), and only what may show them is read.",
         unit="file",
     )
-    gcp: tuple[str, ...] = option((), "Ground control points: .gcp, GeoJSON, image tags.", unit="file")
+    gcp: tuple[str, ...] = option((), "Ground control points: CSV, .gcp, GeoJSON, image tags.", unit="file")
     check_points: tuple[str, ...] = option(
         (), "Ground points that stay out of the adjustment and are measured after it.", unit="file"
     )
@@ -387,13 +387,21 @@ class RunOptions(Options):
         "An earlier run some of whose views are among these: they keep what it knows about them.",
         unit="dir",
     )
-    dem: str | None = option(None, "Terrain heights that hold weakly seen tie points.", unit="file")
+    dem: str | None = option(
+        None,
+        "Terrain heights: they hold tie points seen under less than `min_convergence`, with `dem_for_all` all of them.",
+        unit="file",
+    )
     geoid: str | None = option(None, "Geoid grid for a DEM of orthometric heights.", unit="file")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.geoid is not None and self.dem is None:
             raise InputError("geoid is given without dem: there are no heights to convert")
+        if self.adjust.dem_for_all and self.dem is None:
+            raise InputError(
+                "dem_for_all is given without dem: there are no heights to hold the tie points to"
+            )
         for name in ("overlap_list", "aoi"):
             if self.matches is not None and getattr(self, name) is not None:
                 raise InputError(

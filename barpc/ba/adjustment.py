@@ -284,6 +284,7 @@ def _adjustment(
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier),
         held=found.heights.weak[: block.num_tracks],
+        terrain=found.heights.test(final.points, seen),
         left_out=block.left_out,
         gcp_inlier=inlier[ties.stop :],
         control=found.tested,

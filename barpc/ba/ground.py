@@ -102,6 +102,17 @@ def convergence_angles(structure: Structure, projected: Projected, points: Array
 
 
 @dataclass(frozen=True)
+class TerrainTest:
+    """What a terrain did to the tie points, and how they lie to it."""
+
+    held: int  # tie points that it holds
+    known: int  # tie points where it has a height
+    total: int  # tie points in use
+    offset: float  # median of the adjusted altitudes minus the terrain's [m]; NaN where it has none
+    spread: float  # 1.4826 times their median absolute deviation [m]
+
+
+@dataclass(frozen=True)
 class Heights:
     """The priors on points: GCPs, and heights for tracks that need (or are given) them."""
 
@@ -132,6 +143,19 @@ class Heights:
             middle = 0.5 * (low + high)
         sigma = max(float(high - low) * (1.0 if len(others) >= 10 else 0.5), _FLAT_SIGMA)
         return flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)
+
+    def test(self, points: Array, seen: BoolArray) -> TerrainTest | None:
+        """What the terrain did to the tracks that are `seen` (P,), at their adjusted places; None without one."""
+        if self.dem is None:
+            return None
+        index = self.tracks[seen[self.tracks]]
+        lon, lat, alt = ground_from_ecef(points[index]).T
+        above = alt - self.dem(lon, lat)
+        known = np.isfinite(above)
+        is_held = known if self.options.dem_for_all else known & self.weak[index]
+        offset = float(np.median(above[known])) if known.any() else np.nan
+        spread = 1.4826 * float(np.median(np.abs(above[known] - offset))) if known.any() else np.nan
+        return TerrainTest(int(is_held.sum()), int(known.sum()), len(index), offset, spread)
 
     def warn(self) -> None:
         """Say that tracks are held in height without a DEM."""

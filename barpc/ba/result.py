@@ -11,6 +11,7 @@ from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import TwoGroups
 from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import GaugeReport
+from barpc.ba.ground import TerrainTest
 from barpc.ba.smooth import SmoothTest
 from barpc.ba.snooping import ControlTest
 from barpc.ba.variances import PriorTest
@@ -75,6 +76,8 @@ class Adjustment:
         Pairs of views whose tie points fall into two groups.
     held : (P,)
         Tracks held in height because their rays meet under too small an angle.
+    terrain : TerrainTest or None
+        What a terrain did; None without one.
     left_out : tuple of str
         Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
     control : ControlTest or None
@@ -113,6 +116,7 @@ class Adjustment:
     in_space_rms: float | None
     two_groups: tuple[TwoGroups, ...]
     held: BoolArray
+    terrain: TerrainTest | None
     left_out: tuple[str, ...]
     control: ControlTest | None
     gcp_inlier: BoolArray

@@ -62,14 +62,16 @@ class Formatter(logging.Formatter):
 def print_summary(summary: Summary) -> None:
     """The verdict, a table of views and a table of pairs, on stdout."""
     from barpc.report.records import table
-    from barpc.report.summary import PairEntry, ViewEntry
+    from barpc.report.summary import DATUM, DatumEntry, PairEntry, ViewEntry
 
     width = output_width()
     errors = "Reprojection error of the tie points"
     offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
+    datum = () if summary.scene is None else summary.scene.datum
     for shown in (
         table("views", errors, summary.views, ViewEntry, ViewEntry.TERMINAL, summary.adjusted),
         table("pairs", offsets, summary.pairs, PairEntry, PairEntry.TERMINAL, summary.adjusted),
+        table("datum", DATUM, datum, DatumEntry, DatumEntry.columns(datum)),
     ):
         if shown.rows:
             _echo_table(shown.caption, shown.texts, width)

@@ -20,8 +20,10 @@ from barpc.report.charts import MAX_ROWS, ground_map, numbered, residual_panels
 from barpc.report.compare import flat_options
 from barpc.report.records import Cell, Table, cell_of, table
 from barpc.report.summary import (
+    DATUM,
     STATUS_WORDS,
     CheckPointEntry,
+    DatumEntry,
     GcpEntry,
     PairEntry,
     StageEntry,
@@ -268,8 +270,13 @@ def _gauge(files: RunFiles) -> Section | None:
         answer += f" {scene.num_held_in_height} tie points seen under too small an angle were held in height."
     if not gcps:
         answer += " Ground control points (--gcp) are what helps where it matters."
-    caption = "Ground control: adjusted minus given place"
-    tables = [table("gcps", caption, gcps, GcpEntry, GcpEntry.PAGE)] if gcps else []
+    tables = (
+        [table("datum", DATUM, scene.datum, DatumEntry, DatumEntry.columns(scene.datum))]
+        if scene.datum
+        else []
+    )
+    caption = "Ground control: what all the others say of a point minus its given place"
+    tables += [table("gcps", caption, gcps, GcpEntry, GcpEntry.PAGE)] if gcps else []
     return Section("gauge", "What can the images not tell?", answer, bars=bars, tables=tables, half=True)
 
 

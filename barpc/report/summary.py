@@ -7,7 +7,7 @@ columns of a table there, it stands in that, too.
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version as package_version
 from operator import attrgetter
 from typing import Annotated, Any, ClassVar, Literal
@@ -16,7 +16,7 @@ import numpy as np
 
 from barpc import __version__
 from barpc.ba import Adjustment, check_residuals
-from barpc.ba.gauge import Mode
+from barpc.ba.gauge import MOTIONS, Mode
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.report.records import Cell, Column, Number, Record, plain, said, value_of
 from barpc.report.run import PairTies, Run
@@ -56,6 +56,16 @@ _MODE_WORDS = {
     "turn": "the scene may be turned about the vertical: {0} at its edge",
     "scale": "the scene may be too large or too small: {0} at its edge",
 }
+
+_DATUM_HEADS = {
+    "ties": "tie points",
+    "cameras": "cameras as delivered",
+    "earlier_run": "earlier run",
+    "fixed_views": "fixed views",
+    "gcps": "GCPs",
+    "heights": "heights",
+}
+DATUM = "What holds the scene: share of each source in what is known of its place and shape"
 
 Count = Annotated[int, {"minimum": 0}]
 Side = Annotated[int, {"minimum": 1}]
@@ -142,6 +152,10 @@ def median(values: Iterable[float | None]) -> float:
 
 def _percent(share: float | None) -> float | None:
     return None if share is None else 100 * share
+
+
+def _percent_of(name: str) -> Callable[[Any], float | None]:
+    return lambda record: _percent(getattr(record, name))
 
 
 def _verdict(view: ViewEntry) -> Cell:
@@ -318,6 +332,41 @@ class ModeEntry(Record):
     words: str = said("The same in words", minLength=1)
 
 
+class DatumEntry(Record):
+    """What holds a motion of the scene: shares of what is known of it, of all that pays where it moves."""
+
+    OWN: ClassVar = {"part": Column("motion", lambda one: one.part)} | {
+        name: Column(f"{head} [%]", _percent_of(name), ".0f") for name, head in _DATUM_HEADS.items()
+    }
+
+    part: str = said("Motion of the scene", enum=list(_MODE_WORDS))
+    sigma_m: Number = said(
+        "Posterior standard deviation; at the edge for tilts, turn and scale", "m", "known to", ".2f"
+    )
+    ties: Number = said("Tie points")
+    cameras: Number = said("Accuracies of the cameras as delivered")
+    earlier_run: Number = said("The earlier run")
+    fixed_views: Number = said("Views that are fixed")
+    gcps: Number = said("Ground control points")
+    heights: Number = said("The DEM, or altitudes assumed for tie points seen under too small an angle")
+
+    @classmethod
+    def columns(cls, entries: Sequence[DatumEntry]) -> str:
+        """The columns of a table: sources that tell nothing of any motion are left out."""
+        told = [name for name in _DATUM_HEADS if any((getattr(one, name) or 0.0) >= 0.005 for one in entries)]
+        return " ".join(["part", "sigma_m", *told])
+
+
+class DemEntry(Record):
+    """What the DEM did, and how the tie points lie to it."""
+
+    num_held: Count = said("Tie points that it holds")
+    num_known: Count = said("Tie points where it has a height")
+    num_tracks: Count = said("Tie points that count")
+    offset_m: Number = said("Median of the tie points' altitudes minus the DEM's", "m")
+    spread_m: Number = said("1.4826 times the median absolute deviation of these", "m")
+
+
 class SceneEntry(Record):
     """The block as a whole."""
 
@@ -337,6 +386,8 @@ class SceneEntry(Record):
     num_held_in_height: Count = said("Tie points seen under too small an angle, held in height")
     gcp_residuals_enu_m: tuple[Vector, ...] = said("Adjusted GCPs minus their given place", "m")
     solver: str = said("What the solver did")
+    datum: tuple[DatumEntry, ...] = said("What holds the scene", default=())
+    dem: DemEntry | None = said("What the DEM did; null without one", default=None)
     num_held_out: Count = said("Observations that took no part, to be measured on", default=0)
     model: str = said("Unknowns of each view that were solved for", default="")
     in_space_px: Number = said(
@@ -473,6 +524,7 @@ def published_schema() -> dict[str, Any]:
 
 _SOURCE = attrgetter("format", "path", "notes")
 _CENTER = attrgetter("ecef", "altitude", "method")
+_DEM = attrgetter("held", "known", "total", "offset", "spread")
 _FIT = attrgetter("rmse_ckp", "max_ckp", "min_denominator", "roundtrip", "coverage", "method", "num_ckp")
 
 
@@ -665,13 +717,23 @@ def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: A
 
 
 def _scene(adjustment: Adjustment) -> SceneEntry:
-    gauge, prior = adjustment.gauge, adjustment.prior
+    gauge, prior, terrain = adjustment.gauge, adjustment.prior, adjustment.terrain
+    datum = [
+        DatumEntry(
+            part,
+            float(gauge.motion_sigma[m]),
+            **{key: float(row[m]) for key, row in adjustment.datum.items()},
+        )
+        for m, part in enumerate(MOTIONS)
+    ]
     modes = [ModeEntry(m.sigma, m.meaning, m.motion.tolist(), mode_in_words(m)) for m in gauge.modes]
     return SceneEntry(
         shift_enu_m=gauge.shift.tolist(),
         sigma_enu_m=gauge.sigma.tolist(),
         radius_m=gauge.radius,
         weakest_modes=tuple(modes),
+        datum=tuple(datum),
+        dem=None if terrain is None else DemEntry(*_DEM(terrain)),
         noise=adjustment.noise,
         num_held_out=int(np.count_nonzero(adjustment.held_out)),
         model=adjustment.cameras.unknowns.model,

@@ -245,6 +245,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         tested = run.adjustment.control
         held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
         lines.append(f"With {_count(held, 'GCP')} {known}{'' if held else ' only'}.")
+    lines += _dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()
         seen = f"{np.hypot(*image):.2f} px in the images"
@@ -252,6 +253,29 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
             seen += f" and {_lengths(ground)} on the ground (east, north, up)"
         lines.append(f"{len(run.check_points.names)} check points, not used above, are met to {seen} (RMS).")
     return lines
+
+
+def _dem_lines(adjustment: Adjustment) -> list[str]:
+    """What the DEM did."""
+    terrain, options = adjustment.terrain, adjustment.options
+    if terrain is None:
+        return []
+    held = f"The DEM holds {terrain.held} of {terrain.total} tie points"
+    if not terrain.held:
+        least = f"{options.min_convergence:g} degree{'' if options.min_convergence == 1 else 's'}"
+        why = f"all rays meet under more than {least}; --dem-for-all holds the scene"
+        held += f": {'it has no height where it is needed' if adjustment.held.any() else why}"
+    else:
+        single, common = metres(options.dem_sigma), metres(options.dem_bias_sigma)
+        held += f", each to {single} and all together to {common}"
+    share = 100 * terrain.known / max(terrain.total, 1)
+    lie = f"they lie {terrain.offset:+.1f} m above it (median; spread {terrain.spread:.1f} m)" * bool(
+        terrain.known
+    )
+    return [
+        f"{held}.",
+        f"It has a height for {share:.0f} % of the tie points{'; ' if lie else ''}{lie}.",
+    ]
 
 
 def _lengths(values: Iterable[float]) -> str:
