@@ -164,12 +164,27 @@ def _choose_model(
     if options.model != AUTO or options.drift is not None or prior is not None:
         return found, None
     skew = found.is_skew
-    if skew or found.has_trend:
+    if (skew or found.has_trend) and not _bent_by_control(found, block, outer, options, dem, centers):
         in_image = _solve(block, outer, replace(options, model="affine"), dem, None, None)
         better = in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error
         if better and in_image.after.whole_rms < found.after.whole_rms - _WORTH:
             return in_image, found.after.whole_rms
     return found, None
+
+
+def _bent_by_control(
+    found: _Solution,
+    block: Block,
+    outer: Block,
+    options: AdjustOptions,
+    dem: Terrain | None,
+    centers: Array | None,
+) -> bool:
+    """Whether a trend is there only because control points that contradict something pull at the cameras."""
+    if found.tested is None or found.tested.agrees:
+        return False
+    free = _solve(block.without(block.point >= block.num_tracks), outer, options, dem, centers, None)
+    return not (free.is_skew or free.has_trend)
 
 
 def _solve(

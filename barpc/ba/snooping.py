@@ -3,6 +3,7 @@
 A control point that is used pulls its own residual towards zero, the more the less there is beside it. With Q_l the
 covariance stated of its place and Q_x that of the adjusted point, the residual v = adjusted - given has the covariance
 Q_v = Q_l - Q_x, and what all the others predict of it is off by Q_l Q_v^-1 v: leave-one-out without leaving one out.
+All together they are tested by the sum of v^T Q_l^-1 v over the points: errors that are no one's alone show there.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from barpc.ba.covariance import Covariance
 from barpc.ba.heldout import enu_offsets
@@ -19,7 +21,9 @@ from barpc.scene import BoolArray, GroundPoints
 CRITICAL = 4.0
 """A normalised residual that is larger is no chance: 6e-5 for a component, a thousandth for five points."""
 _PART = 3  # of so many points one may be wrong, or the stated accuracies are
-_LEAST = 1e-6  # redundancy of a point that nothing else tells about
+_LEAST = 1e-6  # redundancy of a direction that nothing else tells about: along the ray of a point seen once
+CHECKED = 0.1  # redundancy of a point that something beside the cameras' priors tells about
+_CHANCE = 1e-3  # that points which are as good as stated scatter by more
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,17 +35,34 @@ class ControlTest:
     used : (G,)
         Points that hold the block; the others were found wrong.
     residual : (G, 3)
-        What all the others say of a point minus its given place, east, north, up [m]; NaN where nothing tells.
+        What all the others say of a point minus its given place, east, north, up [m], in the directions that they
+        tell of; NaN where there is none.
     w : (G,)
         Its largest component over its standard deviation.
     redundancy : (G,)
         How far the others could tell: 0 not at all, 1 as if the point were not used.
+    scatter : float
+        Root mean square residual of the points used over what is expected; NaN where too little is told.
+    fits : bool
+        Whether that may be chance.
     """
 
     used: BoolArray
     residual: Array
     w: Array
     redundancy: Array
+    scatter: float = np.nan
+    fits: bool = True
+
+    @property
+    def checked(self) -> bool:
+        """Whether any point used is checked by the others."""
+        return bool((self.redundancy[self.used] > CHECKED).any())
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the points used contradict nothing, each and all together."""
+        return self.fits and not any(self.status(g) == "contradicts" for g in range(len(self.used)))
 
     def culprit(self) -> int | None:
         """The point that is most clearly wrong; None where none is, or where too many would be."""
@@ -88,8 +109,25 @@ def control_test(
             continue
         left = stated - adjusted[g] if used[g] else stated + adjusted[g]
         redundancy[g] = min(float((np.diag(left) / np.diag(stated)).mean()), 1.0)
-        if np.linalg.eigvalsh(left / np.outer(gcps.sigma[g], gcps.sigma[g])).min() < _LEAST:
+        told, axes = np.linalg.eigh(left / np.outer(gcps.sigma[g], gcps.sigma[g]))
+        if told[-1] < _LEAST:
             continue
-        residual[g] = stated @ np.linalg.solve(left, offset[g]) if used[g] else offset[g]
-        w[g] = np.abs(offset[g] / np.sqrt(np.diag(left))).max()
-    return ControlTest(used, residual, w, redundancy)
+        axes = axes[:, told > _LEAST]
+        whitened = offset[g] / gcps.sigma[g] @ axes
+        shown = axes @ (whitened / told[told > _LEAST]) if used[g] else axes @ whitened
+        residual[g] = gcps.sigma[g] * shown
+        spread = np.sqrt(np.maximum(np.diag(left) / gcps.sigma[g] ** 2, _LEAST))
+        w[g] = (np.abs(offset[g] / gcps.sigma[g]) / spread).max()
+    return ControlTest(used, residual, w, redundancy, *_together(offset / gcps.sigma, redundancy, used))
+
+
+def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[float, bool]:
+    """Scatter of the points used (G, 3), and whether it may be chance.
+
+    The sum of squares is expected to be the redundancies' sum R, and its variance at most 2 R: that of a chi-square.
+    """
+    freedom = 3.0 * float(redundancy[used].sum())
+    if freedom < 1.0:
+        return np.nan, True
+    squares = float((whitened[used & (redundancy > 0)] ** 2).sum())
+    return float(np.sqrt(squares / freedom)), bool(squares <= chi2.isf(_CHANCE, freedom))

@@ -388,6 +388,9 @@ class SceneEntry(Record):
     solver: str = said("What the solver did")
     datum: tuple[DatumEntry, ...] = said("What holds the scene", default=())
     dem: DemEntry | None = said("What the DEM did; null without one", default=None)
+    gcp_scatter: Number = said(
+        "RMS residual of the GCPs used over what their accuracies let expect", default=None
+    )
     num_held_out: Count = said("Observations that took no part, to be measured on", default=0)
     model: str = said("Unknowns of each view that were solved for", default="")
     in_space_px: Number = said(
@@ -733,6 +736,7 @@ def _scene(adjustment: Adjustment) -> SceneEntry:
         radius_m=gauge.radius,
         weakest_modes=tuple(modes),
         datum=tuple(datum),
+        gcp_scatter=None if adjustment.control is None else adjustment.control.scatter,
         dem=None if terrain is None else DemEntry(*_DEM(terrain)),
         noise=adjustment.noise,
         num_held_out=int(np.count_nonzero(adjustment.held_out)),

@@ -218,6 +218,11 @@ def _control_reasons(run: Run) -> list[str]:
             ]
             if names:
                 out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.")
+        if not tested.fits and not any(tested.status(g) == "contradicts" for g in range(len(tested.used))):
+            out.append(
+                f"{_count(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
+                "accuracies are too good, or more than one is wrong."
+            )
     return out + [f"{line}." for p in (run.gcps, run.check_points) if p is not None for line in p.left_out]
 
 
@@ -245,6 +250,13 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         tested = run.adjustment.control
         held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
         lines.append(f"With {_count(held, 'GCP')} {known}{'' if held else ' only'}.")
+        if held and tested is not None and tested.agrees and not tested.checked:
+            lines.append(f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show.")
+        alone = np.unique(run.gcps.view)
+        if held and len(alone) == 1 and len(views) > 1:
+            lines.append(
+                f"They are seen in {views[alone[0]].name} alone, which says nothing along its lines of sight."
+            )
     lines += _dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()

@@ -10,8 +10,10 @@ import pytest
 from barpc.ba import adjust_tracks
 from barpc.ba.snooping import CRITICAL
 from barpc.geodesy import ecef_from_ground, enu_basis, metres_per_unit
+from barpc.options import RunOptions
+from barpc.report import Run, summarize
 from barpc.scene import GroundPoints
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.geometry import sight_enu, triangulate
 from benchmarks.referee import cases, judge, make
 from tests.ba.test_referee import hills
 
@@ -93,3 +95,71 @@ def test_of_two_points_none_is_taken_out():
     scene = scene_of(2, 1)
     tested = adjust_tracks(scene.views, scene.tracks, None, blundered(scene.gcps, {0: 30.0})).control
     assert tested.used.all()
+    assert [tested.status(g) for g in (0, 1)] == ["contradicts", "contradicts"]
+
+
+def said(scene, gcps):
+    """The adjustment and the verdict on it."""
+    found = adjust_tracks(scene.views, scene.tracks, None, gcps)
+    run = Run("adjust", scene.views, (), scene.tracks, adjustment=found, gcps=gcps, options=RunOptions())
+    return found.control, summarize(run)
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_two_points_that_contradict_each_other_are_never_good(seed):
+    scene = scene_of(2, seed)
+    gcps = scene.gcps
+    for east in (2.5, 3.5, 10.0):  # 0.3 m and 0.3 px are stated
+        moved = gcps.lonlatalt.copy()
+        moved[0, 0] += east / metres_per_unit(moved[0])[0]
+        tested, summary = said(scene, replace(gcps, lonlatalt=moved))
+        assert not summary.passed
+        assert not tested.agrees
+        assert any("GCP" in reason for reason in summary.reasons)
+    tested, summary = said(scene, gcps)
+    assert tested.fits
+    assert tested.checked
+    assert not any("Nothing checks" in line for line in summary.verdict)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(("times", "good"), [(1.0, True), (3.5, False)])
+def test_errors_that_are_no_ones_alone_show_in_all_together(seed, times, good):
+    scene = scene_of(6, seed)
+    gcps, rng = scene.gcps, np.random.default_rng(seed)
+    more = np.sqrt(times**2 - 1) * 0.3 * rng.normal(size=(6, 3)) / metres_per_unit(gcps.lonlatalt)
+    tested, summary = said(scene, replace(gcps, lonlatalt=gcps.lonlatalt + more))
+    assert (tested.fits and tested.used.all()) == good
+    if tested.used.all():
+        assert (0.6 < tested.scatter < 1.5) if good else (2.0 < tested.scatter < 6.0)
+    assert any("GCP" in reason for reason in summary.reasons) != good
+
+
+def test_a_point_that_nothing_checks_is_said_to_be():
+    scene = scene_of(1, 1)
+    tested, summary = said(scene, scene.gcps)
+    assert tested.used.all()
+    assert not tested.checked
+    assert any(line == "Nothing checks it: an error in a GCP would not show." for line in summary.verdict)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_points_in_one_image_are_tested_across_its_line_of_sight(seed):
+    scene = scene_of(6, seed)
+    gcps, keep = scene.gcps, scene.gcps.view == 1
+    one = replace(gcps, **{name: getattr(gcps, name)[keep] for name in ("point", "view", "xy", "xy_sigma")})
+    tested, summary = said(scene, one)
+    seen = np.bincount(one.point, minlength=6) > 0
+    assert tested.used.all()
+    assert np.isfinite(tested.w[seen]).all()
+    assert tested.w[seen].max() < CRITICAL
+    ray = sight_enu(scene.views[1].sensor, gcps.lonlatalt[seen])
+    along = np.abs((tested.residual[seen] * ray).sum(axis=1))
+    assert (along < 0.02 * np.linalg.norm(tested.residual[seen], axis=1) + 0.01).all()
+    assert any(f"seen in {scene.views[1].name} alone" in line for line in summary.verdict)
+    wrong = int(np.flatnonzero(seen)[1])
+    moved = one.lonlatalt.copy()
+    moved[wrong, 0] += 30.0 / metres_per_unit(one.lonlatalt[wrong])[0]
+    tested, summary = said(scene, replace(one, lonlatalt=moved))
+    assert np.flatnonzero(~tested.used).tolist() == [wrong]
+    assert not summary.passed
