@@ -5,12 +5,15 @@ The check points never enter a solve.
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.dem import Dem
+from barpc.errors import BarpcWarning
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.pointio.ground import read_gcps
 from barpc.rpcio import read_rpc
@@ -142,3 +145,28 @@ def test_a_gcp_that_was_left_out_lies_nearer_than_before(shared_data):
             rows.append(sensor.project(gcps.lonlatalt[left_out]) - gcps.xy[left_out])
     assert np.sqrt(np.mean(np.square(after))) < np.sqrt(np.mean(np.square(before)))
     assert ecef_from_ground(gcps.lonlatalt).shape == (5, 3)
+
+
+@pytest.mark.parametrize("ventoux", ["right_image"], indirect=True)
+@pytest.mark.parametrize("with_geoid", [True, False])
+def test_a_dem_that_holds_ventoux_moves_it_by_no_more_than_is_stated(shared_data, ventoux, with_geoid):
+    names = [view.name for view in ventoux]
+    pairs = [("left_image", "right_image")]
+    tracks = _pairs(shared_data, "phr_ventoux", pairs, names, "sift")
+    checks = _pairs(shared_data, "phr_ventoux", pairs, names, "ncc_check")
+    geoid = shared_data / "dem/egm96_15.gtx" if with_geoid else None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", BarpcWarning)
+        dem = Dem.open(shared_data / "dem/N44E005.hgt", geoid)
+    found = adjust_tracks(ventoux, tracks, AdjustOptions(dem_for_all=True), dem=dem)
+    free = adjust_tracks(ventoux, tracks, dem=dem)
+    moved = _shift(ventoux, found, checks)
+    assert np.linalg.norm(moved[:2]) < 7.0  # with errors that average away it was 15 m
+    assert (np.abs(moved) < 2.5 * free.gauge.sigma).all()
+    assert free.gauge.sigma[2] > 1.4 * found.gauge.sigma[2] > 14.0  # 20 m together, and the cameras' own 29 m
+    assert (free.terrain.held, free.terrain.known) == (0, free.terrain.total)
+    assert found.terrain.held == found.terrain.total > 200
+    assert free.terrain.offset == pytest.approx(4.0 if with_geoid else 55.0, abs=3.0)
+    assert abs(found.terrain.offset) < abs(free.terrain.offset)
+    assert free.datum["heights"].max() == 0.0
+    assert 0.5 < found.datum["heights"][2] < 0.9
