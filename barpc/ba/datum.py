@@ -1,7 +1,8 @@
 """What holds the scene: how much of what is known of its place, tilts, turn and scale comes from where.
 
-Of all changes of cameras and points that move the scene by one standard deviation in one of its motions, the most
-probable one raises the cost by 1. What each source pays of that is its share of what is known of the motion.
+Of all changes of cameras and points that move the scene in one of its motions, one is the most probable: the cheapest.
+What each source pays of its cost is its share of what is known of the motion. Tie points have none: they tie cameras
+and points to each other, and what bends between them is paid for those who hold on to the Earth.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from barpc.ba.solve import State
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
-SOURCES = ("ties", "cameras", "earlier_run", "fixed_views", "gcps", "heights")
-"""Tie points; the priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; DEM or assumed
-altitudes, with what these are wrong by together."""
+SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights")
+"""The priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; the DEM or assumed altitudes,
+with what these are wrong by together."""
 
 
 def datum_shares(
@@ -62,7 +63,8 @@ def datum_shares(
         paid["gcps"] += (left[is_gcp[prior.index]] ** 2).sum(axis=(0, 1))
         paid["heights"] += (left[~is_gcp[prior.index]] ** 2).sum(axis=(0, 1)) + (shared**2).sum(axis=0)
     _observations(paid, problem, state, weight, unknowns, points, held)
-    return paid
+    with np.errstate(invalid="ignore"):
+        return {source: cost / sum(paid.values()) for source, cost in paid.items()}
 
 
 def _at_rest(reduced: Reduced) -> Reduced:
@@ -82,7 +84,7 @@ def _observations(
     points: Array,
     held: BoolArray,
 ) -> None:
-    """Add what the observations pay: those of GCPs, of tie points in fixed views, and in the others."""
+    """Add what the observations of GCPs pay, and those of tie points in fixed views."""
     structure, projected = problem.structure, problem.linearise(state.params, state.points)
     is_free = problem.free[:: len(problem.free) // structure.num_views]  # views are free or fixed as a whole
     for v, part in enumerate(map(slice, structure.bounds[:-1], structure.bounds[1:])):
@@ -91,4 +93,5 @@ def _observations(
         change += np.einsum("cxk,kxm->ckm", projected.by_point[..., part], points[at])
         cost = ((change * weight[part, None]) ** 2).sum(axis=0)
         paid["gcps"][:] += cost[held[at]].sum(axis=0)
-        paid["ties" if is_free[v] else "fixed_views"][:] += cost[~held[at]].sum(axis=0)
+        if not is_free[v]:
+            paid["fixed_views"][:] += cost[~held[at]].sum(axis=0)

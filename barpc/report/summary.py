@@ -58,14 +58,13 @@ _MODE_WORDS = {
 }
 
 _DATUM_HEADS = {
-    "ties": "tie points",
     "cameras": "cameras as delivered",
     "earlier_run": "earlier run",
     "fixed_views": "fixed views",
     "gcps": "GCPs",
     "heights": "heights",
 }
-DATUM = "What holds the scene: share of each source in what is known of its place and shape"
+DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
 
 Count = Annotated[int, {"minimum": 0}]
 Side = Annotated[int, {"minimum": 1}]
@@ -333,7 +332,7 @@ class ModeEntry(Record):
 
 
 class DatumEntry(Record):
-    """What holds a motion of the scene: shares of what is known of it, of all that pays where it moves."""
+    """What holds a motion of the scene: shares of what is known of it. Tie points have none."""
 
     OWN: ClassVar = {"part": Column("motion", lambda one: one.part)} | {
         name: Column(f"{head} [%]", _percent_of(name), ".0f") for name, head in _DATUM_HEADS.items()
@@ -343,7 +342,6 @@ class DatumEntry(Record):
     sigma_m: Number = said(
         "Posterior standard deviation; at the edge for tilts, turn and scale", "m", "known to", ".2f"
     )
-    ties: Number = said("Tie points")
     cameras: Number = said("Accuracies of the cameras as delivered")
     earlier_run: Number = said("The earlier run")
     fixed_views: Number = said("Views that are fixed")

@@ -276,7 +276,8 @@ def _dem_lines(adjustment: Adjustment) -> list[str]:
     if not terrain.held:
         least = f"{options.min_convergence:g} degree{'' if options.min_convergence == 1 else 's'}"
         why = f"all rays meet under more than {least}; --dem-for-all holds the scene"
-        held += f": {'it has no height where it is needed' if adjustment.held.any() else why}"
+        needed = options.dem_for_all or adjustment.held.any()
+        held += f": {'it has no height where it is needed' if needed else why}"
     else:
         single, common = metres(options.dem_sigma), metres(options.dem_bias_sigma)
         held += f", each to {single} and all together to {common}"

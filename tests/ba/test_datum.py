@@ -1,0 +1,134 @@
+"""What holds the scene is told by its name, in shares that add up; sizes against a dense solution: test_oracle.py."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks, block_prior
+from barpc.ba.datum import SOURCES
+from barpc.report import Run, summarize
+from barpc.scene import GroundPoints
+from barpc.simulate import simulate_block
+from tests.ba.conftest import INDEPENDENT, centers_of
+from tests.ba.test_uncertainty import _divided
+
+BLOCK = simulate_block(4, 400, seed=4, num_gcps=6, alt_range=(200.0, 260.0))
+OPTIONS = AdjustOptions(**INDEPENDENT)
+PLACE = slice(0, 3)  # east, north, up
+
+
+def level(lon, lat):
+    return np.full(len(lon), 230.0)
+
+
+def solved(gcps: GroundPoints | None = None, **more):
+    dem = more.pop("dem", None)
+    options = replace(OPTIONS, **more)
+    return adjust_tracks(BLOCK.views, BLOCK.tracks, options, gcps, dem, centers=centers_of(BLOCK))
+
+
+def test_without_control_the_cameras_as_delivered_hold_the_scene():
+    found = solved()
+    assert set(found.datum) == set(SOURCES)
+    np.testing.assert_allclose(sum(found.datum.values()), 1.0, atol=1e-9)
+    assert (found.datum["cameras"][PLACE] > 0.99).all()
+    for other in ("earlier_run", "fixed_views", "gcps", "heights"):
+        assert (found.datum[other] == 0.0).all()
+
+
+def test_control_points_hold_it_by_their_accuracy():
+    shares = [
+        solved(replace(BLOCK.gcps, sigma=np.full((6, 3), sigma))).datum["gcps"] for sigma in (0.1, 10.0)
+    ]
+    assert (shares[0][PLACE] > 0.93).all()
+    assert (shares[1][PLACE] < 0.9 * shares[0][PLACE]).all()
+    assert (shares[1][PLACE] > 0.05).all()
+
+
+def test_a_terrain_holds_heights_and_no_more_than_its_common_error_lets_it():
+    tight, loose = (
+        solved(dem=level, dem_for_all=True, dem_bias_sigma=sigma).datum["heights"] for sigma in (0.5, 20.0)
+    )
+    assert tight[2] > 0.95
+    assert 0.02 < loose[2] < 0.9
+    assert tight[:2].max() < tight[2]
+    assert (solved(dem=level).datum["heights"] == 0.0).all()
+
+
+def test_views_that_are_fixed_hold_it():
+    names = [view.name for view in BLOCK.views]
+    found = solved(fixed=(names[0], names[1]))
+    assert (found.datum["fixed_views"][PLACE] > 0.9).all()
+    assert (found.datum["cameras"][PLACE] < 0.1).all()
+    assert found.datum["gcps"].max() == 0.0
+
+
+def test_an_earlier_run_holds_the_views_that_are_added():
+    old, new, _ = _divided(BLOCK, 3)
+    centers = centers_of(BLOCK)
+    first = adjust_tracks(BLOCK.views[:3], old, OPTIONS, centers=centers[:3])
+    both = adjust_tracks(BLOCK.views, new, OPTIONS, centers=centers, prior=block_prior(first))
+    assert (both.datum["earlier_run"][PLACE] > 0.5).all()
+    np.testing.assert_allclose(sum(both.datum.values()), 1.0, atol=1e-6)
+
+
+def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
+    gcps = replace(BLOCK.gcps, sigma=np.full((6, 3), 0.2))
+    found = solved(gcps)
+    summary = summarize(Run("adjust", BLOCK.views, (), BLOCK.tracks, adjustment=found, gcps=gcps))
+    assert [entry.part for entry in summary.scene.datum] == [
+        "east", "north", "up", "tilt east", "tilt north", "turn", "scale"
+    ]  # fmt: skip
+    for m, entry in enumerate(summary.scene.datum):
+        assert entry.sigma_m == pytest.approx(found.gauge.motion_sigma[m])
+        for source in SOURCES:
+            assert getattr(entry, source) == pytest.approx(found.datum[source][m])
+    columns = type(entry).columns(summary.scene.datum).split()
+    assert "gcps" in columns
+    assert not {"earlier_run", "fixed_views", "heights"} & set(columns)
+
+
+@pytest.mark.parametrize(
+    ("options", "dem", "says"),
+    [
+        (
+            {},
+            level,
+            "The DEM holds 0 of 396 tie points: all rays meet under more than 0.01 degrees; --dem-for-all holds",
+        ),
+        (
+            {"dem_for_all": True},
+            level,
+            "The DEM holds 400 of 400 tie points, each to 10.0 m and all together to 20.0 m.",
+        ),
+        ({"min_convergence": 90.0}, level, "The DEM holds 400 of 400 tie points"),
+        (
+            {"dem_for_all": True},
+            lambda lon, lat: np.full(len(lon), np.nan),
+            "it has no height where it is needed",
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
+def test_what_a_terrain_did_is_said(options, dem, says):
+    found = adjust_tracks(
+        BLOCK.views,
+        BLOCK.tracks,
+        replace(OPTIONS, **options),
+        None,
+        dem,
+        centers=centers_of(BLOCK),
+        hold_out=False,
+    )
+    summary = summarize(Run("adjust", BLOCK.views, (), BLOCK.tracks, adjustment=found))
+    assert any(says in line for line in summary.verdict), summary.verdict
+    if dem is level:
+        assert any(
+            "It has a height for 100 % of the tie points; they lie " in line for line in summary.verdict
+        )
+        assert summary.scene.dem.num_known == summary.scene.dem.num_tracks
+        assert summary.scene.dem.offset_m == pytest.approx(found.terrain.offset)
+        assert abs(summary.scene.dem.offset_m) < 60.0
