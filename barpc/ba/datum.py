@@ -20,8 +20,8 @@ from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
 SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights")
-"""The priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; the DEM or assumed altitudes,
-with what these are wrong by together."""
+"""The priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; the DEM or assumed
+altitudes, with what these are wrong by together."""
 
 
 def datum_shares(

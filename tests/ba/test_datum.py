@@ -44,7 +44,7 @@ def test_control_points_hold_it_by_their_accuracy():
         solved(replace(BLOCK.gcps, sigma=np.full((6, 3), sigma))).datum["gcps"] for sigma in (0.1, 10.0)
     ]
     assert (shares[0][PLACE] > 0.93).all()
-    assert (shares[1][PLACE] < 0.9 * shares[0][PLACE]).all()
+    assert (shares[1][:2] < 0.9 * shares[0][:2]).all()  # heights the cameras hardly know
     assert (shares[1][PLACE] > 0.05).all()
 
 
