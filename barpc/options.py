@@ -398,10 +398,6 @@ class RunOptions(Options):
         super().__post_init__()
         if self.geoid is not None and self.dem is None:
             raise InputError("geoid is given without dem: there are no heights to convert")
-        if self.adjust.dem_for_all and self.dem is None:
-            raise InputError(
-                "dem_for_all is given without dem: there are no heights to hold the tie points to"
-            )
         for name in ("overlap_list", "aoi"):
             if self.matches is not None and getattr(self, name) is not None:
                 raise InputError(

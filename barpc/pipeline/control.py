@@ -92,7 +92,7 @@ def _implausible(
         yield mistaken, what
         far &= ~mistaken
     most = np.max(away[far[points.point]], initial=0.0) / 1e3
-    yield far, f"as far as {most:,.0f} km from where the images show them, by their cameras"
+    yield far, f"as far as {most:,.0f} km from where the images show it, by their cameras"
     wild = (alt < low - _ALT_REACH) | (alt > high + _ALT_REACH)
     ends = f"{np.min(low, initial=np.inf):.0f} to {np.max(high, initial=-np.inf):.0f} m"
     yield (

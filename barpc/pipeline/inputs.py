@@ -33,6 +33,8 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
         points = load_gcps(paths, views, options)
         for line in () if points is None else points.left_out:
             logger.warning("%s", line)
+    if options.adjust.dem_for_all and options.dem is None:
+        raise InputError("dem_for_all is given without dem: there are no heights to hold the tie points to")
     dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
     if dem is not None:
         _require_cover(dem, str(options.dem), views)

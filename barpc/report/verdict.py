@@ -238,7 +238,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     if not len(run.tracks):
         lines = ["There are no tie points: the cameras are held by control points alone."]
     drift = f"drift of degree {run.adjustment.cameras.unknowns.drift}"
-    if prior.drift_sigma:
+    if prior.drift_sigma and np.isfinite(prior.drift_sigma).all():  # an earlier run's are in its matrix
         sizes = f"{_lengths(prior.drift_sigma)} at the first and last row"
         lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
     lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
