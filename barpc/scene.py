@@ -18,6 +18,9 @@ from barpc.frozen import Frozen
 from barpc.geodesy import Array
 from barpc.sensor import SensorModel
 
+SIGMA_RANGE = 1e-6, 1e9
+"""Standard deviations of ground points [m, px] whose squares can be reckoned with."""
+
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
@@ -132,8 +135,9 @@ class GroundPoints(Frozen):
         self._array("view", (m,), dtype=np.int64)
         self._array("xy", (m, 2), finite=False)
         xy_sigma = self._array("xy_sigma", (m,), finite=False)
-        if not ((sigma > 0).all() and (xy_sigma > 0).all()):
-            raise InputError("ground points: coordinates must be finite and sigmas positive")
+        low, high = SIGMA_RANGE
+        if not all(((spread >= low) & (spread <= high)).all() for spread in (sigma, xy_sigma)):
+            raise InputError(f"ground points: sigmas positive, from {low:g} to {high:g}, are needed")
         if m and (point.min() < 0 or point.max() >= g):
             raise InputError("ground points: an observation names a point that does not exist")
 

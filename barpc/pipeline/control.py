@@ -85,6 +85,7 @@ def _implausible(
     shown, pixel = _shown(points, views, np.clip(alt, low, high))
     reach = np.maximum(_REACH, search * pixel)
     away = _distance(points, shown, (0, 1), (1, 1))
+    yield _any(points, ~np.isfinite(away)), "no ground is seen at the position in the image"
     far = _any(points, away > reach) | (np.abs(points.lonlatalt[:, 1]) > 90.0)
     for what, (columns, *signs) in _MISTAKES.items():
         near = [_distance(points, shown, columns, sign) <= reach for sign in signs]

@@ -341,7 +341,8 @@ def _views() -> list[View]:
 
 GCPS = (
     b'{"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": {"type": "Point",'
-    b' "coordinates": [5.4, 43.2, 120.5]}, "properties": {"ji": [10.5, 20.25], "filename": "left.tif", "id": "one"}}]}'
+    b' "coordinates": [5.4, 43.2, 120.5]}, "properties": {"ji": [10.5, 20.25], "filename": "left.tif", "id": "one",'
+    b' "sigma_m": [1, 1, 2], "sigma_px": 0.3}}]}'
 )
 AREA = (
     b'{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry":'
@@ -359,6 +360,10 @@ ASP_GCPS = (
     b"# WGS84\n1 43.2 5.4 120.5 1 1 1 left.tif 10.5 20.25 0.5 0.5 right.tif 30 40 0.5 0.5\n"
     b"2, 43.3, 5.5, 99, 0.1, 0.1, 0.2, left, 5, 6, 1, 1\n"
 )
+CSV_GCPS = (
+    b"id,Longitude [deg],lat,h,image,px,py,sigma_xy,sigma_z,sigma_px\n1,5.4,43.2,120.5,left.tif,10.5,20.25,1,2,0.5\n"
+    b'1,5.4,43.2,120.5,"right.tif",30,40,1,2,0.5\n2,5.5,43.3,99,left,5,6,,,\n'
+)
 MATCHES = (
     b"image,col,row,track,sigma\nleft,1.5,2.5,0,0.5\nright,3,4,0,0.5\nleft,7,8,b,1\nright.tif,9,1e1,b,1\n"
 )
@@ -374,6 +379,7 @@ SAMPLES: dict[str, Sample] = {
     "rpc nitf": Sample("b.ntf", read_rpc, cache(_nitf), (mutate_text,)),
     "options": Sample("run.toml", read_options, lambda: OPTIONS, (mutate_text,)),
     "gcps": Sample("a.gcp", lambda path: read_gcps(path, NAMES), lambda: ASP_GCPS, (mutate_text,)),
+    "gcps csv": Sample("a.csv", lambda path: read_gcps(path, NAMES), lambda: CSV_GCPS, (mutate_text,)),
     "gcps json": Sample("a.geojson", lambda path: read_gcps(path, NAMES), lambda: GCPS, (mutate_json,)),
     "matches csv": Sample("t.csv", lambda path: read_matches(path, NAMES), lambda: MATCHES, (mutate_text,)),
     "matches npz": Sample(

@@ -170,6 +170,16 @@ def test_what_cannot_be_meant_is_named_and_refused_or_left_out(tmp_path, fault, 
     assert POINTS.names[which[0]] in line
 
 
+@pytest.mark.parametrize("value", ["nan", "inf", "-1e300"])
+def test_a_position_in_the_image_that_is_none_is_refused(tmp_path, value):
+    lines = asp(POINTS).splitlines()
+    words = lines[3].split()
+    words[8] = value
+    lines[3] = " ".join(words)
+    with pytest.raises(InputError, match="point gcp_002: no ground is seen"):
+        load(tmp_path / "p.gcp", "\n".join(lines))
+
+
 def test_latitudes_beyond_the_pole_are_recognised_as_longitudes(tmp_path):
     block = simulate_block(2, 4, num_gcps=5, seed=3, lon=139.7, lat=35.7)
     path = tmp_path / "p.csv"
