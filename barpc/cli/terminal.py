@@ -62,7 +62,7 @@ class Formatter(logging.Formatter):
 def print_summary(summary: Summary) -> None:
     """The verdict, a table of views and a table of pairs, on stdout."""
     from barpc.report.records import table
-    from barpc.report.summary import DATUM, DatumEntry, PairEntry, ViewEntry
+    from barpc.report.summary import DATUM, GCPS, DatumEntry, GcpEntry, PairEntry, ViewEntry
 
     width = output_width()
     errors = "Reprojection error of the tie points"
@@ -71,6 +71,7 @@ def print_summary(summary: Summary) -> None:
     for shown in (
         table("views", errors, summary.views, ViewEntry, ViewEntry.TERMINAL, summary.adjusted),
         table("pairs", offsets, summary.pairs, PairEntry, PairEntry.TERMINAL, summary.adjusted),
+        table("gcps", GCPS, GcpEntry.worst(summary.gcps), GcpEntry, GcpEntry.TERMINAL),
         table("datum", DATUM, datum, DatumEntry, DatumEntry.columns(datum)),
     ):
         if shown.rows:

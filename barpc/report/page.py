@@ -21,6 +21,7 @@ from barpc.report.compare import flat_options
 from barpc.report.records import Cell, Table, cell_of, table
 from barpc.report.summary import (
     DATUM,
+    GCPS,
     STATUS_WORDS,
     CheckPointEntry,
     DatumEntry,
@@ -275,8 +276,7 @@ def _gauge(files: RunFiles) -> Section | None:
         if scene.datum
         else []
     )
-    caption = "Ground control: what all the others say of a point minus its given place"
-    tables += [table("gcps", caption, gcps, GcpEntry, GcpEntry.PAGE)] if gcps else []
+    tables += [table("gcps", GCPS, gcps, GcpEntry, GcpEntry.PAGE)] if gcps else []
     return Section("gauge", "What can the images not tell?", answer, bars=bars, tables=tables, half=True)
 
 

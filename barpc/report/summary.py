@@ -17,10 +17,10 @@ import numpy as np
 from barpc import __version__
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.gauge import MOTIONS, Mode
-from barpc.geodesy import Array, ecef_from_ground
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report.records import Cell, Column, Number, Record, plain, said, value_of
 from barpc.report.run import PairTies, Run
-from barpc.scene import IntArray
+from barpc.scene import GroundPoints, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import (
@@ -35,6 +35,7 @@ from barpc.tie.epipolar import robust_spread
 
 SCHEMA = 2  # Version of summary.json
 MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken
+MAX_GCPS = 20  # GCPs that the terminal shows; summary and page have all
 CELLS = 8  # Cells of an image from left to right and from top to bottom
 
 STATUS_WORDS = {
@@ -64,6 +65,7 @@ _DATUM_HEADS = {
     "gcps": "GCPs",
     "heights": "heights",
 }
+GCPS = "Ground control: what all the others say of a point minus its given place"
 DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
 
 Count = Annotated[int, {"minimum": 0}]
@@ -414,7 +416,8 @@ class GcpEntry(KnownPoint):
     """A ground control point."""
 
     OWN: ClassVar = {"GCP": Column("GCP", lambda point: point.name)}
-    PAGE: ClassVar = "GCP status residual_enu_m w sigma_m"
+    PAGE: ClassVar = "GCP status residual_enu_m residual_px w sigma_m"
+    TERMINAL: ClassVar = "GCP status residual_enu_m residual_px w"
 
     sigma_m: tuple[float, float, float] = said("Stated", "m", "sigma east, north, up", ".2g")
     residual_enu_m: Vector = said(
@@ -434,6 +437,15 @@ class GcpEntry(KnownPoint):
         "Largest component of the residual over its standard deviation", "", "w", ".1f", default=None
     )
     redundancy: Number = said("How far the others can tell, 0 to 1", default=None)
+    residual_px: Number = said(
+        "The residual in the images that show it, RMS", "px", "in images", ".2f", default=None
+    )
+
+    @classmethod
+    def worst(cls, points: Sequence[GcpEntry]) -> list[GcpEntry]:
+        """At most `MAX_GCPS` points, in their order: those that are not used, and of the others the largest w."""
+        order = sorted(points, key=lambda point: (point.used, -(point.w or 0.0)))[:MAX_GCPS]
+        return [point for point in points if any(point is one for one in order)]
 
 
 class SeenEntry(Record):
@@ -793,9 +805,22 @@ def _gcps(run: Run) -> tuple[GcpEntry, ...]:
                 images=images,
                 w=None if tested is None else tested.w[g],
                 redundancy=None if tested is None else tested.redundancy[g],
+                residual_px=_in_images(run, points, g, left[g]),
             )
         )
     return tuple(entries)
+
+
+def _in_images(run: Run, points: GroundPoints, g: int, residual: Array) -> float:
+    """How far a residual (3,), east, north, up [m], of a ground point moves it in the images that show it, RMS [px]."""
+    if run.after is None or not np.isfinite(residual).all():
+        return float("nan")
+    given = points.lonlatalt[g]
+    moved = ground_from_ecef(ecef_from_ground(given) + residual @ enu_basis(given))
+    moves = [
+        run.after[v].project(moved) - run.after[v].project(given) for v in points.view[points.point == g]
+    ]
+    return float(np.sqrt(np.mean(np.square(moves).sum(axis=1)))) if moves else float("nan")
 
 
 def _check_points(run: Run) -> tuple[CheckPointEntry, ...]:

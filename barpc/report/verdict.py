@@ -165,7 +165,9 @@ def _place_is_free(run: Run) -> bool:
     """Whether nothing but the cameras' priors holds the scene's place: control moves it as far as it must."""
     given = [getattr(run.options, name, None) for name in ("dem", "fixed_run")]
     assert run.adjustment is not None
-    return run.gcps is None and not run.adjustment.options.fixed and not any(given)
+    tested = run.adjustment.control
+    held = tested is not None and bool(tested.used.any())
+    return not held and not run.adjustment.options.fixed and not any(given)
 
 
 def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from barpc.ba.snooping import CRITICAL
 from barpc.geodesy import ecef_from_ground, enu_basis, metres_per_unit
 from barpc.options import RunOptions
 from barpc.report import Run, summarize
+from barpc.report.summary import GcpEntry
 from barpc.scene import GroundPoints
 from barpc.sensor.geometry import sight_enu, triangulate
 from benchmarks.referee import cases, judge, make
@@ -163,3 +164,23 @@ def test_points_in_one_image_are_tested_across_its_line_of_sight(seed):
     tested, summary = said(scene, replace(one, lonlatalt=moved))
     assert np.flatnonzero(~tested.used).tolist() == [wrong]
     assert not summary.passed
+
+
+def test_the_summary_has_every_point_with_its_residual_in_the_images():
+    scene = scene_of(6, 1)
+    gcps = blundered(scene.gcps, {1: 30.0}, 1)
+    tested, summary = said(scene, gcps)
+    found = summary.gcps[1]
+    assert (found.used, found.status) == (False, "rejected")
+    assert [one.used for one in summary.gcps] == tested.used.tolist()
+    offset = np.array(found.residual_enu_m)
+    rays = [sight_enu(view.sensor, gcps.lonlatalt[1]) for view in scene.views if view.name in found.images]
+    across = [np.linalg.norm(offset - offset @ ray * ray) for ray in rays]
+    assert found.residual_px == pytest.approx(
+        np.sqrt(np.mean(np.square(across))) / 0.5, rel=0.1
+    )  # pixels of 0.5 m
+    many = [replace(one, used=n != 40, w=float(n)) for n in range(60) for one in summary.gcps[:1]]
+    shown = GcpEntry.worst(many)
+    assert [int(one.w) for one in shown] == [*range(40, 60)]
+    odd = GcpEntry.worst([replace(one, used=one.w != 3) for one in many])
+    assert [int(one.w) for one in odd] == [3, *range(41, 60)]

@@ -167,11 +167,13 @@ def _height(found: AdjustResult) -> float:
 def dem(run: Run, out: Path, scene: Path) -> None:
     tight = AdjustOptions(dem_for_all=True, dem_sigma=0.01, dem_bias_sigma=0.01)
     geoid = str(scene / "dem/g.gtx")
-    free = run("a", adjust=tight)
+    free = run("a", adjust=AdjustOptions())
     held = run("b", adjust=tight, dem=str(scene / "dem/a.tif"), geoid=geoid)
     assert abs(_height(held) - 340.0) < 0.2 * abs(_height(free) - 340.0)
     with pytest.raises(InputError):
         run("c", dem=str(out / "nowhere.tif"))
+    with pytest.raises(InputError, match="dem_for_all is given without dem"):
+        run("d", adjust=tight)
 
 
 @pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
