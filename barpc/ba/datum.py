@@ -45,24 +45,16 @@ def datum_shares(
     variance = np.einsum("mn,nm->m", by_unknown, moves)
     with np.errstate(divide="ignore", invalid="ignore"):
         unknowns = (moves / np.sqrt(variance)).reshape(problem.structure.num_views, -1, len(variance))
-    reduced = _at_rest(covariance.reduced)
-    points = np.stack([reduced.point_step(unknowns[..., m]) for m in range(len(variance))], axis=-1)
     paid = dict(zip(SOURCES, np.zeros((len(SOURCES), len(variance))), strict=True))
     paid["cameras"] += np.einsum("nqm->m", (problem.camera_prior.jacobian()[..., None] * unknowns) ** 2)
     if (joint := problem.joint_prior) is not None:
         flat = unknowns.reshape(-1, len(variance))[joint.index]
         paid["earlier_run"] += ((joint.jacobian() @ flat) ** 2).sum(axis=0)
-    held = np.zeros(len(is_gcp), dtype=bool)
-    if (prior := problem.point_prior) is not None:
-        held[prior.index] = is_gcp[prior.index]
-        shared = np.zeros((prior.common.shape[2], len(variance)))
-        if reduced.common is not None:
-            flat = unknowns.reshape(-1, len(variance))
-            shared = np.stack([reduced.common.step(flat[:, m]) for m in range(len(variance))], axis=-1)
-        left = prior.rows @ points[prior.index] - prior.common @ shared
-        paid["gcps"] += (left[is_gcp[prior.index]] ** 2).sum(axis=(0, 1))
-        paid["heights"] += (left[~is_gcp[prior.index]] ** 2).sum(axis=(0, 1)) + (shared**2).sum(axis=0)
-    _observations(paid, problem, state, weight, unknowns, points, held)
+    if problem.point_prior is not None or not problem.free.all():
+        reduced = _at_rest(covariance.reduced)
+        points = np.stack([reduced.point_step(unknowns[..., m]) for m in range(len(variance))], axis=-1)
+        held = _known_points(paid, problem, reduced, unknowns, points, is_gcp)
+        _observations(paid, problem, state, weight, unknowns, points, held)
     with np.errstate(invalid="ignore"):
         return {source: cost / sum(paid.values()) for source, cost in paid.items()}
 
@@ -75,6 +67,30 @@ def _at_rest(reduced: Reduced) -> Reduced:
     return replace(reduced, half=np.zeros_like(reduced.half), common=common)
 
 
+def _known_points(
+    paid: Mapping[str, Array],
+    problem: Problem,
+    reduced: Reduced,
+    unknowns: Array,
+    points: Array,
+    is_gcp: BoolArray,
+) -> BoolArray:
+    """Add what the places of GCPs and heights pay; the GCPs (P,) that are held."""
+    held = np.zeros(len(is_gcp), dtype=bool)
+    prior, count = problem.point_prior, unknowns.shape[2]
+    if prior is None:
+        return held
+    held[prior.index] = is_gcp[prior.index]
+    shared = np.zeros((prior.common.shape[2], count))
+    if reduced.common is not None:
+        flat = unknowns.reshape(-1, count)
+        shared = np.stack([reduced.common.step(flat[:, m]) for m in range(count)], axis=-1)
+    left = ((prior.rows @ points[prior.index] - prior.common @ shared) ** 2).sum(axis=1)
+    paid["gcps"][:] += left[is_gcp[prior.index]].sum(axis=0)
+    paid["heights"][:] += left[~is_gcp[prior.index]].sum(axis=0) + (shared**2).sum(axis=0)
+    return held
+
+
 def _observations(
     paid: Mapping[str, Array],
     problem: Problem,
@@ -85,8 +101,11 @@ def _observations(
     held: BoolArray,
 ) -> None:
     """Add what the observations of GCPs pay, and those of tie points in fixed views."""
-    structure, projected = problem.structure, problem.linearise(state.params, state.points)
+    structure = problem.structure
     is_free = problem.free[:: len(problem.free) // structure.num_views]  # views are free or fixed as a whole
+    if is_free.all() and not held.any():
+        return
+    projected = problem.linearise(state.params, state.points)
     for v, part in enumerate(map(slice, structure.bounds[:-1], structure.bounds[1:])):
         at = structure.point[part]
         change = np.einsum("cqk,qm->ckm", projected.by_unknown[..., part], unknowns[v])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.options import RunOptions
+from barpc.options import RunOptions, TieOptions
 from barpc.pipeline.control import load_gcps
 from barpc.scene import GroundPoints, View
 from barpc.sensor.corrected import Corrected, Correction
@@ -228,3 +228,43 @@ def test_of_a_file_of_one_image_no_image_is_asked(tmp_path):
     found = load_gcps([str(path)], VIEWS[:1], RunOptions())
     assert found is not None
     np.testing.assert_array_equal(found.xy, one.xy)
+
+
+@pytest.mark.parametrize(("beyond", "passes"), [(400.0, True), (600.0, False)])
+@pytest.mark.parametrize("end", [0, 1])
+def test_altitudes_may_leave_those_of_the_camera_by_half_a_kilometre(tmp_path, end, beyond, passes):
+    alt = VIEWS[0].alt_range[end] + (beyond if end else -beyond)
+    text = asp(moved([0], lambda lon, lat, _: (lon, lat, alt)))
+    if passes:
+        assert load(tmp_path / "p.gcp", text).names == POINTS.names
+    else:
+        with pytest.raises(InputError, match="point gcp_000: altitudes far outside"):
+            load(tmp_path / "p.gcp", text)
+
+
+@pytest.mark.parametrize(
+    ("metres", "search", "passes"), [(700.0, 700.0, True), (1500.0, 700.0, False), (1500.0, 6e3, True)]
+)
+def test_how_far_a_camera_may_be_wrong_is_a_kilometre_or_what_is_searched(tmp_path, metres, search, passes):
+    text = asp(moved([2], lambda lon, lat, alt: (lon, lat + metres / 111e3, alt)))
+    if passes:
+        assert load(tmp_path / "p.gcp", text, tie=TieOptions(search=search)).left_out == ()
+    else:
+        with pytest.raises(InputError, match="point gcp_002: as far as"):
+            load(tmp_path / "p.gcp", text, tie=TieOptions(search=search))
+
+
+def test_several_files_are_one_and_each_is_left_out_alone(tmp_path):
+    for name, text in (("a.gcp", asp(POINTS)), ("b.csv", "nothing\n"), ("c.csv", TEXTS["a.csv"])):
+        (tmp_path / name).write_text(text)
+    paths = [str(tmp_path / name) for name in ("a.gcp", "b.csv", "c.csv")]
+    with pytest.raises(InputError, match=r"b\.csv"):
+        load_gcps(paths, VIEWS, RunOptions())
+    found = load_gcps(paths, VIEWS, RunOptions(keep_going=True))
+    assert found is not None
+    assert found.names == POINTS.names * 2
+    assert len(found.left_out) == 1
+    assert "b.csv" in found.left_out[0]
+    np.testing.assert_array_equal(
+        found.lonlatalt[found.point], np.tile(POINTS.lonlatalt, (2, 1))[found.point]
+    )
