@@ -305,9 +305,10 @@ def _header(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = No
     names = {**_COLUMNS, "sigma": ("sigma", "sigma_px")} if names is None else names
     hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
     found = {key: places[0] for key, places in hits.items() if places}
-    left = [pair for pair in _EITHER if not set(pair) & set(found)]
-    if len(left) == 1 and {"x", "y"} <= set(lower):
-        found |= dict(zip(left[0], (lower.index("x"), lower.index("y")), strict=True))
+    left = [pair for pair in _EITHER if not set(pair) <= set(found)]
+    if len(left) == 1:
+        either = {key: lower.index(word) for key, word in zip(left[0], "xy", strict=True) if word in lower}
+        found = {**either, **found}
     return found
 
 
