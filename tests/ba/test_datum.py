@@ -132,3 +132,11 @@ def test_what_a_terrain_did_is_said(options, dem, says):
         assert summary.scene.dem.num_known == summary.scene.dem.num_tracks
         assert summary.scene.dem.offset_m == pytest.approx(found.terrain.offset)
         assert abs(summary.scene.dem.offset_m) < 60.0
+
+
+def test_the_scene_lies_above_a_terrain_that_is_too_low():
+    low, high = (
+        solved(dem=lambda lon, lat, alt=alt: np.full(len(lon), alt)).terrain for alt in (130.0, 230.0)
+    )
+    assert low.offset == pytest.approx(high.offset + 100.0)
+    assert low.spread == pytest.approx(high.spread)

@@ -11,6 +11,7 @@ import pytest
 from barpc.errors import InputError
 from barpc.options import RunOptions, TieOptions
 from barpc.pipeline.control import load_gcps
+from barpc.pointio.ground import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.scene import GroundPoints, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.simulate import simulate_block
@@ -120,6 +121,23 @@ def test_without_names_points_are_told_apart_by_their_places(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("columns", "cells", "ground", "image"),
+    [
+        ("sigma_xy,sigma_z", "0.3,0.9", (0.3, 0.3, 0.9), IMAGE_SIGMA),
+        ("sigma,sigma_z", "0.3,0.9", (0.3, 0.3, 0.9), IMAGE_SIGMA),
+        ("accuracy,sigma_row,scol", "0.3,0.2,0.7", (0.3, 0.3, 0.3), 0.7),
+        ("sigma_east,sigma_px", "0.3,", (0.3, GROUND_SIGMA, GROUND_SIGMA), IMAGE_SIGMA),
+    ],
+)
+def test_sigmas_may_be_stated_together(tmp_path, columns, cells, ground, image):
+    lines = table(POINTS, "id,lon,lat,h,image,col,row").splitlines()
+    text = "\n".join([f"{lines[0]},{columns}", *(f"{line},{cells}" for line in lines[1:])])
+    found = load(tmp_path / "a.csv", text)
+    np.testing.assert_array_equal(found.sigma, np.tile(ground, (6, 1)))
+    np.testing.assert_array_equal(found.xy_sigma, np.full(len(POINTS.view), image))
+
+
+@pytest.mark.parametrize(
     ("head", "says"),
     [
         ("id,lon,lat,image,col,row", "no column alt"),
@@ -150,6 +168,7 @@ FAULTS = {
     "a sign": ([4], lambda lon, lat, alt: (-lon, lat, alt), "point gcp_004: the sign of a longitude"),
     "another place": ([1], lambda lon, lat, alt: (lon, lat + 0.02, alt), "point gcp_001: as far as 2 km"),
     "too high": ([3], lambda lon, lat, alt: (lon, lat, alt + 3000.0), "point gcp_003: altitudes far outside"),
+    "in space": ([3], lambda lon, lat, alt: (lon, lat, alt + 3e6), "point gcp_003: altitudes far outside"),
     "too low": ([5], lambda lon, lat, alt: (lon, lat, alt - 3000.0), "point gcp_005: altitudes far outside"),
 }  # fmt: skip
 
@@ -243,7 +262,8 @@ def test_altitudes_may_leave_those_of_the_camera_by_half_a_kilometre(tmp_path, e
 
 
 @pytest.mark.parametrize(
-    ("metres", "search", "passes"), [(700.0, 700.0, True), (1500.0, 700.0, False), (1500.0, 6e3, True)]
+    ("metres", "search", "passes"),
+    [(700.0, 700.0, True), (1500.0, 700.0, False), (1500.0, 6e3, True), (2500.0, 4e3, False)],
 )
 def test_how_far_a_camera_may_be_wrong_is_a_kilometre_or_what_is_searched(tmp_path, metres, search, passes):
     text = asp(moved([2], lambda lon, lat, alt: (lon, lat + metres / 111e3, alt)))
