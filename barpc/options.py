@@ -313,11 +313,14 @@ class AdjustOptions(Options):
 class FitOptions(Options):
     """How an RPC is fitted to a sensor model or to points."""
 
-    method: Literal["auto", "ridge", "lcurve", "lcurve-joint", "vendor-denominators"] = option(
-        "auto",
-        """`ridge`: QR compression and a noise-scaled ridge. `lcurve`: the paper's solver; `lcurve-joint` with one h
-        for col and row (78 unknowns) instead of one each (39 + 39). `vendor-denominators`: numerators only. `auto`:
-        `ridge`, and another one where the certificate says that it is better.""",
+    method: Literal["auto", "ridge", "gauss-newton", "lcurve", "lcurve-joint", "vendor-denominators"] = (
+        option(
+            "auto",
+            """`ridge`: QR compression and a noise-scaled ridge. `lcurve`: the paper's solver; `lcurve-joint` with one h
+        for col and row (78 unknowns) instead of one each (39 + 39). `gauss-newton`: the least squares of the error
+        itself, for models without noise. `vendor-denominators`: numerators only. `auto`: `ridge`, and another one
+        where the certificate says that it is better.""",
+        )
     )
     grid: tuple[int, int, int] = option(
         (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4

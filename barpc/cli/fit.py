@@ -136,6 +136,7 @@ def _certificate(fit: RpcFit, verdict: str) -> str:
         f"points        {fit.num_cnp} control, {fit.num_ckp} check, {fit.coverage:.0%} of the image covered",
         "              col [px]     row [px]",
         *(f"{name:14s}{col:<13.3g}{row:.3g}" for name, (col, row) in rows.items()),
+        f"beyond        {fit.beyond:.2%} of the image may miss by more, at most (95 % confidence)",
         f"denominators  at least {fit.min_denominator:.3g} over the box and 25 % around it",
         f"round trip    {fit.roundtrip:.1g} px",
         f"verdict       {verdict or 'within tolerance'}",

@@ -19,7 +19,7 @@ from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.terminal import as_json, echo
 from barpc.errors import RpcError
-from barpc.fit.rpc import smallest_denominator
+from barpc.fit.certificate import smallest_denominator
 from barpc.geojson import collection, feature, polygon
 from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC

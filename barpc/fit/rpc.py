@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
+from barpc.fit.certificate import Errors, Sample, coverage, roundtrip, smallest_denominator
 from barpc.fit.points import control_points, extent, numbers, screened, widened
 from barpc.fit.solve import Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
-from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
-_CHUNK = 8192  # points, check points too, worked on at a time, about
+_CHUNK = 8192
 _LOOPS = 4096  # round trips that a table of points is tried on, about
-_BEYOND = 1.25  # the box and 25 %
+_MISSING = 0.1  # part of the image without a ground point, at most
+_CELLS = 72  # of ``gauss-newton``, along each side of the image
+_EXACT = 1e-6  # px: what no other method is tried on
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +37,13 @@ class RpcFit:
     rmse_cnp, max_cnp : (2,)
         Root mean square and largest error of col, row on the control points [px].
     rmse_ckp, max_ckp : (2,)
-        The same on the check points, which the fit has not seen [px].
+        The same on check points all over image and altitudes, which the fit has not seen [px]; the largest error was
+        also looked for around the worst of them.
+    beyond : float
+        Part of the image and the altitudes that may miss by more than `max_ckp`: no more, with 95 % confidence.
     min_denominator : float
-        Smallest denominator over the ground box and 25 % around it, over that at its centre; near or below 0: a pole.
+        Lower bound of the denominators over the ground box and 25 % around it, over what they are at its centre; above
+        0 there is no pole.
     roundtrip : float
         Largest distance of a check point from where its projection is localised [px]; infinite where that fails.
     coverage : float
@@ -57,6 +63,7 @@ class RpcFit:
     max_cnp: Array
     rmse_ckp: Array
     max_ckp: Array
+    beyond: float
     min_denominator: float
     roundtrip: float
     coverage: float
@@ -85,77 +92,6 @@ class RpcFit:
         if not self.roundtrip <= max(tolerance, 1e-6):
             return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
         return ""
-
-
-@dataclass
-class Errors:
-    """Running root mean square and largest error of (N, 2) residuals [px]."""
-
-    count: int = 0
-    squares: Array = field(default_factory=lambda: np.zeros(2))
-    largest: Array = field(default_factory=lambda: np.zeros(2))
-
-    def add(self, residual: Array) -> None:
-        """Take in residuals (N, 2); one that is NaN makes the result NaN."""
-        if len(residual):
-            self.count += len(residual)
-            self.squares = self.squares + np.einsum("ij,ij->j", residual, residual)
-            self.largest = np.maximum(self.largest, np.abs(residual.T).max(axis=1))
-
-    @property
-    def rmse(self) -> Array:
-        """Root mean square (2,) [px]."""
-        return np.asarray(np.sqrt(self.squares / self.count)) if self.count else np.full(2, np.nan)
-
-
-def check_points(ground: Array) -> Iterator[Array]:
-    """Middles (M, 3) of consecutive control points (n_x, n_y, n_alt, 3), the finite ones, some thousands at a time.
-
-    Strictly inside the box, and never used by the fit.
-    """
-    step = max(1, _CHUNK // max(1, (ground.shape[1] - 1) * (ground.shape[2] - 1)))
-    for start in range(0, ground.shape[0] - 1, step):
-        middle = ground[start : start + step + 1]
-        for axis in range(3):
-            head = middle[(slice(None),) * axis + (slice(None, -1),)]
-            tail = middle[(slice(None),) * axis + (slice(1, None),)]
-            middle = 0.5 * (head + tail)
-        flat = middle.reshape(-1, 3)
-        yield flat[np.isfinite(flat).all(axis=1)]
-
-
-def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
-    """Smallest denominator over a box `low`, `high` (3,) [deg, deg, m] and 25 % around it, over that at its centre."""
-    corner = rpc.normalize(np.stack([low, high]))
-    middle, half = corner.mean(axis=1), 0.5 * np.abs(corner[:, 1] - corner[:, 0])
-    t = np.linspace(-_BEYOND, _BEYOND, 11)
-    lattice = np.stack(np.meshgrid(t, t, t, indexing="ij")).reshape(3, -1)
-    value = rpc.coeffs[1::2] @ monomials(middle[:, None] + half[:, None] * lattice)
-    center = value[:, [lattice.shape[1] // 2]]
-    return float((value / center).min())
-
-
-def roundtrip(rpc: RPC, ground: Array) -> float:
-    """Largest distance [px] between ground points (N, 3) and where their projections are localised."""
-    image, jacobian = rpc.project_jacobian(ground)
-    back = rpc.localize(image, ground[:, 2])
-    miss = back - ground
-    miss[:, 0] = wrap_longitude(miss[:, 0])
-    distance = np.abs(np.einsum("nij,nj->ni", jacobian, miss))
-    return float(distance.max(initial=0.0)) if np.isfinite(distance).all() else float("inf")
-
-
-def coverage(image: Array, low: Array, high: Array) -> float:
-    """Share of the rectangle `low`, `high` (2,) [px] inside the convex hull of image points (N, 2) [px]."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
-    direction = np.column_stack([np.cos(angle), np.sin(angle)])  # outside is beyond all in one direction
-    reach = np.full(len(angle), -np.inf)
-    for start in range(0, len(image), _CHUNK):
-        part = (image[start : start + _CHUNK] - low) / (high - low)
-        reach = np.maximum(reach, (direction @ part.T).max(axis=1))
-    t = (np.arange(20) + 0.5) / 20
-    cells = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
-    return float((cells @ direction.T <= reach + 1e-9).all(axis=1).mean())
 
 
 def fit_rpc(
@@ -191,34 +127,37 @@ def fit_rpc(
     BarpcWarning
         A few control points have no ground point.
     """
-    options = options or FitOptions()
-    ground, image = control_points(model, size, widened(alt_range), options)
-    cnp, cnp_image = _found(ground.reshape(-1, 3), image.reshape(-1, 2), alt_range)
+    options, alt_range = options or FitOptions(), widened(alt_range)
+    sample = Sample.of(model, size, alt_range)
+    if sample.missing > _MISSING:
+        raise FitError(
+            f"the model has no ground point for {sample.missing:.0%} of the image over altitudes "
+            f"{alt_range[0]:g} to {alt_range[1]:g} m: give an altitude range that it is made for"
+        )
+    if sample.missing > 0:
+        message = f"{sample.missing:.1%} of the image has no ground point and is left out: the RPC extrapolates there"
+        warnings.warn(message, BarpcWarning, stacklevel=2)
     vendor = underlying_rpc(model)
 
     def attempt(method: str) -> RpcFit:
-        solution = solve(cnp, cnp_image, options, method, vendor=vendor)
-        residuals = (solution.rpc.project(middle) - model.project(middle) for middle in check_points(ground))
-        loop = max((roundtrip(solution.rpc, middle) for middle in check_points(ground)), default=0.0)
-        return _certified(solution, residuals, loop, size)
-
-    return _first_accepted(attempt, options, vendor, strict)
-
-
-def _found(cnp: Array, image: Array, alt_range: tuple[float, float]) -> tuple[Array, Array]:
-    """The control points (N, 3) and (N, 2) at which the model was localised."""
-    ok = np.isfinite(cnp).all(axis=1) & np.isfinite(image).all(axis=1)
-    if ok.mean() < 0.9:
-        raise FitError(
-            f"the model has no ground point for {1 - ok.mean():.0%} of the image over altitudes "
-            f"{alt_range[0]:g} to {alt_range[1]:g} m: give an altitude range that it is made for"
+        if (
+            method == "gauss-newton"
+        ):  # what an RPC cannot follow may have any frequency: scattered points alias none
+            given = Sample.of(model, size, alt_range, _CELLS, seed=1)
+            ground, image = given.ground, given.points[:, :2]
+        else:
+            ground, image = (
+                part.reshape(-1, part.shape[-1]) for part in control_points(model, size, alt_range, options)
+            )
+            known = np.isfinite(ground).all(axis=1) & np.isfinite(image).all(axis=1)
+            ground, image = ground[known], image[known]
+        ground[:, 0] = wrap_longitude(ground[:, 0], ground[0, 0])
+        solution = solve(ground, image, options, method, vendor=vendor)
+        return _certified(
+            solution, *sample.errors(solution.rpc), roundtrip(solution.rpc, sample.ground), size
         )
-    if ok.all():
-        return cnp, image
-    count = f"{np.count_nonzero(~ok)} of {ok.size} control points"
-    message = f"{count} have no ground point and are left out: the RPC extrapolates there"
-    warnings.warn(message, BarpcWarning, stacklevel=3)
-    return cnp[ok], image[ok]
+
+    return _best(attempt, options, vendor, strict, exact=True)
 
 
 def fit_rpc_points(
@@ -265,11 +204,18 @@ def fit_rpc_points(
 
     def attempt(method: str) -> RpcFit:
         solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
-        left = None if held_out is None else [solution.rpc.project(held_out[0]) - held_out[1]]
+        left = (
+            solution.leave_one_out()
+            if held_out is None
+            else [solution.rpc.project(held_out[0]) - held_out[1]]
+        )
+        errors = Errors()
+        for residual in left:
+            errors.add(residual)
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // _LOOPS)])
-        return _certified(solution, left or solution.leave_one_out(), loop, size)
+        return _certified(solution, errors, errors.largest, loop, size)
 
-    return _first_accepted(attempt, options, vendor, strict)
+    return _best(attempt, options, vendor, strict, exact=False)
 
 
 def underlying_rpc(model: object) -> RPC | None:
@@ -290,51 +236,56 @@ def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
 
 
 def _certified(
-    solution: Solution, residuals: Iterable[Array], loop: float, size: tuple[int, int] | None
+    solution: Solution, seen: Errors, largest: Array, loop: float, size: tuple[int, int] | None
 ) -> RpcFit:
-    """The fit with its certificate; `residuals` (n, 2) [px] of the check points come some at a time."""
+    """The fit with its certificate: errors on the check points, the largest (2,) [px] found near them."""
     problem, rpc = solution.problem, solution.rpc
     ground, image = problem.ground, problem.image
-    on_cnp, on_ckp = Errors(), Errors()
-    for residual in residuals:
-        on_ckp.add(residual)
+    used = Errors()
     for start in range(0, len(ground), _CHUNK):
         part = slice(start, start + _CHUNK)
-        on_cnp.add(rpc.project(ground[part]) - image[part])
+        used.add(rpc.project(ground[part]) - image[part])
     (low, high), (left, right) = extent(ground), extent(image)
     if size is not None:
         left, right = np.full(2, -0.5), np.asarray(size) - 0.5
     return RpcFit(
         rpc=rpc,
-        rmse_cnp=on_cnp.rmse,
-        max_cnp=on_cnp.largest,
-        rmse_ckp=on_ckp.rmse,
-        max_ckp=on_ckp.largest,
+        rmse_cnp=used.rmse,
+        max_cnp=used.largest,
+        rmse_ckp=seen.rmse,
+        max_ckp=largest,
+        beyond=1.0 - 0.05 ** (1.0 / max(seen.count, 1)),
         min_denominator=smallest_denominator(rpc, low, high),
         roundtrip=loop,
         coverage=coverage(image, left, right),
         h=solution.h,
         iterations=solution.iterations,
-        num_cnp=on_cnp.count,
-        num_ckp=on_ckp.count,
+        num_cnp=used.count,
+        num_ckp=seen.count,
         method=solution.method,
     )
 
 
-def _first_accepted(
-    attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool
+def _best(
+    attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool, exact: bool
 ) -> RpcFit:
-    """The fit by the method asked for, with ``auto`` the first accepted; without one the best, or a FitError on it."""
-    methods = [str(options.method)]
+    """The fit by the method asked for, with ``auto`` the best accepted; without one the best, or a FitError on it.
+
+    Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
+    """
+    fits = [attempt("ridge" if options.method == "auto" else str(options.method))]
     if options.method == "auto":
-        methods = ["ridge", "lcurve"] + (["vendor-denominators"] if vendor is not None else [])
-    fits = []
-    for method in methods:
-        fit = attempt(method)
-        if not fit.verdict(options.tolerance):
-            return fit
-        fits.append(fit)
-    best = min(fits, key=lambda fit: (not fit.min_denominator > 0, float(fit.max_ckp.max())))
-    if strict:
-        raise FitError(best.verdict(options.tolerance))
-    return best
+        if exact and not float(fits[0].max_ckp.max()) <= _EXACT:
+            fits.append(attempt("gauss-newton"))
+        others = ["lcurve"] + (["vendor-denominators"] if vendor is not None else [])
+        while others and all(fit.verdict(options.tolerance) for fit in fits):
+            fits.append(attempt(others.pop(0)))
+    wrong = [fit.verdict(options.tolerance) for fit in fits]
+    rank = [
+        (bool(said), not fit.min_denominator > 0, float(np.linalg.norm(fit.rmse_ckp)))
+        for said, fit in zip(wrong, fits, strict=True)
+    ]
+    best = rank.index(min(rank))
+    if strict and wrong[best]:
+        raise FitError(wrong[best])
+    return fits[best]

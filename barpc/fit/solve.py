@@ -11,6 +11,10 @@ factor of (M | y), made chunk by chunk: no condition number is squared, whatever
 with noise sigma in y and a coefficient expected within +- t, the penalty is (sigma / t)^2 x^2. Exact points have no
 noise, hence no penalty; noisy points cannot drive a denominator to zero. sigma is read off the compressed system.
 
+``gauss-newton``: the least squares of y - a / b itself, not of b y - a, from the ridge on: the same rows with what the
+coefficients now give in place of y, and damped towards them. No penalty: for models without noise, whose misfit a ridge
+takes for noise. Steps that bring a denominator near zero over the points are not taken.
+
 ``lcurve``, the paper's solver (Akiki et al. 2021, section 3): one h from the corner of the L-curve, then weighted and
 ICCV iterations. All unknowns are penalised alike, as in the paper; its singular value decompositions are taken of
 the compressed system, which has the same singular values.
@@ -28,6 +32,7 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dtpqrt
 
 from barpc.errors import FitError
+from barpc.fit.certificate import BEYOND, least_value
 from barpc.fit.points import extent
 from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
 from barpc.geodesy import Array, wrap_longitude
@@ -59,6 +64,10 @@ MAX_PASSES = 20
 TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _SAMPLES = 200  # of the L-curve
+_LEAST_DAMPED, _FIRST_DAMPED, _MOST_DAMPED = 1e-12, 1e-6, 1e3  # of the size of a column
+_AROUND = np.full((3, 2), [-BEYOND, BEYOND])
+_MARGIN = 0.1  # of what a denominator is at the centre
+_GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
 
@@ -132,11 +141,16 @@ class Problem:
         return replace(self, first=first) if adds.all() else replace(self, active=self.active[adds])
 
     def rows(
-        self, axis: int, denominator: Array | None = None, free: bool = True
+        self,
+        axis: int,
+        denominator: Array | None = None,
+        free: bool = True,
+        numerator: Array | None = None,
     ) -> Iterator[tuple[slice, Array]]:
         """Rows (n, k + 1) of (M | y) of col (`axis` 0) or row (1), some hundred points at a time.
 
-        A denominator (20,) weights the rows by 1 / b; its coefficients are unknowns too where `free`.
+        A denominator (20,) weights the rows by 1 / b; its coefficients are unknowns too where `free`. With a numerator,
+        too, they are those of the linearised a / b.
         """
         m, norm = len(self.active), self.norm
         k = 2 * m - 1 if free else m
@@ -147,10 +161,15 @@ class Problem:
             basis = monomials((lonlatalt - norm.ground_offset[:, None]) / norm.ground_scale[:, None])
             y = (self.image[part, axis] - norm.image_offset[axis]) / norm.image_scale[axis]
             used = basis if m == len(basis) else basis[self.active]
+            if numerator is not None and denominator is not None:
+                value, below = (numerator @ basis) / (denominator @ basis), denominator @ basis
+                y = below * (y - value) + value
+            else:
+                value = y
             block = np.empty((k + 1, len(y)))
             block[:m] = used
             if free:
-                np.multiply(used[1:], -y, out=block[m:k])
+                np.multiply(used[1:], -value, out=block[m:k])
             block[k] = y
             if denominator is not None:
                 block[: k + 1 if free else m] /= denominator @ basis
@@ -158,13 +177,19 @@ class Problem:
                 block *= self.weight[part]
             yield part, block.T
 
-    def compressed(self, axis: int, denominator: Array | None = None, free: bool = True) -> Compressed:
+    def compressed(
+        self,
+        axis: int,
+        denominator: Array | None = None,
+        free: bool = True,
+        numerator: Array | None = None,
+    ) -> Compressed:
         """The system of the rows of the same parameters."""
         if self.first is not None and axis == 0 and denominator is None and free:
             return self.first
         size = 2 * len(self.active) if free else len(self.active) + 1
         triangle: Array = np.zeros((size, size), order="F")
-        for _, rows in self.rows(axis, denominator, free):
+        for _, rows in self.rows(axis, denominator, free, numerator):
             triangle = _take_in(triangle, rows)
         return Compressed(np.triu(triangle), len(self.image))
 
@@ -400,6 +425,45 @@ def _ridge(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> F
     return _coefficients(problem, solved, quantize), solved, h, passes
 
 
+def _gauss_newton(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+    start, solved, _, passes = _ridge(problem, None, vendor)
+    parts = []
+    for axis in range(2):
+        numerator, denominator = start[2 * axis : 2 * axis + 2]
+        if not least_value(denominator, _AROUND) > _MARGIN:  # from a polynomial, then
+            denominator = np.eye(20)[0]
+            system = problem.compressed(axis, denominator, free=False)
+            numerator = problem.expanded(solution(system), denominator)[0]
+        x = np.concatenate([numerator[problem.active], denominator[problem.active[1:]]])
+        x, solved[axis], steps = _minimised(problem, axis, x)
+        parts.append(problem.expanded(x if quantize is None else solution(solved[axis], quantize)))
+        passes = max(passes, steps)
+    return np.concatenate(parts), solved, np.zeros(2), passes
+
+
+def _minimised(problem: Problem, axis: int, x: Array) -> tuple[Array, Compressed, int]:
+    """Least squares of y - a / b from unknowns x (k,), the system there, and the passes over the points."""
+    numerator, denominator = problem.expanded(x)
+    system, damping, passes = problem.compressed(axis, denominator, numerator=numerator), 0.0, 1
+    size = np.linalg.norm(system.matrix, axis=0)
+    while passes < MAX_PASSES and damping < _MOST_DAMPED:
+        penalty = max(damping, _LEAST_DAMPED) * size
+        ahead = solution(system.penalized(penalty, penalty * x))
+        numerator, denominator = problem.expanded(ahead)
+        before, after = system.squares(x), np.inf
+        if least_value(denominator, _AROUND) > _MARGIN:
+            passes += 1
+            following = problem.compressed(axis, denominator, numerator=numerator)
+            after = following.squares(ahead)
+        if after < before:
+            x, system, damping = ahead, following, 0.1 * damping if damping > _FIRST_DAMPED else 0.0
+            if before - after < _GAIN * before:
+                break
+        else:
+            damping = max(10.0 * damping, _FIRST_DAMPED)
+    return x, system, passes
+
+
 def _lcurve(problem: Problem, quantize: Rounding | None, vendor: RPC | None, joint: bool = False) -> Found:
     results = [solve_lcurve(problem, axes) for axes in ([[0, 1]] if joint else [[0], [1]])]
     parts, systems, sizes, passes = zip(*results, strict=True)
@@ -424,6 +488,7 @@ def _vendor_denominators(problem: Problem, quantize: Rounding | None, vendor: RP
 
 METHODS: dict[str, Callable[[Problem, Rounding | None, RPC | None], Found]] = {
     "ridge": _ridge,
+    "gauss-newton": _gauss_newton,
     "lcurve": _lcurve,
     "lcurve-joint": partial(_lcurve, joint=True),
     "vendor-denominators": _vendor_denominators,

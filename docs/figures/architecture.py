@@ -38,8 +38,8 @@ JOURNEYS = {
         ("fit/rpc.py", "fit_rpc", "any sensor model"),
         ("fit/points.py", "control_points", "-> a grid of ground and image points"),
         ("fit/solve.py", "solve", "-> coefficients, ridge first"),
-        ("fit/rpc.py", "check_points", "middles, never used by the fit"),
-        ("fit/rpc.py", "roundtrip", "-> the certificate"),
+        ("fit/certificate.py", "smallest_denominator", "-> no pole, by a bound"),
+        ("fit/certificate.py", "roundtrip", "-> the certificate, on points that the fit has not seen"),
     ),
 }
 INK, PAPER, LINE, SOFT = "#1d2a35", "#ffffff", "#2e86ab", "#e8f1f5"

@@ -13,7 +13,6 @@ from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.fit.points import control_points
 from barpc.fit.precision import PRECISIONS
-from barpc.fit.rpc import check_points
 from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.rpc import RPC
@@ -66,7 +65,7 @@ def test_the_certificate_holds_on_points_that_neither_grid_contains(camera: Came
     ground, image = random_points(camera, 5000, np.random.default_rng(1))
     error = fit.rpc.project(ground) - image
     assert miss(camera) >= 1.0
-    assert fit.max_ckp.max() <= 4e-8
+    assert fit.max_ckp.max() <= 5e-8  # edges and corners included; its own rounding of coordinates
     assert np.abs(error).max() <= 3 * fit.max_ckp.max()
     assert np.all(np.sqrt((error**2).mean(axis=0)) <= 3 * fit.rmse_ckp)
 
@@ -182,7 +181,7 @@ class Holed:
 
 
 def test_a_small_hole_is_said_and_a_large_one_refused(camera: Camera) -> None:
-    with pytest.warns(BarpcWarning, match="control points have no ground point"):
+    with pytest.warns(BarpcWarning, match=r"^0\.[12]% of the image has no ground point and is left out"):
         fit = fit_rpc(Holed(camera, 0.05), camera.size, camera.alt_range)
     assert fit.max_ckp.max() <= 1e-7
     assert fit.num_cnp < 12 * 12 * 7
@@ -191,17 +190,6 @@ def test_a_small_hole_is_said_and_a_large_one_refused(camera: Camera) -> None:
         fit_rpc(Holed(camera, 0.6), camera.size, camera.alt_range)
     with pytest.raises(FitError, match="nothing to fit over"):
         fit_rpc(camera.model, (0, 5), camera.alt_range)
-
-
-def test_check_points_lie_strictly_between_control_points(camera: Camera) -> None:
-    ground, image = control_points(camera.model, camera.size, camera.alt_range, FitOptions(grid=(9, 8, 7)))
-    middles = np.concatenate(list(check_points(ground)))
-    assert len(middles) == 8 * 7 * 6
-    seen = camera.model.project(middles)
-    assert seen.min() > -0.5
-    assert np.all(seen.max(axis=0) < np.array(camera.size) - 0.5)
-    assert camera.alt_range[0] < middles[:, 2].min() < middles[:, 2].max() < camera.alt_range[1]
-    assert np.array_equal(image[0, 0, :, 0], np.full(7, -0.5))
 
 
 def test_memory_does_not_grow_with_the_number_of_points(camera: Camera) -> None:

@@ -648,7 +648,10 @@ def test_an_rpc_of_three_swaths_reaches_two_thousandths_of_a_pixel(shared_data: 
         swath = quiet_model(annotation_path(shared_data, stamp))
         whole = replace(swath, size=(69300, 13450))
         fit = fit_rpc(
-            whole, whole.size, whole.alt_range, options=FitOptions(grid=(20, 20, 10), nodes="uniform")
+            whole,
+            whole.size,
+            whole.alt_range,
+            options=FitOptions(grid=(20, 20, 10), nodes="uniform", tolerance=0.02),  # in the corners
         )
         image, alt = scatter(whole, whole.alt_range, 5000)
         error = fit.rpc.project(whole.localize(image, alt)) - image

@@ -1,0 +1,189 @@
+"""What an RPC is worth over a whole image: points that the fit has not seen, poles, round trips.
+
+The points are drawn one a cell of the image and at an altitude of its own each, with more along its edges; where the
+error is largest more are drawn around the worst, closer and closer. Poles are excluded by a bound and not by samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import comb
+
+import numpy as np
+import numpy.typing as npt
+
+from barpc.geodesy import Array, wrap_longitude
+from barpc.sensor import SensorModel
+from barpc.sensor.rational import MONOMIALS
+from barpc.sensor.rpc import RPC
+
+BoolArray = npt.NDArray[np.bool_]
+
+CELLS = 45
+"""Along each side of the image: 2025 points of the whole."""
+BEYOND = 1.25  # the box and 25 %: where denominators are looked at
+_EDGE = 12  # points along each edge of the image, at either end of the altitudes
+_WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, how often
+_NEARER = 0.5  # each time
+_PIECES = 8  # of a side of the box in the bound of a denominator
+_CHUNK = 8192
+_BERNSTEIN = np.array([[comb(i, k) / comb(3, k) for k in range(4)] for i in range(4)])
+
+
+@dataclass
+class Errors:
+    """Running root mean square and largest error of (N, 2) residuals [px]."""
+
+    count: int = 0
+    squares: Array = field(default_factory=lambda: np.zeros(2))
+    largest: Array = field(default_factory=lambda: np.zeros(2))
+
+    def add(self, residual: Array) -> None:
+        """Take in residuals (N, 2); one that is NaN makes the result NaN."""
+        if len(residual):
+            self.count += len(residual)
+            self.squares = self.squares + np.einsum("ij,ij->j", residual, residual)
+            self.largest = np.maximum(self.largest, np.abs(residual.T).max(axis=1))
+
+    @property
+    def rmse(self) -> Array:
+        """Root mean square (2,) [px]."""
+        return np.asarray(np.sqrt(self.squares / self.count)) if self.count else np.full(2, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Points of a model all over an image of `size` (width, height) and a range of altitudes."""
+
+    model: SensorModel
+    size: tuple[int, int]
+    alt_range: tuple[float, float]
+    points: (
+        Array  # (N, 3) col, row [px], altitude [m] with a ground point; those all over the image come first
+    )
+    ground: Array  # (N, 3) lon, lat [deg], alt [m]
+    count: int  # of those all over the image
+    missing: float  # part of the image and the altitudes without a ground point
+
+    @classmethod
+    def of(
+        cls,
+        model: SensorModel,
+        size: tuple[int, int],
+        alt_range: tuple[float, float],
+        cells: int = CELLS,
+        seed: int = 0,
+    ) -> Sample:
+        """One point a cell of `cells` along each side of the image, at random in it, and those along the edges."""
+        rng = np.random.default_rng(seed)
+        cell = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+        inside = np.column_stack([cell, rng.permutation(len(cell))]) + rng.random((len(cell), 3))
+        inside /= [cells, cells, len(cell)]
+        t, ends = np.linspace(0.0, 1.0, _EDGE), (0.0, 1.0)
+        edges = [(*at, h) for u in t for end in ends for at in ((u, end), (end, u)) for h in ends]
+        points = _scaled(np.concatenate([inside, edges]), size, alt_range)
+        ground = model.localize(points[:, :2], points[:, 2])
+        known: BoolArray = np.asarray(np.isfinite(ground).all(axis=1))
+        share = float(known[: len(inside)].mean())
+        return cls(
+            model, size, alt_range, points[known], ground[known], int(known[: len(inside)].sum()), 1.0 - share
+        )
+
+    def errors(self, rpc: RPC) -> tuple[Errors, Array]:
+        """What an RPC makes of the points all over the image, and its largest errors (2,) [px], found by looking on.
+
+        They are infinite where the RPC has no image point.
+        """
+        points, miss = (
+            self.points,
+            np.nan_to_num(np.abs(rpc.project(self.ground) - self.points[:, :2]), nan=np.inf),
+        )
+        errors = Errors()
+        errors.add(miss[: self.count])
+        rng, reach = np.random.default_rng(1), np.array([1.0 / CELLS, 1.0 / CELLS, 0.25])
+        unit = (points - _scaled(np.zeros(3), self.size, self.alt_range)) / self._span
+        for _ in range(_ROUNDS if float(miss.max(initial=0.0)) > _TINY else 0):
+            worst = np.unique(
+                np.concatenate([np.argsort(-miss[:, axis], kind="stable")[:_WORST] for axis in range(2)])
+            )
+            near = unit[np.repeat(worst, _AROUND)] + reach * rng.uniform(-1.0, 1.0, (len(worst) * _AROUND, 3))
+            near = near.clip(0.0, 1.0)
+            at = _scaled(near, self.size, self.alt_range)
+            ground = self.model.localize(at[:, :2], at[:, 2])
+            known = np.isfinite(ground).all(axis=1)
+            found = np.nan_to_num(np.abs(rpc.project(ground[known]) - at[known, :2]), nan=np.inf)
+            unit, miss, reach = (
+                np.concatenate([unit, near[known]]),
+                np.concatenate([miss, found]),
+                reach * _NEARER,
+            )
+        return errors, miss.max(axis=0, initial=0.0)
+
+    @property
+    def _span(self) -> Array:
+        return np.array([*self.size, max(self.alt_range[1] - self.alt_range[0], 1e-9)], dtype=np.float64)
+
+
+_TINY = 1e-7  # px: errors that are no larger are rounding, and alike everywhere
+
+
+def _scaled(unit: Array, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
+    """col, row, altitude (..., 3) of places in 0 .. 1."""
+    low, high = alt_range
+    return np.asarray(unit * [*size, high - low] + [-0.5, -0.5, low])
+
+
+def least_value(cubic: Array, box: Array) -> float:
+    """A lower bound, near the least value, of a cubic (20,) over a `box` (3, 2).
+
+    Over every piece of the box it lies above the least of its Bernstein coefficients (Farouki 2012, "The Bernstein
+    polynomial basis: a centennial retrospective").
+    """
+    powers = np.zeros((4, 4, 4))
+    for coefficient, monomial in zip(cubic, MONOMIALS, strict=True):
+        powers[tuple(monomial.count(letter) for letter in "LPH")] = coefficient
+    edges = np.linspace(box[:, 0], box[:, 1], _PIECES + 1)
+    width = (box[:, 1] - box[:, 0]) / _PIECES
+    for axis in range(3):
+        shifted = np.zeros((_PIECES, 4, 4))  # x^p as a polynomial of the place in the piece
+        for p in range(4):
+            for k in range(p + 1):
+                shifted[:, k, p] = comb(p, k) * edges[:-1, axis] ** (p - k) * width[axis] ** k
+        powers = np.tensordot(_BERNSTEIN @ shifted, powers, axes=(2, 2 * axis))
+        powers = np.moveaxis(powers, (0, 1), (2 * axis, 2 * axis + 1))
+    return float(powers.min())
+
+
+def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
+    """A lower bound of the denominators over a box `low`, `high` (3,) [deg, deg, m] and 25 % around it.
+
+    Over what they are at its centre.
+    """
+    corner = rpc.normalize(np.stack([low, high]))
+    middle, half = corner.mean(axis=1), 0.5 * np.abs(corner[:, 1] - corner[:, 0])
+    box = middle[:, None] + half[:, None] * np.array([-BEYOND, BEYOND])
+    center = np.stack([middle, middle], axis=1)
+    return min(least_value(below, box) / least_value(below, center) for below in rpc.coeffs[1::2])
+
+
+def roundtrip(rpc: RPC, ground: Array) -> float:
+    """Largest distance [px] between ground points (N, 3) and where their projections are localised."""
+    image, jacobian = rpc.project_jacobian(ground)
+    back = rpc.localize(image, ground[:, 2])
+    miss = back - ground
+    miss[:, 0] = wrap_longitude(miss[:, 0])
+    distance = np.abs(np.einsum("nij,nj->ni", jacobian, miss))
+    return float(distance.max(initial=0.0)) if np.isfinite(distance).all() else float("inf")
+
+
+def coverage(image: Array, low: Array, high: Array) -> float:
+    """Share of the rectangle `low`, `high` (2,) [px] inside the convex hull of image points (N, 2) [px]."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    direction = np.column_stack([np.cos(angle), np.sin(angle)])  # outside is beyond all in one direction
+    reach = np.full(len(angle), -np.inf)
+    for start in range(0, len(image), _CHUNK):
+        part = (image[start : start + _CHUNK] - low) / (high - low)
+        reach = np.maximum(reach, (direction @ part.T).max(axis=1))
+    t = (np.arange(20) + 0.5) / 20
+    cells = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
+    return float((cells @ direction.T <= reach + 1e-9).all(axis=1).mean())

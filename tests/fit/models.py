@@ -1,0 +1,144 @@
+"""Sensor models that an RPC follows badly: wide, bent, shaken, or on top of the world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.polynomial import Polynomial
+
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.simulate.orbit import Look, fly
+
+
+@dataclass(frozen=True)
+class Bent:
+    """A model whose image is moved by a smooth or rough field of its ideal image points (..., 2) [px]."""
+
+    model: object
+    moves: Callable[[Array], Array]
+
+    def project(self, ground: Array) -> Array:
+        ideal = self.model.project(ground)
+        return ideal + self.moves(ideal)
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        ideal = image
+        for _ in range(60):
+            ideal = image - self.moves(ideal)
+        return self.model.localize(ideal, alt)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A pinhole over lon, lat that looks down, with the radial distortion k1 of Brown at the unit focal length."""
+
+    lon: float
+    lat: float
+    alt: float
+    focal: float
+    size: tuple[int, int]
+    k1: float = 0.0
+
+    def _pose(self) -> tuple[Array, Array]:
+        ground = np.array([self.lon, self.lat, self.alt])
+        east, north, up = enu_basis(ground)
+        return ecef_from_ground(ground), np.stack([east, -north, -up])
+
+    def project(self, ground: Array) -> Array:
+        place, axes = self._pose()
+        seen = (ecef_from_ground(ground) - place) @ axes.T
+        xy = seen[..., :2] / seen[..., 2:]
+        bent = xy * (1.0 + self.k1 * (xy**2).sum(axis=-1, keepdims=True))
+        return self.focal * bent + (np.array(self.size) - 1) / 2
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        place, axes = self._pose()
+        bent = (image - (np.array(self.size) - 1) / 2) / self.focal
+        xy = bent
+        for _ in range(60):
+            xy = bent / (1.0 + self.k1 * (xy**2).sum(axis=-1, keepdims=True))
+        ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1) @ axes
+        alt = np.broadcast_to(alt, ray.shape[:-1])
+        depth = self.alt - alt
+        for _ in range(12):
+            ground = ground_from_ecef(place + depth[..., None] * ray)
+            depth = depth + (ground[..., 2] - alt)
+        return np.concatenate([ground[..., :2], alt[..., None]], axis=-1)
+
+
+def pushbroom(lat: float, size: tuple[int, int] = (20000, 20000), gsd: float = 0.5, incidence: float = 12.0):
+    """An orbiting pushbroom over longitude 5.4 [deg]."""
+    return fly(np.array([5.4, lat, 200.0]), Look(incidence=incidence, azimuth=100.0), size, gsd)
+
+
+def whiskbroom(half_angle: float, size: tuple[int, int] = (2000, 2000)):
+    """Columns are steps of one angle, to `half_angle` [deg] either side: a scanner from 700 km."""
+    plain = pushbroom(45.0, size, 500.0, 0.0)
+    u = np.linspace(-1.0, 1.0, 400)
+    angle = np.radians(half_angle) * u
+    series = Polynomial.fit(u, np.tan(angle), 25).convert().coef
+    scale = np.power(0.5 * (size[0] - 1), -np.arange(len(series), dtype=np.float64))
+    return replace(plain, look=np.stack([0.0 * series, -series * scale]))
+
+
+def bump(
+    size: tuple[int, int], width: float, height: float, at: tuple[float, float]
+) -> Callable[[Array], Array]:
+    """A Gaussian bump of the columns: `width` (one sigma) and height in px, `at` as parts of the image."""
+    middle = np.array(size) * at
+
+    def moves(image: Array) -> Array:
+        away = ((image - middle) ** 2).sum(axis=-1) / width**2
+        return np.stack([height * np.exp(-0.5 * away), 0.0 * away], axis=-1)
+
+    return moves
+
+
+def waves(rows: int, cycles: float, height: float) -> Callable[[Array], Array]:
+    """Columns and rows that swing with the row."""
+
+    def moves(image: Array) -> Array:
+        phase = 2.0 * np.pi * cycles * image[..., 1] / rows
+        return height * np.stack([np.sin(phase), np.cos(phase + 1.0)], axis=-1)
+
+    return moves
+
+
+SIZE = (20000, 20000)
+RANGE = (0.0, 1500.0)
+
+
+@cache
+def hard() -> dict[str, tuple[object, tuple[int, int], tuple[float, float]]]:
+    """Name -> model, size, altitude range: what a cubic RPC cannot follow to a thousandth of a pixel."""
+    found = {
+        "frame, k1 -0.1": (
+            Frame(5.4, 43.2, 5000.0, 12000.0, (14000, 10000), -0.1),
+            (14000, 10000),
+            (0.0, 600.0),
+        ),
+        "frame, k1 0.02": (
+            Frame(5.4, 43.2, 5000.0, 12000.0, (14000, 10000), 0.02),
+            (14000, 10000),
+            (0.0, 600.0),
+        ),
+        "whiskbroom 110 deg": (whiskbroom(55.0), (2000, 2000), RANGE),
+        "pushbroom at 89.9 N": (pushbroom(89.9), SIZE, RANGE),
+        "pushbroom at 78 N, 100k rows": (pushbroom(78.0, (20000, 100000)), (20000, 100000), RANGE),
+        "wide pushbroom": (pushbroom(45.0, (20000, 40000), 15.0), (20000, 40000), (0.0, 4000.0)),
+        "distortion": (
+            Bent(pushbroom(45.0), lambda p: 3e-13 * (p - 1e4) ** 3 + 2e-17 * (p - 1e4) ** 4),
+            SIZE,
+            RANGE,
+        ),
+        "waves 0.25": (Bent(pushbroom(45.0), waves(20000, 0.25, 0.5)), SIZE, RANGE),
+        "waves 1": (Bent(pushbroom(45.0), waves(20000, 1.0, 0.5)), SIZE, RANGE),
+        "waves 7": (Bent(pushbroom(45.0), waves(20000, 7.0, 0.5)), SIZE, RANGE),
+        "waves 60": (Bent(pushbroom(45.0), waves(20000, 60.0, 0.5)), SIZE, RANGE),
+        "bump": (Bent(pushbroom(45.0), bump(SIZE, 250.0, 0.5, (0.37, 0.61))), SIZE, RANGE),
+        "bump in a corner": (Bent(pushbroom(45.0), bump(SIZE, 250.0, 0.5, (0.01, 0.99))), SIZE, RANGE),
+    }
+    return found
