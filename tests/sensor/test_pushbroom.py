@@ -231,6 +231,21 @@ def test_a_shaking_attitude_still_inverts(sensor, points):
         assert np.abs(difference - jacobian[..., axis]).max() < 1e-5 * np.abs(jacobian[..., axis]).max()
 
 
+@pytest.mark.parametrize("angle", [30.0, 90.0, 135.0, 180.0])
+def test_the_axes_of_the_camera_may_be_turned_about_its_line_of_sight(sensor, points, angle):
+    """The same camera, its detector along any direction of its own axes."""
+    cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    attitude = Curve(sensor.attitude.knots, sensor.attitude.coeffs @ turn)
+    turned = replace(sensor, mount=sensor.mount @ turn, attitude=attitude, look=turn[:2, :2].T @ sensor.look)
+    image, alt = points
+    ground = sensor.localize(image, alt)
+    np.testing.assert_allclose(turned.localize(image, alt)[:, :2], ground[:, :2], atol=1e-12)
+    np.testing.assert_allclose(turned.project(ground), image, atol=1e-7)
+    for found, expected in zip(turned.project_jacobian(ground), sensor.project_jacobian(ground), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7)
+
+
 def test_detector_look_angles_may_be_curved(sensor, points):
     """Distortion of some pixels along and across the detector line, as a cubic of the column."""
     cubic = np.zeros((2, 4))
