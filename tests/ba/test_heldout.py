@@ -11,7 +11,6 @@ from barpc.ba import AdjustOptions
 from barpc.ba.adjustment import make_problem
 from barpc.ba.block import Block, join
 from barpc.ba.heldout import HeldOut, _scrambled, keep_out, measure
-from barpc.ba.snooping import CRITICAL, ControlTest
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
@@ -130,33 +129,3 @@ def test_a_view_of_fewer_than_twenty_says_nothing(made) -> None:
     assert np.isnan(
         HeldOut(np.zeros((2, 0)), np.zeros(0, int), np.zeros((0, 3)), *np.full((2, 4), np.nan)).error
     )
-
-
-# --- control points ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("w", "used", "culprit"),
-    [
-        ([1.0, 4.2, 0.5], [1, 1, 1], 1),
-        ([1.0, 3.9, 0.5], [1, 1, 1], None),
-        ([9.0, 8.0], [1, 1], None),  # of two none can be named
-        ([9.0, 8.0, np.nan], [1, 1, 1], None),  # nor of two that tell
-        ([9.0, 8.0, 7.0, 1.0, 1.0], [1, 1, 0, 1, 1], None),  # of five one may be wrong
-        ([9.0, 8.0, 70.0, 1.0, 1.0, 1.0], [1, 1, 0, 1, 1, 1], 0),  # of six two
-        ([9.0, 8.0, 70.0, np.nan, 1.0, 1.0], [1, 1, 0, 1, 1, 1], None),
-        ([9.0, 12.0, np.nan, 1.0], [1, 1, 0, 1], 1),  # one that nothing tells about does not count among them
-    ],
-)  # fmt: skip
-def test_the_worst_of_enough_control_points_is_the_culprit(w, used, culprit) -> None:
-    n = len(w)
-    tested = ControlTest(np.array(used, dtype=bool), np.zeros((n, 3)), np.array(w), np.ones(n))
-    assert tested.culprit() == culprit
-
-
-def test_a_control_point_that_contradicts_is_said_to() -> None:
-    assert 3.9 < CRITICAL < 4.1
-    tested = ControlTest(
-        np.array([True, True, False]), np.zeros((3, 3)), np.array([3.9, 4.1, 9.0]), np.ones(3)
-    )
-    assert [tested.status(g) for g in range(3)] == ["used", "contradicts", "rejected"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import adjust_tracks
-from barpc.ba.snooping import CRITICAL
+from barpc.ba.snooping import CRITICAL, ControlTest
 from barpc.geodesy import ecef_from_ground, enu_basis, metres_per_unit
 from barpc.options import RunOptions
 from barpc.report import Run, summarize
@@ -32,6 +32,33 @@ def blundered(gcps: GroundPoints, wrong: dict[int, float], seed: int = 0) -> Gro
         move = rng.normal(size=3) * [1.0, 1.0, 0.3]
         place[g] += size * move / np.linalg.norm(move) / metres_per_unit(place[g : g + 1])[0]
     return replace(gcps, lonlatalt=place)
+
+
+@pytest.mark.parametrize(
+    ("w", "used", "culprit"),
+    [
+        ([1.0, 4.2, 0.5], [1, 1, 1], 1),
+        ([1.0, 3.9, 0.5], [1, 1, 1], None),
+        ([9.0, 8.0], [1, 1], None),  # of two none can be named
+        ([9.0, 8.0, np.nan], [1, 1, 1], None),  # nor of two that tell
+        ([9.0, 8.0, 7.0, 1.0, 1.0], [1, 1, 0, 1, 1], None),  # of five one may be wrong
+        ([9.0, 8.0, 70.0, 1.0, 1.0, 1.0], [1, 1, 0, 1, 1, 1], 0),  # of six two
+        ([9.0, 8.0, 70.0, np.nan, 1.0, 1.0], [1, 1, 0, 1, 1, 1], None),
+        ([9.0, 12.0, np.nan, 1.0], [1, 1, 0, 1], 1),  # one that nothing tells about does not count among them
+    ],
+)  # fmt: skip
+def test_the_worst_of_enough_control_points_is_the_culprit(w, used, culprit) -> None:
+    n = len(w)
+    tested = ControlTest(np.array(used, dtype=bool), np.zeros((n, 3)), np.array(w), np.ones(n))
+    assert tested.culprit() == culprit
+
+
+def test_a_control_point_that_contradicts_is_said_to() -> None:
+    assert 3.9 < CRITICAL < 4.1
+    tested = ControlTest(
+        np.array([True, True, False]), np.zeros((3, 3)), np.array([3.9, 4.1, 9.0]), np.ones(3)
+    )
+    assert [tested.status(g) for g in range(3)] == ["used", "contradicts", "rejected"]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
