@@ -138,8 +138,9 @@ def test_a_geotransform_without_crs_is_left_out_and_one_with_crs_is_kept(rpc, tm
     """Without CRS it is the origin of a crop, which the RPC that is written has already."""
     origin = rasterio.Affine(1.0, 0, 5000, 0, -1, -5000)
     crop = write_image(tmp_path / "crop.tif", transform=origin)
+    turned = write_image(tmp_path / "turned.tif", transform=origin @ rasterio.Affine.rotation(10.0))
     map_ = write_image(tmp_path / "map.tif", transform=rasterio.Affine(1e-5, 0, 5, 0, -1e-5, 44), crs=4326)
-    for image, kept in ((crop, False), (map_, True)):
+    for image, kept in ((crop, False), (turned, False), (map_, True)):
         write_rpc_copy(rpc, image, tmp_path / "copy.tif", overwrite=True)
         write_rpc_vrt(rpc, image, tmp_path / "copy.vrt", overwrite=True)
         for written in ("copy.tif", "copy.vrt"):

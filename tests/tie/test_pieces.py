@@ -407,10 +407,10 @@ def test_a_pair_that_was_not_matched_is_twice_as_unlike_as_the_worst(spreads, sc
 
 def test_a_point_is_on_the_mask_where_its_nearest_pixel_is() -> None:
     mask = np.zeros((4, 6), dtype=bool)
-    mask[0, 0] = mask[3, 5] = mask[0, 5] = mask[2, 3] = True
+    mask[0, 0] = mask[3, 5] = mask[0, 5] = mask[2, 3] = mask[1, 1] = True
     places = [[0, 0], [0.4, -0.4], [0, 1], [5, 3], [5.4, 3.4], [5, 0], [5, 2], [3, 2], [2, 3], [-0.6, 0], [0, -0.6],
-              [5.6, 3], [5, 3.6], [np.nan, 0]]  # fmt: skip
-    expected = [1, 1, 0, 1, 1, 1, 0, 1, 0, 0, 0, 0, 0, 0]
+              [5.6, 3], [5, 3.6], [np.nan, 0], [np.nan, 1], [1, np.nan], [np.nan, np.nan]]  # fmt: skip
+    expected = [1, 1, 0, 1, 1, 1, 0, 1] + [0] * 9
     np.testing.assert_array_equal(_at(mask, np.array(places, dtype=float)), np.array(expected, dtype=bool))
 
 
