@@ -125,7 +125,7 @@ def fit_rpc(
     Warns
     -----
     BarpcWarning
-        A few control points have no ground point.
+        Part of the image has no ground point.
     """
     options, alt_range = options or FitOptions(), widened(alt_range)
     sample = Sample.of(model, size, alt_range)
@@ -140,24 +140,33 @@ def fit_rpc(
     vendor = underlying_rpc(model)
 
     def attempt(method: str) -> RpcFit:
-        if (
-            method == "gauss-newton"
-        ):  # what an RPC cannot follow may have any frequency: scattered points alias none
-            given = Sample.of(model, size, alt_range, _CELLS, seed=1)
-            ground, image = given.ground, given.points[:, :2]
-        else:
-            ground, image = (
-                part.reshape(-1, part.shape[-1]) for part in control_points(model, size, alt_range, options)
-            )
-            known = np.isfinite(ground).all(axis=1) & np.isfinite(image).all(axis=1)
-            ground, image = ground[known], image[known]
-        ground[:, 0] = wrap_longitude(ground[:, 0], ground[0, 0])
+        ground, image = _given(model, size, alt_range, options, method)
         solution = solve(ground, image, options, method, vendor=vendor)
-        return _certified(
-            solution, *sample.errors(solution.rpc), roundtrip(solution.rpc, sample.ground), size
-        )
+        loop = roundtrip(solution.rpc, sample.ground)
+        return _certified(solution, *sample.errors(solution.rpc), loop, size)
 
     return _best(attempt, options, vendor, strict, exact=True)
+
+
+def _given(
+    model: SensorModel,
+    size: tuple[int, int],
+    alt_range: tuple[float, float],
+    options: FitOptions,
+    method: str,
+) -> tuple[Array, Array]:
+    """Ground (N, 3) and image points (N, 2) for a method."""
+    if method == "gauss-newton":  # what an RPC cannot follow has any frequency: scattered points alias none
+        scattered = Sample.of(model, size, alt_range, _CELLS, seed=1)
+        ground, image = scattered.ground, scattered.points[:, :2]
+    else:
+        grid = control_points(model, size, alt_range, options)
+        ground, image = grid[0].reshape(-1, 3), grid[1].reshape(-1, 2)
+    known = np.isfinite(ground).all(axis=1) & np.isfinite(image).all(axis=1)
+    ground, image = ground[known], image[known]
+    if len(ground):
+        ground[:, 0] = wrap_longitude(ground[:, 0], ground[0, 0])
+    return ground, image
 
 
 def fit_rpc_points(
@@ -204,11 +213,9 @@ def fit_rpc_points(
 
     def attempt(method: str) -> RpcFit:
         solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
-        left = (
-            solution.leave_one_out()
-            if held_out is None
-            else [solution.rpc.project(held_out[0]) - held_out[1]]
-        )
+        left = solution.leave_one_out()
+        if held_out is not None:
+            left = iter([solution.rpc.project(held_out[0]) - held_out[1]])
         errors = Errors()
         for residual in left:
             errors.add(residual)
