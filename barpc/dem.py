@@ -168,6 +168,7 @@ class Dem:
     grid: HeightGrid  # the heights as the file gives them
     geoid: HeightGrid | None  # height of the geoid above the ellipsoid, added to `grid`
     description: str  # which vertical reference was read and what was done with it
+    known: bool = True  # whether it is known what they count from
 
     @classmethod
     def open(cls, path: Path | str, geoid: Path | str | None = None) -> Dem:
@@ -191,7 +192,7 @@ class Dem:
         description = f"{Path(path).name}: vertical reference {known}, {done}"
         if advice or known == "unknown":
             warnings.warn(f"DEM {description}{advice}", BarpcWarning, stacklevel=2)
-        return cls(grid, None if geoid is None else HeightGrid.open(geoid), description)
+        return cls(grid, None if geoid is None else HeightGrid.open(geoid), description, not advice)
 
     def __call__(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Altitude above the ellipsoid (...) [m] at lon, lat (...) [deg]; NaN in voids and outside."""

@@ -279,10 +279,10 @@ class AdjustOptions(Options):
         {}, "Weight of a view's observations (1 where absent): their sigmas are divided by it.", above=0
     )
     dem_sigma: float = option(10.0, "Standard deviation of single heights of the DEM.", unit="m", above=0)
-    dem_bias_sigma: float = option(
-        20.0,
-        """Standard deviation of what all heights of the DEM are wrong by together (a geoid left out: 20 m and more),
-        and of its slopes at the scene's edges.""",
+    dem_bias_sigma: float | None = option(
+        None,
+        """Standard deviation of what all heights of the DEM are wrong by together, and of its slopes at the scene's
+        edges. Without: 20 m (a geoid left out is as much), or 5 m with a reference and heights of a known datum.""",
         unit="m",
         above=0,
     )
@@ -396,11 +396,28 @@ class RunOptions(Options):
         unit="file",
     )
     geoid: str | None = option(None, "Geoid grid for a DEM of orthometric heights.", unit="file")
+    reference: tuple[str, ...] = option(
+        (),
+        """Orthoimage in the right place, of any date, resolution and CRS: with the heights of `dem` it holds the block.
+        Where several show a place, the first counts.""",
+        unit="file",
+    )
+    reference_sigma: float | None = option(
+        None,
+        """Standard deviation of the reference's own place, along an axis. Without: a quarter of its pixel, but at least
+        0.5 m.""",
+        unit="m",
+        above=0,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.geoid is not None and self.dem is None:
             raise InputError("geoid is given without dem: there are no heights to convert")
+        if self.reference and self.dem is None:
+            raise InputError("reference is given without dem: an orthoimage tells no heights")
+        if self.reference_sigma is not None and not self.reference:
+            raise InputError("reference_sigma is given without reference")
         for name in ("overlap_list", "aoi"):
             if self.matches is not None and getattr(self, name) is not None:
                 raise InputError(

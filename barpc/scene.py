@@ -162,6 +162,27 @@ class GroundPoints(Frozen):
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Reference(Frozen):
+    """Control of an orthoimage and a terrain: many points that share the errors of both.
+
+    Parameters
+    ----------
+    points : GroundPoints, their sigmas without the errors in common
+    bias : (3,), standard deviation of what all of them are wrong by together, east, north, up [m]
+    offset : (N, 2), how far each view was found to be off as delivered, east, north [m]; NaN where it was not matched
+    """
+
+    points: GroundPoints
+    bias: Array
+    offset: Array
+
+    def __post_init__(self) -> None:
+        if not (self._array("bias", (3,)) > 0).all():
+            raise InputError("reference: standard deviations must be positive")
+        self._array("offset", (None, 2), finite=False)
+
+
 def middle_altitude(views: Sequence[View]) -> float:
     """Mean of the middle altitudes of views [m]: where points that several of them see are looked for first."""
     return float(np.mean([view.alt_range for view in views]))

@@ -13,7 +13,7 @@ from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import agreeing, two_groups
 from barpc.ba.datum import datum_shares
 from barpc.ba.gauge import gauge_report
-from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control
+from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control, reference_control
 from barpc.ba.heldout import HeldOut, enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior, apply_prior
 from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
@@ -26,7 +26,7 @@ from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
 from barpc.geodesy import Array
 from barpc.options import AUTO, AdjustOptions
-from barpc.scene import BoolArray, GroundPoints, Tracks, View
+from barpc.scene import BoolArray, GroundPoints, Reference, Tracks, View
 
 SMOOTH_LEAST = 0.06  # smooth residuals below this [px] are left alone: two views share what one is wrong by
 _TREND = 0.03  # px: another model is tried
@@ -50,6 +50,7 @@ def adjust_tracks(
     *,
     centers: Array | None = None,
     prior: BlockPrior | None = None,
+    reference: Reference | None = None,
     keep_largest: bool = False,
     hold_out: bool = True,
 ) -> Adjustment:
@@ -59,10 +60,8 @@ def adjust_tracks(
     ----------
     views, tracks : sequence of View, Tracks
         N views and their tie points; `Tracks.view` counts the views.
-    options : AdjustOptions or None
-        None: the defaults.
-    gcps : GroundPoints or None
-        Points of known position and where they are seen.
+    options : AdjustOptions or None, None: the defaults
+    gcps : GroundPoints or None, points of known position and where they are seen
     dem : callable or None
         lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN outside.
     centers : (N, 3) or None
@@ -70,6 +69,7 @@ def adjust_tracks(
     prior : BlockPrior or None
         An earlier block, whose views are among these: its corrections and their joint covariance are the
         prior. `tracks` then holds new observations only.
+    reference : Reference or None, control of an orthoimage and the terrain `dem`
     keep_largest, hold_out : bool
         Go on with the largest group of views where they are not all connected; keep a tenth of the tracks out, to
         measure the result on.
@@ -89,7 +89,7 @@ def adjust_tracks(
     """
     start = time.process_time()
     options = AdjustOptions() if options is None else options
-    block = join(tuple(views), tracks, gcps, options, keep_largest)
+    block = join(tuple(views), tracks, gcps, options, keep_largest, reference)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     inner, outer = block.without(rows), block.without(~rows)
     found, in_space = _choose_model(inner, outer, options, dem, centers, prior)
@@ -232,13 +232,13 @@ def _tested(
     """
     control, start = heights.control[0], replace(start, params=problem.camera_prior.mean)
     points, weight = start.points.copy(), block.use / block.sigma
-    of_points = np.arange(block.num_tracks, block.num_points)
+    of_points = np.arange(block.num_tracks, block.num_known)
     cut = np.isin(of_points, block.point[block.use & ~outcome.inlier])
     used = np.ones(len(cut), dtype=bool)
     while True:
         if cut.any():
             used = used & ~cut
-            heights = replace(heights, control=(control.select(used),))
+            heights = replace(heights, control=(control.select(used), *heights.control[1:]))
             let_go = heights.hold(problem, points)
             for _ in range(_FIRST_STEPS + 1):  # where their rays see them
                 moved = let_go.triangulate(points, let_go.project_points(start.params, points), weight)
@@ -262,17 +262,30 @@ def _adjustment(
     covariance = outcome.minimum.covariance(found.problem.free)
     projected = found.problem.project_points(final.params, final.points)
     cameras = found.problem.cameras
+    placed = seen & (np.arange(len(seen)) < block.num_known)
     points = np.where(seen[:, None], final.points, np.nan)
     points[found.after.index] = found.after.points
     inlier = block.in_order(outcome.inlier)
-    ties = slice(0, len(inlier) - len(block.gcps.view))
+    ties = slice(0, len(inlier) - (block.point >= block.num_tracks).sum())
+    known = slice(ties.stop, ties.stop + len(block.gcps.view))
+    is_tie = found.problem.structure.point < block.num_tracks
     view = np.maximum(block.in_order(block.view), outer.in_order(outer.view))[ties]
     before, after = (
         (block.in_order(inside.T) + outer.in_order(outside.residual.T))[ties]
         for inside, outside in ((found.before, found.start), (outcome.residual, found.after))
     )
-    gauge = gauge_report(covariance, final.points, found.first_points(block), seen)
-    is_gcp = np.arange(block.num_points) >= block.num_tracks
+    gauge = gauge_report(
+        covariance, final.points, found.first_points(block), placed if placed.any() else seen
+    )
+    shares = datum_shares(
+        covariance,
+        gauge.by_unknown,
+        outcome.problem,
+        final,
+        outcome.weight,
+        block.num_tracks,
+        block.num_known,
+    )
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
     return Adjustment(
         names=block.names,
@@ -293,17 +306,18 @@ def _adjustment(
         cameras=cameras,
         covariance=covariance,
         gauge=gauge,
-        datum=datum_shares(covariance, gauge.by_unknown, outcome.problem, final, outcome.weight, is_gcp),
+        datum=shares,
         prior=outcome.prior,
         smooth=outcome.smooth,
         in_space_rms=in_space,
-        two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier),
+        two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],
         terrain=found.heights.test(final.points, seen),
         left_out=block.left_out,
-        gcp_inlier=inlier[ties.stop :],
+        gcp_inlier=inlier[known],
+        reference_inlier=inlier[known.stop :],
         control=found.tested,
-        gcp_residuals=enu_offsets(final.points[block.num_tracks :], block.gcps.lonlatalt),
+        gcp_residuals=enu_offsets(final.points[block.num_tracks : block.num_known], block.gcps.lonlatalt),
         seconds=time.process_time() - start,
         options=options,
     )
@@ -337,7 +351,8 @@ def make_problem(
     if prior is not None:
         centers = _known_centers(block, options, centers, prior)
     unknowns = make_unknowns(views, options.first_model, drift, centers)
-    sigma = prior_sigmas(views, options, drift)
+    off = None if block.reference is None else np.linalg.norm(block.reference.offset, axis=1)
+    sigma = prior_sigmas(views, options, drift, off)
     on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma), None
     if prior is not None:
         on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras)
@@ -366,13 +381,15 @@ def _start(
     params = problem.camera_prior.mean
     points = block.first_points()
     points[~np.isfinite(points)] = 0.0
-    control = ground_control(block.gcps, np.arange(block.num_tracks, block.num_points))
+    control = [ground_control(block.gcps, np.arange(block.num_tracks, block.num_known))]
+    if block.reference is not None:
+        control.append(reference_control(block.reference, np.arange(block.num_known, block.num_points)))
     projected = problem.project_points(params, points)
     seen = np.bincount(block.point, minlength=block.num_points) > 0
     angles = convergence_angles(problem.structure, projected, points)
     weak = seen & (angles < np.radians(options.min_convergence))
     tracks = np.flatnonzero(seen[: block.num_tracks])
-    heights = Heights((control,), weak, tracks, block.alt_range, options, dem)
+    heights = Heights(tuple(control), weak, tracks, block.alt_range, options, dem, block.reference)
     weight = block.use / block.sigma
     for _ in range(_FIRST_STEPS):
         points = heights.hold(problem, points).triangulate(points, projected, weight)

@@ -14,7 +14,7 @@ from barpc.ba.structure import counting_sort
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.options import AdjustOptions
-from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, connected_groups
+from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, Tracks, View, connected_groups
 
 MIN_OBSERVATIONS = 4  # of a view, or it stops: six unknowns need three points, and one to check them
 _LISTED = 10  # views named in a message
@@ -28,14 +28,18 @@ class Block:
 
     views: tuple[View, ...]  # N views
     view: IntArray  # (K,)
-    point: IntArray  # (K,) those from `num_tracks` on are GCPs
+    point: IntArray  # (K,) those from `num_tracks` on are GCPs, those from `num_known` on a reference's
     xy: Array  # (2, K) observed col, row [px]
     sigma: Array  # (K,) [px], view weights applied
-    order: IntArray  # (K,) row of each observation in the tracks, then in the GCPs, as given
+    order: (
+        IntArray  # (K,) row of each observation in the tracks, then in the GCPs and the reference, as given
+    )
     use: BoolArray  # (K,) false for observations in views that are left out
-    gcps: GroundPoints  # whose observations are the last of those given; none where there are none
+    gcps: GroundPoints  # none where there are none
+    reference: Reference | None
     num_tracks: int
-    num_points: int  # tracks and GCPs
+    num_known: int  # tracks and GCPs
+    num_points: int  # and points of the reference
     num_rows: int  # given, used or not
     left_out: tuple[str, ...]  # views outside the largest group
 
@@ -78,7 +82,9 @@ class Block:
             if len(rows):
                 alt = np.full(len(rows), view.altitude)
                 points[self.point[rows]] = ecef_from_ground(view.sensor.localize(self.xy[:, rows].T, alt))
-        points[self.num_tracks :] = ecef_from_ground(self.gcps.lonlatalt)
+        points[self.num_tracks : self.num_known] = ecef_from_ground(self.gcps.lonlatalt)
+        if self.reference is not None:
+            points[self.num_known :] = ecef_from_ground(self.reference.points.lonlatalt)
         return points
 
 
@@ -88,16 +94,20 @@ def join(
     gcps: GroundPoints | None,
     options: AdjustOptions,
     keep_largest: bool = False,
+    reference: Reference | None = None,
 ) -> Block:
     """The block of tracks and GCPs; arguments and errors as in `barpc.ba.adjust_tracks`."""
     names = [view.name for view in views]
     _check_names(names, options)
     gcps = GroundPoints.none() if gcps is None else gcps
-    view = np.concatenate([tracks.view, gcps.view])
+    known = [gcps] if reference is None else [gcps, reference.points]
+    starts = tracks.num_points + np.cumsum([0, *(len(points.names) for points in known)])
+    view = np.concatenate([tracks.view, *(points.view for points in known)])
     if len(view) and view.max() >= len(views):
         raise InputError(f"tracks name view {view.max()}, but there are {len(views)} views")
-    point = np.concatenate([tracks.point, tracks.num_points + gcps.point])
-    xy, sigma = np.concatenate([tracks.xy, gcps.xy]), np.concatenate([tracks.sigma, gcps.xy_sigma])
+    point = np.concatenate([tracks.point, *(s + p.point for s, p in zip(starts, known, strict=False))])
+    xy = np.concatenate([tracks.xy, *(points.xy for points in known)])
+    sigma = np.concatenate([tracks.sigma, *(points.xy_sigma for points in known)])
     key = point * len(views) + view
     rows = np.arange(len(key)) if (np.diff(key) > 0).all() else np.argsort(key, kind="stable")
     if not (np.diff(key[rows]) > 0).all():
@@ -123,8 +133,10 @@ def join(
         order,
         use[order],
         gcps,
+        reference,
         tracks.num_points,
-        tracks.num_points + len(gcps.names),
+        int(starts[1]),
+        int(starts[-1]),
         len(order),
         left_out,
     )

@@ -19,9 +19,10 @@ from barpc.ba.solve import State
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
-SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights")
+SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference")
 """The priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; the DEM or assumed
-altitudes, with what these are wrong by together."""
+altitudes, with what these are wrong by together; a reference orthoimage, with what it is wrong by as a whole."""
+_OF_HEIGHTS = 3  # errors in common that are a terrain's, in front of the reference's own
 
 
 def datum_shares(
@@ -30,7 +31,8 @@ def datum_shares(
     problem: Problem,
     state: State,
     weight: Array,
-    is_gcp: BoolArray,
+    num_tracks: int,
+    num_known: int,
 ) -> Mapping[str, Array]:
     """Share (7,) of each source in what is known of the scene's motions; NaN for one that no free camera tells of.
 
@@ -39,7 +41,7 @@ def datum_shares(
     covariance : Covariance, at the solution
     by_unknown : (7, N q), motions by the unknowns of the cameras
     problem, state, weight : as solved last, and 1 / sigma of every observation (K,)
-    is_gcp : (P,), points that are no tracks
+    num_tracks, num_known : int, points from the first on are GCPs, from the second on a reference's
     """
     moves = covariance.solve(by_unknown.T)
     variance = np.einsum("mn,nm->m", by_unknown, moves)
@@ -53,7 +55,9 @@ def datum_shares(
     if problem.point_prior is not None or not problem.free.all():
         reduced = _at_rest(covariance.reduced)
         points = np.stack([reduced.point_step(unknowns[..., m]) for m in range(len(variance))], axis=-1)
-        held = _known_points(paid, problem, reduced, unknowns, points, is_gcp)
+        number = np.arange(problem.structure.num_points)
+        kinds = {"gcps": (number >= num_tracks) & (number < num_known), "reference": number >= num_known}
+        held = _known_points(paid, problem, reduced, unknowns, points, kinds)
         _observations(paid, problem, state, weight, unknowns, points, held)
     with np.errstate(invalid="ignore"):
         return {source: cost / sum(paid.values()) for source, cost in paid.items()}
@@ -73,21 +77,26 @@ def _known_points(
     reduced: Reduced,
     unknowns: Array,
     points: Array,
-    is_gcp: BoolArray,
-) -> BoolArray:
-    """Add what the places of GCPs and heights pay; the GCPs (P,) that are held."""
-    held = np.zeros(len(is_gcp), dtype=bool)
+    kinds: Mapping[str, BoolArray],
+) -> Mapping[str, BoolArray]:
+    """Add what the places of known points and heights pay; the points (P,) of each kind that are held."""
+    held = {kind: np.zeros(len(rows), dtype=bool) for kind, rows in kinds.items()}
     prior, count = problem.point_prior, unknowns.shape[2]
     if prior is None:
         return held
-    held[prior.index] = is_gcp[prior.index]
+    rest = np.ones(len(prior.index), dtype=bool)
     shared = np.zeros((prior.common.shape[2], count))
     if reduced.common is not None:
         flat = unknowns.reshape(-1, count)
         shared = np.stack([reduced.common.step(flat[:, m]) for m in range(count)], axis=-1)
     left = ((prior.rows @ points[prior.index] - prior.common @ shared) ** 2).sum(axis=1)
-    paid["gcps"][:] += left[is_gcp[prior.index]].sum(axis=0)
-    paid["heights"][:] += left[~is_gcp[prior.index]].sum(axis=0) + (shared**2).sum(axis=0)
+    for kind, rows in kinds.items():
+        own = rows[prior.index]
+        held[kind][prior.index] = own
+        paid[kind][:] += left[own].sum(axis=0)
+        rest &= ~own
+    paid["heights"][:] += left[rest].sum(axis=0) + (shared[:_OF_HEIGHTS] ** 2).sum(axis=0)
+    paid["reference"][:] += (shared[_OF_HEIGHTS:] ** 2).sum(axis=0)
     return held
 
 
@@ -98,12 +107,13 @@ def _observations(
     weight: Array,
     unknowns: Array,
     points: Array,
-    held: BoolArray,
+    held: Mapping[str, BoolArray],
 ) -> None:
-    """Add what the observations of GCPs pay, and those of tie points in fixed views."""
+    """Add what the observations of known points pay, and those of tie points in fixed views."""
     structure = problem.structure
     is_free = problem.free[:: len(problem.free) // structure.num_views]  # views are free or fixed as a whole
-    if is_free.all() and not held.any():
+    known = np.any(list(held.values()), axis=0)
+    if is_free.all() and not known.any():
         return
     projected = problem.linearise(state.params, state.points)
     for v, part in enumerate(map(slice, structure.bounds[:-1], structure.bounds[1:])):
@@ -111,6 +121,7 @@ def _observations(
         change = np.einsum("cqk,qm->ckm", projected.by_unknown[..., part], unknowns[v])
         change += np.einsum("cxk,kxm->ckm", projected.by_point[..., part], points[at])
         cost = ((change * weight[part, None]) ** 2).sum(axis=0)
-        paid["gcps"][:] += cost[held[at]].sum(axis=0)
+        for kind, rows in held.items():
+            paid[kind][:] += cost[rows[at]].sum(axis=0)
         if not is_free[v]:
-            paid["fixed_views"][:] += cost[~held[at]].sum(axis=0)
+            paid["fixed_views"][:] += cost[~known[at]].sum(axis=0)

@@ -15,12 +15,16 @@ from barpc.ba.structure import Structure
 from barpc.errors import BarpcWarning
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.options import AdjustOptions
-from barpc.scene import BoolArray, GroundPoints, IntArray
+from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
 
 Terrain = Callable[[Array, Array], Array]
 """lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN where it is unknown."""
 
 _SLOPE_STEP = 15.0  # m: terrain slopes are taken over twice this distance
+DEM_BIAS = 20.0  # m, where none is stated
+ALIKE = (
+    25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
+)
 _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
 _TOGETHER = 0.25  # of it: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
 
@@ -44,13 +48,36 @@ def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
     return PointPrior(index, ecef_from_ground(gcps.lonlatalt), rows, np.zeros((len(index), 3, 0)))
 
 
+def reference_control(reference: Reference, index: IntArray) -> PointPrior:
+    """Points of a reference as priors on the points `index` (R,).
+
+    What they share: the height and slopes of the terrain, as points held to it do, the orthoimage's own place, and
+    that what was matched may stand above the terrain (houses, trees). A terrain's errors reach over many points: all
+    of these are worth `ALIKE` independent heights, at most.
+    """
+    sigma = reference.points.sigma * [1.0, 1.0, np.sqrt(max(len(index) / ALIKE, 1.0))]
+    alone = ground_control(replace(reference.points, sigma=sigma), index)
+    common = np.zeros((len(index), 3, 6))
+    common[:, 2, 0] = reference.bias[2] / sigma[:, 2]
+    common[:, 2, 1:3] = _slopes(alone.mean, alone.mean) * (reference.bias[2] / sigma[:, 2:])
+    common[:, 2, 5] = reference.points.sigma[:, 2] / sigma[:, 2]
+    common[:, 0, 3], common[:, 1, 4] = reference.bias[0] / sigma[:, 0], reference.bias[1] / sigma[:, 1]
+    return replace(alone, common=common)
+
+
 def terrain_heights(
-    points: Array, index: IntArray, terrain: Terrain, sigma: float, common_sigma: float
+    points: Array,
+    index: IntArray,
+    terrain: Terrain,
+    sigma: float,
+    common_sigma: float,
+    span: Array | None = None,
 ) -> PointPrior:
     """Points `index` (Q,) of (P, 3) held to a terrain: the height above its tangent plane where they stand now.
 
     Single altitudes are known to `sigma` [m]; all of them may be wrong by `common_sigma` [m], and by a slope that
     is as much at the scene's edges. Points where the terrain is unknown are left out.
+    The edges are the points' own, or those of `span` (n, 3) [m], with which they share these errors.
     """
     ground = ground_from_ecef(points[index])
     step = _SLOPE_STEP / metres_per_unit(ground)[:, :2]
@@ -59,7 +86,7 @@ def terrain_heights(
     slope_east = (terrain(lon + step[:, 0], lat) - terrain(lon - step[:, 0], lat)) / (2.0 * _SLOPE_STEP)
     slope_north = (terrain(lon, lat + step[:, 1]) - terrain(lon, lat - step[:, 1])) / (2.0 * _SLOPE_STEP)
     normal = np.stack([-np.nan_to_num(slope_east), -np.nan_to_num(slope_north), np.ones(len(alt))], axis=1)
-    return _heights(ground, index, alt, normal, sigma, common_sigma)
+    return _heights(ground, index, alt, normal, sigma, common_sigma, span)
 
 
 def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
@@ -70,7 +97,13 @@ def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, commo
 
 
 def _heights(
-    ground: Array, index: IntArray, alt: Array, normal: Array, sigma: float, common_sigma: float
+    ground: Array,
+    index: IntArray,
+    alt: Array,
+    normal: Array,
+    sigma: float,
+    common_sigma: float,
+    span: Array | None = None,
 ) -> PointPrior:
     known = np.isfinite(alt)
     foot = np.column_stack([ground[known, :2], alt[known]])
@@ -79,10 +112,16 @@ def _heights(
     common[:, 0, 0] = common_sigma / sigma
     mean = ecef_from_ground(foot)
     if len(foot):
-        middle = mean.mean(axis=0)
-        plane = (mean - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
-        common[:, 0, 1:] = plane / np.maximum(np.abs(plane).max(axis=0), 1.0) * (common_sigma / sigma)
+        common[:, 0, 1:] = _slopes(mean, mean if span is None else span) * (common_sigma / sigma)
     return PointPrior(index[known], mean, rows, common)
+
+
+def _slopes(points: Array, span: Array) -> Array:
+    """How far to the east and north points (n, 3) lie in a scene, 1 at the edges of `span` (m, 3), ECEF [m]."""
+    middle = span.mean(axis=0)
+    enu = enu_basis(ground_from_ecef(middle))[:2]
+    edge = np.abs((span - middle) @ enu.T).max(axis=0)
+    return np.asarray((points - middle) @ enu.T / np.maximum(edge, 1.0))
 
 
 def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:
@@ -110,18 +149,20 @@ class TerrainTest:
     total: int  # tie points in use
     offset: float  # median of the adjusted altitudes minus the terrain's [m]; NaN where it has none
     spread: float  # 1.4826 times their median absolute deviation [m]
+    bias: float  # what its heights may be wrong by together [m]
 
 
 @dataclass(frozen=True)
 class Heights:
     """The priors on points: GCPs, and heights for tracks that need (or are given) them."""
 
-    control: tuple[PointPrior, ...]  # GCPs
+    control: tuple[PointPrior, ...]  # GCPs, then a reference if there is one
     weak: BoolArray  # (P,) points whose rays meet under too small an angle
     tracks: IntArray  # (T,) points that are tracks (GCPs are held already)
     alt_range: tuple[float, float]  # altitudes [m] to expect where no other track tells
     options: AdjustOptions  # `dem_sigma`, `dem_for_all`
     dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
+    reference: Reference | None = None  # whose heights are the DEM's
 
     def hold(self, problem: Problem, points: Array) -> Problem:
         """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
@@ -130,11 +171,15 @@ class Heights:
     def _held(self, points: Array) -> PointPrior | None:
         dem, options = self.dem, self.options
         weak = self.weak[self.tracks]
-        index = self.tracks if dem is not None and options.dem_for_all else self.tracks[weak]
+        index = self.tracks if dem is not None and self._whole else self.tracks[weak]
         if not len(index):
             return None
         if dem is not None:
-            return terrain_heights(points, index, dem, options.dem_sigma, options.dem_bias_sigma)
+            alike, span = 1.0, None
+            if self.reference is not None:
+                alike, span = max(len(index) / ALIKE, 1.0), self.control[1].mean
+            sigma = options.dem_sigma * alike**0.5
+            return terrain_heights(points, index, dem, sigma, self._bias, span)
         others = self.tracks[~weak]
         if len(others) >= 10:
             low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
@@ -144,6 +189,18 @@ class Heights:
         sigma = max(float(high - low) * (1.0 if len(others) >= 10 else 0.5), _FLAT_SIGMA)
         return flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)
 
+    @property
+    def _whole(self) -> bool:
+        """Whether a terrain holds all tracks."""
+        return self.options.dem_for_all or self.reference is not None
+
+    @property
+    def _bias(self) -> float:
+        """What a terrain may be wrong by as a whole [m]."""
+        return float(
+            self.options.dem_bias_sigma or DEM_BIAS if self.reference is None else self.reference.bias[2]
+        )
+
     def test(self, points: Array, seen: BoolArray) -> TerrainTest | None:
         """What the terrain did to the tracks that are `seen` (P,), at their adjusted places; None without one."""
         if self.dem is None:
@@ -152,10 +209,10 @@ class Heights:
         lon, lat, alt = ground_from_ecef(points[index]).T
         above = alt - self.dem(lon, lat)
         known = np.isfinite(above)
-        is_held = known if self.options.dem_for_all else known & self.weak[index]
+        is_held = known if self._whole else known & self.weak[index]
         offset = float(np.median(above[known])) if known.any() else np.nan
         spread = 1.4826 * float(np.median(np.abs(above[known] - offset))) if known.any() else np.nan
-        return TerrainTest(int(is_held.sum()), int(known.sum()), len(index), offset, spread)
+        return TerrainTest(int(is_held.sum()), int(known.sum()), len(index), offset, spread, self._bias)
 
     def warn(self) -> None:
         """Say that tracks are held in height without a DEM."""

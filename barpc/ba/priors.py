@@ -107,9 +107,16 @@ def stated_accuracy(view: View) -> float:
     return stated if stated is not None and stated > USABLE_ACCURACY else DEFAULT_ACCURACY
 
 
-def prior_sigmas(views: tuple[View, ...], options: AdjustOptions, drift: int) -> Array:
-    """Prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px)."""
+def prior_sigmas(
+    views: tuple[View, ...], options: AdjustOptions, drift: int, off: Array | None = None
+) -> Array:
+    """Prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px).
+
+    A view that is known to be `off` (N,) [m] by more than it states is not held to that.
+    """
     stated = np.array([stated_accuracy(view) for view in views])
+    if off is not None:
+        stated = np.fmax(stated, off)
     parts = []
     for name, sigma in (("rotation", options.sigma_attitude), ("translation", options.sigma_position)):
         if name in options.first_model:

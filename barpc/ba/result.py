@@ -84,6 +84,8 @@ class Adjustment:
         Ground control points against each other and the cameras.
     gcp_inlier : (M,)
         Observations of GCPs that were kept.
+    reference_inlier : (M,)
+        Observations of a reference's points that were kept.
     gcp_residuals : (G, 3)
         East, north, up [m] of the adjusted GCPs minus their given place.
     seconds : float
@@ -120,6 +122,7 @@ class Adjustment:
     left_out: tuple[str, ...]
     control: ControlTest | None
     gcp_inlier: BoolArray
+    reference_inlier: BoolArray
     gcp_residuals: Array
     seconds: float
     options: AdjustOptions = field(repr=False)

@@ -78,7 +78,8 @@ class Rounds:
         self.state, self.options, self.heights, self.residual = state, options, heights, residual
         self.robust = options.loss != "linear"
         is_tie = block.point < block.num_tracks
-        self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie)
+        of_reference = block.point >= block.num_known
+        self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie, of_reference)
         self.smooth = Smooth(problem.structure, problem.xy, unknowns)
         self.variances = Variances.of(problem.camera_prior, unknowns, options, bool(block.gcps.names))
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
@@ -145,8 +146,8 @@ class Rounds:
         """Choose what is used by the residuals that scatter."""
         if self.robust:
             s = self.observations.squared(self._scatter(), self.use.astype(np.float64))
-            near = s <= (self.options.robust_threshold * self.noise) ** 2
-            self.use = self.observations.tied(self.everything & (near | self.observations.is_spared(s)))
+            near = self.observations.is_near(s, self.options.robust_threshold * self.noise)
+            self.use = self.observations.tied(self.everything & near)
 
     def _solve(self) -> Minimum:
         """Least squares of what is used; a second pass follows the first robust one always, and is exact."""

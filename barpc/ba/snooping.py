@@ -89,7 +89,7 @@ def control_test(
     covariance : Covariance
         Of the solution.
     points : (P, 3)
-        Adjusted, ECEF [m]; those from `first` on are the GCPs.
+        Adjusted, ECEF [m]; from `first` on the GCPs.
     first : int
         Number of tracks.
     gcps : GroundPoints
@@ -100,7 +100,7 @@ def control_test(
     count = len(gcps.names)
     seen = np.bincount(gcps.point, minlength=count)
     enu = enu_basis(gcps.lonlatalt)
-    offset = enu_offsets(points[first:], gcps.lonlatalt)
+    offset = enu_offsets(points[first : first + count], gcps.lonlatalt)
     adjusted = enu @ covariance.points(first + np.arange(count)) @ np.swapaxes(enu, 1, 2)
     residual, w, redundancy = np.full((count, 3), np.nan), np.full(count, np.nan), np.zeros(count)
     for g in range(count):

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from barpc.ba.ground import ALIKE
 from barpc.ba.problem import Problem
 from barpc.ba.smooth import SPLINES
 from barpc.geodesy import Array
@@ -20,6 +21,7 @@ MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to
 _LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
 _LEAST_FREEDOM = 20
 _GROSS = 100.0  # sigmas: a control point of another place would take the block with it
+_CUT = 5.0  # sigmas: of a reference's points, which were compared with each other before
 
 Loss = Callable[[Array], tuple[Array, Array]]
 """s (...) -> rho(s), rho'(s); rho(0) = 0, rho'(0) = 1."""
@@ -65,19 +67,34 @@ LOSSES: dict[str, Loss] = {
 class Observations:
     """How much observations count: stated sigmas, the observed noise, and the cap on a view's information."""
 
-    def __init__(self, problem: Problem, sigma: Array, noise_floor: float, is_tie: BoolArray) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        sigma: Array,
+        noise_floor: float,
+        is_tie: BoolArray,
+        of_reference: BoolArray | None = None,
+    ) -> None:
         self.structure, self.sigma, self.noise_floor = problem.structure, sigma, noise_floor
         self.is_tie = is_tie
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True
-        self.is_control = (
-            ~is_tie & self.has_prior[self.structure.point]
-        )  # whose noise is tested point by point
+        self.of_reference = np.zeros_like(is_tie) if of_reference is None else of_reference
+        # control points are tested point by point
+        self.is_control = ~is_tie & ~self.of_reference & self.has_prior[self.structure.point]
 
     def is_spared(self, squared: Array) -> BoolArray:
-        """Observations (K,) of control points: they are tested point by point at the end, unless grossly wrong."""
-        return np.asarray(self.is_control & (squared < _GROSS**2))
+        """Observations (K,) of control points: they are tested point by point at the end, unless grossly wrong.
+
+        Those of a reference agree with each other: how far the cameras are off says nothing of them.
+        """
+        return np.asarray((self.is_control & (squared < _GROSS**2)) | self.of_reference)
+
+    def is_near(self, squared: Array, scale: float) -> BoolArray:
+        """Observations (K,) that are no farther off than so many standard deviations; a reference's by their own."""
+        near = np.where(self.of_reference, squared <= _CUT**2, squared <= scale**2)
+        return np.asarray(near | (self.is_control & (squared < _GROSS**2)))
 
     def freedom(self, counted: Array) -> Array:
         """Degrees of freedom (K,) of an observation once its point is estimated: 1/2 of two views', to 2.
@@ -109,6 +126,9 @@ class Observations:
         information = self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0]
         floor = self.noise_floor**2 + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
+        count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
+        alike = np.sqrt(np.minimum(ALIKE / np.maximum(count, 1.0), 1.0))
+        weight = np.where(self.of_reference, use / self.sigma * alike[self.structure.view], weight)
         return np.where(self.is_tie, weight * cap[self.structure.view], weight)
 
     def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
@@ -116,7 +136,7 @@ class Observations:
 
         `fitted` further parameters have been taken out of the residuals.
         """
-        use = use & ~self.is_control
+        use = use & ~self.is_control & ~self.of_reference
         whitened = residual[:, use] / self.sigma[use]
         seen = np.zeros(self.structure.num_points, dtype=bool)
         seen[self.structure.point[use]] = True

@@ -37,6 +37,7 @@ def adjust(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flag
     Examples:
       barpc adjust scene/*.tif -o adjusted
       barpc adjust a.tif b.tif --gcp points.gcp --dem srtm.tif --geoid egm96.gtx -o adjusted
+      barpc adjust scene/*.tif --reference ortho.tif --dem srtm.tif --geoid egm96.gtx -o adjusted
       barpc adjust --image-list images.txt -j 8 --keep-going -o adjusted
     """
     from barpc import pipeline

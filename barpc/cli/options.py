@@ -17,7 +17,17 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 TIE = ("tie.band", "matches", "overlap_list", "aoi", "tie.keypoints_per_image", "tie.search")
 CAMERA = ("adjust.model", "adjust.drift", "adjust.sigma_attitude", "adjust.sigma_position", "adjust.fixed")
-GROUND = ("gcp", "check_points", "fixed_run", "dem", "adjust.dem_sigma", "adjust.dem_for_all", "geoid")
+GROUND = (
+    "gcp",
+    "check_points",
+    "fixed_run",
+    "dem",
+    "adjust.dem_sigma",
+    "adjust.dem_for_all",
+    "geoid",
+    "reference",
+    "reference_sigma",
+)
 ADJUSTMENT = (*CAMERA, *GROUND)
 MATCH = ("overwrite", "keep_going")
 RUN = (*MATCH, "images", "rpc_formats")

@@ -18,6 +18,7 @@ from barpc.pointio.names import ViewNames
 from barpc.scene import BoolArray, Tracks, View
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import read_names
+from barpc.tie.ortho import Sheet
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +36,8 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
             logger.warning("%s", line)
     if options.adjust.dem_for_all and options.dem is None:
         raise InputError("dem_for_all is given without dem: there are no heights to hold the tie points to")
+    for path in options.reference:
+        Sheet.open(path)
     dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
     if dem is not None:
         _require_cover(dem, str(options.dem), views)

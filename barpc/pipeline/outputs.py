@@ -16,13 +16,14 @@ from barpc.pipeline.inputs import PRIOR
 from barpc.report import Run, Summary
 from barpc.report.page import can_render, report_html
 from barpc.report.records import plain
-from barpc.report.tables import TABLES
+from barpc.report.tables import TABLES, gcps_geojson
 from barpc.rpcio import CARRIERS, WRITABLE, sidecars, write_camera
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.workspace import Workspace, own_files
 
 MATCHES = ("matches.csv", "matches.npz")
+GCPS = "gcps.geojson"  # of a reference
 
 REOPENED = 1e-5
 """A reopened file may differ from P_BA by the error of the fit and this [px] more (15-digit printing)."""
@@ -62,6 +63,7 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """The outputs of a run, before it starts; of the tie points of pairs those that are in the folder."""
     names = [*TABLES, "summary.json", *(["report.html"] if can_render() else [])]
+    names += [GCPS] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
         pairs = [path.name for path in (folder / "asp").glob("*__*.txt") if _is_pair(path.stem, stems)]
@@ -96,6 +98,8 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> None:
     for name, content in TABLES.items():
         with workspace.output(name) as partial:
             partial.write_bytes(content(run, summary))
+    if run.reference is not None and run.reference.control is not None and run.adjustment is not None:
+        workspace.write_text(GCPS, gcps_geojson(run).decode())
     if can_render():
         workspace.write_text("report.html", report_html(summary, workspace.folder))
     workspace.write_text("summary.json", json.dumps(plain(summary), indent=1) + "\n")

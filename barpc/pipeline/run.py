@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
+from barpc.ba.ground import DEM_BIAS
 from barpc.dem import Dem
 from barpc.errors import DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
@@ -35,10 +36,13 @@ from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
+from barpc.tie.reference import Registration, register
 from barpc.tie.tasks import Progress
 from barpc.workspace import Workspace, fingerprint
 
 logger = logging.getLogger(__name__)
+
+REFERENCE_BIAS = 5.0  # m: of the heights that go with a reference, where it is known what they count from
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -128,7 +132,8 @@ def adjust(
     names, keep = _files(run, options, folder)
     with Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names) as workspace:
         with workspace.stage("fingerprints"):
-            fingerprints = {view.path: fingerprint(view.path) for view in run.views}
+            paths = [*(view.path for view in run.views), *_references(options)]
+            fingerprints = {path: fingerprint(path) for path in paths}
         with CachingExecutor(workspace, fingerprints, executor) as caching:
             run = _solve(run, options, workspace, caching, progress)
         if run.adjustment is not None and options.stop_after == "all":
@@ -168,7 +173,7 @@ def _as_given(views: Iterable[View], images: Sequence[Image]) -> tuple[View, ...
 def _loaded(kind: Literal["adjust", "check"], images: Sequence[Image], options: RunOptions) -> Run:
     for path in input_files(options):
         plain_path(path)
-    least = 1 if options.gcp else 2  # one image and control points are enough
+    least = 1 if options.gcp or options.reference else 2  # one image and control are enough
     loaded = load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
     none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
     return Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options)
@@ -201,9 +206,34 @@ def _solve(
         if options.stop_after == "matching":
             _write_matches(run, workspace)
             return replace(run, kind="match")
+        if run.reference is None and given[0] is not None and options.reference:
+            with workspace.stage("reference"):
+                run = replace(run, reference=_registered(run, options, given[0], executor, progress))
         with workspace.stage("adjustment" + again):
             run = _adjusted(run, options, *given)
     return run
+
+
+def _references(options: RunOptions) -> list[str]:
+    return [str(Path(path).absolute()) for path in options.reference]
+
+
+def _registered(
+    run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None
+) -> Registration:
+    """What the reference says of the cameras as delivered."""
+    given = options.adjust.dem_bias_sigma
+    bias = (REFERENCE_BIAS if dem.known else DEM_BIAS) if given is None else given
+    return register(
+        run.views,
+        _references(options),
+        dem,
+        options.tie.band,
+        sigma=options.reference_sigma,
+        height_sigma=(options.adjust.dem_sigma, bias),
+        executor=executor,
+        progress=progress,
+    )
 
 
 def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior | None) -> Run:
@@ -221,6 +251,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
         dem,
         centers=np.array([center.ecef for center in centers]),
         prior=prior,
+        reference=None if run.reference is None else run.reference.control,
         keep_largest=options.keep_going,
     )
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment)
@@ -274,6 +305,7 @@ def _only(run: Run, names: frozenset[str]) -> Run:
         sources=tuple(run.sources[i] for i in kept),
         left_out=(*run.left_out, *dropped),
         adjustment=None,
+        reference=None,
     )
 
 

@@ -27,6 +27,7 @@ from barpc.report.summary import (
     DatumEntry,
     GcpEntry,
     PairEntry,
+    ReferenceViewEntry,
     StageEntry,
     Summary,
     ViewEntry,
@@ -269,7 +270,7 @@ def _gauge(files: RunFiles) -> Section | None:
     answer = "Images fix each other, not their place on the Earth. What is left open, one sigma, the weakest first."
     if scene.num_held_in_height:
         answer += f" {scene.num_held_in_height} tie points seen under too small an angle were held in height."
-    if not gcps:
+    if not gcps and not (files.summary.reference and files.summary.reference.used):
         answer += " Ground control points (--gcp) are what helps where it matters."
     tables = (
         [table("datum", DATUM, scene.datum, DatumEntry, DatumEntry.columns(scene.datum))]
@@ -277,6 +278,11 @@ def _gauge(files: RunFiles) -> Section | None:
         else []
     )
     tables += [table("gcps", GCPS, gcps, GcpEntry, GcpEntry.PAGE)] if gcps else []
+    if (reference := files.summary.reference) is not None:
+        caption = "Reference: what it says of each camera as delivered"
+        tables.append(
+            table("reference", caption, reference.views, ReferenceViewEntry, ReferenceViewEntry.PAGE)
+        )
     return Section("gauge", "What can the images not tell?", answer, bars=bars, tables=tables, half=True)
 
 

@@ -17,7 +17,7 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Triangulation, triangulate
-from barpc.tie import PairReport
+from barpc.tie import PairReport, Registration
 
 MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
@@ -41,7 +41,8 @@ class Run:
     `sources`: where the views' RPCs came from (empty: not from files); `matched`: pairs that were matched (empty: tie
     points from a file); `adjustment`, `centers`, `fits`: of an adjustment that went so far; `written`, per view: file,
     consumer that reopened it, largest difference to P_BA [px] or why it does not read it; `left_out`: files, and why;
-    `stages`: their seconds and peak memory so far; `check_points` stayed out of the adjustment.
+    `stages`: their seconds and peak memory so far; `check_points` stayed out of the adjustment; `reference`: what an
+    orthoimage said.
     """
 
     kind: Literal["adjust", "check", "match"]
@@ -59,6 +60,7 @@ class Run:
     out_dir: str = ""
     gcps: GroundPoints | None = None
     check_points: GroundPoints | None = None
+    reference: Registration | None = None
 
     @property
     def before(self) -> tuple[SensorModel, ...]:

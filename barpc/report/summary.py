@@ -64,6 +64,7 @@ _DATUM_HEADS = {
     "fixed_views": "fixed views",
     "gcps": "GCPs",
     "heights": "heights",
+    "reference": "reference",
 }
 GCPS = "Ground control: what all the others say of a point minus its given place"
 DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
@@ -349,6 +350,7 @@ class DatumEntry(Record):
     fixed_views: Number = said("Views that are fixed")
     gcps: Number = said("Ground control points")
     heights: Number = said("The DEM, or altitudes assumed for tie points seen under too small an angle")
+    reference: Number = said("A reference orthoimage", default=None)
 
     @classmethod
     def columns(cls, entries: Sequence[DatumEntry]) -> str:
@@ -448,6 +450,40 @@ class GcpEntry(KnownPoint):
         return [point for point in points if any(point is one for one in order)]
 
 
+class ReferenceViewEntry(Record):
+    """What a reference says of an image."""
+
+    PAGE: ClassVar = "name peak offset_en_m num_tried num_passed num_points scatter_m"
+
+    name: str = said("View", head="image")
+    peak: Number = said(
+        "By how many standard deviations the vote for one shift stands out; below 6.5 it is none",
+        "",
+        "peak",
+        ".1f",
+    )
+    offset_en_m: Pixel | None = said(
+        "How far off the camera as delivered shows everything, east, north",
+        "m",
+        ("off east", "north"),
+        "+.2f",
+    )
+    num_tried: Count = said("Points looked for", head="points tried")
+    num_passed: Count = said("That beat their decoy and came back", head="found")
+    num_points: Count = said("That agree with each other and held the block", head="used")
+    scatter_m: Number = said("Standard deviation of those across the line of sight", "m", "scatter", ".2f")
+
+
+class ReferenceEntry(Record):
+    """A reference orthoimage."""
+
+    used: bool = said("Whether it holds the block")
+    step_m: Number = said("Resolution at which it was matched", "m")
+    sigma_m: Number = said("Standard deviation of its own place, along an axis", "m")
+    num_points: Count = said("Points on the ground that hold the block")
+    views: tuple[ReferenceViewEntry, ...] = said("What it says of each image")
+
+
 class SeenEntry(Record):
     """Where a check point is seen."""
 
@@ -516,6 +552,7 @@ class Summary(Record):
         "Options of the run"
     )
     versions: Mapping[str, str] = said("Versions of Python and packages")
+    reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
 
     @property
     def adjusted(self) -> bool:
@@ -570,6 +607,7 @@ def measure(run: Run) -> Summary:
         scene=None if run.adjustment is None else _scene(run.adjustment),
         gcps=_gcps(run),
         check_points=_check_points(run),
+        reference=_reference(run),
         stages=tuple(StageEntry.read(stage) for stage in run.stages),
         options=plain(run.options),
         versions={"python": platform.python_version(), **{name: package_version(name) for name in names}},
@@ -821,6 +859,32 @@ def _in_images(run: Run, points: GroundPoints, g: int, residual: Array) -> float
         run.after[v].project(moved) - run.after[v].project(given) for v in points.view[points.point == g]
     ]
     return float(np.sqrt(np.mean(np.square(moves).sum(axis=1)))) if moves else float("nan")
+
+
+def _reference(run: Run) -> ReferenceEntry | None:
+    found, adjustment = run.reference, run.adjustment
+    if found is None:
+        return None
+    control = None if adjustment is None else found.control
+    kept = np.zeros(len(run.views), np.int64)
+    points = 0
+    if control is not None and adjustment is not None:
+        rows = adjustment.reference_inlier
+        kept = np.bincount(control.points.view[rows], minlength=len(run.views))
+        points = len(np.unique(control.points.point[rows]))
+    views = tuple(
+        ReferenceViewEntry(
+            name=view.name,
+            peak=view.peak,
+            offset_en_m=view.offset if view.points else None,
+            num_tried=view.tried,
+            num_passed=view.passed,
+            num_points=int(count),
+            scatter_m=view.scatter,
+        )
+        for view, count in zip(found.views, kept, strict=True)
+    )
+    return ReferenceEntry(points > 0, found.step, found.sigma, points, views)
 
 
 def _check_points(run: Run) -> tuple[CheckPointEntry, ...]:

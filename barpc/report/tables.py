@@ -139,6 +139,32 @@ def _points_ply(run: Run, _: Summary) -> bytes:
     return ("\n".join(header) + "\n").encode() + records.tobytes()
 
 
+def gcps_geojson(run: Run) -> bytes:
+    """The points of a reference that held the block, as `--gcp` reads them: a feature an observation."""
+    control = None if run.reference is None else run.reference.control
+    assert control is not None
+    assert run.adjustment is not None
+    points, kept = control.points, run.adjustment.reference_inlier
+    places, sigmas, pixels = (
+        points.lonlatalt.round(9).tolist(),
+        points.sigma.tolist(),
+        points.xy.round(4).tolist(),
+    )
+    features = []
+    for row in np.flatnonzero(kept).tolist():
+        g, view = int(points.point[row]), run.views[points.view[row]]
+        properties = {
+            "id": points.names[g],
+            "filename": Path(view.path).name,
+            "ji": pixels[row],
+            "sigma_m": sigmas[g],
+        }
+        place = {"type": "Point", "coordinates": places[g]}
+        features.append(json.dumps({"type": "Feature", "geometry": place, "properties": properties}))
+    text = ",\n".join(features)
+    return f'{{"type": "FeatureCollection", "features": [\n{text}\n]}}\n'.encode()
+
+
 TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
     "residuals.csv": _residuals_csv,
     "residuals.geojson": _residuals_geojson,

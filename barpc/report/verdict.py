@@ -13,6 +13,7 @@ from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
+from barpc.tie.reference import PEAK
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
 FEW_OBSERVATIONS = 30  # A view with fewer is called weakly tied, unless control points hold it
@@ -22,6 +23,7 @@ MANY_REJECTED = 0.3  # A view that lost a larger share of its observations is ca
 SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
 NOISE_LIMIT = 2.5  # Tie points that scatter by more than so many times what the matcher states need a look
+_MOST_NAMED = 5  # images in a sentence
 MOVED = 3.0  # A scene that moved by more than so many of its own standard deviations needs a look
 
 GOOD = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
@@ -55,9 +57,13 @@ def _failure(view: ViewEntry, run: Run) -> str:
     return ""
 
 
-def _weakness(view: ViewEntry, _: Run) -> str:
+def _weakness(view: ViewEntry, run: Run) -> str:
     few = view.num_observations
     if few >= FEW_OBSERVATIONS or view.num_gcps >= ENOUGH_GCPS:
+        return ""
+    if run.reference is not None and any(
+        found.points and found.name == view.name for found in run.reference.views
+    ):
         return ""
     return f"{f'only {few}' if few else 'no'} tie points: check overlap, clouds and dates"
 
@@ -206,8 +212,15 @@ def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
 
 
 def _control_reasons(run: Run) -> list[str]:
-    """Ground points that were cut, and what was left out of their files."""
+    """Ground points that were cut, what was left out of their files, a reference of no use."""
     out = []
+    if run.reference is not None and run.adjustment is not None and run.reference.control is None:
+        peak = max((view.peak for view in run.reference.views), default=0.0)
+        out.append(
+            f"The reference does not show what the images show (its highest peak stands out by {peak:.1f} standard "
+            f"deviations, {PEAK:g} are needed): another place, too old, or without texture. It was not used, and moved "
+            "nothing."
+        )
     tested = None if run.adjustment is None else run.adjustment.control
     if run.gcps is not None and tested is not None:
         for status, words in _CONTROL_WORDS.items():
@@ -238,15 +251,18 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     gauge, prior = run.adjustment.gauge, run.adjustment.prior
     lines = [f"Tie points of {len(views)} images agree to {after:.3f} px (before: {before:.3f} px)."]
     if not len(run.tracks):
-        lines = ["There are no tie points: the cameras are held by control points alone."]
+        lines = ["There are no tie points: the cameras are held by control alone."]
     drift = f"drift of degree {run.adjustment.cameras.unknowns.drift}"
     if prior.drift_sigma and np.isfinite(prior.drift_sigma).all():  # an earlier run's are in its matrix
         sizes = f"{_lengths(prior.drift_sigma)} at the first and last row"
         lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
-    lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
+    if len(run.tracks) or run.gcps is not None:
+        lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
+    lines += _reference_lines(run)
     known = f"its place is known to {_lengths(gauge.sigma)} (east, north, up; one sigma)"
     if run.gcps is None:
-        lines.append(f"Without ground control {known} only.")
+        held_by = "Without ground control" if run.reference is None or run.reference.control is None else "So"
+        lines.append(f"{held_by} {known}{' only' if held_by != 'So' else ''}.")
     else:
         is_seen = np.bincount(run.gcps.point, minlength=len(run.gcps.names)) > 0
         tested = run.adjustment.control
@@ -281,7 +297,7 @@ def _dem_lines(adjustment: Adjustment) -> list[str]:
         needed = options.dem_for_all or adjustment.held.any()
         held += f": {'it has no height where it is needed' if needed else why}"
     else:
-        single, common = metres(options.dem_sigma), metres(options.dem_bias_sigma)
+        single, common = metres(options.dem_sigma), metres(terrain.bias)
         held += f", each to {single} and all together to {common}"
     share = 100 * terrain.known / max(terrain.total, 1)
     lie = f"they lie {terrain.offset:+.1f} m above it (median; spread {terrain.spread:.1f} m)" * bool(
@@ -291,6 +307,23 @@ def _dem_lines(adjustment: Adjustment) -> list[str]:
         f"{held}.",
         f"It has a height for {share:.0f} % of the tie points{'; ' if lie else ''}{lie}.",
     ]
+
+
+def _reference_lines(run: Run) -> list[str]:
+    """What a reference was good for."""
+    found = run.reference
+    if found is None or found.control is None:
+        return []
+    matched = [view for view in found.views if view.points]
+    used, tried = sum(view.points for view in matched), sum(view.tried for view in matched)
+    off = ", ".join(f"{np.hypot(*view.offset):.1f} m ({view.name})" for view in matched[:_MOST_NAMED])
+    more = f" and {len(matched) - _MOST_NAMED} more" if len(matched) > _MOST_NAMED else ""
+    text = (
+        f"Reference: {used} of {tried} points matched at {metres(found.step)} in {_count(len(matched), 'image')}, peak "
+        f"{min(view.peak for view in matched):.1f} or more; as delivered they were off by {off}{more}."
+    )
+    rest = [view.name for view in found.views if not view.points]
+    return [text, f"The reference holds no point of {listed(rest)}."] if rest else [text]
 
 
 def _lengths(values: Iterable[float]) -> str:

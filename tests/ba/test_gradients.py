@@ -13,13 +13,13 @@ import pytest
 
 from barpc.ba import ground as on_points
 from barpc.ba.cameras import Cameras
-from barpc.ba.ground import flat_heights, ground_control, terrain_heights
+from barpc.ba.ground import flat_heights, ground_control, reference_control, terrain_heights
 from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.unknowns import make_unknowns
 from barpc.ba.weights import LOSSES
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.options import AUTO, Model
-from barpc.scene import GroundPoints, View
+from barpc.scene import GroundPoints, Reference, View
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import simulate_block
 
@@ -112,6 +112,9 @@ def _point_priors():
     )
     return points, {
         "ground_control": ground_control(gcps, index),
+        "reference_control": reference_control(
+            Reference(gcps, np.array([0.4, 0.7, 2.0]), np.zeros((1, 2))), index
+        ),
         "terrain_heights": terrain_heights(
             points, index, lambda lon, lat: 100.0 + 800.0 * (lon - 5.4) + 300.0 * (lat - 43), 3.0, 0.0
         ),
@@ -159,8 +162,11 @@ def test_priors_on_points_have_the_derivatives_of_central_differences(name):
     for axis in range(3):
         step = np.zeros_like(points)
         step[:, axis] = 1.0
-        numeric = (block.residual(points + step) - block.residual(points - step)) / 2
+        numeric = (block.apart(points + step) - block.apart(points - step)) / 2
         np.testing.assert_allclose(block.jacobian()[..., axis], numeric, rtol=0, atol=1e-7)
+        slope = (block.cost(points + step) - block.cost(points - step)) / 4  # common errors are the best ones
+        wanted = (block.jacobian()[..., axis] * block.residual(points)).sum()
+        assert slope == pytest.approx(wanted, rel=1e-6, abs=1e-6)
 
 
 def test_a_terrain_prior_measures_the_distance_along_the_vertical():

@@ -188,6 +188,28 @@ def geoid(run: Run, out: Path, scene: Path) -> None:
         RunOptions(geoid="g.gtx")
 
 
+def reference(run: Run, out: Path, scene: Path) -> None:  # what it does to a block: test_reference
+    dem, geoid = str(scene / "dem/a.tif"), str(scene / "dem/g.gtx")
+    found = run("a", dem=dem, geoid=geoid, reference=(dem,))
+    assert found.summary["reference"]["used"] is False
+    assert any("does not show" in reason for reason in found.summary["reasons"])
+    assert run("b", dem=dem, geoid=geoid).summary.get("reference") is None
+    with pytest.raises(InputError, match="reference is given without dem"):
+        RunOptions(reference=("r.tif",))
+
+
+def reference_sigma(run: Run, out: Path, scene: Path) -> None:
+    given = {"dem": str(scene / "dem/a.tif"), "geoid": str(scene / "dem/g.gtx")}
+    given["reference"] = (given["dem"],)
+    sigmas = [
+        run(name, **given, reference_sigma=size).summary["reference"]["sigma_m"]
+        for name, size in (("a", None), ("b", 7.0))
+    ]
+    assert sigmas == [pytest.approx(0.25 * 111.0, rel=0.3), 7.0]  # a quarter of its pixel
+    with pytest.raises(InputError, match="reference_sigma is given without reference"):
+        RunOptions(reference_sigma=1.0)
+
+
 def tie(run: Run, out: Path, scene: Path) -> None:
     few = run("a", None, stop_after="matching", tie=TieOptions(points_per_image=80))
     many = run("b", None, stop_after="matching")
@@ -208,7 +230,8 @@ ROWS = {
     "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "check_points": check_points,
-    "fixed_run": fixed_run, "dem": dem, "geoid": geoid, "tie": tie, "adjust": adjust_, "fit": fit,
+    "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
+    "reference": reference, "reference_sigma": reference_sigma, "tie": tie, "adjust": adjust_, "fit": fit,
 }  # fmt: skip
 
 

@@ -1,0 +1,200 @@
+"""Images and orthoimages on one grid on the ground, as channels that can be compared (`barpc.tie.channels`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from rasterio import Affine
+from rasterio._err import CPLE_BaseError
+from rasterio.crs import CRS
+from rasterio.errors import CRSError
+from rasterio.warp import transform as warp_points
+
+from barpc.errors import InputError
+from barpc.frozen import Frozen
+from barpc.geodesy import Array, metres_per_unit
+from barpc.raster import open_raster
+from barpc.scene import BoolArray, View
+from barpc.tie.channels import ORIENTATIONS, channels
+from barpc.tie.raster import Box, FloatImage, grow, levelled, read_pixels
+
+Terrain = Callable[[Array, Array], Array]
+"""lon, lat (...) [deg] -> altitude (...) [m above the ellipsoid], NaN where it is unknown."""
+
+_NODE = 8  # px between exact projections; straight lines between them
+_KNOWN = 0.99  # of what a pixel is made of must be valid
+
+
+@dataclass(frozen=True, eq=False)
+class Patch(Frozen):
+    """A grid on the ground, rows to the south.
+
+    Parameters
+    ----------
+    lonlat : (2,), of its first pixel [deg]
+    step : float [m]
+    shape : (int, int), rows, columns
+    heights : (m, n), of the terrain at its nodes [m above the ellipsoid]
+    moved : (2,), how far a camera shows everything from its place, east, north [m]
+    """
+
+    lonlat: Array
+    step: float
+    shape: tuple[int, int]
+    heights: Array
+    moved: Array
+
+    @classmethod
+    def on(cls, terrain: Terrain, lonlat: Array, step: float, shape: tuple[int, int], moved: Array) -> Patch:
+        """A patch with the heights of a terrain."""
+        nodes = _nodes(lonlat, step, shape)
+        return cls(lonlat, step, shape, terrain(nodes[..., 0], nodes[..., 1]), moved)
+
+    def nodes(self) -> Array:
+        """lon, lat (m, n, 2) [deg] of the nodes."""
+        return _nodes(self.lonlat, self.step, self.shape)
+
+    def image(self, view: View) -> Array:
+        """Where a camera that is off by `moved` shows the nodes (m, n, 2) [px]."""
+        lonlat = self.nodes() + self.moved / metres_per_unit(np.append(self.lonlat, 0.0))[:2]
+        return view.sensor.project(np.concatenate([lonlat, self.heights[..., None]], axis=2))
+
+    def seen(self, view: View, at: Array) -> Array:
+        """Image points (n, 2) [px] of places x, y (n, 2) [px] of the grid."""
+        rows, cols = _between(at[:, 1], self.shape[0]), _between(at[:, 0], self.shape[1])
+        return np.asarray(np.einsum("nr,rck,nc->nk", rows, self.image(view), cols))
+
+
+def _ticks(count: int) -> Array:
+    return np.linspace(0.0, count - 1.0, -(-(count - 1) // _NODE) + 1)
+
+
+def _between(at: Array, count: int) -> Array:
+    """Weights (n, nodes) of the nodes along an axis of `count` px for places (n,)."""
+    ticks = _ticks(count)
+    return np.stack([np.interp(at, ticks, row) for row in np.eye(len(ticks))], axis=1)
+
+
+def _nodes(lonlat: Array, step: float, shape: tuple[int, int]) -> Array:
+    metres = metres_per_unit(np.append(lonlat, 0.0))[:2]
+    lon = lonlat[0] + step * _ticks(shape[1]) / metres[0]
+    lat = lonlat[1] - step * _ticks(shape[0]) / metres[1]
+    return np.stack(np.meshgrid(lon, lat), axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """An orthoimage: how its pixels lie on the ground."""
+
+    path: str
+    crs: CRS
+    to_pixel: Affine
+    size: tuple[int, int]
+    bands: tuple[int, ...]  # that are averaged
+
+    @classmethod
+    def open(cls, path: str) -> Sheet:
+        """An orthoimage from any raster with a CRS; else an InputError."""
+        with open_raster(path) as dataset:
+            crs, forward, size = dataset.crs, dataset.transform, (dataset.width, dataset.height)
+            bands = (1, 2, 3) if dataset.count >= 3 else (1,)
+        if crs is None or not abs(forward.determinant) > 0:
+            raise InputError(
+                f"{path}: a reference is an orthoimage, and this raster has no place on the ground"
+            )
+        return cls(path, crs, ~forward, size, bands)
+
+    def image(self, lonlat: Array) -> Array:
+        """col, row (..., 2) [px] of lon, lat (..., 2) [deg]."""
+        lon, lat = lonlat.reshape(-1, 2).T
+        try:
+            x, y = np.array(warp_points("EPSG:4326", self.crs, lon, lat))
+        except (CRSError, CPLE_BaseError) as error:
+            raise InputError(f"{self.path}: lon, lat cannot be brought into its CRS ({error})") from error
+        a, b, c, d, e, f = self.to_pixel[:6]
+        return np.stack([a * x + b * y + c, d * x + e * y + f], axis=1).reshape(lonlat.shape) - 0.5
+
+    def shows(self, lonlat: Array) -> BoolArray:
+        """Whether places (..., 2) [deg] lie on it."""
+        at = self.image(lonlat)
+        return np.asarray(((at >= 0) & (at <= np.array(self.size) - 1.0)).all(axis=-1))
+
+    def step(self, lonlat: Array) -> float:
+        """How large its pixels are at a place (2,) [m]."""
+        metres = metres_per_unit(np.append(lonlat, 0.0))[:2]
+        at = self.image(lonlat + np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]]) / metres)
+        return float(10.0 / np.sqrt(abs(np.linalg.det(at[1:] - at[0]))))
+
+
+def of_image(view: View, band: int, patch: Patch) -> FloatImage:
+    """Channels (C, H, W) of an image on a patch, through its camera."""
+    return channels(*_picture(view.path, (band,), view.size, patch.image(view), patch.shape))
+
+
+def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
+    """Channels (C, H, W) of a patch, of the first of several orthoimages that shows a place."""
+    nodes, whole = patch.nodes(), np.zeros((ORIENTATIONS, *patch.shape), np.float32)
+    for path in paths:
+        sheet = Sheet.open(path)
+        picture, valid = _picture(path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape)
+        if valid.any():
+            whole = np.where(np.abs(whole).sum(axis=0) > 0, whole, channels(picture, valid))
+    return whole
+
+
+def shown(picture: FloatImage) -> float:
+    """Share of a picture of channels (C, H, W) that shows something."""
+    return float((np.abs(picture).sum(axis=0) > 0).mean())
+
+
+def _picture(
+    path: str, bands: Sequence[int], size: tuple[int, int], nodes: Array, shape: tuple[int, int]
+) -> tuple[FloatImage, BoolArray]:
+    """A raster on a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px], and which pixels mean something.
+
+    Where it is finer than the grid, it is averaged first.
+    """
+    nothing = np.zeros(shape, np.float32), np.zeros(shape, dtype=bool)
+    rows, cols = (_between(np.arange(n, dtype=np.float64), n) for n in shape)
+    at = np.stack([rows @ nodes[..., i] @ cols.T for i in (0, 1)], axis=2)
+    if not np.isfinite(at).all():
+        return nothing
+    low, high = np.floor(at.min(axis=(0, 1))).astype(int), np.ceil(at.max(axis=(0, 1))).astype(int)
+    if (high < 0).any() or (low >= size).any():
+        return nothing
+    sides = (nodes[-1, 0] - nodes[0, 0]) / (shape[0] - 1), (nodes[0, -1] - nodes[0, 0]) / (shape[1] - 1)
+    apart = float(np.sqrt(abs(np.linalg.det(np.stack(sides)))))
+    thin = max(1, int(apart))
+    box = grow((int(low[0]), int(low[1]), *(high - low + 1).tolist()), 2 * thin + 2, size)
+    if min(box[2:]) < thin:
+        return nothing
+    box = box[0], box[1], box[2] // thin * thin, box[3] // thin * thin
+    picture, valid = _thinned(path, bands, box, thin)
+    if not (valid > 0).any():
+        return nothing
+    if (left := apart / thin) > 1.1:
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * (left**2 - 1.0) ** 0.5), np.float32)
+    x, y = np.moveaxis(((at - box[:2] + 0.5) / thin - 0.5).astype(np.float32), 2, 0)
+    found = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    inside = cv2.remap(valid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
+    return np.asarray(found, np.float32), np.asarray(inside > _KNOWN)
+
+
+def _thinned(path: str, bands: Sequence[int], box: Box, thin: int) -> tuple[FloatImage, FloatImage]:
+    """The mean of bands of a window, averaged over `thin` x `thin` px, and how much of each of these is known."""
+    cv2.setNumThreads(1)
+    picture, valid = np.zeros((box[3], box[2]), np.float32), np.ones((box[3], box[2]), dtype=bool)
+    for band in bands:
+        pixels, known = read_pixels(path, box, band)
+        picture += levelled(pixels, known)
+        valid &= known
+    picture[~valid] = picture[valid].mean() if valid.any() else 0.0
+    small = box[2] // thin, box[3] // thin
+    parts = (
+        cv2.resize(part, small, interpolation=cv2.INTER_AREA) for part in (picture, valid.astype(np.float32))
+    )
+    mean, share = (np.asarray(part, np.float32) for part in parts)
+    return mean, share

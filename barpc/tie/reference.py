@@ -1,0 +1,361 @@
+"""Control from a reference orthoimage: it and an image, brought onto one grid on the ground, are matched densely.
+
+An image is projected through its camera and the terrain onto a local grid, at the coarser of the two resolutions. First
+many blocks vote together for one shift of the whole camera, within `REACH` metres; how far the peak stands above the
+rest of the sum says whether this is the same place. With the camera moved so, points on a regular grid on the ground,
+the same for all views, are looked for one by one (`barpc.tie.channels`), and those are kept that agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from barpc.geodesy import Array, metres_per_unit
+from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
+from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
+from barpc.tie.channels import Found, correlation, find, joined, margin
+from barpc.tie.ortho import Patch, Sheet, Terrain, of_image, of_reference, shown
+from barpc.tie.raster import FloatImage
+from barpc.tie.tasks import Progress, ordered
+
+REACH = 150.0  # m: how far a camera may be off
+PEAK = 6.5  # a vote that stands out by fewer standard deviations is none: other places reach 5.1
+_QUOTA = 1000  # points in a view, about
+_HALF = 16  # px: templates reach so far to each side
+_APART = 8  # px between points, at least
+_SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
+_FINE, _SIDE, _BLOCKS = (
+    2.0,
+    64,
+    8,
+)  # of the first vote: m a pixel, at least; px of a block; blocks along a side
+_SHOWN = 0.5, 0.3  # of a block and of the reference around it
+_TILE = 192, 48  # px: points of a tile are looked for together; where the rasters are much finer
+_PIXELS = 20e6  # of a tile in a raster, at most, about
+_LEAST = 12  # points that agree in a view
+_MARGIN, _BACK = 0.1, 1.5  # by which a correlation beats its decoy's; px that the way back may miss by
+_NEAR, _FAR, _ROUNDS = (
+    3.0,
+    3.0,
+    8,
+)  # px: shifts that agree, to begin with; robust standard deviations; of the affine
+
+
+@dataclass(frozen=True)
+class ViewMatch:
+    """What became of a view."""
+
+    name: str
+    peak: float  # standard deviations by which the vote's peak stands out
+    offset: tuple[float, float]  # how far off the camera shows everything, east, north [m]
+    tried: int = 0  # points looked for
+    passed: int = 0  # that beat their decoys and came back
+    points: int = 0  # of them, those that agree with each other
+    scatter: float = float("nan")  # of those, across the line of sight [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """What a reference says of views: control, where any view was matched, and what became of each."""
+
+    control: Reference | None
+    views: tuple[ViewMatch, ...]
+    step: float  # resolution at which they were matched [m]
+    sigma: float  # standard deviation of its own place, along an axis [m]
+
+
+def register(
+    views: Sequence[View],
+    paths: Sequence[str],
+    terrain: Terrain,
+    band: int = 1,
+    *,
+    sigma: float | None = None,
+    height_sigma: tuple[float, float] = (10.0, 5.0),
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Registration:
+    """Register views to orthoimages and a terrain.
+
+    Parameters
+    ----------
+    views, band : sequence of View, int, images, and which band of them
+    paths : sequence of str, orthoimages with a CRS; where several show a place, the first
+    terrain : callable, lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside
+    sigma : float, optional, standard deviation of the orthoimages' own place [m]; None: a quarter of their pixel, but
+        at least half a metre
+    height_sigma : (float, float), of single heights of the terrain and of all together [m]
+    executor, progress : as elsewhere
+    """
+    sheets = [Sheet.open(path) for path in paths]
+    middles = [_on_terrain(view, terrain, (np.array([view.size]) - 1.0) / 2.0)[0] for view in views]
+    known = [middle[:2] for middle in middles if np.isfinite(middle).all()]
+    pixels = [min(sheet.step(place) for sheet in sheets) for place in known]
+    own = [float(ground_sample_distance(view.sensor, _middle(view))[1]) for view in views]
+    work = _Work(
+        tuple(views),
+        sheets,
+        terrain,
+        band,
+        step=max(pixels + own),
+        pixel=min(pixels + own),
+        executor=executor,
+        progress=progress,
+    )
+    votes = work.vote()
+    return work.search(
+        votes, max(0.5, 0.25 * max(pixels, default=0.0)) if sigma is None else sigma, height_sigma
+    )
+
+
+# --- tasks ------------------------------------------------------------------------------------------------
+
+
+def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int) -> FloatImage | None:
+    """How well a block of an image, the middle of a patch, goes with the reference at shifts of up to `reach` px.
+
+    (2 reach + 1, 2 reach + 1) correlations; None where it or the reference shows nothing.
+    """
+    template = of_image(view, band, patch)[:, reach:-reach, reach:-reach]
+    if shown(template) < _SHOWN[0]:
+        return None
+    area = of_reference(paths, patch)
+    return None if shown(area) < _SHOWN[1] else correlation(template[None], area[None])[0]
+
+
+def search(view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int) -> Found:
+    """Points x, y (n, 2) [px] of the reference on a patch, looked for in an image."""
+    return find(of_reference(paths, patch), of_image(view, band, patch), points, _HALF, reach)
+
+
+# --- all of it --------------------------------------------------------------------------------------------
+
+
+def _middle(view: View) -> Array:
+    return view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.array(view.altitude))
+
+
+def _on_terrain(view: View, terrain: Terrain, image: Array) -> Array:
+    """Ground points (n, 3) that pixels (n, 2) show, NaN where the terrain is unknown."""
+    ground = view.sensor.localize(image, np.full(len(image), view.altitude))
+    for _ in range(6):
+        ground = view.sensor.localize(image, terrain(ground[:, 0], ground[:, 1]))
+    return ground
+
+
+def peak(votes: Sequence[FloatImage | None]) -> tuple[float, Array]:
+    """Of the sum of votes: how many standard deviations its peak stands out by, and where, x, y from the middle."""
+    cast = [one for one in votes if one is not None]
+    if not cast:
+        return 0.0, np.zeros(2)
+    total = np.sum(cast, axis=0, dtype=np.float64)
+    middle = np.median(total)
+    spread = 1.4826 * float(np.median(np.abs(total - middle)))
+    row, col = np.unravel_index(total.argmax(), total.shape)
+    z = float((total.max() - middle) / spread) if spread > 0 else 0.0
+    return z, np.array([col, row], dtype=np.float64) - total.shape[0] // 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Tile:
+    """Points of a view that are looked for together."""
+
+    points: IntArray  # which
+    patch: Patch
+    at: Array  # where on it they are, x, y (n, 2) [px]
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """Views and what they are registered to."""
+
+    views: tuple[View, ...]
+    sheets: list[Sheet]
+    terrain: Terrain
+    band: int
+    step: float  # of the grids [m]
+    pixel: float  # the smallest of any raster [m]
+    executor: Executor | None
+    progress: Progress | None
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        return tuple(sheet.path for sheet in self.sheets)
+
+    def vote(self) -> list[tuple[float, Array]]:
+        """Of every view the peak of its vote, and how far its camera is off (2,) [m]."""
+        coarse = max(self.step, _FINE)
+        found = self._votes([np.zeros(2)] * len(self.views), coarse, REACH, "reference: vote")
+        if coarse == self.step:
+            return found
+        near = [shift for _, shift in found]
+        again = self._votes(near, max(self.step, coarse / 4.0), 4.0 * coarse, "reference: second vote")
+        return [(z, shift) for (z, _), (_, shift) in zip(found, again, strict=True)]
+
+    def _votes(
+        self, moved: Sequence[Array], step: float, reach: float, stage: str
+    ) -> list[tuple[float, Array]]:
+        px, tasks, ends = int(np.ceil(reach / step)), [], [0]
+        for view, shift in zip(self.views, moved, strict=True):
+            tasks += [
+                (view, self.band, self.paths, patch, px) for patch in self._blocks(view, shift, step, px)
+            ]
+            ends.append(len(tasks))
+        cast = ordered(self.executor, vote, tasks, stage, self.progress)
+        peaks = [peak(cast[start:stop]) for start, stop in pairwise(ends)]
+        # a block of the image that the reference shows `at` px away: the camera is off by the rest
+        return [(z, shift - at * [step, -step]) for (z, at), shift in zip(peaks, moved, strict=True)]
+
+    def _blocks(self, view: View, moved: Array, step: float, reach: int) -> list[Patch]:
+        """Patches around blocks of an image, evenly spread, that the reference may show."""
+        wide = _SIDE * step / float(ground_sample_distance(view.sensor, _middle(view))[1])
+        axes = []
+        for length in view.size:
+            edge = 0.5 * min(wide, length)
+            axes.append(np.linspace(edge, length - edge, int(np.clip((length - edge) // wide, 1, _BLOCKS))))
+        ground = _on_terrain(view, self.terrain, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
+        ground = ground[np.isfinite(ground).all(axis=1)]
+        metres = metres_per_unit(ground)[:, :2]
+        places = ground[:, :2] - moved / metres
+        count = _SIDE + 2 * reach
+        corner = np.array([-0.5, 0.5]) * count * step
+        seen = np.any([sheet.shows(places) for sheet in self.sheets], axis=0) if len(places) else []
+        return [
+            Patch.on(self.terrain, place + corner / scale, step, (count, count), moved)
+            for place, scale, here in zip(places, metres, seen, strict=True)
+            if here
+        ]
+
+    def search(
+        self, votes: Sequence[tuple[float, Array]], sigma: float, height_sigma: tuple[float, float]
+    ) -> Registration:
+        """Points looked for in every view whose vote stands out, and what they make."""
+        places, heights = self._lattice(
+            [view for view, (z, _) in zip(self.views, votes, strict=True) if z >= PEAK]
+        )
+        reach = int(np.ceil(_SEARCH[0] + _SEARCH[1] / self.step))
+        tiles = [
+            self._tiles(view, moved, places, heights, reach) if z >= PEAK else []
+            for view, (z, moved) in zip(self.views, votes, strict=True)
+        ]
+        tasks = [
+            (view, self.band, self.paths, tile.patch, np.rint(tile.at), reach)
+            for view, own in zip(self.views, tiles, strict=True)
+            for tile in own
+        ]
+        done = iter(ordered(self.executor, search, tasks, "reference: points", self.progress))
+        reports, rows = [], []
+        for i, (view, (z, moved), own) in enumerate(zip(self.views, votes, tiles, strict=True)):
+            none = ViewMatch(view.name, z, (float(moved[0]), float(moved[1])))
+            report, kept = self._agreeing(view, none, [(tile, next(done)) for tile in own], places)
+            reports.append(report)
+            if kept is not None:
+                rows.append((np.full(len(kept[0]), i), *kept))
+        control = None
+        if rows:
+            view_of, point, xy, xy_sigma = (np.concatenate(column) for column in zip(*rows, strict=True))
+            used, closed = np.unique(point, return_inverse=True)
+            single = np.tile([0.1 * self.step, 0.1 * self.step, height_sigma[0]], (len(used), 1))
+            ground = np.column_stack([places[used], heights[used]])
+            names = tuple(f"reference_{n}" for n in used)
+            points = GroundPoints(names, ground, single, closed, view_of, xy, xy_sigma)
+            offset = np.array([r.offset if r.points else (np.nan, np.nan) for r in reports])
+            control = Reference(points, np.array([sigma, sigma, height_sigma[1]]), offset)
+        return Registration(control, tuple(reports), self.step, sigma)
+
+    def _lattice(self, views: Sequence[View]) -> tuple[Array, Array]:
+        """Places (n, 2) [deg] on a regular grid over views, where the reference shows them, and their heights (n,)."""
+        if not views:
+            return np.zeros((0, 2)), np.zeros(0)
+        rings = [footprint(view.sensor, view.size, view.altitude) for view in views]
+        origin = np.concatenate(rings).mean(axis=0)
+        metres = metres_per_unit(np.append(origin, 0.0))[:2]
+        local = [(ring - origin) * metres for ring in rings]
+        areas = [
+            0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)
+        ]
+        apart = self.step * max(_APART, round((max(areas) / _QUOTA) ** 0.5 / self.step))
+        every = np.concatenate(local)
+        low, high = (
+            np.floor((every.min(axis=0) - REACH) / apart),
+            np.ceil((every.max(axis=0) + REACH) / apart),
+        )
+        grid = np.meshgrid(*(apart * np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
+        places = origin + np.stack(grid, axis=-1).reshape(-1, 2) / metres
+        places = places[np.any([sheet.shows(places) for sheet in self.sheets], axis=0)]
+        heights = self.terrain(places[:, 0], places[:, 1])
+        return places[np.isfinite(heights)], heights[np.isfinite(heights)]
+
+    def _tiles(self, view: View, moved: Array, places: Array, heights: Array, reach: int) -> list[_Tile]:
+        """The points of a view, tile by tile."""
+        metres = metres_per_unit(np.append(places.mean(axis=0), 0.0))[:2]
+        at = view.sensor.project(np.column_stack([places + moved / metres, heights]))
+        edge = 0.5 * _HALF * self.step / float(ground_sample_distance(view.sensor, _middle(view))[1])
+        with np.errstate(invalid="ignore"):
+            inside = np.flatnonzero(((at >= edge) & (at <= np.array(view.size) - 1.0 - edge)).all(axis=1))
+        pad = margin(_HALF, reach) + 1
+        fits = (_TILE[0] + 2 * pad) ** 2 * (self.step / self.pixel) ** 2 < _PIXELS
+        cell = np.floor(places[inside] * metres / self.step / _TILE[0 if fits else 1]).astype(np.int64)
+        _, group = np.unique(cell, axis=0, return_inverse=True)
+        tiles = []
+        for points in (inside[group.ravel() == g] for g in range(int(group.max(initial=-1)) + 1)):
+            first = np.array([places[points, 0].min(), places[points, 1].max()])
+            scale = metres_per_unit(np.append(first, 0.0))[:2]
+            px = (places[points] - first) * scale / self.step * [1.0, -1.0] + pad
+            shape = (int(px[:, 1].max()) + pad + 2, int(px[:, 0].max()) + pad + 2)
+            corner = first + np.array([-pad, pad]) * self.step / scale
+            tiles.append(_Tile(points, Patch.on(self.terrain, corner, self.step, shape, moved), px))
+        return tiles
+
+    def _agreeing(
+        self, view: View, report: ViewMatch, parts: Sequence[tuple[_Tile, Found]], places: Array
+    ) -> tuple[ViewMatch, tuple[IntArray, Array, Array] | None]:
+        """A view's points that agree with an affine: report; their index, image points, standard deviations [px]."""
+        if not parts:
+            return report, None
+        point, found = np.concatenate([tile.points for tile, _ in parts]), joined([part for _, part in parts])
+        passed = found.passed(_MARGIN, _BACK)
+        report = replace(report, tried=len(point), passed=int(passed.sum()))
+        middle = np.append(places[point].mean(axis=0), view.altitude)
+        local = (places[point] - middle[:2]) * metres_per_unit(middle)[:2]
+        sight = sight_enu(view.sensor, middle)[:2]
+        sight = sight / max(float(np.linalg.norm(sight)), 1e-9)
+        turned = np.stack(
+            [[sight[1], -sight[0]], sight]
+        )  # across it; along it, where the terrain's errors move points
+        agreed = _affine(local, found.shift * [self.step, -self.step] @ turned.T, passed, self.step)
+        if agreed is None:
+            return report, None
+        fitted, keep, scatter = agreed
+        xy = np.concatenate([tile.patch.seen(view, tile.at + part.shift) for tile, part in parts])
+        east, north = ((fitted @ turned)[keep].mean(axis=0) + report.offset).tolist()
+        report = replace(report, offset=(east, north), points=int(keep.sum()), scatter=scatter)
+        gsd = float(ground_sample_distance(view.sensor, middle)[1])
+        return report, (point[keep], xy[keep], np.full(int(keep.sum()), scatter / gsd))
+
+
+def _affine(
+    local: Array, shift: Array, passed: BoolArray, step: float
+) -> tuple[Array, BoolArray, float] | None:
+    """An affine (n, 2) through most of the shifts (n, 2), those near it, their standard deviation along the first axis.
+
+    The search starts where most shifts lie together. None where too few agree.
+    """
+    if passed.sum() < _LEAST:
+        return None
+    design = np.column_stack([np.ones(len(local)), local / max(float(np.abs(local).max()), 1.0)])
+    apart = np.linalg.norm(shift[passed, None] - shift[None, passed], axis=2)
+    fitted = np.broadcast_to(shift[passed][(apart < _NEAR * step).sum(axis=1).argmax()], shift.shape)
+    scale, keep = np.full(2, _NEAR * step / _FAR), passed
+    for _ in range(_ROUNDS):
+        keep = passed & (np.abs(shift - fitted) < _FAR * scale).all(axis=1)
+        if keep.sum() < _LEAST:
+            return None
+        fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]
+        scale = 1.4826 * np.median(np.abs(shift - fitted)[keep], axis=0).clip(0.02 * step)
+    return fitted, keep, float(scale[0])

@@ -1,0 +1,135 @@
+"""A block that an orthoimage of another season brings to its place, and one that a wrong one leaves where it is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.cli import main
+from barpc.errors import InputError
+from barpc.options import RunOptions
+from barpc.pipeline import adjust
+from barpc.pointio.ground import read_gcps
+from barpc.rpcio import read_rpc
+from tests.pipeline.test_synthetic import SAMPLES, errors_at_check_points
+from tests.scenes import ImageOptions, Scene
+from tests.scenes.season import other_season, write_dem, write_reference
+from tests.scenes.terrain import Grid
+
+IMAGES = sorted(SAMPLES.glob("*.tif"))
+DEM_BIAS = 2.0
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return json.loads((SAMPLES / "truth.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def place(truth, tmp_path_factory):
+    """A folder with a reference, a mirrored one, a terrain and tie points."""
+    out = tmp_path_factory.mktemp("place")
+    options = {key: tuple(v) if isinstance(v, list) else v for key, v in truth["options"].items()}
+    scene = Scene(ImageOptions(**options))
+    season = other_season(scene, 5)
+    mirrored = Grid(season.origin, season.step, np.ascontiguousarray(season.values[:, ::-1]))
+    write_reference(out / "ref.tif", scene, season, 2.0)
+    write_reference(out / "wrong.tif", scene, mirrored, 2.0)
+    write_dem(out / "dem.tif", scene, 5, error=1.0, bias=DEM_BIAS)
+    adjust(IMAGES, out / "ties", RunOptions(stop_after="matching"))
+    return out
+
+
+@pytest.fixture(scope="module")
+def options(place):
+    return RunOptions(
+        matches=str(place / "ties/matches.npz"),
+        dem=str(place / "dem.tif"),
+        reference=(str(place / "ref.tif"),),
+    )
+
+
+@pytest.fixture(scope="module")
+def held(place, options):
+    return adjust(IMAGES, place / "held", options)
+
+
+def place_of(out, result, truth) -> np.ndarray:
+    """Mean error of the scene, east, north, up (3,) [m]."""
+    return errors_at_check_points([read_rpc(out / f"{v.name}.vrt") for v in result.run.views], truth)[1]
+
+
+def test_the_scene_stands_where_the_reference_says(held, place, truth):
+    error, sigma = place_of(place / "held", held, truth), np.array(held.summary["scene"]["sigma_enu_m"])
+    assert np.hypot(*error[:2]) < 1.0
+    assert abs(error[2]) < DEM_BIAS + 2.0  # of the terrain's own noise, a metre
+    assert (np.abs(error) <= 3 * sigma).all()
+    assert sigma == pytest.approx([0.5, 0.5, 5.4], rel=0.15)
+    assert held.passed
+    delivered = np.array([view["offset_en_m"] for view in held.summary["reference"]["views"]])
+    assert (np.linalg.norm(delivered, axis=1) > 5.0).all()
+
+
+def test_the_run_says_what_the_reference_did(held, place):
+    found = held.summary["reference"]
+    assert found["used"]
+    assert found["step_m"] == pytest.approx(2.0, rel=1e-3)
+    assert all(view["num_points"] <= view["num_passed"] <= view["num_tried"] for view in found["views"])
+    (line,) = [line for line in held.summary["verdict"] if line.startswith("Reference:")]
+    assert "in 3 images" in line
+    assert not [line for line in held.summary["verdict"] if "Without ground control" in line]
+    points = read_gcps(place / "held/gcps.geojson", [view.name for view in held.run.views])
+    assert len(points.names) == found["num_points"]
+    assert len(points.view) == sum(view["num_points"] for view in found["views"])
+
+
+def test_its_points_can_be_read_as_gcps(held, place):
+    points = read_gcps(place / "held/gcps.geojson", [view.name for view in held.run.views])
+    image = np.array(
+        [
+            held.adjustment.sensors[v].project(points.lonlatalt[p])
+            for v, p in zip(points.view, points.point, strict=True)
+        ]
+    )
+    assert np.median(np.linalg.norm(image - points.xy, axis=1)) < 8.0  # px, of 2 m pixels and single heights
+
+
+def test_a_stated_sigma_is_the_scene_s(options, tmp_path):
+    run = adjust(IMAGES, tmp_path / "run", replace(options, reference_sigma=2.0))
+    assert run.summary["scene"]["sigma_enu_m"][:2] == pytest.approx([2.0, 2.0], rel=0.1)
+
+
+def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, capsys):
+    alone = adjust(IMAGES, tmp_path / "alone", replace(options, reference=()))
+    flags = ["--matches", options.matches, "--dem", options.dem, "--reference", str(place / "wrong.tif")]
+    with pytest.raises(SystemExit) as stopped:
+        main(["adjust", *map(str, IMAGES), *flags, "-o", str(tmp_path / "wrong")])
+    assert stopped.value.code == 3
+    assert "does not show what the images show" in capsys.readouterr().out
+    assert not (tmp_path / "wrong/gcps.geojson").exists()
+    for view in alone.run.views:
+        name = f"{view.name}_RPC.TXT"
+        assert (tmp_path / "wrong" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+
+
+def test_one_image_is_enough(options, truth, tmp_path):
+    run = adjust(IMAGES[:1], tmp_path / "run", replace(options, matches=None))
+    points = [p for p in truth["check_points"] if run.run.views[0].name in p["image"]]
+    ground = np.array([p["ground"] for p in points])
+    image = np.array([p["image"][run.run.views[0].name] for p in points])
+    before, after = (
+        np.linalg.norm((sensor.project(ground) - image).mean(axis=0))
+        for sensor in (run.run.before[0], run.run.after[0])
+    )
+    assert before > 10.0
+    assert after < 3.0  # px of half a metre: 1 m of it the terrain's bias, seen from the side
+
+
+def test_without_a_terrain_it_is_refused():
+    with pytest.raises(InputError, match="reference is given without dem"):
+        RunOptions(reference=("ortho.tif",))
+    with pytest.raises(InputError, match="reference_sigma is given without reference"):
+        RunOptions(reference_sigma=1.0)
