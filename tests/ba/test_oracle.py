@@ -554,8 +554,9 @@ def test_weak_tracks_are_held_to_the_altitude_of_the_others(strong, spread, alt,
     assert replace(heights, weak=np.zeros(strong + 2, dtype=bool))._held(points) is None
 
 
+@pytest.mark.parametrize("known", [12, 11])  # the last known point is a GCP, or a reference's
 @pytest.mark.parametrize("fixed", [(), (1,)])
-def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fixed):
+def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fixed, known):
     case = make_case(1, tuple(f"view_{v:04d}" for v in fixed))
     free = np.append(case.problem.free, np.ones(case.points.size, dtype=bool))
     matrix, _, _ = case.dense
@@ -565,8 +566,7 @@ def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fix
     use = np.ones(12, dtype=bool)
     covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
     report = gauge_report(covariance, case.points, case.points, use)
-    is_gcp = np.arange(12) >= 10
-    found = datum_shares(covariance, report.by_unknown, case.problem, _state(case), case.weight, is_gcp)
+    found = datum_shares(covariance, report.by_unknown, case.problem, _state(case), case.weight, 10, known)
 
     middle = case.points.mean(axis=0)
     enu = enu_of(*ground_of(middle)[:2])
@@ -583,12 +583,14 @@ def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fix
     paid = (jacobian @ np.vstack([cheapest, follow @ cheapest])) ** 2
     view, point = np.repeat(case.plain.view, 2), np.repeat(case.plain.point, 2)
     seen, ends = len(view), np.cumsum([len(view), case.params.size, 6, 3])
-    of_gcps = point >= 10
+    of_gcps, of_reference = (point >= 10) & (point < known), point >= known
+    middle = ends[1] + 3 * (known - 10)
     kept = np.isin(view, fixed)
     expected = {
-        "fixed_views": paid[:seen][~of_gcps & kept].sum(axis=0),
+        "fixed_views": paid[:seen][(point < 10) & kept].sum(axis=0),
         "cameras": paid[ends[0] : ends[1]].sum(axis=0),
-        "gcps": paid[:seen][of_gcps].sum(axis=0) + paid[ends[1] : ends[2]].sum(axis=0),
+        "gcps": paid[:seen][of_gcps].sum(axis=0) + paid[ends[1] : middle].sum(axis=0),
+        "reference": paid[:seen][of_reference].sum(axis=0) + paid[middle : ends[2]].sum(axis=0),
         "heights": paid[ends[2] : ends[3]].sum(axis=0),
         "earlier_run": np.zeros(7),
     }
