@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +11,9 @@ import numpy as np
 from barpc.ba.block import Block, join
 from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import agreeing, two_groups
+from barpc.ba.covariance import Covariance
 from barpc.ba.datum import datum_shares
-from barpc.ba.gauge import gauge_report
+from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control, reference_control
 from barpc.ba.heldout import HeldOut, enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior, apply_prior
@@ -262,7 +263,6 @@ def _adjustment(
     covariance = outcome.minimum.covariance(found.problem.free)
     projected = found.problem.project_points(final.params, final.points)
     cameras = found.problem.cameras
-    placed = seen & (np.arange(len(seen)) < block.num_known)
     points = np.where(seen[:, None], final.points, np.nan)
     points[found.after.index] = found.after.points
     inlier = block.in_order(outcome.inlier)
@@ -274,18 +274,7 @@ def _adjustment(
         (block.in_order(inside.T) + outer.in_order(outside.residual.T))[ties]
         for inside, outside in ((found.before, found.start), (outcome.residual, found.after))
     )
-    gauge = gauge_report(
-        covariance, final.points, found.first_points(block), placed if placed.any() else seen
-    )
-    shares = datum_shares(
-        covariance,
-        gauge.by_unknown,
-        outcome.problem,
-        final,
-        outcome.weight,
-        block.num_tracks,
-        block.num_known,
-    )
+    gauge, shares = _place(found, block, covariance)
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
     return Adjustment(
         names=block.names,
@@ -321,6 +310,16 @@ def _adjustment(
         seconds=time.process_time() - start,
         options=options,
     )
+
+
+def _place(found: _Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
+    """Where the scene went and how well that is known, and what holds it."""
+    placed = found.seen & (np.arange(len(found.seen)) < block.num_known)
+    counted = placed if placed.any() else found.seen
+    gauge = gauge_report(covariance, found.final.points, found.first_points(block), counted)
+    known, outcome = (block.num_tracks, block.num_known), found.outcome
+    shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, *known)
+    return gauge, shares
 
 
 def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
