@@ -40,7 +40,7 @@ def choose(
         after = SimpleNamespace(error=1.0, whole_rms=1.0)
         if options.model == "affine":
             after = SimpleNamespace(error=error, whole_rms=rms)
-        return SimpleNamespace(is_skew=skew, has_trend=trend, after=after, model=options.model)
+        return SimpleNamespace(is_skew=skew, has_trend=trend, after=after, model=options.model, tested=None)
 
     monkeypatch.setattr(adjustment, "_solve", solved)
     prior = given.pop("prior", None)
