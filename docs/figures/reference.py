@@ -52,8 +52,8 @@ def main() -> None:
         patch = Patch.on(terrain, corner, 0.5, (SIDE, SIDE), np.zeros(2))
         under = Sheet.open(str(sheet))
         shown = [_picture(str(sheet), under.bands, under.size, under.image(patch.nodes()), patch.shape)[0]]
-        for view in (delivered, adjusted):
-            shown.append(_picture(delivered.path, (1,), delivered.size, patch.image(view), patch.shape)[0])
+        seen = [patch.image(view) for view in (delivered, adjusted)]
+        shown += [_picture(delivered.path, (1,), delivered.size, at, patch.shape)[0] for at in seen]
     first, *others = map(grey, shown)
     rows, cols = np.indices(first.shape) // TILE
     panels = [first, *(np.where((rows + cols) % 2 == 0, first, other) for other in others)]
