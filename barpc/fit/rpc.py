@@ -145,7 +145,11 @@ def fit_rpc(
         loop = roundtrip(solution.rpc, sample.ground)
         return _certified(solution, *sample.errors(solution.rpc), loop, size)
 
-    return _best(attempt, options, vendor, strict, exact=True)
+    try:
+        return _best(attempt, options, vendor, strict, exact=True)
+    except FitError as error:
+        advice = getattr(model, "advice", "")  # of a model that knows why
+        raise FitError("; ".join(filter(None, (str(error), advice)))) from error
 
 
 def _given(

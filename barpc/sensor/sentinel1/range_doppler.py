@@ -122,6 +122,14 @@ class RangeDoppler(Frozen):
         epoch, lines = extent(annotation, burst)
         return build([annotation], epoch, (annotation.samples, lines), orbit, atmosphere, bistatic)
 
+    @property
+    def advice(self) -> str:
+        """What to do where no RPC follows this model; empty where nothing special."""
+        ground_range = (
+            "the ground range of a GRD changes every second, with the terrain: take the SLC of the scene"
+        )
+        return ground_range if isinstance(self.frame, GroundFrame) else ""
+
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
         """Zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points (..., 3).
 
