@@ -37,7 +37,7 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
     if options.adjust.dem_for_all and options.dem is None:
         raise InputError("dem_for_all is given without dem: there are no heights to hold the tie points to")
     for path in options.reference:
-        Sheet.open(path)
+        Sheet.read(path)
     dem = None if options.dem is None else Dem.open(options.dem, options.geoid)
     if dem is not None:
         _require_cover(dem, str(options.dem), views)

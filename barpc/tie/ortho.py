@@ -96,7 +96,7 @@ class Sheet:
     bands: tuple[int, ...]  # that are averaged
 
     @classmethod
-    def open(cls, path: str) -> Sheet:
+    def read(cls, path: str) -> Sheet:
         """An orthoimage from any raster with a CRS; else an InputError."""
         with open_raster(path) as dataset:
             crs, forward, size = dataset.crs, dataset.transform, (dataset.width, dataset.height)
@@ -138,7 +138,7 @@ def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
     """Channels (C, H, W) of a patch, of the first of several orthoimages that shows a place."""
     nodes, whole = patch.nodes(), np.zeros((ORIENTATIONS, *patch.shape), np.float32)
     for path in paths:
-        sheet = Sheet.open(path)
+        sheet = Sheet.read(path)
         picture, valid = _picture(path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape)
         if valid.any():
             whole = np.where(np.abs(whole).sum(axis=0) > 0, whole, channels(picture, valid))

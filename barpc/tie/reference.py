@@ -92,7 +92,7 @@ def register(
     height_sigma : (float, float), of single heights of the terrain and of all together [m]
     executor, progress : as elsewhere
     """
-    sheets = [Sheet.open(path) for path in paths]
+    sheets = [Sheet.read(path) for path in paths]
     middles = [_on_terrain(view, terrain, (np.array([view.size]) - 1.0) / 2.0)[0] for view in views]
     known = [middle[:2] for middle in middles if np.isfinite(middle).all()]
     pixels = [min(sheet.step(place) for sheet in sheets) for place in known]

@@ -50,7 +50,7 @@ def main() -> None:
         middle = delivered.sensor.localize(np.array(delivered.size) / 2.0, np.array(scene.options.alt))
         corner = middle[:2] + np.array([-0.5, 0.5]) * SIDE * 0.5 / np.array([78e3, 111e3])
         patch = Patch.on(terrain, corner, 0.5, (SIDE, SIDE), np.zeros(2))
-        under = Sheet.open(str(sheet))
+        under = Sheet.read(str(sheet))
         shown = [_picture(str(sheet), under.bands, under.size, under.image(patch.nodes()), patch.shape)[0]]
         seen = [patch.image(view) for view in (delivered, adjusted)]
         shown += [_picture(delivered.path, (1,), delivered.size, at, patch.shape)[0] for at in seen]

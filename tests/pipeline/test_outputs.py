@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -268,7 +269,8 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
         watched = lambda self, name, *given, real=real: (written.append(name), real(self, name, *given))[1]  # noqa: E731
         monkeypatch.setattr(Workspace, method, watched)
     with Workspace(tmp_path / "out") as run:
-        outputs.write_tables(run, None, "what was found")  # type: ignore[arg-type]
+        plain = SimpleNamespace(reference=None)
+        outputs.write_tables(run, plain, "what was found")  # type: ignore[arg-type]
     names = ["a.csv", "b.csv", *(["report.html"] if page else []), "summary.json"]
     assert list(dict.fromkeys(written)) == names
     folder = tmp_path / "out"
