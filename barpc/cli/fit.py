@@ -131,12 +131,13 @@ def _write(fit: RpcFit, source: str, output: str, overwrite: bool) -> str:
 def _certificate(fit: RpcFit, verdict: str) -> str:
     rows = {"control rmse": fit.rmse_cnp, "control max": fit.max_cnp}
     rows |= {"check rmse": fit.rmse_ckp, "check max": fit.max_ckp}
+    more = f"beyond        {fit.beyond:.2%} of the image may miss by more, at most (95 % confidence)"
     lines = [
         f"method        {fit.method}, {fit.iterations} passes, h {fit.h[0]:.2g} {fit.h[1]:.2g}",
         f"points        {fit.num_cnp} control, {fit.num_ckp} check, {fit.coverage:.0%} of the image covered",
         "              col [px]     row [px]",
         *(f"{name:14s}{col:<13.3g}{row:.3g}" for name, (col, row) in rows.items()),
-        f"beyond        {fit.beyond:.2%} of the image may miss by more, at most (95 % confidence)",
+        *([more] if fit.beyond < 1 else []),  # given points say nothing of the rest
         f"denominators  at least {fit.min_denominator:.3g} over the box and 25 % around it",
         f"round trip    {fit.roundtrip:.1g} px",
         f"verdict       {verdict or 'within tolerance'}",

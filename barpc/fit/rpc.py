@@ -40,7 +40,8 @@ class RpcFit:
         The same on check points all over image and altitudes, which the fit has not seen [px]; the largest error was
         also looked for around the worst of them.
     beyond : float
-        Part of the image and the altitudes that may miss by more than `max_ckp`: no more, with 95 % confidence.
+        Part of the image and the altitudes that may miss by more than `max_ckp`: no more, with 95 % confidence. 1 for
+        given points, which may lie anywhere and say nothing of the rest.
     min_denominator : float
         Lower bound of the denominators over the ground box and 25 % around it, over what they are at its centre; above
         0 there is no pole.
@@ -141,7 +142,9 @@ def fit_rpc(
         ground, image = _given(model, size, alt_range, options, method)
         solution = solve(ground, image, options, method, vendor=vendor)
         loop = roundtrip(solution.rpc, sample.ground)
-        return _certified(solution, *sample.errors(solution.rpc), loop, size)
+        return _certified(
+            solution, *sample.errors(solution.rpc), loop, size, 1.0 - 0.05 ** (1.0 / sample.count)
+        )
 
     try:
         return _best(attempt, options, vendor, strict, exact=True)
@@ -245,7 +248,12 @@ def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
 
 
 def _certified(
-    solution: Solution, seen: Errors, largest: Array, loop: float, size: tuple[int, int] | None
+    solution: Solution,
+    seen: Errors,
+    largest: Array,
+    loop: float,
+    size: tuple[int, int] | None,
+    beyond: float = 1.0,
 ) -> RpcFit:
     """The fit with its certificate: errors on the check points, the largest (2,) [px] found near them."""
     problem, rpc = solution.problem, solution.rpc
@@ -263,7 +271,7 @@ def _certified(
         max_cnp=used.largest,
         rmse_ckp=seen.rmse,
         max_ckp=largest,
-        beyond=1.0 - 0.05 ** (1.0 / max(seen.count, 1)),
+        beyond=beyond,
         min_denominator=smallest_denominator(rpc, low, high),
         roundtrip=loop,
         coverage=coverage(image, left, right),

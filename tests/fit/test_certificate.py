@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from barpc.errors import BarpcWarning, FitError
-from barpc.fit import FitOptions, RpcFit, fit_rpc
+from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.certificate import CELLS, Sample, least_value, smallest_denominator
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
@@ -44,6 +44,8 @@ def test_the_largest_error_certified_is_that_of_a_hundred_thousand_points(fits, 
     # one point of 2025 may be a bump's only one
     np.testing.assert_allclose(np.sqrt((error**2).mean()), np.sqrt((fit.rmse_ckp**2).mean()), rtol=0.3)
     assert 2000 < fit.num_ckp <= CELLS**2
+    assert fit.beyond == pytest.approx(3.0 / fit.num_ckp, rel=0.01)
+    assert (error > fit.max_ckp).any(axis=1).mean() < fit.beyond
     assert fit.min_denominator > 0.1
 
 
@@ -129,6 +131,11 @@ def test_no_optimiser_finds_a_better_rpc_without_a_pole(fits, name):
     rmse = np.sqrt(((fits[name].rpc.project(ground) - image) ** 2).mean(axis=0))
     for axis in range(2):
         assert rmse[axis] <= 1.05 * best_possible(name, axis, fits[name].rpc) + 1e-7
+
+
+def test_given_points_say_nothing_of_the_rest_of_the_image():
+    ground, image = truth("distortion", 400)
+    assert fit_rpc_points(ground, image).beyond == 1.0
 
 
 def test_smooth_cameras_are_fitted_by_the_ridge_alone():
