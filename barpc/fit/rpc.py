@@ -110,8 +110,7 @@ def fit_rpc(
     model : SensorModel
         Any camera: an RPC behind a correction, a pushbroom or radar model.
     size : (width, height), image that the RPC is for [px]
-    alt_range : (low, high)
-        Altitudes that the RPC is for [m above the ellipsoid]; at least 100 m are taken around a flat scene.
+    alt_range : (low, high), altitudes [m above the ellipsoid]; at least 100 m are taken around a flat scene
     options : FitOptions, optional, grid, solver, tolerance
     strict : bool
         Raise where the tolerance is missed; otherwise give the best fit found, to be judged by `RpcFit.verdict`.
