@@ -313,14 +313,21 @@ class AdjustOptions(Options):
 class FitOptions(Options):
     """How an RPC is fitted to a sensor model or to points."""
 
-    method: Literal["auto", "ridge", "gauss-newton", "lcurve", "lcurve-joint", "vendor-denominators"] = (
-        option(
-            "auto",
-            """`ridge`: QR compression and a noise-scaled ridge. `lcurve`: the paper's solver; `lcurve-joint` with one h
+    method: Literal[
+        "auto",
+        "ridge",
+        "gauss-newton",
+        "common-denominator",
+        "lcurve",
+        "lcurve-joint",
+        "vendor-denominators",
+    ] = option(
+        "auto",
+        """`ridge`: QR compression and a noise-scaled ridge. `lcurve`: the paper's solver; `lcurve-joint` with one h
         for col and row (78 unknowns) instead of one each (39 + 39). `gauss-newton`: the least squares of the error
         itself, for models without noise. `vendor-denominators`: numerators only. `auto`: `ridge`, and another one
-        where the certificate says that it is better.""",
-        )
+        where the certificate says that it is better. `common-denominator`: one for col and row, by `ridge` and
+        `gauss-newton` as `auto` goes.""",
     )
     grid: tuple[int, int, int] = option(
         (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4
@@ -336,6 +343,11 @@ class FitOptions(Options):
     )
     precision: Literal["nitf", "rpcm"] | None = option(
         None, "Fit numbers that a format with few digits can hold."
+    )
+    localisation: bool = option(
+        False,
+        """Fit the localisation RPC, too: lon, lat as quotients of cubics of col, row and altitude, which txt, json and
+        vrt files hold.""",
     )
     allow_mirrored: bool = option(
         False,

@@ -1,9 +1,9 @@
-"""The paper's experiments redrawn: error against grid length and against area, barpc beside rpcfit.
+"""The paper's two experiments redrawn: error against the area of a crop and against the grid length, beside rpcfit.
 
-Grid length 5 to 50 over the full image, and 5 to 100 % of the area at grid length 10, ten altitude layers
-(six for the radar). Optical: vendors' RPCs behind 30 microradians and 10 m, a subset that rpcfit survives.
-Radar: the paper's Sentinel-1 points, thinned or cut. RMSE on check points: mean over files, band from the
-smallest to the largest.
+Area: squares around the middle of the image, up to its shorter side, 50 x 50 x 10 control points in each. Grid length:
+n x n x 10 points over the whole image. Check points lie in the middle of the control points' cells. Optical: every
+vendor's RPC behind 30 microradians and 10 m. Radar: the paper's Sentinel-1 points (20 x 20 x 10 at most), cut around
+their middle or thinned, on its own test points. RMSE over col and row: a thin line a file, mean and standard deviation.
 
     python benchmarks/paper_figure.py --data DATA --rpcfit SITE_PACKAGES -o docs/figures/paper_figure.svg
 """
@@ -14,7 +14,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -27,14 +27,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from barpc.errors import FitError
 from barpc.fit import FitOptions, fit_rpc_points
 from barpc.geodesy import Array
+from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
-from benchmarks.fit import PECULIAR, Peer, grid_of, rms
+from benchmarks.fit import Peer, grid_of, rms
 from tests.fit.cameras import Camera, vendor
 
 LENGTHS = (5, 7, 10, 15, 20, 30, 40, 50)
-SHARES = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
-RADAR_LENGTH = 20
-"""Grid length of the paper's radar points."""
+SHARES = (0.01, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+LONGEST, RADAR_LENGTH = 50, 20
+"""Grid lengths of the paper's experiment on areas, and of its radar points."""
 Fit = Callable[[Array, Array], RPC]
 Points = tuple[Array, Array, Array, Array]
 
@@ -44,36 +45,54 @@ def ours(ground: Array, image: Array) -> RPC:
     return fit_rpc_points(ground, image, options=FitOptions(tolerance=10.0), strict=False).rpc
 
 
-def optical(camera: Camera, length: int, share: float) -> Points:
-    """Control and check points of a part of an image."""
-    width, height = (max(1, round(n * np.sqrt(share))) for n in camera.size)
-    return grid_of(replace(camera, size=(width, height)), (length, length, 10))
+@dataclass(frozen=True)
+class Window:
+    """A camera whose image begins at `corner` [px] of another's."""
+
+    model: SensorModel
+    corner: Array
+
+    def project(self, ground: Array) -> Array:
+        return self.model.project(ground) - self.corner
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        return self.model.localize(image + self.corner, alt)
 
 
-def radar(data: Path, length: int, share: float) -> Points:
-    """The paper's control points (20 x 20 x 10), thinned to a length and cut to a part of the swath."""
+def optical(camera: Camera, length: int, share: float | None) -> Points:
+    """Control and check points of a square around the middle, or of the whole image."""
+    if share is not None:
+        side = max(1, round(min(camera.size) * np.sqrt(share)))
+        corner = np.floor((np.array(camera.size) - side) / 2)
+        camera = replace(camera, size=(side, side), model=Window(camera.model, corner))
+    return grid_of(camera, (length, length, 10))
+
+
+def radar(data: Path, length: int, share: float | None) -> Points:
+    """The paper's points: thinned to a length, cut to a part of the swath around its middle."""
     ground, image, check, truth = (
         np.load(data / "sar" / "rpcfit" / f"s1_{part}{d}d.npy") for part in ("train", "test") for d in (3, 2)
     )
     low, high = ground[:, :2].min(axis=0), ground[:, :2].max(axis=0)
-    edge = low + (high - low) * np.sqrt(share) + 1e-9
+    half = 0.5 * (high - low) * np.sqrt(share or 1.0) + 1e-9
     lines = [np.unique(ground[:, i].round(9)) for i in (0, 1)]
-    lines = [line[line <= edge[i]] for i, line in enumerate(lines)]
+    middle = 0.5 * (low + high)
+    lines = [line[np.abs(line - middle[i]) <= half[i]] for i, line in enumerate(lines)]
     wanted = [
         line[np.unique(np.linspace(0, len(line) - 1, min(length, len(line))).astype(int))] for line in lines
     ]
     used = np.all([np.isin(ground[:, i].round(9), wanted[i]) for i in (0, 1)], axis=0)
-    inside = np.all(check[:, :2] <= edge, axis=1)
+    inside = np.all(np.abs(check[:, :2] - middle) <= half, axis=1)
     return ground[used], image[used], check[inside], truth[inside]
 
 
-def errors(fit: Fit, points: Points) -> Array:
-    """RMSE of col, row on the check points; NaN where the fit fails."""
+def error(fit: Fit, points: Points) -> float:
+    """RMSE [px] over col and row of the check points; NaN where the fit fails."""
     ground, image, check, truth = points
     try:
-        return rms(fit(ground, image).project(check) - truth)
+        return float(np.sqrt((rms(fit(ground, image).project(check) - truth) ** 2).mean()))
     except (FitError, ValueError, np.linalg.LinAlgError):
-        return np.full(2, np.nan)
+        return float("nan")
 
 
 def main() -> None:
@@ -84,45 +103,52 @@ def main() -> None:
         "--data", type=Path, required=True, help="folder of vendors' RPC files and radar points"
     )
     parser.add_argument("--rpcfit", metavar="DIR", help="site-packages folder that holds rpcfit")
-    parser.add_argument("--files", type=int, default=6, help="optical files, spread over all")
-    parser.add_argument("--longest", type=int, default=50, help="largest grid length")
+    parser.add_argument("--every", type=int, default=1, help="take every so many optical files")
+    parser.add_argument("--longest", type=int, default=LONGEST, help="largest grid length")
     parser.add_argument("-o", "--output", type=Path, help="figure to write (svg, png)")
     args = parser.parse_args()
-    cameras = [camera for camera in vendor(args.data) if camera.name != PECULIAR]
-    cameras = cameras[:: max(1, len(cameras) // args.files)][: args.files]
+    cameras = vendor(args.data)[:: args.every]
     fits: dict[str, Fit] = {"barpc": ours}
     if args.rpcfit:
         fits["rpcfit"] = Peer(args.rpcfit).fit
     lengths = [n for n in LENGTHS if n <= args.longest]
-    sweeps = {
-        "grid length": ([(n, 1.0) for n in lengths], lengths),
-        "area [%]": ([(10, s) for s in SHARES], [100 * s for s in SHARES]),
+    sweeps: dict[str, tuple[list[tuple[int, float | None]], list[float]]] = {
+        "area [% of the largest square]": ([(args.longest, s) for s in SHARES], [100 * s for s in SHARES]),
+        "grid length": ([(n, None) for n in lengths], list(map(float, lengths))),
     }
     results: dict[tuple[str, str, str], Array] = {}
-    for sweep, (settings, _) in sweeps.items():
+    for sweep, (settings, values) in sweeps.items():
         for name, fit in fits.items():
-            table = [[errors(fit, optical(c, n, s)) for c in cameras] for n, s in settings]
-            results["optical", sweep, name] = np.array(table)
-            table = [
-                [errors(fit, radar(args.data, n, s)) if n <= RADAR_LENGTH else np.full(2, np.nan)]
-                for n, s in settings
-            ]
-            results["Sentinel-1", sweep, name] = np.array(table)
-    for (sensor, sweep, name), value in results.items():
-        print(f"{sensor}, {sweep}, {name}: mean rmse [px] over {value.shape[1]} file(s)")
-        for x, rows in zip(sweeps[sweep][1], value, strict=True):
-            good = rows[np.isfinite(rows).all(axis=1)]
-            col, row = good.mean(axis=0) if len(good) else (np.nan, np.nan)
-            print(
-                f"  {x:6.0f}  row {row:.2e}  col {col:.2e}"
-                + ("" if len(good) == len(rows) else f"  ({len(good)} ok)")
-            )
+            found = {
+                "optical": [[error(fit, optical(c, n, s)) for c in cameras] for n, s in settings],
+                "Sentinel-1": [
+                    [error(fit, radar(args.data, n, s))] if s or n <= RADAR_LENGTH else [np.nan]
+                    for n, s in settings
+                ],
+            }
+            for sensor, table in found.items():
+                results[sensor, sweep, name] = np.array(table)
+                tell(f"{sensor}, {sweep}, {name}", values, np.array(table), [c.name for c in cameras])
     if args.output:
         draw(results, {name: xs for name, (_, xs) in sweeps.items()}, args.output)
 
 
+def tell(what: str, values: list[float], table: Array, names: list[str]) -> None:
+    """A line a setting; which file makes the mean."""
+    print(f"{what}: rmse [px] over {table.shape[1]} file(s)", flush=True)
+    for value, row in zip(values, table, strict=True):
+        good = row[np.isfinite(row)]
+        if not len(good):
+            continue
+        worst = f"  worst {good.max():.2e} ({names[int(np.nanargmax(row))]})" if len(row) > 1 else ""
+        missing = f"  ({len(good)} ok)" if len(good) < len(row) else ""
+        print(
+            f"  {value:6.0f}  mean {good.mean():.2e} sd {good.std():.2e} median {np.median(good):.2e}{worst}{missing}"
+        )
+
+
 def draw(results: dict[tuple[str, str, str], Array], axes: dict[str, list[float]], output: Path) -> None:
-    """A panel a sensor and sweep; solid lines rows, dashed lines columns, bands over the files."""
+    """A panel a sensor and sweep: files as thin lines, their mean, a band of one standard deviation on either side."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -133,13 +159,13 @@ def draw(results: dict[tuple[str, str, str], Array], axes: dict[str, list[float]
     colors = {"barpc": "tab:blue", "rpcfit": "tab:red"}
     for (sensor, sweep, name), value in results.items():
         panel = panels[["optical", "Sentinel-1"].index(sensor), list(axes).index(sweep)]
-        for axis, style in ((1, "-"), (0, "--")):
-            rows = np.ma.masked_invalid(value[..., axis])
-            mean, low, high = rows.mean(axis=1), rows.min(axis=1), rows.max(axis=1)
-            label = f"{name} {'row' if axis else 'col'}"
-            panel.plot(axes[sweep], mean, style, color=colors[name], label=label, marker=".")
-            if value.shape[1] > 1:
-                panel.fill_between(axes[sweep], low, high, color=colors[name], alpha=0.12, linewidth=0)
+        rows = np.ma.masked_invalid(value)
+        mean, spread = rows.mean(axis=1), rows.std(axis=1)
+        panel.plot(axes[sweep], mean, color=colors[name], label=f"{name}, mean", marker=".", linewidth=2)
+        if value.shape[1] > 1:
+            panel.plot(axes[sweep], rows, color=colors[name], alpha=0.35, linewidth=0.5)
+            low = np.maximum(mean - spread, rows.min())
+            panel.fill_between(axes[sweep], low, mean + spread, color=colors[name], alpha=0.12, linewidth=0)
         panel.set_yscale("log")
         panel.set_title(sensor)
         panel.set_xlabel(sweep)

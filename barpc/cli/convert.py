@@ -14,7 +14,7 @@ import numpy as np
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.terminal import as_json, echo, say, tell_gate
 from barpc.errors import InputError, OutputError
-from barpc.handoff import Reading, refuse_hiding, unverified, verify
+from barpc.handoff import TOLERANCE, Reading, refuse_hiding, unverified, verify
 from barpc.raster import open_raster
 from barpc.rpcio import (
     CARRIERS,
@@ -22,6 +22,7 @@ from barpc.rpcio import (
     WRITABLE,
     find_rpc,
     hidden_by,
+    read_rpc,
     shadows,
     sidecars,
     write_camera,
@@ -104,11 +105,18 @@ def convert(
         write_camera(camera.rpc, target, image, overwrite=overwrite)
     else:
         write_rpc(camera.rpc, target, format=formats, overwrite=overwrite)
-    row = {"source": str(camera.path), "format": camera.format, "target": target}
-    echo(json.dumps(row) if as_json else f"{camera.path} ({camera.format}) -> {target}")
+    lost = float(camera.rpc.off(read_rpc(target)).max())
+    row = {"source": str(camera.path), "format": camera.format, "target": target, "max_px": lost}
+    text = f"{camera.path} ({camera.format}) -> {target} (read back: {lost:.1g} px)"
+    echo(json.dumps(row) if as_json else text)
     for note in () if as_json else camera.notes:
         say(note)
-    return 0
+    if lost <= TOLERANCE:
+        return 0
+    return tell_gate(
+        f"{target} holds too few digits for this RPC, {lost:.2g} px off: 'barpc fit' fits one that it holds",
+        [],
+    )
 
 
 # --- one file ---------------------------------------------------------------------------------------------

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.cli.options import flag, run_options
-from barpc.cli.terminal import as_json, echo, tell_gate
+from barpc.cli.terminal import as_json, echo, say, tell_gate
 
 if TYPE_CHECKING:
-    from barpc.fit import RpcFit
+    from barpc.fit import Localisation, RpcFit
 
 _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third of the accuracy
 
@@ -26,7 +26,8 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
     "--alt-range",
     type=(float, float),
     metavar="LOW HIGH",
-    help="Altitudes [m above the ellipsoid] to fit over.  [default: the camera's own]",
+    help="Altitudes [m above the ellipsoid] to fit over.  [default: the camera's own; of a radar all "
+    "ground on Earth, -500 to 9000 m, where an RPC holds it]",
 )
 @click.option("--dem", metavar="FILE", help="Take the altitudes of this DEM over the image, with a margin.")
 @click.option(
@@ -39,6 +40,7 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 )
 @click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
 @flag("fit.tolerance")
+@flag("fit.localisation")
 @click.option("--options", "options_file", metavar="FILE", help="TOML file; its table [fit] counts here.")
 @click.option("--keep-going", is_flag=True, help="Write the RPC although it misses the tolerance; exit 3.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
@@ -73,32 +75,38 @@ def fit(
         from barpc.cli.convert import check_target
 
         check_target(output, [image], overwrite)
-    fit, tolerance = _fit(source, flags)
+    fit, tolerance = _fit(source, output, flags)
+    written = False
+    if output is not None and (keep_going or not fit.verdict(tolerance)):
+        fit, written = _write(fit, image, output, overwrite, None if keep_going else tolerance)
     verdict = fit.verdict(tolerance)
-    reread = None
-    if output is not None and (keep_going or not verdict):
-        reread = _write(fit, image, output, overwrite)
     if as_json:
-        summary = {**fit.summary(), "verdict": verdict, "output": output if reread else None}
+        summary = {**fit.summary(), "verdict": verdict, "output": output if written else None}
         echo(json.dumps(summary, indent=1))
     elif not obj["quiet"]:
         echo(_certificate(fit, verdict))
-        if reread:
-            echo(f"written       {reread}")
+        if written:
+            echo(f"written       {output} (read back: these are its figures)")
+    if flags["flag_fit_localisation"] and written and fit.rpc.direct is None:
+        return tell_gate(f"{output} holds no localisation RPC: give a name in _RPC.TXT, .json or .vrt", [])
     if not verdict:
         return 0
-    written = "written all the same" if reread else "nothing written (--keep-going writes it all the same)"
-    return tell_gate(f"{verdict}; {written}", [])
+    how = "written all the same" if written else "nothing written (--keep-going writes it all the same)"
+    return tell_gate(f"{verdict}; {how}", [])
 
 
-def _fit(source: str, flags: dict[str, Any]) -> tuple[RpcFit, float]:
+def _fit(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit, float]:
     """The fit and the tolerance [px] that it is to meet."""
     from barpc.cameras import open_camera, read_points, split_spec
     from barpc.dem import Dem
     from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
     from barpc.fit.points import terrain_range
+    from barpc.rpcio import Carrier, row_of
 
     options = run_options(flags, flags["options_file"]).fit
+    row = None if output is None else row_of(output)
+    if isinstance(row, Carrier) and options.precision is None:
+        options = replace(options, precision=row.precision)
     points, size = read_points(source)
     if points is not None:
         ground, image = points.ground, points.image
@@ -111,21 +119,38 @@ def _fit(source: str, flags: dict[str, Any]) -> tuple[RpcFit, float]:
     if flags["dem"] and not flags["alt_range"]:
         terrain = Dem.open(flags["dem"], flags["geoid"])
         alt_range = terrain_range(camera.model, camera.extent, alt_range, terrain, flags["dem_margin"])
+    elif not flags["alt_range"] and (all_ground := getattr(camera.model, "all_ground", None)):
+        fit = fit_rpc(camera.model, camera.extent, all_ground, options=options, strict=False)
+        if not fit.verdict(options.tolerance):
+            return fit, options.tolerance
+        low, high = alt_range
+        say(
+            f"no RPC holds all ground on Earth here: fitted over the scene's altitudes, {low:g} to {high:g} m"
+        )
     fit = fit_rpc(camera.model, camera.extent, alt_range, options=options, strict=False)
     return fit, options.tolerance
 
 
-def _write(fit: RpcFit, source: str, output: str, overwrite: bool) -> str:
-    """Write the RPC, read it back as a consumer does, and say what is lost."""
-    import numpy as np
+class _Missed(Exception):  # noqa: N818 - it never leaves this page
+    """What was written does not hold the fit: it goes again."""
 
+
+def _write(
+    fit: RpcFit, source: str, output: str, overwrite: bool, tolerance: float | None
+) -> tuple[RpcFit, bool]:
+    """Write the RPC and read it back: the fit as its file holds it, and whether it stays there (within a tolerance)."""
+    from barpc.atomic import replacing
     from barpc.rpcio import read_rpc, write_camera
 
-    write_camera(fit.rpc, output, source, overwrite=overwrite)
-    corners = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1)
-    ground = fit.rpc.ground_offset + corners * fit.rpc.ground_scale
-    lost = float(np.abs(read_rpc(output).project(ground) - fit.rpc.project(ground)).max())
-    return f"{output} (read back: {lost:.1g} px)"
+    try:
+        with replacing(output, overwrite=overwrite) as partial:
+            write_camera(fit.rpc, partial, source, place=output, overwrite=True)
+            fit = fit.as_written(read_rpc(partial))
+            if tolerance is not None and fit.verdict(tolerance):
+                raise _Missed
+    except _Missed:
+        return fit, False
+    return fit, True
 
 
 def _certificate(fit: RpcFit, verdict: str) -> str:
@@ -140,6 +165,14 @@ def _certificate(fit: RpcFit, verdict: str) -> str:
         *([more] if fit.beyond < 1 else []),  # given points say nothing of the rest
         f"denominators  at least {fit.min_denominator:.3g} over the box and 25 % around it",
         f"round trip    {fit.roundtrip:.1g} px",
+        *([] if fit.localisation is None else [_localisation(fit.localisation)]),
         f"verdict       {verdict or 'within tolerance'}",
     ]
     return "\n".join(lines)
+
+
+def _localisation(found: Localisation) -> str:
+    return (
+        f"localisation  rmse {found.rmse_m:.3g} m, max {found.max_m:.3g} m; projected again {found.rmse_px:.3g} and "
+        f"{found.max_px:.3g} px; denominators at least {found.min_denominator:.3g}"
+    )

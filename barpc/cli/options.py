@@ -133,7 +133,7 @@ def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOption
     """Defaults, then the options file, then the flags that were given."""
     options = RunOptions() if options_file is None else read_options(options_file)
     values: dict[str, Any] = {}
-    for target in (*TIE, *ADJUSTMENT, *RUN, "fit.tolerance"):
+    for target in (*TIE, *ADJUSTMENT, *RUN, "fit.tolerance", "fit.localisation"):
         value = flags.get("flag_" + target.replace(".", "_"))
         if value is None:
             continue

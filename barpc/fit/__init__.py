@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from barpc.fit.localisation import Localisation
 from barpc.fit.precision import Normalization
 from barpc.fit.rpc import RpcFit, fit_rpc, fit_rpc_points
 from barpc.options import FitOptions
 
-__all__ = ["FitOptions", "Normalization", "RpcFit", "fit_rpc", "fit_rpc_points"]
+__all__ = ["FitOptions", "Localisation", "Normalization", "RpcFit", "fit_rpc", "fit_rpc_points"]

@@ -6,6 +6,7 @@ error is largest more are drawn around the worst, closer and closer. Poles are e
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import comb
 
@@ -94,10 +95,11 @@ class Sample:
 
         They are infinite where the RPC has no image point.
         """
-        points, miss = (
-            self.points,
-            np.nan_to_num(np.abs(rpc.project(self.ground) - self.points[:, :2]), nan=np.inf),
-        )
+        return self.sought(lambda ground, points: rpc.project(ground) - points[:, :2])
+
+    def sought(self, off: Callable[[Array, Array], Array]) -> tuple[Errors, Array]:
+        """As `errors`, of what ground points (N, 3) and their (N, 3) col, row [px], altitude are off by: (N, 2)."""
+        points, miss = self.points, _size(off(self.ground, self.points))
         errors = Errors()
         errors.add(miss[: self.count])
         rng, reach = np.random.default_rng(1), np.array([1.0 / CELLS, 1.0 / CELLS, 0.25])
@@ -111,7 +113,7 @@ class Sample:
             at = _scaled(near, self.size, self.alt_range)
             ground = self.model.localize(at[:, :2], at[:, 2])
             known = np.isfinite(ground).all(axis=1)
-            found = np.nan_to_num(np.abs(rpc.project(ground[known]) - at[known, :2]), nan=np.inf)
+            found = _size(off(ground[known], at[known]))
             unit, miss, reach = (
                 np.concatenate([unit, near[known]]),
                 np.concatenate([miss, found]),
@@ -125,6 +127,10 @@ class Sample:
 
 
 _TINY = 1e-7  # px: errors that are no larger are rounding, and alike everywhere
+
+
+def _size(values: Array) -> Array:
+    return np.nan_to_num(np.abs(values), nan=np.inf)
 
 
 def _scaled(unit: Array, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
@@ -159,11 +165,15 @@ def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
 
     Over what they are at its centre.
     """
-    corner = rpc.normalize(np.stack([low, high]))
-    middle, half = corner.mean(axis=1), 0.5 * np.abs(corner[:, 1] - corner[:, 0])
-    box = middle[:, None] + half[:, None] * np.array([-BEYOND, BEYOND])
+    return smallest_value(rpc.coeffs[1::2], rpc.normalize(np.stack([low, high])))
+
+
+def smallest_value(cubics: Array, box: Array) -> float:
+    """A lower bound of cubics (k, 20) over a box (3, 2) and 25 % around it, over what they are at its centre."""
+    middle, half = box.mean(axis=1), 0.5 * np.abs(box[:, 1] - box[:, 0])
+    around = middle[:, None] + half[:, None] * np.array([-BEYOND, BEYOND])
     center = np.stack([middle, middle], axis=1)
-    return min(least_value(below, box) / least_value(below, center) for below in rpc.coeffs[1::2])
+    return min(least_value(cubic, around) / least_value(cubic, center) for cubic in cubics)
 
 
 def roundtrip(rpc: RPC, ground: Array) -> float:

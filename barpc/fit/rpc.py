@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit.certificate import Errors, Sample, coverage, roundtrip, smallest_denominator
+from barpc.fit.localisation import Localisation, Seen, inverse, off, with_localisation
 from barpc.fit.points import control_points, extent, numbers, screened, widened
-from barpc.fit.solve import Solution, solve
+from barpc.fit.solve import COMMON, Problem, Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
@@ -57,6 +58,8 @@ class RpcFit:
         Number of points.
     method : str
         The solver whose result this is.
+    localisation : Localisation or None
+        The certificate of `rpc.direct`, where it was asked for.
     """
 
     rpc: RPC
@@ -73,11 +76,27 @@ class RpcFit:
     num_cnp: int
     num_ckp: int
     method: str
+    localisation: Localisation | None = None
 
     def summary(self) -> dict[str, Any]:
         """The certificate as plain numbers and lists, col before row, lengths in px."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
+        if self.localisation is None:
+            del values["localisation"]
+        else:
+            values["localisation"] = asdict(self.localisation)
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
+
+    def as_written(self, rpc: RPC) -> RpcFit:
+        """The fit with the RPC that a file of it holds: what that lost over its box is added to the errors."""
+        lost = self.rpc.off(rpc)
+        return replace(
+            self,
+            rpc=rpc,
+            rmse_ckp=self.rmse_ckp + np.sqrt((lost**2).mean(axis=0)),
+            max_ckp=self.max_ckp + lost.max(axis=0),
+            localisation=None if rpc.direct is None else self.localisation,
+        )
 
     def verdict(self, tolerance: float) -> str:
         """What is wrong with this fit at a tolerance [px], in words; empty if nothing is."""
@@ -92,7 +111,7 @@ class RpcFit:
             return "the RPC has a pole near the scene: use more control points or a stronger regularisation"
         if not self.roundtrip <= max(tolerance, 1e-6):
             return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
-        return ""
+        return "" if self.localisation is None else self.localisation.verdict(tolerance)
 
 
 def fit_rpc(
@@ -145,8 +164,17 @@ def fit_rpc(
             solution, *sample.errors(solution.rpc), loop, size, 1.0 - 0.05 ** (1.0 / sample.count)
         )
 
+    def seen(rpc: RPC, _: Solution) -> tuple[Errors, Array]:
+        return sample.sought(
+            lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2])
+        )
+
     try:
-        return _best(attempt, options, vendor, strict, exact=True)
+        fit = _best(attempt, options, vendor, strict, exact=True)
+        if not options.localisation:
+            return fit
+        given = lambda method: inverse(fit.rpc, *_given(model, size, alt_range, options, method))  # noqa: E731
+        return _localised(fit, given, seen, options, strict, exact=True)
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
@@ -226,7 +254,46 @@ def fit_rpc_points(
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // _LOOPS)])
         return _certified(solution, errors, errors.largest, loop, size)
 
-    return _best(attempt, options, vendor, strict, exact=False)
+    def seen(rpc: RPC, found: Solution) -> tuple[Errors, Array]:
+        errors = Errors()
+        for places, known, at in _places(rpc, found, held_out, cnp, cnp_image):
+            errors.add(off(rpc, places, known, at))
+        return errors, errors.largest
+
+    fit = _best(attempt, options, vendor, strict, exact=False)
+    if not options.localisation:
+        return fit
+    problem = inverse(fit.rpc, cnp, cnp_image, weight)
+    return _localised(fit, lambda _: problem, seen, options, strict, exact=False)
+
+
+def _places(
+    rpc: RPC, found: Solution, held_out: tuple[Array, Array] | None, ground: Array, image: Array
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Where a localisation RPC sees check points, and these; or each of its own points, without that point's help."""
+    if held_out is not None:
+        yield rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out
+        return
+    start = 0
+    for residual in found.leave_one_out():
+        part = slice(start, start + len(residual))
+        start = part.stop
+        yield ground[part] + np.pad(residual, ((0, 0), (0, 1))), ground[part], image[part]
+
+
+def _localised(
+    fit: RpcFit,
+    problem: Callable[[str], Problem],
+    seen: Seen,
+    options: FitOptions,
+    strict: bool,
+    exact: bool,
+) -> RpcFit:
+    """The fit with a localisation RPC and its certificate; FitError where `strict` and it does not hold."""
+    rpc, certificate = with_localisation(fit.rpc, problem, seen, options, exact)
+    if strict and (wrong := certificate.verdict(options.tolerance)):
+        raise FitError(wrong)
+    return replace(fit, rpc=rpc, localisation=certificate)
 
 
 def underlying_rpc(model: object) -> RPC | None:
@@ -278,21 +345,22 @@ def _certified(
         iterations=solution.iterations,
         num_cnp=used.count,
         num_ckp=seen.count,
-        method=solution.method,
+        method=COMMON if problem.common else solution.method,
     )
 
 
 def _best(
     attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool, exact: bool
 ) -> RpcFit:
-    """The fit by the method asked for, with ``auto`` the best accepted; without one the best, or a FitError on it.
+    """The fit by the method asked for, of several (``auto``) the best accepted; without one the best, or a FitError.
 
     Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
     """
-    fits = [attempt("ridge" if options.method == "auto" else str(options.method))]
+    several = options.method in ("auto", COMMON)
+    fits = [attempt("ridge" if several else str(options.method))]
+    if several and exact and not float(fits[0].max_ckp.max()) <= _EXACT:
+        fits.append(attempt("gauss-newton"))
     if options.method == "auto":
-        if exact and not float(fits[0].max_ckp.max()) <= _EXACT:
-            fits.append(attempt("gauss-newton"))
         others = ["lcurve"] + (["vendor-denominators"] if vendor is not None else [])
         while others and all(fit.verdict(options.tolerance) for fit in fits):
             fits.append(attempt(others.pop(0)))

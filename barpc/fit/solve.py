@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -55,6 +55,8 @@ _DEGREE = np.array([0, *(len(monomial) for monomial in MONOMIALS[1:])])
 _NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
 _DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
 _SIGMA_STEPS = 2
+COMMON = "common-denominator"
+"""The method that solves col and row together, first by a ridge and then, of a model, by Gauss-Newton."""
 TAU = 0.003
 """Standard deviation that ``ridge`` expects of a denominator coefficient of degree one (no unit)."""
 WEIGHTED = 1
@@ -128,6 +130,7 @@ class Problem:
     norm: Normalization
     active: IntArray = field(default_factory=lambda: ALL)  # monomials in use, the constant one first
     weight: Array | None = None  # (N,)
+    common: bool = False  # one denominator of both coordinates
     first: Compressed | None = None  # of col without a denominator, where it is known already
 
     def screened(self) -> Problem:
@@ -156,9 +159,8 @@ class Problem:
         k = 2 * m - 1 if free else m
         for start in range(0, len(self.image), CHUNK):
             part = slice(start, start + CHUNK)
-            lonlatalt = self.ground[part].T.copy()
-            lonlatalt[0] = wrap_longitude(lonlatalt[0], norm.ground_offset[0])
-            basis = monomials((lonlatalt - norm.ground_offset[:, None]) / norm.ground_scale[:, None])
+            x = np.subtract(self.ground[part].T, norm.ground_offset[:, None], order="C")
+            basis = monomials(x / norm.ground_scale[:, None])
             y = (self.image[part, axis] - norm.image_offset[axis]) / norm.image_scale[axis]
             used = basis if m == len(basis) else basis[self.active]
             if numerator is not None and denominator is not None:
@@ -193,26 +195,57 @@ class Problem:
             triangle = _take_in(triangle, rows)
         return Compressed(np.triu(triangle), len(self.image))
 
+    @property
+    def parts(self) -> tuple[tuple[int, ...], ...]:
+        """The coordinates that have unknowns in common."""
+        return ((0, 1),) if self.common else ((0,), (1,))
+
+    def system(
+        self, axes: Sequence[int], denominator: Array | None = None, numerators: Sequence[Array] = ()
+    ) -> Compressed:
+        """The system of a part: `compressed` of one coordinate, or both above each other with one denominator."""
+        above = numerators if len(numerators) else [None] * len(axes)
+        each = [self.compressed(i, denominator, numerator=a) for i, a in zip(axes, above, strict=True)]
+        if len(each) == 1:
+            return each[0]
+        m, (col, row) = len(self.active), (system.triangle for system in each)
+        row = row * self.aspect
+        nothing = np.zeros((len(col), m))
+        both = np.vstack([np.hstack([col[:, :m], nothing, col[:, m:]]), np.hstack([nothing, row])])
+        size = both.shape[1]
+        triangle = _take_in(np.zeros((size, size), order="F"), both)
+        return Compressed(np.triu(triangle), 2 * len(self.image))
+
+    @property
+    def aspect(self) -> float:
+        """What a row counts for beside a column where they are solved together: both in pixels."""
+        return float(self.norm.image_scale[1] / self.norm.image_scale[0])
+
     def expanded(self, solution: Array, denominator: Array | None = None) -> Array:
-        """Numerator and denominator (2, 20) of a solution; monomials not in use are zero."""
+        """Numerators, one or two, and denominator (n + 1, 20) of a solution; monomials not in use are zero."""
         m = len(self.active)
-        out = np.zeros((2, 20))
-        out[0, self.active] = solution[:m]
+        count = max(len(solution) // m, 1)
+        out = np.zeros((count + 1, 20))
+        out[:count, self.active] = solution[: count * m].reshape(count, m)
         if denominator is not None:
-            out[1] = denominator
+            out[-1] = denominator
         else:
-            out[1, 0], out[1, self.active[1:]] = 1.0, solution[m:]
+            out[-1, 0], out[-1, self.active[1:]] = 1.0, solution[count * m :]
         return out
 
+    def packed(self, expanded: Array) -> Array:
+        """The solution (k,) that `expanded` makes numerators and denominator of."""
+        return np.concatenate([*expanded[:-1, self.active], expanded[-1, self.active[1:]]])
 
-def expected_size(active: IntArray) -> Array:
-    """Size (k,) expected of each unknown; infinite where nothing is expected.
+
+def expected_size(active: IntArray, numerators: int = 1) -> Array:
+    """Size (k,) expected of each unknown, those of the denominator last; infinite where nothing is expected.
 
     Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
     of degree two, a hundredth of degree three: what vendors' RPCs show, with room.
     """
     degree = _DEGREE[active]
-    return np.concatenate([_NUMERATOR[degree], TAU * _DENOMINATOR[degree[1:]]])
+    return np.concatenate([*[_NUMERATOR[degree]] * numerators, TAU * _DENOMINATOR[degree[1:]]])
 
 
 def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float]:
@@ -307,7 +340,12 @@ def solve_lcurve(problem: Problem, axes: Sequence[int]) -> tuple[Array, list[Com
 
 
 def _coefficients(problem: Problem, systems: list[Compressed], quantize: Rounding | None = None) -> Array:
-    return np.concatenate([problem.expanded(solution(system, quantize)) for system in systems])
+    return _quotients([problem.expanded(solution(system, quantize)) for system in systems])
+
+
+def _quotients(parts: Sequence[Array]) -> Array:
+    """Coefficients (4, 20) of parts, each its numerators and their denominator last."""
+    return np.stack([row for part in parts for above in part[:-1] for row in (above, part[-1])])
 
 
 def _reweighted(
@@ -317,7 +355,7 @@ def _reweighted(
     squares, following = 0.0, []
     for i, axis in enumerate(axes):
         system = problem.compressed(axis, coeffs[2 * i + 1])
-        x = np.concatenate([coeffs[2 * i, problem.active], coeffs[2 * i + 1, problem.active[1:]]])
+        x = problem.packed(coeffs[2 * i : 2 * i + 2])
         squares += system.squares(x) * float(problem.norm.image_scale[axis]) ** 2
         # corrected: |M x - y|^2 + |x - x_previous|^2
         following.append(system.penalized(penalty, x if corrected else 0.0))
@@ -326,33 +364,48 @@ def _reweighted(
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """An RPC and how it was found: what was solved, and the final systems of col and row with their penalties."""
+    """Coefficients and how they were found: the problem, and the final systems of its parts with their penalties."""
 
-    rpc: RPC
+    coeffs: Array  # (4, 20)
     problem: Problem
     solved: list[Compressed]
     h: Array
     iterations: int
     method: str
 
+    @cached_property
+    def rpc(self) -> RPC:
+        """The camera, of points on the ground."""
+        norm = self.problem.norm
+        return RPC(self.coeffs, norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
+
     def leave_one_out(self) -> Iterator[Array]:
-        """Residuals (n, 2) [px] that points would have if they had not been used, some hundred at a time.
+        """Residuals (n, 2) that points would have if they had not been used, some hundred at a time.
 
         r / (1 - leverage), the leverage from the final system: exact for a linear problem.
         """
-        inverses = [np.linalg.pinv(system.matrix) for system in self.solved]
-        rows = [
-            self.problem.rows(axis, self.rpc.coeffs[2 * axis + 1], len(inverse) > len(self.problem.active))
-            for axis, inverse in enumerate(inverses)
-        ]
+        problem, inverses = self.problem, self._inverses()
+        free = [len(inverse) > len(problem.active) for inverse in inverses]
+        rows = [problem.rows(axis, self.coeffs[2 * axis + 1], free[axis]) for axis in range(2)]
         for both in zip(*rows, strict=True):
-            part = both[0][0]
-            residual = self.rpc.project(self.problem.ground[part]) - self.problem.image[part]
-            for axis, (_, block) in enumerate(both):
+            residual = np.empty((len(both[0][1]), 2))
+            for axis, (part, block) in enumerate(both):
+                x = problem.packed(self.coeffs[2 * axis : 2 * axis + 2])[: len(inverses[axis])]
                 spread = block[:, :-1] @ inverses[axis]
                 leverage = np.einsum("ij,ij->i", spread, spread)
+                residual[:, axis] = (block[:, :-1] @ x - block[:, -1]) * problem.norm.image_scale[axis]
                 residual[:, axis] /= np.maximum(1.0 - leverage, 1e-6)
+                if problem.weight is not None:
+                    residual[:, axis] /= problem.weight[part]
             yield residual
+
+    def _inverses(self) -> list[Array]:
+        """For col and row, what takes its row of (M | y) to the unknowns' standard deviations (k, n)."""
+        inverses = [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
+        if len(inverses) == 2:
+            return inverses
+        (both,), m = inverses, len(self.problem.active)
+        return [np.delete(both, slice(m, 2 * m), axis=0), both[m:] * self.problem.aspect]
 
 
 def tidy(values: Array) -> Array:
@@ -396,64 +449,70 @@ def solve(
     if keeps and vendor is None:
         raise FitError(f"{method}: the model is not built on an RPC whose denominators could be kept")
     norm = normalization(ground, image, options, vendor if keeps else None)
-    problem = Problem(ground, image, norm, weight=weight).screened()
+    if keeps:  # its offset may lie a whole turn away
+        ground = np.column_stack([wrap_longitude(ground[:, 0], norm.ground_offset[0]), ground[:, 1:]])
+    common = options.method == COMMON
+    problem = Problem(ground, image, norm, weight=weight, common=common).screened()
     unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)
     if len(ground) <= unknowns:
         raise FitError(
             f"{len(ground)} points are too few: each coordinate has {unknowns} unknowns, "
             f"give {unknowns + 1} points or more"
         )
+    return solve_problem(problem, options, method, vendor)
+
+
+def solve_problem(problem: Problem, options: FitOptions, method: str, vendor: RPC | None = None) -> Solution:
+    """The solution of a problem by a method, its numbers rounded to the options' precision."""
     quantize = None if options.precision is None else PRECISIONS[options.precision].coeffs
-    coeffs, solved, h, passes = METHODS[method](problem, quantize, vendor)
-    rpc = RPC(coeffs, norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
-    return Solution(rpc, problem, solved, h, passes, method)
+    coeffs, systems, h, passes = METHODS[method](problem, quantize, vendor)
+    return Solution(coeffs, problem, systems, h, passes, method)
 
 
 def _ridge(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
-    expected = expected_size(problem.active)
     solved, h, passes = [], np.zeros(2), 1
-    for axis in range(2):
-        denominator = None
+    for axes in problem.parts:
+        expected, denominator = expected_size(problem.active, len(axes)), None
         for done in range(1 + WEIGHTED):
-            system, sigma = noise_scaled(problem.compressed(axis, denominator), expected)
-            denominator = problem.expanded(solution(system))[1]
+            system, sigma = noise_scaled(problem.system(axes, denominator), expected)
+            denominator = problem.expanded(solution(system))[-1]
             passes = max(passes, 1 + done)
             if np.abs(denominator[1:]).sum() < _EVEN:
                 break
         solved.append(system)
-        h[axis] = sigma / TAU
+        h[list(axes)] = sigma / TAU
     return _coefficients(problem, solved, quantize), solved, h, passes
 
 
 def _gauss_newton(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
-    start, solved, _, passes = _ridge(problem, None, vendor)
-    parts = []
-    for axis in range(2):
-        numerator, denominator = start[2 * axis : 2 * axis + 2]
+    start, _, _, passes = _ridge(problem, None, vendor)
+    parts, solved = [], []
+    for axes in problem.parts:
+        numerators, denominator = start[[2 * axis for axis in axes]], start[2 * axes[0] + 1]
         if not least_value(denominator, _AROUND) > _MARGIN:  # from a polynomial, then
             denominator = np.eye(20)[0]
-            system = problem.compressed(axis, denominator, free=False)
-            numerator = problem.expanded(solution(system), denominator)[0]
-        x = np.concatenate([numerator[problem.active], denominator[problem.active[1:]]])
-        x, solved[axis], steps = _minimised(problem, axis, x)
-        parts.append(problem.expanded(x if quantize is None else solution(solved[axis], quantize)))
+            systems = [problem.compressed(axis, denominator, free=False) for axis in axes]
+            numerators = np.stack([problem.expanded(solution(one), denominator)[0] for one in systems])
+        x, system, steps = _minimised(problem, axes, problem.packed(np.vstack([numerators, denominator])))
+        parts.append(problem.expanded(x if quantize is None else solution(system, quantize)))
+        solved.append(system)
         passes = max(passes, steps)
-    return np.concatenate(parts), solved, np.zeros(2), passes
+    return _quotients(parts), solved, np.zeros(2), passes
 
 
-def _minimised(problem: Problem, axis: int, x: Array) -> tuple[Array, Compressed, int]:
+def _minimised(problem: Problem, axes: Sequence[int], x: Array) -> tuple[Array, Compressed, int]:
     """Least squares of y - a / b from unknowns x (k,), the system there, and the passes over the points."""
-    numerator, denominator = problem.expanded(x)
-    system, damping, passes = problem.compressed(axis, denominator, numerator=numerator), 0.0, 1
+    *numerators, denominator = problem.expanded(x)
+    system, damping, passes = problem.system(axes, denominator, numerators), 0.0, 1
     size = np.linalg.norm(system.matrix, axis=0)
     while passes < MAX_PASSES and damping < _MOST_DAMPED:
         penalty = max(damping, _LEAST_DAMPED) * size
         ahead = solution(system.penalized(penalty, penalty * x))
-        numerator, denominator = problem.expanded(ahead)
+        *numerators, denominator = problem.expanded(ahead)
         before, after = system.squares(x), np.inf
         if least_value(denominator, _AROUND) > _MARGIN:
             passes += 1
-            following = problem.compressed(axis, denominator, numerator=numerator)
+            following = problem.system(axes, denominator, numerators)
             after = following.squares(ahead)
         if after < before:
             x, system, damping = ahead, following, 0.1 * damping if damping > _FIRST_DAMPED else 0.0

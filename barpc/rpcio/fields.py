@@ -18,6 +18,8 @@ from barpc.sensor.rpc import RPC
 OFFSETS = ("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF")
 SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")
 COEFFICIENTS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
+DIRECT = ("LON_NUM_COEFF", "LON_DEN_COEFF", "LAT_NUM_COEFF", "LAT_DEN_COEFF")  # rpcm's: of a localisation RPC
+LISTS = COEFFICIENTS + DIRECT
 ERRORS = ("ERR_BIAS", "ERR_RAND")
 SINGLE = ERRORS + OFFSETS + SCALES
 KEYS = SINGLE + COEFFICIENTS  # GDAL's names of all fields, in the order of the GeoTIFF tag
@@ -32,7 +34,7 @@ MAXAR = dict(zip(KEYS, _MAXAR.split(), strict=True))
 Fields = dict[str, list[float]]
 """Field name -> its numbers: one, or twenty for the four lists of coefficients (RPC00B order)."""
 
-_INDEXED = re.compile(rf"({'|'.join(COEFFICIENTS)})_(\d+)")
+_INDEXED = re.compile(rf"({'|'.join(LISTS)})_(\d+)")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?")
 
 
@@ -100,7 +102,8 @@ def rpc_from_fields(
     """
     if options is not None and options.first_pixel is not None:
         first_pixel = options.first_pixel
-    for key, count in [*((k, 1) for k in OFFSETS + SCALES), *((k, 20) for k in COEFFICIENTS)]:
+    lists = LISTS if any(key in fields for key in DIRECT) else COEFFICIENTS
+    for key, count in [*((k, 1) for k in OFFSETS + SCALES), *((k, 20) for k in lists)]:
         found = len(fields.get(key, ()))
         if found != count:
             what = "is missing" if not found else f"has {found} numbers, expected {count}"
@@ -115,6 +118,7 @@ def rpc_from_fields(
             image_scale=np.array([fields[f"{axis}_SCALE"][0] for axis in image]),
             err_bias=_accuracy(fields.get("ERR_BIAS")),
             err_rand=_accuracy(fields.get("ERR_RAND")),
+            direct=np.array([fields[key] for key in DIRECT]) if lists is LISTS else None,
         )
     except RpcFormatError:
         raise
@@ -129,8 +133,11 @@ def _accuracy(value: Sequence[float] | None) -> float | None:
     return float(value[0])
 
 
-def fields_from_rpc(rpc: RPC) -> Fields:
-    """The fields of an RPC, in the order that files give them; unknown accuracies are left out."""
+def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
+    """The fields of an RPC, in the order that files give them; unknown accuracies are left out.
+
+    Those of its localisation RPC come last, in files that hold them (`direct`).
+    """
     fields = {key: [value] for key, value in zip(ERRORS, (rpc.err_bias, rpc.err_rand), strict=True) if value}
     for keys, image, ground in (
         (OFFSETS, rpc.image_offset, rpc.ground_offset),
@@ -139,4 +146,6 @@ def fields_from_rpc(rpc: RPC) -> Fields:
         (col, row), (lon, lat, alt) = image.tolist(), ground.tolist()
         fields |= {key: [value] for key, value in zip(keys, (row, col, lat, lon, alt), strict=True)}
     col_num, col_den, row_num, row_den = rpc.coeffs.tolist()
-    return fields | dict(zip(COEFFICIENTS, (row_num, row_den, col_num, col_den), strict=True))
+    fields |= dict(zip(COEFFICIENTS, (row_num, row_den, col_num, col_den), strict=True))
+    held = rpc.direct.tolist() if direct and rpc.direct is not None else []
+    return fields | dict(zip(DIRECT, held, strict=False))

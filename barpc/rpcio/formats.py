@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from barpc.atomic import write_text
 from barpc.errors import InputError, RpcFormatError
@@ -75,6 +76,9 @@ class Carrier:
     suffixes: tuple[str, ...]
     write: Callable[[RPC, Path, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
     consumers: tuple[str, ...] = ("gdal", "rpcm", "shareloc", "orthority")
+    precision: Literal["nitf"] | None = (
+        None  # whose digits it holds (`barpc.fit.precision`); None: all of them
+    )
 
 
 def _vrt(rpc: RPC, image: Path, path: Path, place: Path, overwrite: bool) -> None:
@@ -92,7 +96,7 @@ def _nitf(rpc: RPC, image: Path, path: Path, _place: Path, overwrite: bool) -> N
 CARRIERS: dict[str, Carrier] = {
     "vrt": Carrier((".vrt",), _vrt),
     "copy": Carrier((".tif", ".tiff"), _copy),
-    "nitf": Carrier((".ntf",), _nitf),
+    "nitf": Carrier((".ntf",), _nitf, precision="nitf"),
 }
 """Name -> raster that carries an RPC."""
 

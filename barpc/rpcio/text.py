@@ -11,8 +11,10 @@ from typing import Any
 from barpc.errors import RpcFormatError
 from barpc.rpcio.fields import (
     COEFFICIENTS,
+    DIRECT,
     ERRORS,
     KEYS,
+    LISTS,
     MAXAR,
     OFFSETS,
     SCALES,
@@ -52,7 +54,7 @@ def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[st
     """A line for every number; the coefficients of a list have these indices."""
     lines = []
     for key, values in fields.items():
-        names = [f"{key}_{index}" for index in indices] if key in COEFFICIENTS else [key]
+        names = [f"{key}_{index}" for index in indices] if key in LISTS else [key]
         lines += [f"{k}{separator}{format_number(value)}" for k, value in zip(names, values, strict=True)]
     return lines
 
@@ -60,14 +62,16 @@ def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[st
 def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
     """``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT)."""
     found = ((key.upper(), value) for key, value in _pairs(text))
-    known = ((k, v) for k, v in found if k in SINGLE or k.rpartition("_")[0] in COEFFICIENTS)
+    known = ((k, v) for k, v in found if k in SINGLE or k.rpartition("_")[0] in LISTS)
     pairs = [(key, number(value, name, key)) for key, value in known]
     return rpc_from_fields(collect_numbered(pairs, name), name, options)
 
 
 def write_txt(rpc: RPC) -> str:
     """``KEY: value`` without units (rpcm stumbles on them); every number reads back to the bit."""
-    return "\n".join(_numbered(fields_from_rpc(rpc), ": ", [str(i) for i in range(1, 21)])) + "\n"
+    return (
+        "\n".join(_numbered(fields_from_rpc(rpc, direct=True), ": ", [str(i) for i in range(1, 21)])) + "\n"
+    )
 
 
 # --- .RPB -------------------------------------------------------------------------------------------------
@@ -147,6 +151,7 @@ _RPCM_WORDS = (
     "alt_scale row_num row_den col_num col_den"
 )
 _RPCM = dict(zip(KEYS, _RPCM_WORDS.split(), strict=True))
+_RPCM |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
 _PLAIN = {key: key.lower() for key in KEYS}
 
 
@@ -188,10 +193,10 @@ def _values(value: Any, name: str, key: str) -> list[float]:
 
 
 def write_json(rpc: RPC) -> str:
-    """The dictionary of rpcm and s2p, without the vendor's direct coefficients."""
-    fields = fields_from_rpc(rpc)
-    order = (*(key for key in KEYS if key not in ERRORS), *ERRORS)
-    rpcm = {_RPCM[k]: fields[k] if k in COEFFICIENTS else fields[k][0] for k in order if k in fields}
+    """The dictionary of rpcm and s2p."""
+    fields = fields_from_rpc(rpc, direct=True)
+    order = (*(key for key in KEYS if key not in ERRORS), *DIRECT, *ERRORS)
+    rpcm = {_RPCM[k]: fields[k] if k in LISTS else fields[k][0] for k in order if k in fields}
     return json.dumps({"rpc": rpcm}, indent=1) + "\n"
 
 

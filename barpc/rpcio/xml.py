@@ -10,6 +10,7 @@ from xml.etree.ElementTree import Element
 from barpc.errors import ImageError, RpcFormatError
 from barpc.rpcio.fields import (
     COEFFICIENTS,
+    DIRECT,
     ERRORS,
     KEYS,
     MAXAR,
@@ -162,7 +163,7 @@ def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
 
 def rpc_from_domain(items: Mapping[str, str], name: str, options: ReadOptions) -> RPC:
     """The RPC in GDAL's metadata domain; other keys are passed over."""
-    fields = {key: numbers(value, name, key) for key, value in items.items() if key in KEYS}
+    fields = {key: numbers(value, name, key) for key, value in items.items() if key in KEYS + DIRECT}
     return rpc_from_fields(fields, name, options)
 
 
@@ -170,6 +171,6 @@ def rpc_domain(rpc: RPC) -> str:
     """The `<Metadata domain="RPC">` element of an RPC, numbers that read back to the bit."""
     rows = [
         f'    <MDI key="{key}">{" ".join(map(format_number, values))}</MDI>'
-        for key, values in sorted(fields_from_rpc(rpc).items())
+        for key, values in sorted(fields_from_rpc(rpc, direct=True).items())
     ]
     return "\n".join(['  <Metadata domain="RPC">', *rows, "  </Metadata>"])

@@ -13,7 +13,7 @@ import numpy as np
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
-from barpc.sensor.rational import CHUNK, REACH, BoolArray, Rational
+from barpc.sensor.rational import CHUNK, REACH, BoolArray, Rational, monomials
 
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 
@@ -31,6 +31,9 @@ class RPC(Frozen):
     image_offset, image_scale : (2,), col, row [px]; (0, 0) is the centre of the top-left pixel
     err_bias, err_rand : float or None
         Stated accuracy [m], RMS per horizontal axis: common to the image, of each point; None where unknown.
+    direct : (4, 20), optional
+        The localisation RPC: numerator and denominator of the longitude, then of the latitude, in RPC00B order with the
+        column for L and the row for P, normalised alike. `localize` inverts `coeffs` instead, which is exact.
 
     Raises
     ------
@@ -45,6 +48,7 @@ class RPC(Frozen):
     image_scale: Array
     err_bias: float | None = None
     err_rand: float | None = None
+    direct: Array | None = None
     _map: Rational = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -53,8 +57,12 @@ class RPC(Frozen):
             value = self._array(name, shape, RpcError)
             if name.endswith("scale") and (value == 0).any():
                 raise RpcError(f"RPC {name}: a scale is zero")
-        if not self.coeffs[1::2].any(axis=1).all():
-            raise RpcError("RPC coeffs: a denominator is zero everywhere")
+        if self.direct is not None:
+            self._array("direct", (4, 20), RpcError)
+        for name in ("coeffs", "direct"):
+            held = getattr(self, name)
+            if held is not None and not held[1::2].any(axis=1).all():
+                raise RpcError(f"RPC {name}: a denominator is zero everywhere")
         self._keep("_map", Rational(self.coeffs, _ACCURACY / np.abs(self.image_scale)))
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
@@ -82,6 +90,25 @@ class RPC(Frozen):
         that projects to `image`.
         """
         return pointwise(self._localize, CHUNK, [(3,)], image, alt, rows=20)[0]
+
+    def off(self, other: RPC) -> Array:
+        """How far another RPC's image points are off (729, 2) [px], over the box; 0 where neither has any."""
+        places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 3), axis=-1).reshape(-1, 3)
+        image, seen = (rpc.project(self.ground_offset + places * self.ground_scale) for rpc in (self, other))
+        return np.where(np.isnan(image) & np.isnan(seen), 0.0, np.abs(seen - image))
+
+    def localize_direct(self, image: Array, alt: Array) -> Array:
+        """As `localize`, by the localisation RPC: no iteration, and as near as that was fitted."""
+        return pointwise(self._localize_direct, CHUNK, [(3,)], image, alt, rows=20)[0]
+
+    def _localize_direct(self, image: Array, alt: Array, work: Array) -> list[Array]:
+        if self.direct is None:
+            raise RpcError("this RPC comes without a localisation RPC")
+        x = np.vstack([image.T, alt]) - np.append(self.image_offset, self.ground_offset[2])[:, None]
+        x /= np.append(self.image_scale, self.ground_scale[2])[:, None]
+        poly = self.direct @ monomials(x, work)
+        lonlat = poly[::2] / poly[1::2] * self.ground_scale[:2, None] + self.ground_offset[:2, None]
+        return [np.vstack([lonlat, alt]).T]
 
     def _project(self, ground: Array, work: Array) -> list[Array]:
         value = self._map.value(self.normalize(ground, work[20:23]), work[:20], work[23:])

@@ -62,6 +62,7 @@ ELSEWHERE = {
     "weighted": "test_weighted_passes_are_made_where_the_denominator_varies",
     "space": "test_the_grid_is_regular_where_it_is_asked_for",
     "nodes": "test_nodes_are_where_they_are_asked_for",
+    "localisation": "test_a_localisation_rpc_comes_only_where_it_is_asked_for",
     "tolerance": "test_the_tolerance_decides_whether_a_fit_is_accepted",
     "allow_mirrored": "test_mirrored_points_are_taken_where_allowed",
 }

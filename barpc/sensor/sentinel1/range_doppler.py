@@ -123,6 +123,11 @@ class RangeDoppler(Frozen):
         return build([annotation], epoch, (annotation.samples, lines), orbit, atmosphere, bistatic)
 
     @property
+    def all_ground(self) -> tuple[float, float] | None:
+        """Altitudes of all ground on Earth [m], which an RPC of a swath holds to 5e-3 px; None of a GRD."""
+        return None if self.advice else (-500.0, 9000.0)
+
+    @property
     def advice(self) -> str:
         """What to do where no RPC follows this model; empty where nothing special."""
         ground_range = (
