@@ -317,6 +317,7 @@ class FitOptions(Options):
         "auto",
         "ridge",
         "gauss-newton",
+        "minimax",
         "common-denominator",
         "lcurve",
         "lcurve-joint",
@@ -325,9 +326,9 @@ class FitOptions(Options):
         "auto",
         """`ridge`: QR compression and a noise-scaled ridge. `lcurve`: the paper's solver; `lcurve-joint` with one h
         for col and row (78 unknowns) instead of one each (39 + 39). `gauss-newton`: the least squares of the error
-        itself, for models without noise. `vendor-denominators`: numerators only. `auto`: `ridge`, and another one
-        where the certificate says that it is better. `common-denominator`: one for col and row, by `ridge` and
-        `gauss-newton` as `auto` goes.""",
+        itself, for models without noise; `minimax`: the least largest error instead. `vendor-denominators`: numerators
+        only. `auto`: `ridge`, and another one where the certificate says that it is better. `common-denominator`: one
+        for col and row, by `ridge` and `gauss-newton` as `auto` goes.""",
     )
     grid: tuple[int, int, int] = option(
         (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4

@@ -24,6 +24,7 @@ _CHUNK = 8192
 _LOOPS = 4096  # round trips that a table of points is tried on, about
 _MISSING = 0.1  # part of the image without a ground point, at most
 _CELLS = 72  # of ``gauss-newton``, along each side of the image
+_HOPE = 3.0  # times the tolerance: what ``minimax`` may bring below it
 _EXACT = 1e-6  # px: what no other method is tried on
 
 
@@ -106,6 +107,8 @@ class RpcFit:
                 f"the RPC misses its check points by up to {worst:.3g} px (RMSE col {self.rmse_ckp[0]:.3g}, "
                 f"row {self.rmse_ckp[1]:.3g}), wanted {tolerance:g}: fit a smaller altitude range or a "
                 "smaller image, or raise the tolerance"
+                + ", or fit by the method minimax"
+                * (self.method == "gauss-newton" and worst < _HOPE * tolerance)
             )
         if not self.min_denominator > 0:
             return "the RPC has a pole near the scene: use more control points or a stronger regularisation"
@@ -188,7 +191,10 @@ def _given(
     method: str,
 ) -> tuple[Array, Array]:
     """Ground (N, 3) and image points (N, 2) for a method."""
-    if method == "gauss-newton":  # what an RPC cannot follow has any frequency: scattered points alias none
+    if method in (
+        "gauss-newton",
+        "minimax",
+    ):  # what an RPC cannot follow has any frequency: scattered points alias none
         scattered = Sample.of(model, size, alt_range, _CELLS, seed=1)
         ground, image = scattered.ground, scattered.points[:, :2]
     else:

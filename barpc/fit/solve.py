@@ -15,6 +15,9 @@ noise, hence no penalty; noisy points cannot drive a denominator to zero. sigma 
 coefficients now give in place of y, and damped towards them. No penalty: for models without noise, whose misfit a ridge
 takes for noise. Steps that bring a denominator near zero over the points are not taken.
 
+``minimax``: from there on the least largest error, by least squares whose weights grow with the errors (Lawson,
+"Contributions to the theory of linear least maximum approximation", 1961).
+
 ``lcurve``, the paper's solver (Akiki et al. 2021, section 3): one h from the corner of the L-curve, then weighted and
 ICCV iterations. All unknowns are penalised alike, as in the paper; its singular value decompositions are taken of
 the compressed system, which has the same singular values.
@@ -69,6 +72,7 @@ _SAMPLES = 200  # of the L-curve
 _LEAST_DAMPED, _FIRST_DAMPED, _MOST_DAMPED = 1e-12, 1e-6, 1e3  # of the size of a column
 _AROUND = np.full((3, 2), [-BEYOND, BEYOND])
 _MARGIN = 0.1  # of what a denominator is at the centre
+_REWEIGHTED = 7  # times, of ``minimax``
 _GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
@@ -232,6 +236,11 @@ class Problem:
         else:
             out[-1, 0], out[-1, self.active[1:]] = 1.0, solution[count * m :]
         return out
+
+    def errors(self, axis: int, x: Array) -> Array:
+        """What a solution leaves of a coordinate (N,), in scales of the image."""
+        rows = self.rows(axis, self.expanded(x)[-1])
+        return np.concatenate([np.abs(block[:, :-1] @ x - block[:, -1]) for _, block in rows])
 
     def packed(self, expanded: Array) -> Array:
         """The solution (k,) that `expanded` makes numerators and denominator of."""
@@ -523,6 +532,28 @@ def _minimised(problem: Problem, axes: Sequence[int], x: Array) -> tuple[Array, 
     return x, system, passes
 
 
+def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
+    coeffs, solved, h, passes = _gauss_newton(problem, None, vendor)
+    given, parts = 1.0 if problem.weight is None else problem.weight, []
+    for axis in range(2):
+        x, least, weight = (
+            problem.packed(coeffs[2 * axis : 2 * axis + 2]),
+            np.inf,
+            np.ones(len(problem.image)),
+        )
+        for _ in range(_REWEIGHTED):
+            errors = problem.errors(axis, x)
+            if errors.max() < least:
+                least, best = float(errors.max()), x
+            weight *= errors  # Lawson's
+            weight /= weight.mean()
+            heavy = replace(problem, weight=given * np.sqrt(weight), first=None)
+            x, solved[axis], steps = _minimised(heavy, (axis,), x)
+            passes += steps
+        parts.append(problem.expanded(best if quantize is None else solution(solved[axis], quantize)))
+    return _quotients(parts), solved, h, passes
+
+
 def _lcurve(problem: Problem, quantize: Rounding | None, vendor: RPC | None, joint: bool = False) -> Found:
     results = [solve_lcurve(problem, axes) for axes in ([[0, 1]] if joint else [[0], [1]])]
     parts, systems, sizes, passes = zip(*results, strict=True)
@@ -548,6 +579,7 @@ def _vendor_denominators(problem: Problem, quantize: Rounding | None, vendor: RP
 METHODS: dict[str, Callable[[Problem, Rounding | None, RPC | None], Found]] = {
     "ridge": _ridge,
     "gauss-newton": _gauss_newton,
+    "minimax": _minimax,
     "lcurve": _lcurve,
     "lcurve-joint": partial(_lcurve, joint=True),
     "vendor-denominators": _vendor_denominators,

@@ -17,6 +17,7 @@ import numpy as np
 from barpc import __version__
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.gauge import MOTIONS, Mode
+from barpc.fit import RpcFit
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report.records import Cell, Column, Number, Record, plain, said, value_of
 from barpc.report.run import PairTies, Run
@@ -133,6 +134,9 @@ class FitEntry(Record):
     coverage: Number = said("Share of the image that the fit's points cover")
     method: str = said("Solver", head="solver")
     num_check_points: Count = said("Check points", head="check points")
+    localisation_m: Number = said(
+        "Largest distance on the ground of the localisation RPC from P_BA", "m", default=None
+    )
 
 
 def largest(values: Sequence[float | None] | None) -> float | None:
@@ -578,6 +582,11 @@ _DEM = attrgetter("held", "known", "total", "offset", "spread")
 _FIT = attrgetter("rmse_ckp", "max_ckp", "min_denominator", "roundtrip", "coverage", "method", "num_ckp")
 
 
+def _fit_entry(fit: RpcFit) -> FitEntry:
+    place = fit.localisation
+    return FitEntry(*_FIT(fit), localisation_m=None if place is None else place.max_m)
+
+
 def measure(run: Run) -> Summary:
     """The summary of a run, without the verdict on it. Numbers may be NaN here."""
     reports = {report.names: report for report in run.matched}
@@ -644,7 +653,7 @@ def _views(run: Run) -> tuple[ViewEntry, ...]:
             prior_scale=None if adjustment is None else adjustment.prior.scale[i],
             correction=None if adjustment is None else _correction(adjustment, i, middle),
             camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
-            fit=FitEntry(*_FIT(run.fits[i])) if run.fits else None,
+            fit=_fit_entry(run.fits[i]) if run.fits else None,
             outputs=dict(run.written[i]) if run.written else {},
             status="adjusted",
             advice="",

@@ -10,6 +10,7 @@ import pytest
 
 from barpc.cli import main
 from barpc.rpcio import read_rpc, write_rpc
+from barpc.sensor.sentinel1 import RangeDoppler
 from tests.fit.cameras import Camera, random_points, synthetic
 
 
@@ -124,3 +125,71 @@ def test_the_altitudes_may_come_from_a_dem(
     low, high = rpc.ground_offset[2] - rpc.ground_scale[2], rpc.ground_offset[2] + rpc.ground_scale[2]
     assert 200.0 < low < 400.0
     assert 700.0 < high < 1100.0
+
+
+def test_a_file_of_few_digits_is_fitted_for_them_and_certified_as_it_reads_back(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image, out = shared_data / "optical" / "phr_triplet_north" / "img_01.tif", tmp_path / "a.ntf"
+    narrow = ("--alt-range", 100, 400, "--json")
+    assert run("fit", image, "-o", out, *narrow) == 0
+    report, truth, written = json.loads(capsys.readouterr().out), read_rpc(image), read_rpc(out)
+    rng = np.random.default_rng(0)
+    at = rng.uniform(0, 1, (4000, 2)) * [1024, 560] - 0.5
+    error = np.abs(written.project(truth.localize(at, rng.uniform(100, 400, 4000))) - at)
+    assert 1e-7 < error.max() <= 1.2 * max(report["max_ckp"])
+    assert max(report["max_ckp"]) <= 2 * error.max()
+    (tmp_path / "fit.toml").write_text('[fit]\nprecision = "rpcm"\n')  # digits that this file does not hold
+    out.unlink()
+    assert run("fit", image, "-o", out, *narrow, "--options", tmp_path / "fit.toml") == 3
+    said = capsys.readouterr()
+    assert not out.exists()
+    assert max(json.loads(said.out)["max_ckp"]) > 0.1
+    assert "nothing written" in said.err
+    assert run("fit", image, "-o", out, *narrow, "--options", tmp_path / "fit.toml", "--keep-going") == 3
+    assert out.exists()
+
+
+def test_a_copy_into_few_digits_is_not_passed_over(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = shared_data / "optical" / "phr_triplet_north" / "img_01.tif"
+    assert run("convert", image, tmp_path / "a.ntf", "--json") == 3
+    said = capsys.readouterr()
+    assert json.loads(said.out)["max_px"] > 0.1
+    assert "'barpc fit'" in said.err
+    for name in ("b_RPC.TXT", "b.tif"):
+        assert run("convert", image, tmp_path / name, "--json") == 0
+        assert json.loads(capsys.readouterr().out)["max_px"] <= 1e-6
+
+
+def test_a_localisation_rpc_is_written_where_the_file_holds_it(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = shared_data / "optical" / "phr_triplet_north" / "img_01.tif"
+    for name in ("a.vrt", "b_RPC.TXT"):
+        assert run("fit", image, "-o", tmp_path / name, "--localisation", "--alt-range", 0, 500) == 0
+        assert "localisation  rmse" in capsys.readouterr().out
+        rpc, at = read_rpc(tmp_path / name), np.array([[10.0, 500.0], [1000.0, 20.0]])
+        found = rpc.localize_direct(at, np.array([100.0, 400.0]))
+        assert np.abs(rpc.project(found) - at).max() < 1e-4
+    assert run("fit", image, "-o", tmp_path / "c.RPB", "--localisation") == 3
+    assert "holds no localisation RPC" in capsys.readouterr().err
+
+
+def test_of_a_radar_swath_all_ground_on_earth_is_held_to_five_thousandths_of_a_pixel(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = sorted((shared_data / "sar").glob("s1a-iw1-slc-vv-20160114*.xml"))[0]
+    assert run("fit", source, "-o", tmp_path / "iw1_RPC.TXT") == 0
+    model, rpc = RangeDoppler.from_annotation(source), read_rpc(tmp_path / "iw1_RPC.TXT")
+    rng = np.random.default_rng(0)
+    at = rng.uniform(0, 1, (3000, 2)) * model.size - 0.5
+    for low, high in ((-500, -400), (0, 1000), (8900, 9000)):
+        ground = model.localize(at, rng.uniform(low, high, 3000))
+        assert np.abs(rpc.project(ground) - at).max() <= 5e-3
+    capsys.readouterr()
+    tight = ("--tolerance", 0.002)
+    assert run("fit", source, "-o", tmp_path / "low_RPC.TXT", *tight) == 0
+    assert "the scene's altitudes, -197 to 530 m" in capsys.readouterr().err
+    assert read_rpc(tmp_path / "low_RPC.TXT").ground_offset[2] < 200.0
