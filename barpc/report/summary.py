@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version as package_version
 from operator import attrgetter
 from typing import Annotated, Any, ClassVar, Literal
@@ -584,7 +585,7 @@ _FIT = attrgetter("rmse_ckp", "max_ckp", "min_denominator", "roundtrip", "covera
 
 def _fit_entry(fit: RpcFit) -> FitEntry:
     place = fit.localisation
-    return FitEntry(*_FIT(fit), localisation_m=None if place is None else place.max_m)
+    return replace(FitEntry(*_FIT(fit)), localisation_m=None if place is None else place.max_m)
 
 
 def measure(run: Run) -> Summary:
