@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from barpc.geodesy import Array, wrap_longitude
 from barpc.sensor import SensorModel
-from barpc.sensor.rational import MONOMIALS
+from barpc.sensor.rational import MONOMIALS, monomials
 from barpc.sensor.rpc import RPC
 
 BoolArray = npt.NDArray[np.bool_]
@@ -172,8 +172,8 @@ def smallest_value(cubics: Array, box: Array) -> float:
     """A lower bound of cubics (k, 20) over a box (3, 2) and 25 % around it, over what they are at its centre."""
     middle, half = box.mean(axis=1), 0.5 * np.abs(box[:, 1] - box[:, 0])
     around = middle[:, None] + half[:, None] * np.array([-BEYOND, BEYOND])
-    center = np.stack([middle, middle], axis=1)
-    return min(least_value(cubic, around) / least_value(cubic, center) for cubic in cubics)
+    center = (cubics @ monomials(middle[:, None]))[:, 0]
+    return min(least_value(cubic, around) / value for cubic, value in zip(cubics, center.tolist(), strict=True))
 
 
 def roundtrip(rpc: RPC, ground: Array) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from barpc.errors import FitError, RpcError, RpcFormatError
+from barpc.errors import FitError, RpcFormatError
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.solve import COMMON, solve
 from barpc.geodesy import Array, ecef_from_ground
@@ -96,18 +96,6 @@ def test_a_crop_and_a_coarser_image_keep_it(camera: Camera) -> None:
     coarse = rpc.window(400, 30, 2.0, 4.0)
     at = (image + 0.5 - [400, 30]) / [2.0, 4.0] - 0.5
     np.testing.assert_allclose(coarse.localize_direct(at, alt), truth, rtol=1e-13)
-
-
-def test_a_localisation_rpc_comes_only_where_it_is_asked_for(camera: Camera) -> None:
-    fit = fit_rpc(camera.model, camera.size, camera.alt_range)
-    assert fit.rpc.direct is None
-    assert fit.localisation is None
-    assert "localisation" not in fit.summary()
-    with pytest.raises(RpcError, match="without a localisation RPC"):
-        fit.rpc.localize_direct(np.zeros(2), np.array(0.0))
-    asked = fit_rpc(camera.model, camera.size, camera.alt_range, options=BOTH)
-    assert (asked.rpc.coeffs == fit.rpc.coeffs).all()
-    assert json.loads(json.dumps(asked.summary()))["localisation"]["max_px"] < 3e-3
 
 
 def test_one_that_misses_is_refused(frame: RpcFit) -> None:

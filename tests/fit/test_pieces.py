@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from barpc.errors import FitError, InputError
+from barpc.errors import FitError, InputError, RpcError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import rpc as fit_module
 from barpc.fit.certificate import Errors, coverage, roundtrip, smallest_denominator
@@ -102,6 +103,18 @@ def test_an_option_changes_the_result_in_its_direction(camera: Camera, row: Row)
             fit = fit_rpc(model, camera.size, camera.alt_range, options=options, strict=False)
         found.append(row.observable(fit))
     assert (found[1] - found[0]) * row.sign > 0.05 * abs(found[0]), found
+
+
+def test_a_localisation_rpc_comes_only_where_it_is_asked_for(camera: Camera) -> None:
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range)
+    assert fit.rpc.direct is None
+    assert fit.localisation is None
+    assert "localisation" not in fit.summary()
+    with pytest.raises(RpcError, match="without a localisation RPC"):
+        fit.rpc.localize_direct(np.zeros(2), np.array(0.0))
+    asked = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(localisation=True))
+    assert (asked.rpc.coeffs == fit.rpc.coeffs).all()
+    assert json.loads(json.dumps(asked.summary()))["localisation"]["max_px"] < 3e-3
 
 
 def test_weighted_passes_are_made_where_the_denominator_varies(camera: Camera) -> None:
