@@ -101,6 +101,16 @@ def convert(
         text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
         echo(json.dumps({"path": target, "window": window}) if as_json else text)
         return 0
+    return _copy(camera, image, target, formats, overwrite, as_json)
+
+
+# --- one file ---------------------------------------------------------------------------------------------
+
+
+def _copy(
+    camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool, as_json: bool
+) -> int:
+    """Write an RPC as it is, read it back and say how far off it is."""
     if formats is None:
         write_camera(camera.rpc, target, image, overwrite=overwrite)
     else:
@@ -117,9 +127,6 @@ def convert(
         f"{target} holds too few digits for this RPC, {lost:.2g} px off: 'barpc fit' fits one that it holds",
         [],
     )
-
-
-# --- one file ---------------------------------------------------------------------------------------------
 
 
 def check_target(

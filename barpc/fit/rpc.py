@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from barpc.errors import BarpcWarning, FitError
 from barpc.fit.certificate import Errors, Sample, coverage, roundtrip, smallest_denominator
 from barpc.fit.localisation import Localisation, Seen, inverse, off, with_localisation
 from barpc.fit.points import control_points, extent, numbers, screened, widened
-from barpc.fit.solve import COMMON, Problem, Solution, solve
+from barpc.fit.solve import COMMON, Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
@@ -159,25 +160,16 @@ def fit_rpc(
         warnings.warn(message, BarpcWarning, stacklevel=2)
     vendor = underlying_rpc(model)
 
-    def attempt(method: str) -> RpcFit:
-        ground, image = _given(model, size, alt_range, options, method)
-        solution = solve(ground, image, options, method, vendor=vendor)
-        loop = roundtrip(solution.rpc, sample.ground)
-        return _certified(
-            solution, *sample.errors(solution.rpc), loop, size, 1.0 - 0.05 ** (1.0 / sample.count)
-        )
+    given = partial(_given, model, size, alt_range, options)
 
-    def seen(rpc: RPC, _: Solution) -> tuple[Errors, Array]:
-        return sample.sought(
-            lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2])
-        )
+    def attempt(method: str) -> RpcFit:
+        solution = solve(*given(method), options, method, vendor=vendor)
+        loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
+        return _certified(solution, *sample.errors(solution.rpc), loop, size, beyond)
 
     try:
         fit = _best(attempt, options, vendor, strict, exact=True)
-        if not options.localisation:
-            return fit
-        given = lambda method: inverse(fit.rpc, *_given(model, size, alt_range, options, method))  # noqa: E731
-        return _localised(fit, given, seen, options, strict, exact=True)
+        return _localised(fit, given, partial(_missed, sample), options, strict)
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
@@ -260,43 +252,49 @@ def fit_rpc_points(
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // _LOOPS)])
         return _certified(solution, errors, errors.largest, loop, size)
 
-    def seen(rpc: RPC, found: Solution) -> tuple[Errors, Array]:
-        errors = Errors()
-        for places, known, at in _places(rpc, found, held_out, cnp, cnp_image):
-            errors.add(off(rpc, places, known, at))
-        return errors, errors.largest
-
     fit = _best(attempt, options, vendor, strict, exact=False)
-    if not options.localisation:
-        return fit
-    problem = inverse(fit.rpc, cnp, cnp_image, weight)
-    return _localised(fit, lambda _: problem, seen, options, strict, exact=False)
+    seen, given = partial(_left_out, held_out, cnp, cnp_image), (cnp, cnp_image)
+    return _localised(fit, lambda _: given, seen, options, strict, weight, exact=False)
 
 
-def _places(
-    rpc: RPC, found: Solution, held_out: tuple[Array, Array] | None, ground: Array, image: Array
-) -> Iterator[tuple[Array, Array, Array]]:
-    """Where a localisation RPC sees check points, and these; or each of its own points, without that point's help."""
+def _missed(sample: Sample, rpc: RPC, _: Solution) -> tuple[Errors, Array]:
+    """What a localisation RPC is off by on the check points of a model."""
+    return sample.sought(
+        lambda ground, at: off(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2])
+    )
+
+
+def _left_out(
+    held_out: tuple[Array, Array] | None, ground: Array, image: Array, rpc: RPC, found: Solution
+) -> tuple[Errors, Array]:
+    """The same on given check points, or on its own points, each without that point's help."""
+    errors, start = Errors(), 0
     if held_out is not None:
-        yield rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out
-        return
-    start = 0
+        errors.add(off(rpc, rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out))
+        return errors, errors.largest
     for residual in found.leave_one_out():
         part = slice(start, start + len(residual))
         start = part.stop
-        yield ground[part] + np.pad(residual, ((0, 0), (0, 1))), ground[part], image[part]
+        places = ground[part] + np.pad(residual, ((0, 0), (0, 1)))
+        errors.add(off(rpc, places, ground[part], image[part]))
+    return errors, errors.largest
 
 
 def _localised(
     fit: RpcFit,
-    problem: Callable[[str], Problem],
+    given: Callable[[str], tuple[Array, Array]],
     seen: Seen,
     options: FitOptions,
     strict: bool,
-    exact: bool,
+    weight: Array | None = None,
+    exact: bool = True,
 ) -> RpcFit:
-    """The fit with a localisation RPC and its certificate; FitError where `strict` and it does not hold."""
-    rpc, certificate = with_localisation(fit.rpc, problem, seen, options, exact)
+    """The fit, where asked for with a localisation RPC and its certificate; FitError where `strict` and it misses."""
+    if not options.localisation:
+        return fit
+    rpc, certificate = with_localisation(
+        fit.rpc, lambda method: inverse(fit.rpc, *given(method), weight), seen, options, exact
+    )
     if strict and (wrong := certificate.verdict(options.tolerance)):
         raise FitError(wrong)
     return replace(fit, rpc=rpc, localisation=certificate)
