@@ -124,7 +124,8 @@ def _copy(
     if lost <= TOLERANCE:
         return 0
     return tell_gate(
-        f"{target} holds too few digits for this RPC, {lost:.2g} px off: 'barpc fit' fits one that it holds",
+        f"{target} reads back {lost:.2g} px off: too few digits for this RPC ('barpc fit' fits one that it holds), or "
+        "another RPC file beside it",
         [],
     )
 

@@ -173,9 +173,9 @@ def smallest_value(cubics: Array, box: Array) -> float:
     middle, half = box.mean(axis=1), 0.5 * np.abs(box[:, 1] - box[:, 0])
     around = middle[:, None] + half[:, None] * np.array([-BEYOND, BEYOND])
     center = (cubics @ monomials(middle[:, None]))[:, 0]
-    return min(
-        least_value(cubic, around) / value for cubic, value in zip(cubics, center.tolist(), strict=True)
-    )
+    least = np.array([least_value(cubic, around) for cubic in cubics])
+    with np.errstate(all="ignore"):  # NaN where a pole is at the centre
+        return float((least / center).min())
 
 
 def roundtrip(rpc: RPC, ground: Array) -> float:

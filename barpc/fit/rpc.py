@@ -237,7 +237,7 @@ def fit_rpc_points(
         Too few points, not finite, swapped columns, points in a plane; or the tolerance is not reached.
     """
     options = options or FitOptions()
-    cnp, cnp_image = screened(ground, image, options.allow_mirrored)
+    given = cnp, cnp_image = screened(ground, image, options.allow_mirrored)
     weight = relative_weight(sigma, len(cnp))
     held_out = None if check is None else numbers(*check)
 
@@ -253,7 +253,7 @@ def fit_rpc_points(
         return _certified(solution, errors, errors.largest, loop, size)
 
     fit = _best(attempt, options, vendor, strict, exact=False)
-    seen, given = partial(_left_out, held_out, cnp, cnp_image), (cnp, cnp_image)
+    seen = partial(_left_out, held_out, *given)
     return _localised(fit, lambda _: given, seen, options, strict, weight, exact=False)
 
 
