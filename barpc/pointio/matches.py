@@ -1,8 +1,8 @@
-"""Tables of tie points: CSV and npz (image, col, row, track), and the text matches of ASP.
+"""Tie points: tables of them (image, col, row, track) as CSV and npz, and the matches that other programs write.
 
 (0, 0) is the centre of the top-left pixel. CSV: a header with the columns `image, col, row, track` and, where it is
-known, `sigma` [px], in any order. npz: arrays `names`, `view`, `track`, `xy` (K, 2) and `sigma`. ASP: files
-`[prefix-]LEFT__RIGHT.txt` or a folder of them, as `--matches-as-txt` writes them.
+known, `sigma` [px], in any order. npz: arrays `names`, `view`, `track`, `xy` (K, 2) and `sigma`. Files of one pair
+(ASP, LightGlue), or a folder of them: `barpc.pointio.pairfiles`; also COLMAP's databases and hloc's HDF5.
 """
 
 from __future__ import annotations
@@ -14,39 +14,56 @@ from pathlib import Path
 import numpy as np
 
 from barpc.errors import InputError
-from barpc.frozen import load_npz
+from barpc.frozen import Arrays, load_npz
 from barpc.geodesy import Array
+from barpc.pointio.colmap import MAGIC as COLMAP
+from barpc.pointio.colmap import read_colmap
+from barpc.pointio.hloc import MAGIC as HDF5
+from barpc.pointio.hloc import read_hloc
+from barpc.pointio.links import SIGMA, Links
 from barpc.pointio.names import ViewNames, cell, from_cell
-from barpc.scene import IntArray, Tracks, connected_labels
-from barpc.sidefile import TABLE, opened_text, read_text
-
-SIGMA = 0.5  # standard deviation of each coordinate [px] where the file states none
+from barpc.pointio.pairfiles import (
+    ENDINGS,
+    in_folder,
+    is_dictionary,
+    matched_keypoints,
+    pair_of,
+    read_pair_files,
+)
+from barpc.scene import IntArray, Tracks
+from barpc.sidefile import TABLE, opened_text, read_head
 
 _COLUMNS = ("image", "col", "row", "track")
 
 
-def read_matches(path: Path | str, names: Sequence[str]) -> Tracks:
-    """Tie points of a file; tracks with fewer than two views, or with two observations in one, are left out.
+def read_links(path: Path | str, names: Sequence[str]) -> Links:
+    """The matches in a file, or a folder of files of pairs, between the views called `names`.
 
-    A CSV, an npz, an ASP text match file or a folder of these; observations in other images than the views called
-    `names` are left out. InputError where it does not parse, or holds no track of these views.
+    What a file holds is told by its content. Points in other images are left out; InputError where it does not parse,
+    or holds no match of these views.
     """
     path = Path(path)
     views = ViewNames(names, str(path))
     try:
-        if path.is_dir():
-            view, point, xy, spread = _read_asp(sorted(path.glob("*__*.txt")), views)
-        elif path.suffix.lower() == ".npz":
-            view, point, xy, spread = _read_npz(path, views)
-        elif "__" in path.name and path.suffix.lower() in (".txt", ".match"):
-            view, point, xy, spread = _read_asp([path], views)
-        else:
-            view, point, xy, spread = _read_csv(path, views)
+        links = _read(path, views)
     except (OSError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as tie points ({error})") from error
-    if not (np.isfinite(xy).all() and np.isfinite(spread).all() and (spread > 0).all()):
+    if not (np.isfinite(links.xy).all() and np.isfinite(links.sigma).all() and (links.sigma > 0).all()):
         raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
-    return _tracks(path, view, point, xy, spread)
+    if not (links.view[links.ends[:, 0]] != links.view[links.ends[:, 1]]).any():
+        others = ", ".join(name[:60] for name in [*views.strangers][:3])
+        found = f"; it names {others}, and the images are {', '.join(views.names[:3])}" if others else ""
+        raise InputError(f"{path}: no track is seen in two of the views{found}")
+    return links
+
+
+def read_matches(path: Path | str, names: Sequence[str]) -> Tracks:
+    """Tie points as a file states them; tracks with fewer than two views, or two points in one, are left out.
+
+    As `read_links`; points that are linked, by way of others too, are one track.
+    """
+    links = read_links(path, names)
+    return _tracks(Path(path), links.view, links.tracks(), links.xy, links.sigma)
 
 
 def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> None:
@@ -90,10 +107,24 @@ def asp_text(first: Array, second: Array) -> str:
     return "\n".join([f"{len(first)} {len(second)}", *rows]) + "\n"
 
 
-Columns = tuple[IntArray, IntArray, Array, Array]
+def _read(path: Path, views: ViewNames) -> Links:
+    if path.is_dir():
+        return Links.of_pairs(read_pair_files(in_folder(path), views))
+    head, ending = read_head(path, TABLE, 16), path.suffix.lower()
+    for magic, read in ((COLMAP, read_colmap), (HDF5, read_hloc)):
+        if head.startswith(magic):
+            return Links.of_pairs(read(path, views))
+    if ending == ".npz" and not is_dictionary(arrays := load_npz(path)):
+        return _table(path, arrays, views)
+    if ending == ".npz":
+        pair = pair_of(path, views)
+        return Links.of_pairs([] if pair is None else [(*pair, *matched_keypoints(path, arrays))])
+    if "__" in path.name and ending in ENDINGS:
+        return Links.of_pairs(read_pair_files([path], views))
+    return _read_csv(path, views)
 
 
-def _read_csv(path: Path, views: ViewNames) -> Columns:
+def _read_csv(path: Path, views: ViewNames) -> Links:
     with opened_text(path, TABLE, newline="") as text:
         lines = csv.reader(line for line in text if line.strip() and not line.startswith("#"))
         header = [word.strip().lower() for word in next(lines, [])]
@@ -120,11 +151,10 @@ def _read_csv(path: Path, views: ViewNames) -> Columns:
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     _, first, inverse = np.unique(np.array(tracks, dtype=str), return_index=True, return_inverse=True)
     point = np.argsort(np.argsort(first))[inverse.ravel()] if len(rows) else np.zeros(0, dtype=np.int64)
-    return table[:, 0].astype(np.int64), point, table[:, 1:3], table[:, 3]
+    return Links.of_tracks(table[:, 0].astype(np.int64), point, table[:, 1:3], table[:, 3])
 
 
-def _read_npz(path: Path, views: ViewNames) -> Columns:
-    file = load_npz(path)
+def _table(path: Path, file: Arrays, views: ViewNames) -> Links:
     try:
         own = np.array([-1 if (i := views.find(str(name))) is None else i for name in file["names"]])
         index, point = (np.asarray(file[key], dtype=np.int64) for key in ("view", "track"))
@@ -138,58 +168,7 @@ def _read_npz(path: Path, views: ViewNames) -> Columns:
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path}: not an npz of names, view, track, xy (K, 2) ({error})") from error
     keep = view >= 0
-    return view[keep], point[keep], xy[keep], spread[keep]
-
-
-def _read_asp(paths: Sequence[Path], views: ViewNames) -> Columns:
-    """Pairs that share a keypoint are one track."""
-    view, xy, pairs = [], [], []
-    count = 0
-    for path in paths:
-        left, right = (views.find(name) for name in _asp_images(path, views))
-        if left is None or right is None:
-            continue
-        first, second = _asp_points(path)
-        n = len(first)
-        view += [np.full(n, left), np.full(n, right)]
-        xy += [first, second]
-        pairs.append(count + np.column_stack([np.arange(n), n + np.arange(n)]))
-        count += 2 * n
-    if not count:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0)
-    keypoints = np.column_stack([np.concatenate(view), np.concatenate(xy)])
-    unique, index = np.unique(keypoints, axis=0, return_inverse=True)
-    point = connected_labels(len(unique), index.ravel()[np.concatenate(pairs)])
-    return unique[:, 0].astype(np.int64), point, unique[:, 1:], np.full(len(unique), SIGMA)
-
-
-def _asp_images(path: Path, views: ViewNames) -> tuple[str, str]:
-    """The two images that a match file's name means, a run's prefix before the first one left out."""
-    stem = path.name.removesuffix(".txt").removesuffix(".match")
-    cuts = [(stem[:i], stem[i + 2 :]) for i in range(len(stem) - 1) if stem.startswith("__", i)]
-    for left, right in cuts:  # either name may hold the two lines, too
-        if views.exact(left) is not None and views.exact(right) is not None:
-            return left, right
-    for left, right in cuts:
-        while views.find(left) is None and "-" in left:
-            left = left.split("-", 1)[1]
-        if views.find(left) is not None and views.find(right) is not None:
-            return left, right
-    return cuts[0]
-
-
-def _asp_points(path: Path) -> tuple[Array, Array]:
-    """Points (M, 2) of both images: counts on the first line, then one keypoint a line, col and row first."""
-    try:
-        lines = read_text(path, TABLE).split("\n")
-        left, right = (int(word) for word in lines[0].split()[:2])
-        rows = [line.split()[:2] for line in lines[1:] if line.strip()]
-        points = np.array(rows, dtype=np.float64).reshape(-1, 2)
-    except ValueError as error:
-        raise InputError(f"{path}: not an ASP text match file ({error})") from error
-    if left != right or len(points) != left + right:
-        raise InputError(f"{path}: says {left} and {right} keypoints but holds {len(points)}")
-    return points[:left], points[left:]
+    return Links.of_tracks(view[keep], point[keep], xy[keep], spread[keep])
 
 
 def _tracks(path: Path, view: IntArray, point: IntArray, xy: Array, sigma: Array) -> Tracks:

@@ -40,6 +40,7 @@ from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.sentinel1 import open_product
 from barpc.tie.pairs import read_area
 from barpc.workspace import Workspace
+from tests.pointio.test_foreign import binary, colmap
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 from tests.sensor.s1_product import Product
@@ -231,6 +232,12 @@ def _npz(**arrays: object) -> bytes:
     return file.getvalue()
 
 
+@cache
+def _database() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        return colmap(Path(folder)).read_bytes()
+
+
 def _prior() -> bytes:
     return _npz(
         names=np.array(NAMES), model="rotation", drift=0, params=np.zeros((2, 3)), information=np.eye(6),
@@ -395,6 +402,21 @@ SAMPLES: dict[str, Sample] = {
         lambda path: read_matches(path, NAMES),
         lambda: b"2 2\n1 2 0 0\n3 4 0 0\n5 6 0 0\n7 8 0 0\n",
         (mutate_text,),
+    ),
+    "matches asp binary": Sample(
+        "run-left__right.match",
+        lambda path: read_matches(path, NAMES),
+        lambda: binary(np.eye(2), 9 * np.eye(2), 2),
+        (mutate_header,),
+    ),
+    "matches colmap": Sample(
+        "t.db", lambda path: read_matches(path, ["a", "b"]), _database, (mutate_header,)
+    ),
+    "matches dictionary": Sample(
+        "left__right.npz",
+        lambda path: read_matches(path, NAMES),
+        lambda: _npz(keypoints0=np.eye(2), keypoints1=9 * np.eye(2), matches=np.array([[0, 1], [1, 0]])),
+        (mutate_npz,),
     ),
     "points csv": Sample(
         "p.csv",

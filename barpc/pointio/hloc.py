@@ -1,0 +1,106 @@
+"""Matches in HDF5 files as hloc and scripts around LightGlue write them: keypoints in one file, matches in another.
+
+Keypoints of an image: a dataset `NAME/keypoints`, or `NAME` itself; matches of a pair: `NAME0/NAME1/matches0`, or
+`NAME0/NAME1` (M, 2) itself, slashes of names written as dashes. Needs h5py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barpc.errors import BarpcError, InputError
+from barpc.pointio.links import PairPoints, index_pairs
+from barpc.pointio.names import ViewNames
+from barpc.sidefile import MB, Kind, opened
+
+MAGIC = b"\x89HDF\r\n\x1a\n"
+_FILE = Kind("an HDF5 file", None)  # most of it are descriptors, which are not read
+_CONTENT = Kind("the keypoints and matches of an HDF5 file", 1024 * MB)
+_KEYPOINTS, _MATCHES = "keypoints", "matches0"
+_FEATURES = ("features.h5", "keypoints.h5")
+
+
+def read_hloc(path: Path, views: ViewNames) -> Iterator[PairPoints]:
+    """The matches between two of the views; the keypoints are looked for in the file, then beside it."""
+    try:
+        import h5py
+    except ImportError:
+        raise InputError(
+            f"{path}: HDF5 is read with h5py, which is not installed: pip install h5py"
+        ) from None
+    try:
+        with ExitStack() as files:
+            matches = _Datasets(path, files, h5py)
+            keypoints = matches
+            if not matches.keypoints:
+                keypoints = _Datasets(_features(path), files, h5py)
+            yield from _matches(matches, keypoints, views)
+    except BarpcError:
+        raise
+    except Exception as error:  # h5py raises what the damage happens to hit
+        said = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: not an HDF5 file of matches that can be read ({said})") from error
+
+
+def _features(path: Path) -> Path:
+    """The file of the keypoints that belongs to a file of matches."""
+    names = [*([path.stem.split("_matches")[0] + path.suffix] if "_matches" in path.stem else []), *_FEATURES]
+    for name in names:
+        if (path.parent / name).is_file():
+            return path.parent / name
+    raise InputError(f"{path}: holds no keypoints; they are looked for beside it as {', '.join(names)}")
+
+
+class _Datasets:
+    """The arrays of a file by image and by pair; links to other files are not followed."""
+
+    def __init__(self, path: Path, files: ExitStack, h5py: Any) -> None:
+        self._path, self._bytes = path, 0
+        file = files.enter_context(h5py.File(files.enter_context(opened(path, _FILE)), "r"))
+        self.keypoints: dict[str, Any] = {}
+        self.matches: dict[tuple[str, str], Any] = {}
+
+        def sort(name: str, found: Any) -> None:
+            if not isinstance(found, h5py.Dataset):
+                return
+            *parts, last = name.split("/")
+            if last == _KEYPOINTS or (found.ndim == 2 and found.shape[1] == 2 and found.dtype.kind == "f"):
+                self.keypoints["-".join(parts if last == _KEYPOINTS else [*parts, last])] = found
+            elif len(ends := parts if last == _MATCHES else [*parts, last]) == 2 and found.dtype.kind in "iu":
+                self.matches[ends[0], ends[1]] = found
+
+        file.visititems(sort)  # passes over links, to other files and within
+
+    def array(self, found: Any) -> Any:
+        """The content of a dataset that lies in the file itself."""
+        if found.is_virtual or found.external:
+            raise ValueError(f"{found.name} lies in another file")
+        self._bytes += found.size * found.dtype.itemsize
+        _CONTENT.check(self._path, self._bytes)
+        return np.asarray(found[()])
+
+
+def _matches(matches: _Datasets, keypoints: _Datasets, views: ViewNames) -> Iterator[PairPoints]:
+    known = {
+        name: view for name in keypoints.keypoints if (view := _view(name, keypoints, views)) is not None
+    }
+    points: dict[str, Any] = {}
+    for ends, numbers in matches.matches.items():
+        if not known.keys() >= set(ends) or known[ends[0]] == known[ends[1]]:
+            continue
+        for name in set(ends) - points.keys():
+            points[name] = keypoints.array(keypoints.keypoints[name])[:, :2].astype(np.float64)
+        first, second = (points[name] for name in ends)
+        rows = index_pairs(matches.array(numbers), (len(first), len(second)))
+        yield known[ends[0]], known[ends[1]], first[rows[:, 0]], second[rows[:, 1]]
+
+
+def _view(name: str, keypoints: _Datasets, views: ViewNames) -> int | None:
+    """The view of an image, by its name with slashes or with dashes for them."""
+    path = keypoints.keypoints[name].name.strip("/").removesuffix(f"/{_KEYPOINTS}")
+    return views.find(path)

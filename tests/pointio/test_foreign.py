@@ -1,0 +1,303 @@
+"""Matches as other programs write them: the same points whoever wrote them, and one line where a file lies."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.errors import InputError
+from barpc.pointio.matches import read_links, read_matches
+
+NAMES = ["a", "b", "c"]
+KEYPOINTS = {
+    "a": np.array([[0.0, 0.0], [10.25, 3.5], [7.0, 99.75]]),
+    "b": np.array([[1.5, 1.5], [11.5, 4.25], [8.0, 8.0], [3.0, 2.0]]),
+    "c": np.array([[40.5, 2.0], [20.0, 30.0]]),
+}
+MATCHES = {("a", "b"): [[0, 1], [1, 3], [2, 2]], ("b", "c"): [[1, 0]]}
+"""One of three views, a(0) - b(1) - c(0), and two of two."""
+
+
+def colmap(folder: Path, geometries: bool = True, shift: float = 0.5, names: str = "sub/{}.tif") -> Path:
+    """A database of COLMAP's: it counts from the corner of the first pixel; more columns than two, raw matches too."""
+    path = folder / "database.db"
+    with closing(sqlite3.connect(path)) as db:
+        db.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT, camera_id INTEGER)")
+        for table, key in (
+            ("keypoints", "image_id"),
+            ("matches", "pair_id"),
+            ("two_view_geometries", "pair_id"),
+        ):
+            db.execute(
+                f"CREATE TABLE {table} ({key} INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)"
+            )
+        ids = {"b": 3, "a": 5, "stranger": 6, "c": 8}
+        for name, number in ids.items():
+            xy = KEYPOINTS.get(name, np.zeros((1, 2)))
+            table = np.hstack([xy + shift, np.ones((len(xy), 2))]).astype("<f4")
+            db.execute("INSERT INTO images VALUES (?, ?, 1)", (number, names.format(name)))
+            db.execute("INSERT INTO keypoints VALUES (?, ?, 4, ?)", (number, len(xy), table.tobytes()))
+        for (first, second), rows in {**MATCHES, ("a", "stranger"): [[0, 0]]}.items():
+            found, ends = np.array(rows, "<u4"), (ids[first], ids[second])
+            found, ends = (found, ends) if ends[0] < ends[1] else (found[:, ::-1], ends[::-1])
+            pair = ends[0] * 2147483647 + ends[1]
+            raw = np.vstack([found, [[0, 0]]]).astype("<u4") if geometries else found
+            db.execute("INSERT INTO matches VALUES (?, ?, 2, ?)", (pair, len(raw), raw.tobytes()))
+            if geometries:
+                db.execute(
+                    "INSERT INTO two_view_geometries VALUES (?, ?, 2, ?)", (pair, len(found), found.tobytes())
+                )
+        db.commit()
+    return path
+
+
+def dictionaries(folder: Path, kind: str = "matches") -> Path:
+    for (first, second), rows in MATCHES.items():
+        one, two, found = KEYPOINTS[first], KEYPOINTS[second], np.array(rows)
+        arrays = {"keypoints0": one.astype(np.float32), "keypoints1": two, "scores": np.ones(len(found))}
+        if kind == "rows":
+            arrays |= {"keypoints0": one[found[:, 0]], "keypoints1": two[found[:, 1]]}
+        elif kind == "matches0":
+            partner = np.full(len(one), -1)
+            partner[found[:, 0]] = found[:, 1]
+            arrays |= {"matches0": partner, "matches": found}
+        else:
+            arrays |= {"matches": found}
+        name = f"{first}_{second}_matches" if kind == "rows" else f"{first}__{second}"
+        np.savez(folder / f"{name}.npz", **arrays)
+    return folder
+
+
+def binary(left: np.ndarray, right: np.ndarray, length: int = 0) -> bytes:
+    data = struct.pack("<QQ", len(left), len(right))
+    for x, y in [*left, *right]:
+        data += struct.pack("<ffiifff?IIQ", x, y, int(x), int(y), 0, 1, 0.5, True, 0, 0, length)
+        data += np.arange(length, dtype="<f4").tobytes()
+    return data
+
+
+def asp(folder: Path, length: int = 0) -> Path:
+    for (first, second), rows in MATCHES.items():
+        found = np.array(rows)
+        ends = KEYPOINTS[first][found[:, 0]], KEYPOINTS[second][found[:, 1]]
+        (folder / f"run-{first}__{second}.match").write_bytes(binary(ends[0] + 1, ends[1] + 1))
+        (folder / f"run-{first}__{second}-clean.match").write_bytes(binary(*ends, length))
+    return folder
+
+
+def hloc(folder: Path, kind: str = "hloc") -> Path:
+    h5py = pytest.importorskip("h5py")
+    path = folder / "feats_matches-lightglue.h5"
+    with h5py.File(folder / ("feats.h5" if kind == "hloc" else "keypoints.h5"), "w") as features:
+        for name, xy in KEYPOINTS.items():
+            features[f"sub/{name}.tif/keypoints" if kind == "hloc" else f"{name}.tif"] = xy.astype(np.float32)
+        features["sub/a.tif/descriptors" if kind == "hloc" else "more/descriptors"] = np.ones(
+            (4, 3), np.float16
+        )
+    with h5py.File(path, "w") as file:
+        for (first, second), rows in MATCHES.items():
+            if kind == "hloc":
+                partner = np.full(len(KEYPOINTS[first]), -1)
+                partner[np.array(rows)[:, 0]] = np.array(rows)[:, 1]
+                file[f"sub-{first}.tif/sub-{second}.tif/matches0"] = partner
+                file[f"sub-{first}.tif/sub-{second}.tif/matching_scores0"] = np.ones(len(partner))
+            else:
+                file[f"{first}.tif/{second}.tif"] = np.array(rows)
+    return path
+
+
+WRITTEN = {
+    "colmap": colmap,
+    "colmap, raw matches": lambda folder: colmap(folder, geometries=False),
+    "lightglue": dictionaries,
+    "superglue": lambda folder: dictionaries(folder, "matches0"),
+    "points alone": lambda folder: dictionaries(folder, "rows"),
+    "asp": asp,
+    "asp with descriptors": lambda folder: asp(folder, 128),
+    "hloc": hloc,
+    "one array a pair": lambda folder: hloc(folder, "plain"),
+}
+
+
+@pytest.mark.parametrize("kind", WRITTEN)
+def test_whoever_wrote_them_the_matches_are_the_same(tmp_path: Path, kind: str) -> None:
+    path = WRITTEN[kind](tmp_path)
+    links = read_links(path, NAMES)
+    found = {
+        tuple(
+            (NAMES[links.view[row]], *links.xy[row].tolist())
+            for row in sorted(ends, key=lambda r: links.view[r])
+        )
+        for ends in links.ends.tolist()
+    }
+    assert found == {
+        tuple((name, *KEYPOINTS[name][row].tolist()) for name, row in zip(pair, rows, strict=True))
+        for pair, listed in MATCHES.items()
+        for rows in listed
+    }
+    tracks = read_matches(path, NAMES)
+    assert sorted(np.bincount(tracks.point).tolist()) == [2, 2, 3]
+
+
+def test_pixels_count_from_where_their_program_counts_them(tmp_path: Path) -> None:
+    """COLMAP's first pixel has its centre at 0.5, as the documentation of its database says."""
+    links = read_links(colmap(tmp_path, shift=0.0), NAMES)
+    assert links.xy.min() == -0.5
+
+
+def rewritten(statement: str, *more: str):
+    def prepare(folder: Path) -> Path:
+        path = colmap(folder)
+        with closing(sqlite3.connect(path)) as db:
+            for one in (statement, *more):
+                db.execute(one)
+            db.commit()
+        return path
+
+    return prepare
+
+
+def file(name: str, content: bytes):
+    def prepare(folder: Path) -> Path:
+        (folder / name).write_bytes(content)
+        return folder / name
+
+    return prepare
+
+
+def cut(folder: Path) -> Path:
+    path = colmap(folder)
+    path.write_bytes(path.read_bytes()[:9000])
+    return path
+
+
+def unfinished(folder: Path) -> Path:
+    path = colmap(folder)
+    (folder / "database.db-wal").write_bytes(b"x")
+    return path
+
+
+def npz(**arrays: object):
+    def prepare(folder: Path) -> Path:
+        np.savez(
+            folder / "a__b.npz", **{"keypoints0": np.ones((2, 2)), "keypoints1": np.ones((2, 2)), **arrays}
+        )
+        return folder / "a__b.npz"
+
+    return prepare
+
+
+def h5(fill, features: bool = True):
+    def prepare(folder: Path) -> Path:
+        h5py = pytest.importorskip("h5py")
+        path = hloc(folder)
+        if not features:
+            (folder / "feats.h5").unlink()
+        with h5py.File(path, "a") as file:
+            fill(h5py, file, folder)
+        return path
+
+    return prepare
+
+
+def outside(h5py, file, folder: Path) -> None:
+    """The matches of a pair are a link to, or the bytes of, a file elsewhere."""
+    del file["sub-a.tif"], file["sub-b.tif"]
+    (folder / "secret").write_bytes(bytes(24))
+    group = file.create_group("sub-a.tif/sub-b.tif")
+    group.create_dataset("matches0", (3,), "i8", external=[(str(folder / "secret"), 0, 24)])
+
+
+def linked(h5py, file, folder: Path) -> None:
+    del file["sub-a.tif"], file["sub-b.tif"]
+    (folder / "other").mkdir()
+    file["sub-a.tif"] = h5py.ExternalLink(str(hloc(folder / "other")), "sub-a.tif")
+
+
+LIES = {
+    "a text for a database": (file("d.db", b"SQLite format 3\0 and no more"), "not a COLMAP database"),
+    "a database cut short": (cut, "not a COLMAP database"),
+    "a database of something else": (rewritten("DROP TABLE keypoints"), "no table keypoints"),
+    "a database still written": (unfinished, "close it first"),
+    "a view for a table": (
+        rewritten("DROP TABLE matches", "CREATE VIEW matches AS SELECT 1 pair_id, 1 rows, 2 cols, x'00' data"),
+        "matches is a view",
+    ),
+    "a column that computes": (
+        rewritten(
+            "DROP TABLE matches",
+            "CREATE TABLE matches (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, blob BLOB, "
+            "data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL)",
+            "DELETE FROM two_view_geometries",
+            "INSERT INTO matches (pair_id, rows, cols) SELECT 3 * 2147483647 + 5, 1, 2",
+        ),
+        "not a COLMAP database",
+    ),
+    "a blob of another length": (rewritten("UPDATE keypoints SET rows = 1000000"), "not a COLMAP database"),
+    "a keypoint that is not there": (rewritten("UPDATE keypoints SET rows = 1, data = zeroblob(16)"), "beyond the"),
+    "words for numbers": (rewritten("UPDATE keypoints SET rows = 'many'"), "not a COLMAP database"),
+    "no keypoints": (rewritten("DELETE FROM keypoints"), "no keypoints of image"),
+    "coordinates that are not finite": (
+        rewritten("UPDATE keypoints SET data = x'0000c07f0000c07f', rows = 1, cols = 2",
+                  "UPDATE two_view_geometries SET rows = 1, data = zeroblob(8)"),
+        "not finite",
+    ),
+    "names of other images": (
+        rewritten("UPDATE images SET name = 'x' || image_id"),
+        "it names x3, x5, x6, and the images are a, b",
+    ),
+    "matches of a keypoint too many": (npz(matches=np.array([[0, 2]])), "beyond the 2 and 2"),
+    "matches in numbers with a point": (npz(matches=np.ones((1, 2))), "not whole numbers"),
+    "keypoints in three dimensions": (npz(keypoints0=np.ones((2, 3))), "keypoints of shape"),
+    "keypoints of no partners": (npz(keypoints0=np.ones((3, 2))), "no matches0"),
+    "matches without keypoints": (npz(keypoints1=np.array("a")), "not an npz of keypoints0"),
+    "a pickle among them": (npz(matches=np.array([{}], dtype=object)), "Python objects"),
+    "places that are not finite": (npz(keypoints0=np.full((2, 2), np.nan)), "not finite"),
+    "a pair of others": (lambda f: npz()(f).rename(f / "x__y.npz"), "it names x, y, and the images are a, b"),
+    "counts and no points": (file("a__b.match", struct.pack("<QQ", 2**62, 2**62)), "not an ASP match file"),
+    "more points than bytes": (file("a__b.match", binary(np.ones((2, 2)), np.ones((2, 2)))[:-1]), "not 2 and 2"),
+    "a descriptor without end": (
+        file("a__b.match", binary(np.ones((1, 2)), np.ones((1, 2))).replace(bytes(8), b"\xff" * 8)),
+        "not an ASP match file",
+    ),
+    "text for an HDF5 file": (file("m.h5", b"\x89HDF\r\n\x1a\n and no more"), "HDF5|superblock"),
+    "no keypoints beside an HDF5 file": (h5(lambda *_: None, features=False), r"looked for beside it as feats\.h5"),
+    "matches that lie elsewhere": (h5(outside), "in another file"),
+    "a link to another file": (h5(linked), "no track is seen in two"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_a_file_that_lies_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    prepare, says = LIES[name]
+    path = prepare(tmp_path)
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    with pytest.raises(InputError, match=says) as caught:
+        read_links(path, NAMES)
+    assert str(path.parent) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500
+    assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
+
+
+def test_a_trigger_is_not_run_and_nothing_is_left_beside_the_file(tmp_path: Path) -> None:
+    path = rewritten(
+        "PRAGMA journal_mode = WAL", "CREATE TRIGGER t AFTER INSERT ON images BEGIN DELETE FROM images; END"
+    )(tmp_path)
+    path = path.rename(tmp_path / "été ?mode=rwc&#%41.db")
+    path.chmod(0o444)
+    assert len(read_links(path, NAMES).ends) == 4
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_without_h5py_it_is_said_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    (tmp_path / "m.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(InputError, match=r"m\.h5: HDF5 is read with h5py, .*pip install h5py$"):
+        read_links(tmp_path / "m.h5", NAMES)
