@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import reprlib
 import tomllib
 from collections.abc import Mapping
@@ -28,6 +29,7 @@ Nodes = Literal["uniform", "chebyshev"]
 AUTO, GEOMETRIC = "auto", "rotation+translation"
 Model = Literal["auto", "rotation+translation", "rotation", "translation", "shift", "shift-drift", "affine"]
 
+HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
 _MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
 _SHORT = reprlib.Repr()
 _SHORT.maxstring, _SHORT.maxother = 60, 200
@@ -44,6 +46,7 @@ class Rule:
     most: float | None = None
     below: float | None = None  # not reached
     rows: str = ""  # the table whose keys are the values allowed, as module and name
+    hook: bool = False  # or `module:name`, of a user's own
 
     def holds(self, number: float) -> bool:
         """Whether a number lies within the bounds; NaN and the infinities do not."""
@@ -131,7 +134,7 @@ def wanted(kind: Any, rule: Rule) -> str:
         count = "a list" if parts[-1] is ... else f"{len(parts)} values"
         return f"{count}, each {wanted(parts[0], rule)}"
     if choices := rule.choices(kind):
-        return f"one of {', '.join(map(str, choices))}"
+        return f"one of {', '.join(map(str, choices))}" + (", or module:name" if rule.hook else "")
     words = {
         bool: "true or false",
         int: "a whole number",
@@ -150,9 +153,11 @@ def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
     elif get_origin(kind) is tuple:
         if isinstance(value, (list, tuple)) and (parts[-1] is ... or len(parts) == len(value)):
             return tuple(checked(name, parts[0], rule, item) for item in value)
+    elif rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value):
+        found = value
     elif choices := rule.choices(kind):
         if type(value) not in (str, int) or value not in choices:
-            raise InputError(f"{name} {value!r} is not one of {', '.join(map(str, choices))}")
+            raise InputError(f"{name} {value!r} is not {wanted(kind, rule)}")
         found = value
     else:
         found = _plain(kind, rule, value)
@@ -184,7 +189,12 @@ class TieOptions(Options):
     """How tie points are found; every length is in pixels of the full image."""
 
     band: int = option(1, "Band of multi-band images, from 1.", least=1)
-    matcher: str = option("guided", "What matches a pair.", rows="barpc.tie.matching.MATCHERS")
+    matcher: str = option(
+        "guided",
+        "What matches a pair. `module:name`: a function of yours, in a module that Python finds; it is run.",
+        rows="barpc.tie.matching.MATCHERS",
+        hook=True,
+    )
     tile: int = option(
         1024, "Side of the tiles that are read and searched for keypoints.", unit="px", least=128
     )
@@ -384,7 +394,13 @@ class RunOptions(Options):
     )
     overwrite: bool = option(False, "Replace the results of an earlier run in the same folder.")
     matches: str | None = option(
-        None, "Tie points to use instead of matching (CSV, npz, ASP text).", unit="file"
+        None,
+        """Matches of pairs (CSV, npz, COLMAP, hloc, ASP), to be verified and registered; the other pairs are matched. A
+        folder: of files LEFT__RIGHT of a pair.""",
+        unit="file",
+    )
+    matches_only: bool = option(
+        False, "Take the matches of the file as tie points as they are, and match nothing."
     )
     overlap_list: str | None = option(
         None, "Match only these pairs: two image names or paths a line.", unit="file"
@@ -431,10 +447,12 @@ class RunOptions(Options):
             raise InputError("reference is given without dem: an orthoimage tells no heights")
         if self.reference_sigma is not None and not self.reference:
             raise InputError("reference_sigma is given without reference")
+        if self.matches_only and self.matches is None:
+            raise InputError("matches_only is given without matches: there would be no tie points")
         for name in ("overlap_list", "aoi"):
-            if self.matches is not None and getattr(self, name) is not None:
+            if self.matches_only and getattr(self, name) is not None:
                 raise InputError(
-                    f"{name} is given with matches: nothing is matched then; leave one of them out"
+                    f"{name} is given with matches_only: nothing is matched then; leave one of them out"
                 )
 
 
@@ -496,7 +514,8 @@ def _schema(kind: Any, rule: Rule) -> dict[str, Any]:
         count = {} if parts[-1] is ... else {"minItems": len(parts), "maxItems": len(parts)}
         return {"type": "array", "items": _schema(parts[0], rule), **count}
     if choices := rule.choices(kind):
-        return {"enum": list(choices)}
+        listed = {"enum": list(choices)}
+        return {"anyOf": [listed, {"type": "string", "pattern": f"^{HOOK}$"}]} if rule.hook else listed
     bounds = {
         "minimum": rule.least,
         "exclusiveMinimum": rule.above,

@@ -101,6 +101,7 @@ def row(
         reference=(str(reference),),
         dem=str(kind / "dem.tif"),
         matches=str(kind / "ties/matches.npz"),
+        matches_only=True,
         overwrite=True,
     )
     result = adjust(images, out, options)

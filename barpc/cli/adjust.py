@@ -58,7 +58,7 @@ def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags
     \b
     Examples:
       barpc match scene/*.tif -o ties
-      barpc adjust scene/*.tif --matches ties/matches.npz -o adjusted
+      barpc adjust scene/*.tif --matches ties/matches.npz --matches-only -o adjusted
     """
     from barpc import pipeline
 

@@ -15,7 +15,16 @@ from barpc.options import Declared, RunOptions, checked, declared, read_options,
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-TIE = ("tie.band", "matches", "overlap_list", "aoi", "tie.keypoints_per_image", "tie.search")
+TIE = (
+    "tie.band",
+    "tie.matcher",
+    "matches",
+    "matches_only",
+    "overlap_list",
+    "aoi",
+    "tie.keypoints_per_image",
+    "tie.search",
+)
 CAMERA = ("adjust.model", "adjust.drift", "adjust.sigma_attitude", "adjust.sigma_position", "adjust.fixed")
 GROUND = (
     "gcp",
@@ -69,7 +78,13 @@ def flag(target: str) -> Callable[[Function], Function]:
             raise click.BadParameter(str(error)) from error
 
     listed = "" if rule.rows else "|".join(map(str, rule.choices(kind)))
-    metavar = "NAMES" if rule.rows else f"[{listed}]" if listed else (rule.unit or kind.__name__).upper()
+    metavar = (
+        ("NAMES" if several else "NAME")
+        if rule.rows
+        else f"[{listed}]"
+        if listed
+        else (rule.unit or kind.__name__).upper()
+    )
     notes = [f"default: {_shown(one.default)}"] if one.default not in (None, ()) else []
     if kind in (int, float) and (bounds := replace(rule, unit="").bounds()):
         notes.append(bounds.strip())

@@ -21,10 +21,11 @@ from barpc.handoff import refuse_hiding, unverified
 from barpc.options import RunOptions
 from barpc.pipeline.control import load_gcps
 from barpc.pipeline.executor import CachingExecutor
+from barpc.pipeline.given import given_matches, given_tracks
 from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
 from barpc.pipeline.views import Image, image_path, load_views
-from barpc.pointio.matches import asp_text, read_matches, write_matches
+from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.report import Run, Summary, summarize
 from barpc.report.page import remake_report
@@ -36,6 +37,7 @@ from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
+from barpc.tie.hook import hook_file
 from barpc.tie.reference import Registration, register
 from barpc.tie.tasks import Progress
 from barpc.workspace import Workspace, fingerprint
@@ -134,6 +136,8 @@ def adjust(
         with workspace.stage("fingerprints"):
             paths = [*(view.path for view in run.views), *_references(options)]
             fingerprints = {path: fingerprint(path) for path in paths}
+            if (code := hook_file(options.tie.matcher)) is not None:
+                fingerprints[options.tie.matcher] = fingerprint(code)
         with CachingExecutor(workspace, fingerprints, executor) as caching:
             run = _solve(run, options, workspace, caching, progress)
         if run.adjustment is not None and options.stop_after == "all":
@@ -199,7 +203,7 @@ def _solve(
     run: Run, options: RunOptions, workspace: Workspace, executor: Executor, progress: Progress | None
 ) -> Run:
     given = side_inputs(options, run.views)
-    for number in range(1 if options.matches is not None else options.num_passes):
+    for number in range(1 if options.matches_only else options.num_passes):
         again = f" (pass {number + 1})" if number else ""
         with workspace.stage("tie points" + again):
             run = _with_ties(run, options, executor, progress)
@@ -260,8 +264,8 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
 def _with_ties(run: Run, options: RunOptions, executor: Executor | None, progress: Progress | None) -> Run:
     """The run with tie points: from a file, or matched, with the corrected cameras in a later pass."""
     views = run.views
-    if options.matches is not None:
-        return replace(run, tracks=read_matches(options.matches, [view.name for view in views]))
+    if options.matches is not None and options.matches_only:
+        return replace(run, tracks=given_tracks(options.matches, views))
     if len(views) < 2:
         return run
     if run.adjustment is not None:
@@ -272,6 +276,8 @@ def _with_ties(run: Run, options: RunOptions, executor: Executor | None, progres
         given["only"] = read_pairs(options.overlap_list, views, [path for path, _ in run.left_out])
     if options.aoi is not None:
         given["area"] = read_area(options.aoi)
+    if options.matches is not None:
+        given["given"] = given_matches(options.matches, views, partly=bool(run.left_out))
     try:
         ties = find_tracks(views, options.tie, **given)
     except DisconnectedError as error:

@@ -44,11 +44,17 @@ class Prediction:
 
     def contains(self, xy: Array) -> BoolArray:
         """Which matches (M, 2, 2) lie in the bands: for a matcher that looks everywhere."""
-        where = self.at(xy[:, 0])
-        along, across = where.errors(xy[:, 1]).T
-        inside: BoolArray = (along >= where.before) & (along <= where.after)
-        inside &= np.abs(across) <= self.half_width
-        return inside
+        return self.judge(xy[:, 0], xy[:, 1])[0]
+
+    def judge(self, first: Array, second: Array) -> tuple[BoolArray, Array]:
+        """Which places (M, 2), (M, 2) lie in the bands, and how far from their middles (M,), 1 at the edge.
+
+        False matches lie anywhere in a band: where nothing else tells how alike two places look, this does.
+        """
+        where = self.at(first)
+        along, across = where.errors(second).T
+        aside = np.abs(across) / self.half_width
+        return (along >= where.before) & (along <= where.after) & (aside <= 1.0), aside
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,12 +23,19 @@ from barpc.scene import View
 from barpc.tie.epipolar import Frame, agreeing, frame, robust_affine, robust_spread
 from barpc.tie.features import Keypoints
 from barpc.tie.guided import Guided
+from barpc.tie.hook import Hook, hooked
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
 from barpc.tie.pairs import Pair, shared_tiles
 from barpc.tie.tasks import Progress, ordered
 
 MATCHERS: dict[str, type[Matcher]] = {"guided": Guided}
 """Name -> matcher."""
+
+
+def matcher_named(name: str) -> type[Matcher] | Hook:
+    """The matcher that an option names: a row of `MATCHERS`, or what `module:name` stands for."""
+    return MATCHERS[name] if name in MATCHERS else hooked(name)
+
 
 TOLERANCE = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
@@ -67,7 +74,7 @@ def match_pair(
     """Match two views; keypoints are empty for a matcher that wants none. No matches: the report says why."""
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
     report = PairReport(names, "ok", counts, angle=pair.angle, overlap=pair.overlap)
-    kind = MATCHERS[options.matcher]
+    kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
     search = _Search(views, keypoints, options)
@@ -132,7 +139,7 @@ class _Search:
         self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions
     ) -> None:
         self._views, self._options = views, options
-        self._matcher = MATCHERS[options.matcher](options, keypoints)
+        self._matcher = matcher_named(options.matcher)(options, keypoints)
         points = keypoints[0].xy
         self._windows = cache(lambda: shared_tiles(views, [Pair((0, 1), 1.0, 0.0)], options)[0])
         if not self._matcher.detects:

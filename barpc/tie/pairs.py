@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
@@ -204,6 +204,7 @@ def select_pairs(
     *,
     only: Sequence[tuple[int, int]] = (),
     area: Area | None = None,
+    given: Collection[tuple[int, int]] = (),
 ) -> list[Pair]:
     """The pairs of views to match, ascending: the best partners of every view, and what else connects them all.
 
@@ -217,6 +218,8 @@ def select_pairs(
         These pairs, all that overlap, and no others.
     area : Area, optional
         Where the overlap counts; None: everywhere.
+    given : collection of (int, int)
+        Pairs, ascending, that are matched already: they are among those returned, overlap or not.
 
     Raises
     ------
@@ -233,13 +236,15 @@ def select_pairs(
     where += " inside the area of interest" if area is not None else ""
     require_connected(
         views,
-        [pair.views for pair in pairs],
+        [*(pair.views for pair in pairs), *given],
         f"no overlap of at least {options.min_overlap:.0%} under {options.angles[0]:g} to "
         f"{options.angles[1]:g} deg {where}; remove the stray images or lower the minimum overlap",
     )
     for i, j in sorted(wanted - {pair.views for pair in pairs}):
         logger.warning("%s - %s: listed, but they do not overlap as asked", views[i].name, views[j].name)
-    return pairs if wanted else _best(pairs, len(views), options.neighbours)
+    chosen = pairs if wanted or not pairs else _best(pairs, len(views), options.neighbours)
+    found = {**{pair: Pair(pair, *(float("nan"),) * 2) for pair in given}, **{p.views: p for p in pairs}}
+    return [found[pair] for pair in sorted({*given, *(pair.views for pair in chosen)})]
 
 
 def _candidates(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -14,13 +16,17 @@ from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.features import detect, join
+from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
-from barpc.tie.matching import MATCHERS, PairReport, match
+from barpc.tie.matching import PairReport, match, matcher_named
 from barpc.tie.pairs import Area, Pair, require_connected, select_pairs
 from barpc.tie.register import refine
 from barpc.tie.tasks import Progress
 
+logger = logging.getLogger(__name__)
+
 _DEFAULTS = TieOptions()
+_NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
@@ -43,6 +49,7 @@ def find_tracks(
     progress: Progress | None = None,
     only: Sequence[tuple[int, int]] = (),
     area: Area | None = None,
+    given: GivenMatches = _NOTHING,
 ) -> TieResult:
     """Find the tie points of overlapping images.
 
@@ -58,6 +65,9 @@ def find_tracks(
         Match these pairs and no others.
     area : Area, optional
         Tie points only here, as the cameras see it; None: everywhere.
+    given : mapping of (int, int), ascending, to Matches
+        Pairs that others have matched: verified and registered as the rest, which is matched here. Where too few can be
+        registered (radar against optical, other seasons) they are taken at their places, as exact as they were found.
 
     Raises
     ------
@@ -68,11 +78,15 @@ def find_tracks(
     ImageError
         An image cannot be read.
     """
-    pairs = select_pairs(views, options, only=only, area=area)
+    matcher = matcher_named(options.matcher)
+    pairs = select_pairs(views, options, only=only, area=area, given=given)
+    known, others = ([p for p in pairs if (p.views in given) is there] for there in (True, False))
     keypoints = [join([])] * len(views)
-    if MATCHERS[options.matcher].detects:
-        keypoints = detect(views, options, pairs=pairs, area=area, executor=executor, progress=progress)
-    matched = match(views, keypoints, pairs, options, executor=executor, progress=progress)
+    if matcher.detects and others:
+        keypoints = detect(views, options, pairs=others, area=area, executor=executor, progress=progress)
+    own = iter(match(views, keypoints, others, options, executor=executor, progress=progress))
+    theirs = iter(verify(views, given, known, options, executor=executor, progress=progress))
+    matched = [next(theirs if pair.views in given else own) for pair in pairs]
     found, reports = [matches for matches, _ in matched], tuple(report for _, report in matched)
     require_matches(views, pairs, reports)
     sizes, most = [view.size for view in views], options.points_per_image
@@ -80,9 +94,35 @@ def find_tracks(
     spreads = {p.views: r.spread for p, r in zip(pairs, reports, strict=True) if r.status == "ok"}
     linked = thin(linked, sizes, int(_SPARE * most))
     tracks = refine(views, linked, spreads, options, executor=executor, progress=progress)
+    verified = {p.views: m for p, m in zip(pairs, found, strict=True) if p.views in given and len(m)}
+    tracks = _with_unregistered(views, tracks, verified, options)
     tracks = thin(inside(views, tracks, area), sizes, most)
     require_tracks(views, tracks, pairs, reports, options)
     return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
+
+
+def _with_unregistered(
+    views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions
+) -> Tracks:
+    """Tracks, and the verified matches of those given pairs of which too few could be registered."""
+    counts = pair_counts(tracks)
+    lost = [pair for pair in given if counts.get(pair, 0) < options.min_matches]
+    if not lost:
+        return tracks
+    for i, j in lost:
+        words = (
+            "%s - %s: %d of %d given matches could be registered: they are used as they are, good to %.2f px"
+        )
+        count, known = counts.get((i, j), 0), given[i, j]
+        logger.warning(words, views[i].name, views[j].name, count, len(known), known.sigma)
+    sizes, most = [view.size for view in views], options.points_per_image
+    more = thin(link(lost, [given[pair] for pair in lost]), sizes, most)
+    return Tracks(
+        np.concatenate([tracks.view, more.view]),
+        np.concatenate([tracks.point, tracks.num_points + more.point]),
+        np.concatenate([tracks.xy, more.xy]),
+        np.concatenate([tracks.sigma, more.sigma]),
+    )
 
 
 def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
@@ -125,9 +165,9 @@ def require_tracks(
     options: TieOptions,
 ) -> None:
     """As `require_matches`, for the pairs that `min_matches` tracks or more are left of."""
-    left = []
+    left, counts = [], pair_counts(tracks)
     for pair, report in zip(pairs, reports, strict=True):
-        common = len(common_tracks(tracks, *pair.views)[0])
+        common = counts.get(pair.views, 0)
         status = "ok" if common >= options.min_matches else f"only {common} tracks after registration"
         left.append(replace(report, status=status if report.status == "ok" else report.status))
     require_matches(views, pairs, left)
@@ -209,6 +249,16 @@ def _fill(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views:
                 total[views[r]] += 1
         waiting = left
     return keep
+
+
+def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
+    """How many tracks the pairs of views, ascending, have in common; only those that have any."""
+    found, step, num = [np.empty(0, np.int64)], 1, int(tracks.view.max(initial=0)) + 1
+    while step < len(tracks) and (same := tracks.point[step:] == tracks.point[:-step]).any():
+        found.append(tracks.view[:-step][same] * num + tracks.view[step:][same])
+        step += 1
+    keys, counts = np.unique(np.concatenate(found), return_counts=True)
+    return {divmod(key, num): count for key, count in zip(keys.tolist(), counts.tolist(), strict=True)}
 
 
 def common_tracks(tracks: Tracks, first: int, second: int) -> tuple[Array, Array]:

@@ -40,7 +40,7 @@ def ties(pristine, tmp_path_factory):  # noqa: F811
 
 
 def test_a_good_run_ends_with_0_and_no_word_on_stderr(pristine, ties, tmp_path):  # noqa: F811
-    said = command("adjust", *pristine, "--matches", ties, "-o", tmp_path / "out")
+    said = command("adjust", *pristine, "--matches", ties, "--matches-only", "-o", tmp_path / "out")
     assert said.code == 0, said
     assert said.err == ""
 
@@ -50,7 +50,9 @@ def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
     few = [row for row in rows if not row.startswith("view_02")]
     few += [row for row in rows if row.startswith("view_02")][:20]
     (tmp_path / "few.csv").write_text("\n".join([head, *few]))
-    said = command("adjust", *pristine, "--matches", tmp_path / "few.csv", "-o", tmp_path / "out")
+    said = command(
+        "adjust", *pristine, "--matches", tmp_path / "few.csv", "--matches-only", "-o", tmp_path / "out"
+    )
     assert_told(said, "1 needs a look", "view_02: weakly tied")
 
 
@@ -69,7 +71,7 @@ def test_a_file_left_out_ends_with_3(pristine, tmp_path):  # noqa: F811
 
 def test_a_fit_that_misses_its_tolerance_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
     (tmp_path / "o.toml").write_text("[fit]\ntolerance = 1e-15\n")
-    given = ("adjust", *pristine, "--matches", ties, "--options", tmp_path / "o.toml", "-o")
+    given = ("adjust", *pristine, "--matches", ties, "--matches-only", "--options", tmp_path / "o.toml", "-o")
     assert command(*given, tmp_path / "none").code == 1
     assert_told(command(*given, tmp_path / "out", "--keep-going"), "not adjusted", "one RPC cannot hold")
 

@@ -37,7 +37,7 @@ def test_tie_points_from_a_file_give_the_same_answer(matched, tmp_path):
     result, out = matched
     runs = []
     for name in ("matches.csv", "matches.npz"):
-        again = adjust(IMAGES, tmp_path / name, RunOptions(matches=str(out / name)))
+        again = adjust(IMAGES, tmp_path / name, RunOptions(matches_only=True, matches=str(out / name)))
         np.testing.assert_array_equal(again.tracks.xy, result.tracks.xy)
         np.testing.assert_array_equal(again.tracks.sigma, result.tracks.sigma)
         runs.append(again.adjustment.params)
@@ -62,7 +62,9 @@ def test_asp_text_matches_hold_the_same_tie_points(matched):
 
 
 def test_control_points_put_the_scene_in_its_place(matched, truth, tmp_path):
-    options = RunOptions(matches=str(matched[1] / "matches.npz"), gcp=(str(SAMPLES / "gcps.geojson"),))
+    options = RunOptions(
+        matches_only=True, matches=str(matched[1] / "matches.npz"), gcp=(str(SAMPLES / "gcps.geojson"),)
+    )
     result = adjust(IMAGES, tmp_path / "out", options)
     rms, offset = errors_at_check_points(
         [read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], truth
@@ -113,7 +115,9 @@ def test_a_stray_image_is_named_and_left_out_when_asked(shared_data, tmp_path):
 
 def test_a_later_run_goes_on_from_an_earlier_block(matched, truth, tmp_path):
     adjust(IMAGES[:2], tmp_path / "two")
-    joint = adjust(IMAGES, tmp_path / "joint", RunOptions(matches=str(matched[1] / "matches.npz")))
+    joint = adjust(
+        IMAGES, tmp_path / "joint", RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"))
+    )
     result = adjust(IMAGES, tmp_path / "three", RunOptions(fixed_run=str(tmp_path / "two")))
     rms, _ = errors_at_check_points([read_rpc(tmp_path / f"three/{v.name}.vrt") for v in result.views], truth)
     assert rms <= 0.03
@@ -179,8 +183,10 @@ def test_paths_with_spaces_and_accents_and_equal_stems(tmp_path):
 
 def test_check_points_are_measured_and_not_used(matched, tmp_path):
     ties, known = str(matched[1] / "matches.npz"), (str(SAMPLES / "gcps.geojson"),)
-    free = adjust(IMAGES, tmp_path / "free", RunOptions(matches=ties))
-    checked = adjust(IMAGES, tmp_path / "checked", RunOptions(matches=ties, check_points=known))
+    free = adjust(IMAGES, tmp_path / "free", RunOptions(matches_only=True, matches=ties))
+    checked = adjust(
+        IMAGES, tmp_path / "checked", RunOptions(matches_only=True, matches=ties, check_points=known)
+    )
     np.testing.assert_array_equal(checked.adjustment.params, free.adjustment.params)
     points = checked.summary["check_points"]
     assert len(points) == 5

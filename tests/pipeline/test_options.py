@@ -32,7 +32,11 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_scene(folder, ImageOptions(size=(260, 260), seed=1, views=3, gcps=4))
     images = sorted(folder.glob("*.tif"))
     adjust(images, folder / "first", RunOptions(stop_after="matching"))
-    adjust(images[:2], folder / "earlier", RunOptions(matches=str(folder / "first/matches.csv")))
+    adjust(
+        images[:2],
+        folder / "earlier",
+        RunOptions(matches_only=True, matches=str(folder / "first/matches.csv")),
+    )
     (folder / "dem").mkdir()
     heights = np.full((200, 200), 300.0, np.float32)
     write_dem(folder / "dem/a.tif", "EPSG:4326+5773", heights, transform=_around())
@@ -51,6 +55,7 @@ def run(scene: Path, tmp_path: Path) -> Run:
     def make(out: str = "out", matches: str | None = "first/matches.csv", **options: Any) -> AdjustResult:
         given = None if matches is None else str(scene / matches)
         images = options.pop("given", sorted(scene.glob("*.tif")))
+        options = {"matches_only": given is not None, **options}
         return adjust(images, tmp_path / out, RunOptions(matches=given, **options))
 
     return make
@@ -113,6 +118,17 @@ def overwrite(run: Run, out: Path, scene: Path) -> None:
 
 
 def matches(run: Run, out: Path, scene: Path) -> None:
+    """What is given of a pair is verified and registered, the other pairs are matched."""
+    rows = (scene / "first/matches.csv").read_text().splitlines()
+    (scene / "pair.csv").write_text("\n".join(row for row in rows if not row.startswith("view_02")) + "\n")
+    found = run("a", "pair.csv", matches_only=False, stop_after="matching")
+    given = [report for report in found.run.matched if report.names == ("view_00", "view_01")]
+    assert len(found.run.matched) == 3
+    assert given[0].verified <= given[0].keypoints[0] < 600
+    assert len(found.tracks.view[found.tracks.view == 2]) > 100
+
+
+def matches_only(run: Run, out: Path, scene: Path) -> None:
     rows = (scene / "first/matches.csv").read_text().splitlines()
     (scene / "fewer.csv").write_text("\n".join(rows[: len(rows) // 2]) + "\n")
     few, many = run("a", "fewer.csv", stop_after="adjustment"), run("b", stop_after="adjustment")
@@ -228,7 +244,7 @@ def fit(run: Run, out: Path, scene: Path) -> None:
 
 ROWS = {
     "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
-    "keep_going": keep_going, "overwrite": overwrite, "matches": matches,
+    "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
     "reference": reference, "reference_sigma": reference_sigma, "tie": tie, "adjust": adjust_, "fit": fit,
@@ -253,8 +269,12 @@ def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene:
         ({"images": "jpeg"}, "images"),
         ({"stop_after": "lunch"}, "stop_after"),
         ({"num_passes": 0}, "num_passes"),
-        ({"matches": "a", "aoi": "b"}, "aoi is given with matches"),
-        ({"matches": "a", "overlap_list": "b"}, "overlap_list is given with matches"),
+        ({"matches": "a", "matches_only": True, "aoi": "b"}, "aoi is given with matches_only"),
+        (
+            {"matches": "a", "matches_only": True, "overlap_list": "b"},
+            "overlap_list is given with matches_only",
+        ),
+        ({"matches_only": True}, "matches_only is given without matches"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(given: dict[str, Any], message: str) -> None:

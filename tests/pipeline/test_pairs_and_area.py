@@ -98,7 +98,7 @@ def test_the_files_are_inputs_that_a_run_never_writes() -> None:
 @pytest.mark.parametrize("name", ["overlap_list", "aoi"])
 def test_what_tells_how_to_match_contradicts_given_matches(name) -> None:
     with pytest.raises(InputError, match=f"{name} is given with matches"):
-        RunOptions(matches="m.csv", **{name: "file"})
+        RunOptions(matches="m.csv", matches_only=True, **{name: "file"})
 
 
 def run(*args: object) -> tuple[int, str]:

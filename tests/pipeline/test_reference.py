@@ -47,6 +47,7 @@ def place(truth, tmp_path_factory):
 def options(place):
     return RunOptions(
         matches=str(place / "ties/matches.npz"),
+        matches_only=True,
         dem=str(place / "dem.tif"),
         reference=(str(place / "ref.tif"),),
     )
@@ -104,7 +105,15 @@ def test_a_stated_sigma_is_the_scene_s(options, tmp_path):
 
 def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, capsys):
     alone = adjust(IMAGES, tmp_path / "alone", replace(options, reference=()))
-    flags = ["--matches", options.matches, "--dem", options.dem, "--reference", str(place / "wrong.tif")]
+    flags = [
+        "--matches",
+        options.matches,
+        "--matches-only",
+        "--dem",
+        options.dem,
+        "--reference",
+        str(place / "wrong.tif"),
+    ]
     with pytest.raises(SystemExit) as stopped:
         main(["adjust", *map(str, IMAGES), *flags, "-o", str(tmp_path / "wrong")])
     assert stopped.value.code == 3
@@ -116,7 +125,7 @@ def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, ca
 
 
 def test_one_image_is_enough(options, truth, tmp_path):
-    run = adjust(IMAGES[:1], tmp_path / "run", replace(options, matches=None))
+    run = adjust(IMAGES[:1], tmp_path / "run", replace(options, matches=None, matches_only=False))
     points = [p for p in truth["check_points"] if run.run.views[0].name in p["image"]]
     ground = np.array([p["ground"] for p in points])
     image = np.array([p["image"][run.run.views[0].name] for p in points])

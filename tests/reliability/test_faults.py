@@ -163,7 +163,7 @@ def outliers(scene: Scene) -> Args:
         wrong = int(track) % 10 and view == "view_01"
         rows.append(",".join([view, *(map(str, RNG.uniform(0, SIDE, 2)) if wrong else xy), track]))
     shutil.rmtree(scene.folder / "good")
-    return [scene.a, scene.b, "--matches", scene.file("ties.csv", "\n".join(rows))]
+    return [scene.a, scene.b, "--matches", scene.file("ties.csv", "\n".join(rows)), "--matches-only"]
 
 
 def smooth(values: np.ndarray) -> np.ndarray:

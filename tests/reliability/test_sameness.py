@@ -53,7 +53,8 @@ def ways(scene: Path) -> dict[str, RunOptions]:
     return {
         "the defaults": RunOptions(),
         "two passes": RunOptions(num_passes=2),
-        "given matches": RunOptions(matches=str(scene / "ties/matches.csv")),
+        "given matches": RunOptions(matches=str(scene / "ties/matches.csv"), matches_only=True),
+        "matches to be verified": RunOptions(matches=str(scene / "ties/matches.csv")),
         "control points": RunOptions(gcp=(str(scene / "gcps.geojson"),)),
         "a list of pairs": RunOptions(overlap_list=str(scene / "pairs.txt")),
         "an area": RunOptions(aoi=str(scene / "area.geojson")),
@@ -120,7 +121,9 @@ def distance(first: AdjustResult, second: AdjustResult, names: dict[str, str] | 
 
 def test_the_order_of_rows_and_the_names_of_files_change_rounding_alone(scene, tmp_path):
     images = images_of(scene, "given matches")
-    given = RunOptions(matches=str(scene / "ties/matches.csv"), gcp=(str(scene / "gcps.geojson"),))
+    given = RunOptions(
+        matches_only=True, matches=str(scene / "ties/matches.csv"), gcp=(str(scene / "gcps.geojson"),)
+    )
     result = adjust(images, tmp_path / "first", given)
     head, *rows = csv.reader((scene / "ties/matches.csv").read_text().splitlines())
     points = json.loads((scene / "gcps.geojson").read_text())

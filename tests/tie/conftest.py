@@ -82,7 +82,12 @@ class Rendered:
             self.altitude.append(np.where(step, np.nan, altitude))
 
     def errors(self, first: int, second: int, xy_first: np.ndarray, xy_second: np.ndarray) -> np.ndarray:
-        """True place in the second view minus the measured one (M, 2) [px], where the truth is known.
+        """True place in the second view minus the measured one (M, 2) [px], where the truth is known."""
+        errors = self.place(first, second, xy_first) - xy_second
+        return errors[np.isfinite(errors).all(axis=1)]
+
+    def place(self, first: int, second: int, xy_first: np.ndarray) -> np.ndarray:
+        """True place in the second view (M, 2) [px]; NaN where it is not known.
 
         Beside a step of the ground (one pixel) it is not: what is seen may be the one side or the other.
         """
@@ -92,8 +97,7 @@ class Rendered:
         upper = alt[row, col] * (1 - x) + alt[row, col + 1] * x
         lower = alt[row + 1, col] * (1 - x) + alt[row + 1, col + 1] * x
         ground = self.scene.shots[first].exact.localize(xy_first, upper * (1 - y) + lower * y)
-        errors = self.scene.shots[second].exact.project(ground) - xy_second
-        return errors[np.isfinite(errors).all(axis=1)]
+        return self.scene.shots[second].exact.project(ground)
 
 
 @pytest.fixture(scope="session")

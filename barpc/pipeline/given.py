@@ -1,0 +1,64 @@
+"""Matches that a run is given, for its views."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from barpc.errors import InputError
+from barpc.geodesy import Array
+from barpc.pointio.matches import read_links, read_matches
+from barpc.scene import IntArray, Tracks, View
+from barpc.tie import Matches
+from barpc.tie.epipolar import grouped
+
+logger = logging.getLogger(__name__)
+
+_MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
+
+
+def given_tracks(path: str | Path, views: Sequence[View]) -> Tracks:
+    """The tie points of a file as they are."""
+    tracks = read_matches(path, [view.name for view in views])
+    _require_inside(path, views, tracks.view, tracks.xy)
+    return tracks
+
+
+def given_matches(
+    path: str | Path, views: Sequence[View], *, partly: bool = False
+) -> dict[tuple[int, int], Matches]:
+    """The matches of a file, pair by pair; a file without any is an error, but for a part (`partly`) of the images."""
+    try:
+        links = read_links(path, [view.name for view in views])
+    except InputError as error:
+        if not partly:
+            raise
+        logger.warning("%s", error)
+        return {}
+    _require_inside(path, views, links.view, links.xy)
+    swapped = links.view[links.ends[:, 0]] > links.view[links.ends[:, 1]]
+    ends = np.where(swapped[:, None], links.ends[:, ::-1], links.ends)
+    places = links.xy[ends].reshape(-1, 4)  # so that the order of the file does not matter
+    ends = ends[np.lexsort(places[:, ::-1].T)]
+    first, second = links.view[ends].T
+    found = {}
+    for rows in grouped(first, second):
+        pair, chosen = (int(first[rows[0]]), int(second[rows[0]])), ends[rows]
+        if pair[0] != pair[1]:
+            found[pair] = Matches(links.xy[chosen], np.zeros(len(chosen)), -1 - chosen)
+    return found
+
+
+def _require_inside(path: str | Path, views: Sequence[View], view: IntArray, xy: Array) -> None:
+    """Raise unless the points (K, 2) [px] lie in their images."""
+    beyond = np.array([view.size for view in views])[view] + (_MARGIN - 1.0)
+    wrong = np.flatnonzero(~((xy >= -_MARGIN) & (xy <= beyond)).all(axis=1))
+    if len(wrong):
+        of, (col, row) = views[view[wrong[0]]], xy[wrong[0]].tolist()
+        raise InputError(
+            f"{path}: {len(wrong)} of {len(xy)} points lie outside their images, as ({col:g}, {row:g}) in {of.name},"
+            f" {of.size[0]} x {of.size[1]} pixels; were they found in other crops, or in reduced images?"
+        )

@@ -1,0 +1,136 @@
+"""`--matches`: real matches, made noisy, through the whole tool; what a user gets wrong; `--matcher` in workers."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.errors import InputError
+from barpc.pipeline import RunOptions, adjust, check
+from barpc.pipeline.given import given_matches, given_tracks
+from barpc.pipeline.views import load_views
+from barpc.pointio.matches import read_matches
+from barpc.tie.epipolar import agreeing, frame, robust_spread
+from tests.pointio.test_foreign import binary
+
+from .conftest import check_points
+from .test_synthetic import SAMPLES
+
+IMAGES = sorted(SAMPLES.glob("*.tif"))
+NOISE = 0.4  # px a coordinate
+
+
+def noisy(shared_data: Path, folder: Path, *pairs: tuple[str, str]) -> Path:
+    """Points that SIFT and a fundamental matrix gave, with more noise, as ASP's binary files."""
+    folder.mkdir(exist_ok=True)
+    for first, second in pairs:
+        (path,) = (shared_data / "truth/ties").glob(f"*__{first}__{second}__sift.csv")
+        table = np.genfromtxt(path, delimiter=",", names=True)
+        xy = np.stack([table[name] for name in ("col_a", "row_a", "col_b", "row_b")], axis=1)
+        xy = np.maximum(xy + np.random.default_rng(len(xy)).normal(0, NOISE, xy.shape), 0)
+        (folder / f"run-{first}__{second}.match").write_bytes(binary(xy[:, :2], xy[:, 2:], 3))
+    return folder
+
+
+def spread(views, tracks, i: int, j: int) -> float:
+    """Across the epipolar lines [px], both ends together."""
+    a, b = tracks.view == i, tracks.view == j
+    _, rows_a, rows_b = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
+    first, second = tracks.xy[a][rows_a], tracks.xy[b][rows_b]
+    return robust_spread(agreeing(first, frame(views[i], views[j], first).errors(second)[:, 1])[1])
+
+
+def test_noisy_matches_of_real_images_become_as_exact_as_our_own(shared_data, tmp_path) -> None:
+    images = sorted((shared_data / "optical/phr_triplet_north").glob("*.tif"))
+    ties = noisy(shared_data, tmp_path / "ties", ("img_01", "img_02"), ("img_02", "img_03"))
+    result = adjust(images, tmp_path / "out", RunOptions(matches=str(ties)))
+    raw = read_matches(ties, [view.name for view in result.views])
+    reports = {report.names: report for report in result.run.matched}
+    for i, j in ((0, 1), (1, 2)):
+        assert spread(result.run.views, raw, i, j) > 0.55
+        assert 0.03 < spread(result.run.views, result.tracks, i, j) <= 0.1
+        assert 1400 < reports[f"img_0{i + 1}", f"img_0{j + 1}"].verified <= 1500
+    assert reports["img_01", "img_03"].verified > 2000  # matched here
+    cameras = result.adjustment.sensors
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        xy = check_points(shared_data, f"img_0{i + 1}", f"img_0{j + 1}")
+        pair = [replace(view, sensor=camera) for view, camera in zip(result.run.views, cameras, strict=True)]
+        across = frame(pair[i], pair[j], xy[:, :2]).errors(xy[:, 2:])[:, 1]
+        assert abs(np.median(across)) <= 0.05
+
+
+@pytest.mark.parametrize("read", [given_matches, given_tracks])
+@pytest.mark.parametrize(("far", "fails"), [(0.4, False), (0.6, True), (-1e4, True)])
+def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) -> None:
+    """Those of the whole image where a crop is given; a pixel more is borne."""
+    views = load_views(IMAGES).views
+    (width, height), names = views[1].size, [view.name for view in views]
+    rows = [f"{names[0]},5,{t},{t}\n{names[1]},{width + far},{t},{t}\n" for t in range(9)]
+    (tmp_path / "m.csv").write_text("image,col,row,track\n" + "".join(rows))
+    if not fails:
+        assert read(tmp_path / "m.csv", views)
+        return
+    said = f"m.csv: 9 of 18 points lie outside .* in view_01, {width} x {height} pixels"
+    with pytest.raises(InputError, match=said):
+        read(tmp_path / "m.csv", views)
+
+
+def test_an_image_that_is_left_out_leaves_the_rest_of_the_matches(shared_data, tmp_path) -> None:
+    """The stray image is the only one that the file ties: what is left is matched here."""
+    stray = sorted((shared_data / "optical/phr_triplet_north").glob("*.tif"))[:2]
+    ties = noisy(shared_data, tmp_path / "ties", ("img_01", "img_02"))
+    result = check([*IMAGES, *stray], RunOptions(matches=str(ties), keep_going=True))
+    assert [view.name for view in result.views] == [path.stem for path in IMAGES]
+    assert len(result.run.matched) == 3
+
+
+MODULE = """
+import cv2, numpy as np
+from pathlib import Path
+from barpc.raster import open_raster
+def match(a, b, prediction):
+    Path(__file__).with_name("called").write_text("yes")
+    found = []
+    for view in (a, b):
+        with open_raster(view.path) as image:
+            grey = cv2.normalize(image.read(1), None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+        found.append(cv2.SIFT.create(2000).detectAndCompute(grey, None))
+    pairs = cv2.BFMatcher(crossCheck=True).match(found[0][1], found[1][1])
+    return np.array([[found[0][0][m.queryIdx].pt, found[1][0][m.trainIdx].pt] for m in pairs])
+"""
+
+
+def test_a_matcher_by_name_works_in_worker_processes_with_the_same_bytes(tmp_path) -> None:
+    (tmp_path / "mine.py").write_text(MODULE)
+    written = []
+    for jobs in ("1", "2"):
+        out = tmp_path / jobs
+        run = [
+            sys.executable,
+            "-m",
+            "barpc",
+            "-q",
+            "match",
+            *map(str, IMAGES[:2]),
+            "-j",
+            jobs,
+            "-o",
+            str(out),
+        ]
+        places = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+        env = {**os.environ, "PYTHONPATH": places, "PYTHONDONTWRITEBYTECODE": "1"}
+        done = subprocess.run(
+            [*run, "--matcher", "mine:match"], env=env, capture_output=True, text=True, check=False
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        written.append((out / "matches.csv").read_bytes())
+        (tmp_path / "called").unlink()
+    assert written[0] == written[1]
+    assert json.loads((tmp_path / "1/summary.json").read_text())["options"]["tie"]["matcher"] == "mine:match"

@@ -1,0 +1,120 @@
+"""Matches of others: noisy true ones become as exact as our own, false ones go, the rest of the pairs is matched."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.errors import DisconnectedError
+from barpc.raster import open_raster
+from barpc.scene import Tracks
+from barpc.tie import Matches, TieOptions, common_tracks, find_tracks
+from barpc.tie.tracks import pair_counts
+
+from .conftest import Rendered, write_image
+
+PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def true_matches(
+    scene: Rendered, *pairs: tuple[int, int], count: int = 500, noise: float = 0.4, false: float = 0.0
+) -> dict[tuple[int, int], Matches]:
+    """Places that the exact cameras join, each coordinate with noise; pairs have the points of the first view alike."""
+    made = {}
+    for pair in pairs:
+        rng = np.random.default_rng(pair[0])
+        first = rng.uniform(30, 569, (4 * count, 2))
+        numbers = np.arange(len(first))
+        xy = np.stack([first, scene.place(*pair, first)], axis=1)
+        rows = np.flatnonzero(((xy > 30) & (xy < 569)).all(axis=(1, 2)))[:count]
+        xy = xy[rows] + rng.normal(0, noise, (len(rows), 2, 2))
+        wrong = rng.random(len(xy)) < false
+        xy[wrong, 1] = rng.uniform(30, 569, (wrong.sum(), 2))
+        index = -1 - np.stack([numbers[rows], numbers[rows] + 10_000 * (1 + sum(pair))], axis=1)
+        made[pair] = Matches(xy, np.zeros(len(xy)), index)
+    return made
+
+
+def typical(scene: Rendered, tracks: Tracks, i: int, j: int) -> float:
+    return 1.4826 * np.median(np.abs(scene.errors(i, j, *common_tracks(tracks, i, j))), axis=0).max()
+
+
+@pytest.mark.parametrize(("noise", "false"), [(0.3, 0.0), (0.5, 0.0), (0.4, 0.6)])
+def test_half_a_pixel_becomes_a_tenth_and_false_matches_go(render, noise: float, false: float) -> None:
+    scene = render(views=3)
+    given = true_matches(scene, *PAIRS, noise=noise, false=false)
+    result = find_tracks(scene.views, given=given)
+    assert result.keypoints == (0, 0, 0)  # nothing else is looked for
+    for pair, report in zip(PAIRS, result.pairs, strict=True):
+        true = (1 - false) * len(given[pair])
+        assert report.status == "ok"
+        assert 0.75 * true <= report.verified <= 1.15 * true
+        assert noise < report.spread < 2 * noise  # of both ends together
+        assert pair_counts(result.tracks)[pair] >= 0.55 * true
+        assert typical(scene, result.tracks, *pair) <= 0.1
+        errors = np.abs(scene.errors(*pair, *common_tracks(result.tracks, *pair))).max(axis=1)
+        assert (errors > 1.0).mean() <= 0.02
+
+
+def test_false_matches_alone_are_refused_and_said(render, caplog) -> None:
+    scene = render(views=2)
+    with pytest.raises(Exception, match=r"(no common offset|too few matches).* \(500 and 500"):
+        find_tracks(scene.views, given=true_matches(scene, (0, 1), false=1.0))
+    assert "the matches given are not used" in caplog.text
+    with pytest.raises(Exception, match="too few matches given"):
+        find_tracks(scene.views, given=true_matches(scene, (0, 1), count=11))
+
+
+def test_pairs_that_are_not_given_are_matched_and_points_in_common_are_one_track(render) -> None:
+    scene = render(views=3)
+    result = find_tracks(scene.views, given=true_matches(scene, (0, 1), (0, 2)))
+    assert [report.keypoints[0] == 500 for report in result.pairs] == [True, True, False]
+    assert result.pairs[2].verified > 500
+    lengths = np.bincount(result.tracks.point)
+    assert (lengths == 3).sum() > 150  # of the points that the given pairs share
+    for pair in PAIRS:
+        assert typical(scene, result.tracks, *pair) <= 0.1
+
+
+def test_a_camera_that_is_wrong_by_hundreds_of_pixels_does_not_refuse_them(render) -> None:
+    scene = render(views=2)
+    first, second = scene.views
+    moved = replace(second, sensor=second.sensor.crop(-300.0, -200.0))
+    result = find_tracks([first, moved], given=true_matches(scene, (0, 1)))
+    assert result.pairs[0].verified > 400
+    assert np.hypot(*result.pairs[0].offset) > 150
+    assert typical(scene, result.tracks, 0, 1) <= 0.1
+
+
+def test_what_cannot_be_registered_is_used_as_it_is(render, tmp_path, caplog) -> None:
+    """A negative of the second image: no patch is like its other, the true places stay true."""
+    scene = render(views=2)
+    first, second = scene.views
+    with open_raster(second.path) as image:
+        path = write_image(tmp_path / "negative.tif", 4000 - image.read(1).clip(0, 3999))
+    given = true_matches(scene, (0, 1), noise=0.3, false=0.2)
+    with caplog.at_level(logging.WARNING):
+        result = find_tracks([first, replace(second, path=str(path))], given=given)
+    assert "used as they are, good to 0." in caplog.text
+    assert result.tracks.num_points >= 0.7 * 400
+    errors = np.abs(scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))).max(axis=1)
+    assert 0.2 < np.median(errors) < 0.6
+    assert (errors > 3.0).mean() <= 0.02
+    assert ((result.tracks.sigma > 0.25) & (result.tracks.sigma < 0.6)).all()
+
+
+def test_given_pairs_connect_what_the_cameras_say_is_apart(render) -> None:
+    scene = render(views=2)
+    options = TieOptions(angles=(50.0, 60.0))
+    with pytest.raises(DisconnectedError, match="no overlap"):
+        find_tracks(scene.views, options)
+    assert find_tracks(scene.views, options, given=true_matches(scene, (0, 1))).tracks.num_points > 300
+
+
+def test_pairs_are_counted_in_one_go() -> None:
+    tracks = Tracks([0, 1, 3, 0, 3, 1, 3], [0, 0, 0, 1, 1, 2, 2], np.zeros((7, 2)), np.ones(7))
+    assert pair_counts(tracks) == {(0, 1): 1, (0, 3): 2, (1, 3): 2}
+    assert pair_counts(tracks.select(np.zeros(7, dtype=bool))) == {}

@@ -1,0 +1,209 @@
+"""A matcher of the user's own, named on the command line: it is run, believed no more than others, and told of."""
+
+from __future__ import annotations
+
+import sys
+import types
+from contextlib import nullcontext
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from barpc.errors import InputError, TiePointError
+from barpc.options import TieOptions, read_options
+from barpc.pipeline import RunOptions, adjust
+from barpc.tie import common_tracks, find_tracks
+from barpc.tie.hook import hook_file, hooked
+from barpc.tie.matching import MATCHERS, matcher_named
+
+ROOT = Path(__file__).parents[2]
+TEXT = '''
+import cv2, numpy as np
+from barpc.raster import open_raster
+calls = []
+def match(a, b, prediction):
+    """SIFT of both images, matched everywhere."""
+    calls.append(a.name)
+    found = []
+    for view in (a, b):
+        with open_raster(view.path) as image:
+            grey = image.read(1).astype(float)
+        low, high = np.percentile(grey, [0.5, 99.5])
+        grey = (255 * ((grey - low) / (high - low)).clip(0, 1)).astype("u1")
+        found.append(cv2.SIFT.create(1500).detectAndCompute(grey, None))
+    pairs = cv2.BFMatcher(crossCheck=True).match(found[0][1], found[1][1])
+    xy = np.array([[found[0][0][m.queryIdx].pt, found[1][0][m.trainIdx].pt] for m in pairs])
+    return RETURN
+def wrong_shape(a, b, prediction):
+    return np.zeros((3, 4))
+def not_finite(a, b, prediction):
+    return np.full((3, 2, 2), np.nan)
+def broken(a, b, prediction):
+    raise RuntimeError("no weights\\nhere")
+number = 3
+'''
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """`module("xy")`: a module of a user's own whose function returns that; the name of the module."""
+
+    def make(returns: str = "xy", name: str = "users_matcher") -> str:
+        (tmp_path / f"{name}.py").write_text(TEXT.replace("RETURN", returns))
+        monkeypatch.syspath_prepend(str(tmp_path))
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        return name
+
+    yield make
+    sys.modules.pop("users_matcher", None)
+
+
+@pytest.mark.parametrize("returns", ["xy", "xy, np.array([m.distance for m in pairs])"])
+def test_a_function_is_a_matcher_with_and_without_scores(render, module, returns: str) -> None:
+    scene = render(views=2)
+    options = TieOptions(matcher=f"{module(returns)}:match")
+    result = find_tracks(scene.views, options)
+    assert result.keypoints == (0, 0)
+    assert result.pairs[0].control_share <= 0.01
+    assert result.tracks.num_points > 200
+    errors = scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))
+    assert 1.4826 * np.median(np.abs(errors), axis=0).max() <= 0.1
+    assert 3 <= len(sys.modules["users_matcher"].calls) <= 12
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "says"),
+    [
+        ("nowhere_at_all:match", InputError, "No module named 'nowhere_at_all'.* PYTHONPATH"),
+        ("users_matcher:absent", InputError, "no attribute 'absent'"),
+        ("users_matcher:number", InputError, "neither a function nor a class"),
+        (
+            "users_matcher:wrong_shape",
+            TiePointError,
+            r"view_00 - view_01: .*\(M, 2, 2\) are expected.*\(3, 4\)",
+        ),
+        ("users_matcher:not_finite", TiePointError, "not finite"),
+        ("users_matcher:broken", TiePointError, "RuntimeError: no weights here"),
+    ],
+)
+def test_what_is_wrong_with_it_is_said_in_one_line(render, module, name: str, error: type, says: str) -> None:
+    module()
+    with pytest.raises(error, match=says) as caught:
+        find_tracks(render(views=2).views, TieOptions(matcher=name))
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["", "guide", "os.system", "a:b:c", "a: b", "../x:y", "a:b()", ":b", "a:", "a\n:b"]
+)
+def test_a_name_that_is_none_is_refused_before_anything_is_imported(name: str) -> None:
+    with pytest.raises(InputError, match=r"one of guided.*or module:name"):
+        TieOptions(matcher=name)
+
+
+def test_reading_options_imports_nothing(tmp_path: Path) -> None:
+    (tmp_path / "o.toml").write_text('[tie]\nmatcher = "antigravity:match"\n')
+    assert read_options(tmp_path / "o.toml").tie.matcher == "antigravity:match"
+    assert "antigravity" not in sys.modules
+
+
+def test_rows_of_the_table_and_classes_are_what_they_are(module) -> None:
+    assert matcher_named("guided") is MATCHERS["guided"]
+    assert hooked("barpc.tie.guided:Guided") is MATCHERS["guided"]
+    assert hook_file("guided") is None
+    assert hook_file("nowhere_at_all.x:match") is None
+    assert Path(hook_file(f"{module()}:match")).name == "users_matcher.py"
+
+
+def test_a_changed_module_is_run_again_an_unchanged_one_not(
+    render, module, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    views = render(views=2).views
+    options = RunOptions(tie=TieOptions(matcher=f"{module()}:match"), stop_after="matching", overwrite=True)
+    counts = []
+    for returns in ("xy", "xy", "xy[::2]"):
+        module(returns)
+        result = adjust(views, tmp_path / "run", options)
+        counts.append(
+            (len(getattr(sys.modules.get("users_matcher"), "calls", [])), result.run.matched[0].verified)
+        )
+    assert counts[0][0] > 0
+    assert counts[1] == (0, counts[0][1])
+    assert 0.4 < counts[2][1] / counts[0][1] < 0.6
+
+
+# -- the example --------------------------------------------------------------------------------------
+
+
+class Disk:
+    """What `kornia.feature.DISK` is called with and gives, with OpenCV's detector inside."""
+
+    @staticmethod
+    def from_pretrained(checkpoint: str) -> Disk:
+        assert checkpoint == "depth"
+        return Disk()
+
+    def eval(self) -> Disk:
+        return self
+
+    def __call__(
+        self, images: np.ndarray, n: int, *, pad_if_not_divisible: bool
+    ) -> list[types.SimpleNamespace]:
+        assert images.ndim == 4
+        assert images.shape[:2] == (1, 3)
+        assert images.dtype == np.float32
+        assert 0 <= images.min() <= images.max() <= 1
+        assert pad_if_not_divisible
+        points, described = cv2.SIFT.create(n).detectAndCompute((255 * images[0, 0]).astype(np.uint8), None)
+        xy = np.array([point.pt for point in points], np.float32)
+        return [types.SimpleNamespace(keypoints=xy, descriptors=described)]
+
+
+class LightGlueMatcher:
+    """The same of `kornia.feature.LightGlueMatcher`."""
+
+    def __init__(self, features: str) -> None:
+        assert features == "disk"
+
+    def eval(self) -> LightGlueMatcher:
+        return self
+
+    def __call__(self, first, second, frames_1, frames_2, hw1, hw2) -> tuple[np.ndarray, np.ndarray]:
+        assert frames_1.shape == (1, len(first), 2, 3)
+        assert frames_2.shape == (1, len(second), 2, 3)
+        for (height, width), places in ((hw1, frames_1), (hw2, frames_2)):
+            assert (places[0, :, :, 2] <= [width, height]).all()
+        found = cv2.BFMatcher(crossCheck=True).match(first, second)
+        score = np.array([[np.exp(-m.distance / 200.0)] for m in found], np.float32)  # higher is better
+        return score, np.array([(m.queryIdx, m.trainIdx) for m in found]).reshape(-1, 2)
+
+
+def frames(xy: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    assert scale.shape == (1, xy.shape[1], 1, 1)
+    return np.concatenate([scale * np.eye(2), xy[..., None]], axis=3)
+
+
+def test_the_example_of_the_manual_runs_with_what_has_kornias_interface(render, monkeypatch) -> None:
+    feature = types.ModuleType("kornia.feature")
+    feature.DISK, feature.LightGlueMatcher, feature.laf_from_center_scale_ori = Disk, LightGlueMatcher, frames
+    kornia, torch = types.ModuleType("kornia"), types.ModuleType("torch")
+    kornia.feature = feature
+    torch.from_numpy, torch.inference_mode = np.asarray, nullcontext
+    torch.Tensor = type("Tensor", (), {})  # looked for by whoever asks whether an array is one
+    torch.ones = lambda *shape: np.ones(shape)
+    for name, stand_in in {"kornia": kornia, "kornia.feature": feature, "torch": torch}.items():
+        monkeypatch.setitem(sys.modules, name, stand_in)
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    monkeypatch.delitem(sys.modules, "lightglue_matcher", raising=False)
+    scene = render(views=2)
+    result = find_tracks(scene.views, TieOptions(matcher="lightglue_matcher:match", tile=400))
+    assert result.tracks.num_points > 400
+    ((places, unlike),) = sys.modules["lightglue_matcher"]._pairs.values()
+    true = np.hypot(*(scene.place(0, 1, places[:, 0]) - places[:, 1]).T) < 1.0
+    assert np.median(unlike[true]) < 0.9 * np.median(unlike[~true])
+    errors = scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))
+    assert 1.4826 * np.median(np.abs(errors), axis=0).max() <= 0.1
