@@ -355,9 +355,10 @@ def make_problem(
     on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma), None
     if prior is not None:
         on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras)
+    joined = None if jointly is None else np.unique(jointly.index // unknowns.size)
     return Problem(
         Cameras(views, unknowns, block.xy[1]),
-        make_structure(block.view, block.point, len(views), block.num_points),
+        make_structure(block.view, block.point, len(views), block.num_points, unknowns.place, joined),
         block.xy,
         on_cameras,
         np.repeat([name not in options.fixed for name in block.names], unknowns.size),

@@ -90,15 +90,17 @@ class Cameras:
 
     def _chunks(self, bounds: IntArray) -> Iterator[slice]:
         """Runs of views of one kind with about CHUNK observations together; other sensors one by one."""
-        start, n = 0, len(self.sensors)
-        while start < n:
-            stop = start + 1
-            rpcs = self.is_rpc[start]
-            while rpcs and stop < n and self.is_rpc[stop] and bounds[stop + 1] - bounds[start] <= CHUNK:
-                stop += 1
-            if bounds[stop] > bounds[start]:
-                yield slice(start, stop)
-            start = stop
+        run: slice | None = None
+        for v in np.flatnonzero(np.diff(bounds)).tolist():
+            if run is not None:
+                more = v == run.stop and self.is_rpc[v] and self.is_rpc[run.start]
+                if more and bounds[v + 1] - bounds[run.start] <= CHUNK:
+                    run = slice(run.start, v + 1)
+                    continue
+                yield run
+            run = slice(v, v + 1)
+        if run is not None:
+            yield run
 
     def _project(
         self, params: Array, ecef: Array, views: slice, bounds: IntArray, wanted: Wanted, row: Array | None

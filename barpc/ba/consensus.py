@@ -14,7 +14,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from barpc.ba.cameras import Projected
-from barpc.ba.structure import Structure
+from barpc.ba.normal import CHUNK
+from barpc.ba.structure import Structure, parts
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
@@ -118,13 +119,15 @@ def agreeing(
 
 def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
     """Offset across the epipolar line (Q,) [px]: what no move of the point takes away from two observations."""
-    one, two = by_point.take(first, axis=2), by_point.take(second, axis=2)
-    rays = cross(one[0], one[1]), cross(two[0], two[1])  # of a ray only the other's image moves
-    of_first, of_second = (one * rays[1]).sum(axis=1), (two * rays[0]).sum(axis=1)
-    normal = np.stack([of_first[1], -of_first[0], of_second[1], -of_second[0]])
-    four = np.concatenate([residual.take(first, axis=1), residual.take(second, axis=1)])
-    with np.errstate(all="ignore"):
-        offset: Array = np.sqrt(2.0) * (normal * four).sum(axis=0) / np.linalg.norm(normal, axis=0)
+    offset = np.empty(len(first))
+    for part in parts(len(first), CHUNK):
+        one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)
+        rays = cross(one[0], one[1]), cross(two[0], two[1])  # of a ray only the other's image moves
+        of_first, of_second = (one * rays[1]).sum(axis=1), (two * rays[0]).sum(axis=1)
+        normal = np.stack([of_first[1], -of_first[0], of_second[1], -of_second[0]])
+        four = np.concatenate([residual.take(first[part], axis=1), residual.take(second[part], axis=1)])
+        with np.errstate(all="ignore"):
+            offset[part] = np.sqrt(2.0) * (normal * four).sum(axis=0) / np.linalg.norm(normal, axis=0)
     return offset
 
 

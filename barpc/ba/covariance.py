@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from barpc.ba.linear import Factor
+from barpc.ba.multifrontal import Blocks
 from barpc.ba.normal import Reduced, solve_transposed
 from barpc.ba.structure import parts
 from barpc.geodesy import Array
@@ -39,13 +40,30 @@ class Covariance:
 
     def view(self, i: int, j: int | None = None) -> Array:
         """Covariance (q, q) of the unknowns of view i (with those of view j)."""
-        places = [self._places(np.array([v])) for v in (i, i if j is None else j)]
-        return self._columns(places[1], "full" in self.__dict__)[places[0]]
+        return self._of_pair(i, i if j is None else j, "full" in self.__dict__)
 
     def joint(self, views: IntArray) -> Array:
         """Covariance (m q, m q) of the unknowns of some views."""
-        place = self._places(views)
-        return self._columns(place, len(self.free) <= _SMALL or "full" in self.__dict__)[place]
+        of_full = len(self.free) <= _SMALL or "full" in self.__dict__
+        if of_full or self.factor.inverse is None:
+            place = self._places(views)
+            return self._columns(place, of_full)[place]
+        return np.block([[self._of_pair(int(i), int(j), False) for j in views] for i in views])
+
+    def _of_pair(self, i: int, j: int, of_full: bool) -> Array:
+        """Covariance (q, q) of view i with view j: where they share points, all such are known at once."""
+        if self.factor.inverse is not None and not of_full:
+            if i == j:
+                return np.asarray(self._near.diagonal[i])
+            if (at := self._near.pair(min(i, j), max(i, j))) is not None:
+                return np.asarray(self._near.pairs[at] if i < j else self._near.pairs[at].T)
+        return self._columns(self._places(np.array([j])), of_full)[self._places(np.array([i]))]
+
+    @cached_property
+    def _near(self) -> Blocks:
+        """The covariance of every view, and of those that share points."""
+        assert self.factor.inverse is not None
+        return self.factor.inverse()
 
     def _places(self, views: IntArray) -> IntArray:
         q = self.num_unknowns

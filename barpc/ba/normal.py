@@ -14,7 +14,8 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from barpc.ba.linear import Factor, Matrix, factorize
+from barpc.ba.linear import Factor, Matrix, factorize, factorize_blocks
+from barpc.ba.multifrontal import Blocks
 from barpc.ba.priors import PointPrior
 from barpc.ba.structure import Structure, parts
 from barpc.geodesy import Array
@@ -58,19 +59,35 @@ class Reduced:
 
     def plain(self, free: BoolArray) -> Array:
         """S (n, n) as an array, of the unknowns that are free (N q,)."""
-        if isinstance(self.matrix, np.ndarray):
-            return self.matrix if free.all() else self.matrix[np.ix_(free, free)]
-        matrix: Array = self.matrix.tocsr()[free][:, free].toarray()
-        if self.common is not None:
-            matrix -= self.common.by_camera[:, free].T @ self.common.by_camera[:, free]
-        return matrix
+        dense = self.matrix if isinstance(self.matrix, np.ndarray) else self.matrix.plain()
+        if self.common is not None and dense is not self.matrix:
+            dense -= self.common.by_camera.T @ self.common.by_camera
+        return dense if free.all() else dense[np.ix_(free, free)]
 
     def factor(self, free: BoolArray, damping: float = 0.0) -> Factor:
-        """The factorised S, of the unknowns that are free (N q,)."""
+        """The factorised S, of the unknowns that are free (N q,): those of whole views."""
         if isinstance(self.matrix, np.ndarray):
             return factorize(self.plain(free), damping)
-        matrix = self.matrix if free.all() else self.matrix.tocsr()[free][:, free]
-        return factorize(matrix, damping, None if self.common is None else self.common.by_camera[:, free])
+        order = self.structure.order(free[:: self.cross.shape[2]])
+        less = None if self.common is None else self.common.by_camera[:, free]
+        return factorize_blocks(self.matrix, order, damping, less)
+
+    def with_joint(self, index: IntArray, information: Array) -> Matrix:
+        """S and the information (n, n) of unknowns `index` (n,), which are those of views that are joined."""
+        if isinstance(self.matrix, np.ndarray):
+            matrix = self.matrix.copy()
+            matrix[np.ix_(index, index)] += information
+            return matrix
+        q = self.cross.shape[2]
+        views = index[::q] // q
+        blocks = information.reshape(len(views), q, len(views), q)
+        diagonal, pairs = self.matrix.diagonal.copy(), self.matrix.pairs.copy()
+        every = np.arange(len(views))
+        diagonal[views] += blocks[every, :, every, :]
+        i, j = np.nonzero(views[:, None] < views)
+        key, n = self.structure.pair_view @ [len(diagonal), 1], len(diagonal)
+        pairs[np.searchsorted(key, views[i] * n + views[j])] += blocks[i, :, j, :]
+        return Blocks(diagonal, pairs, self.structure.pair_view)
 
     def point_step(self, step: Array) -> Array:
         """The move of the points (P, 3) [m] that goes with a step (N, q) of the camera unknowns."""
@@ -253,16 +270,5 @@ def _pair_blocks(structure: Structure, cross: Array) -> Array:
 
 def _assemble(structure: Structure, diagonal: Array, pairs: Array) -> Matrix:
     n, q, _ = diagonal.shape
-    i, j = structure.pair_view.T
-    if n * q <= DENSE_UNKNOWNS:
-        dense = np.zeros((n, q, n, q))
-        dense[np.arange(n), :, np.arange(n), :] = diagonal
-        dense[i, :, j, :] = pairs
-        dense[j, :, i, :] = pairs.transpose(0, 2, 1)
-        return dense.reshape(n * q, n * q)
-    row = np.concatenate([np.arange(n), i, j])
-    col = np.concatenate([np.arange(n), j, i])
-    order = np.lexsort((col, row))
-    data = np.concatenate([diagonal, pairs, pairs.transpose(0, 2, 1)])[order]
-    indptr = np.searchsorted(row[order], np.arange(n + 1))
-    return sp.bsr_array((data, col[order], indptr), shape=(n * q, n * q))
+    blocks = Blocks(diagonal, pairs, structure.pair_view)
+    return blocks.plain() if n * q <= DENSE_UNKNOWNS else blocks

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.sparse as sp
 
 from barpc.ba.cameras import Cameras, Projected
 from barpc.ba.normal import (
@@ -21,6 +20,8 @@ from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.structure import Structure
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
+
+_KEPT = 1_000_000  # observations whose derivatives are kept from one step to the next: 208 bytes each
 
 
 @dataclass(frozen=True)
@@ -55,12 +56,20 @@ class Problem:
         return float(flat @ flat) + self.prior_cost(params, points)
 
     def linearise(self, params: Array, points: Array) -> Projected:
-        """Image points with all derivatives, for `reduce`; the next call writes over them."""
-        if not self._room:
-            self._room.append(self.cameras.room(self.xy.shape[1]))
-        structure = self.structure
-        ecef = structure.of_points(points)
-        return self.cameras.project(params, ecef, structure.bounds, out=self._room[0])
+        """Image points with all derivatives, for `reduce`; the next call may write over them."""
+        structure, out = self.structure, None
+        if self.xy.shape[1] <= _KEPT:
+            if not self._room:
+                self._room.append(self.cameras.room(self.xy.shape[1]))
+            out = self._room[0]
+        return self.cameras.project(params, structure.of_points(points), structure.bounds, out=out)
+
+    def prepare(self, params: Array, points: Array) -> tuple[Array, Projected | None]:
+        """Residuals (2, K) [px], and `linearise` unless it is too much to keep until `reduce` uses it up."""
+        if self.xy.shape[1] > _KEPT:
+            return self.residuals(params, points), None
+        projected = self.linearise(params, points)
+        return projected.image - self.xy, projected
 
     def reduce(
         self, params: Array, points: Array, weight: Array, projected: Projected | None = None
@@ -131,12 +140,4 @@ class Problem:
         root = prior.jacobian()
         gradient = reduced.gradient.copy()
         gradient[prior.index] += root.T @ prior.residual(params)
-        matrix = reduced.matrix
-        information = root.T @ root
-        if isinstance(matrix, np.ndarray):
-            matrix = matrix.copy()
-            matrix[np.ix_(prior.index, prior.index)] += information
-            return replace(reduced, matrix=matrix, gradient=gradient)
-        row, col = np.meshgrid(prior.index, prior.index, indexing="ij")
-        extra = sp.coo_array((information.ravel(), (row.ravel(), col.ravel())), shape=matrix.shape)
-        return replace(reduced, matrix=sp.csr_array(matrix) + sp.csr_array(extra), gradient=gradient)
+        return replace(reduced, matrix=reduced.with_joint(prior.index, root.T @ root), gradient=gradient)

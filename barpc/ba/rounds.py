@@ -72,8 +72,7 @@ class Rounds:
         use: BoolArray,
     ) -> None:
         unknowns = problem.cameras.unknowns
-        projected = problem.linearise(state.params, state.points)
-        residual = projected.image - problem.xy
+        residual, projected = problem.prepare(state.params, state.points)
         self.problem = heights.hold(problem, state.points)
         self.state, self.options, self.heights, self.residual = state, options, heights, residual
         self.robust = options.loss != "linear"
@@ -85,7 +84,7 @@ class Rounds:
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = self.use.astype(np.float64)
-        self.projected: Projected | None = projected  # of the state, until the first pass moves it
+        self.projected = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0
         self.misfit: Array | float = 0.0
         self.weight = self.counted
@@ -102,9 +101,15 @@ class Rounds:
     def _search(self) -> None:
         """Robust rounds, under priors that leave room for what is not expected."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
-        assert self.projected is not None
-        self.state, self.residual, self.counted, self.noise = _robust(
-            start, self.observations, self.state, self.projected, self.use, self.options, self.smooth
+        self.state, self.residual, self.counted, self.noise, self.projected = _robust(
+            start,
+            self.observations,
+            self.state,
+            self.residual,
+            self.projected,
+            self.use,
+            self.options,
+            self.smooth,
         )
         self.misfit = self.smooth.test(self.residual, self.use).rms
 
@@ -112,7 +117,7 @@ class Rounds:
         """One pass; the outcome where it is the last."""
         options, was_in_use, noise = self.options, self.use, self.noise
         many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
-        if self.robust and self.projected is None and many_cut:
+        if self.robust and self.passes and many_cut:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = revived(self.problem, self.state, self.residual, self.use, weight)
         self.problem = self.heights.hold(self.problem, self.state.points)
@@ -198,20 +203,21 @@ def _robust(
     problem: Problem,
     observations: Observations,
     state: State,
-    projected: Projected,
+    residual: Array,
+    projected: Projected | None,
     use: BoolArray,
     options: AdjustOptions,
     smooth: Smooth,
-) -> tuple[State, Array, Array, float]:
+) -> tuple[State, Array, Array, float, Projected | None]:
     """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
 
-    The state, its residuals, how much every observation counts, and the noise: a median that counts observations by
+    The state, its residuals, how much every observation counts, the noise, and what is kept of the state's projection.
+    The noise is a median that counts observations by
     their weights and so leaves the wrong ones behind, but not below what the best fifth of all shows, nor below half of
-    what is stated, or a few that fit by chance would be left. `projected` is of the state, before and after.
+    what is stated, or a few that fit by chance would be left.
     """
     loss = LOSSES[options.loss]
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
-    residual = projected.image - problem.xy
     s = observations.squared(residual, counted)
     for _ in range(_ROBUST_ROUNDS):
         least = float(np.sqrt(np.quantile(s[use], _LOW) / _LOW)) if use.any() else 1.0
@@ -222,11 +228,11 @@ def _robust(
         scale = 3.0 * noise if np.isinf(scale) or clean else max(3.0 * noise, _SHRINK * scale)
         counted = _counted(observations, use, s, loss(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
-        residual = problem.linearise(state.params, state.points).image - problem.xy  # into `projected`
+        residual, projected = problem.prepare(state.params, state.points)
         near = scale <= _NEAR * noise
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
         counted = _counted(observations, use, s, loss(s / scale**2)[1])
-    return state, residual, counted, noise
+    return state, residual, counted, noise, projected
 
 
 def _counted(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import BSpline
 from scipy.stats import f as f_distribution
 
 from barpc.ba.structure import Structure
@@ -26,6 +25,7 @@ SPLINES = 14
 """Cubic B-splines over the rows of an image: what changes over a tenth of it, or more slowly, is smooth."""
 
 TERMS = SPLINES + 4  # and col, col^2, col^3, row col
+_KEPT = 1_000_000  # observations whose terms are kept: they are worked out once, and take 144 bytes each
 _PER_TERM = 10  # observations a term, or the view is left as it is
 _SIGMAS = 5.0  # a mean product of neighbours that is smaller may be chance
 _RIDGE = 1e-6  # of a term's own weight
@@ -61,9 +61,16 @@ class Smooth:
         self.structure = structure
         col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
         self._place = xy
-        self._basis = np.empty((TERMS, xy.shape[1]))
-        self._basis[:SPLINES] = _bsplines(row)
-        self._basis[SPLINES:] = col, col**2, col**3, row * col
+        self._col, self._row = col, row
+        self._kept = self._terms(slice(None)) if len(col) <= _KEPT else None
+
+    def _basis(self, rows: slice) -> Array:
+        """The terms (TERMS, n) at some observations."""
+        return self._terms(rows) if self._kept is None else self._kept[:, rows]
+
+    def _terms(self, rows: slice) -> Array:
+        col, row = self._col[rows], self._row[rows]
+        return np.vstack([_bsplines(row), col, col**2, col**3, row * col])
 
     def part(self, residual: Array, weight: Array, fit: Fit | None = None) -> Array:
         """The smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
@@ -72,7 +79,7 @@ class Smooth:
         """
         out = np.zeros_like(residual)
         for rows, coefficients in (self.fit(residual, weight) if fit is None else fit).values():
-            out[:, rows] = coefficients @ self._basis[:, rows]
+            out[:, rows] = coefficients @ self._basis(rows)
         return out
 
     def test(self, residual: Array, use: BoolArray, fit: Fit | None = None) -> SmoothTest:
@@ -86,14 +93,15 @@ class Smooth:
         residual = np.where(use, residual, 0.0)
         for v, (rows, coefficients) in (self.fit(residual, weight) if fit is None else fit).items():
             count = 2 * float(weight[rows].sum())
-            smooth = (coefficients @ self._basis[:, rows]) * weight[rows]
+            basis = self._basis(rows)
+            smooth = (coefficients @ basis) * weight[rows]
             explained = float((smooth**2).sum())
             left = float((residual[:, rows] ** 2).sum()) - explained
             terms = 2.0 * TERMS
             scatter = max(left / (count - terms), 1e-30)
             significance[v] = float(f_distribution.sf(explained / terms / scatter, terms, count - terms))
             rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / (0.5 * count))
-            along = (coefficients[:, :SPLINES] @ self._basis[:SPLINES, rows]) * weight[rows]
+            along = (coefficients[:, :SPLINES] @ basis[:SPLINES]) * weight[rows]
             by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)
         return SmoothTest(rms, significance, by_row, np.zeros(n))
 
@@ -127,7 +135,7 @@ class Smooth:
 
     def _coefficients(self, rows: slice, residual: Array, weight: Array) -> Array:
         """Coefficients (2, terms) of one view."""
-        basis = self._basis[:, rows]
+        basis = self._basis(rows)
         weighted = basis * weight[rows]
         matrix = weighted @ basis.T
         diagonal = np.diag(matrix)
@@ -140,6 +148,11 @@ class Smooth:
 
 def _bsplines(u: Array) -> Array:
     """Uniform cubic B-splines (SPLINES, n) at u (n,) in -1 .. 1."""
-    pieces = SPLINES - 3
-    basis = BSpline.design_matrix((u + 1.0) * (0.5 * pieces), np.arange(-3.0, pieces + 4), 3)
-    return np.asarray(basis.toarray().T)
+    at = (u + 1.0) * (0.5 * (SPLINES - 3))
+    first = np.minimum(at.astype(np.int64), SPLINES - 4)
+    t = at - first
+    basis = np.zeros((SPLINES, len(u)))
+    pieces = (1.0 - t) ** 3, (3.0 * t - 6.0) * t**2 + 4.0, ((3.0 - 3.0 * t) * t + 3.0) * t + 1.0, t**3
+    for n, piece in enumerate(pieces):
+        basis[first + n, np.arange(len(u))] = piece / 6.0
+    return basis

@@ -118,8 +118,8 @@ def _settled(gain: float, before: float, cost: float, tolerance: float) -> bool:
     return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
 
 
-def gauss_newton(problem: Problem, state: State, weight: Array, projected: Projected) -> State:
-    """One undamped step from a linearised state: for rounds whose weights change anyway."""
+def gauss_newton(problem: Problem, state: State, weight: Array, projected: Projected | None = None) -> State:
+    """One undamped step: for rounds whose weights change anyway. `projected` as in `minimise`."""
     reduced = problem.reduce(state.params, state.points, weight, projected)
     step, gain, _ = camera_step(problem, reduced)
     return state.moved(step, reduced, max(_finite(reduced.cost) - gain, 0.0))
@@ -154,17 +154,19 @@ def _levenberg_marquardt(
         if _settled(gain, before, state.cost, tolerance):
             status = _status(state, "the next step gains too little")
             return Minimum(ahead, reduced, None if damping else factor, status)
-        trial = problem.reduce(ahead.params, ahead.points, weight)
-        if trial.cost <= state.cost * (1.0 + 1e-12):
-            state = replace(ahead, cost=trial.cost, history=(*state.history, trial.cost))
-            reduced, before = trial, gain if not damping else np.inf
+        del reduced, factor  # of a large block no two fit
+        reduced = problem.reduce(ahead.params, ahead.points, weight)
+        if reduced.cost <= state.cost * (1.0 + 1e-12):
+            state = replace(ahead, cost=reduced.cost, history=(*state.history, reduced.cost))
+            before = gain if not damping else np.inf
             damping = damping / 10.0 if damping > 1e-8 else 0.0
-        elif gain <= (_ROUNDING if damping < 1e8 else _LOST) * state.cost:
+            continue
+        reduced = problem.reduce(state.params, state.points, weight)
+        if gain <= (_ROUNDING if damping < 1e8 else _LOST) * state.cost:
             return Minimum(state, reduced, status=_status(state, "what a step gains is lost in rounding"))
-        elif damping >= 1e8:
+        if damping >= 1e8:
             raise AdjustError(f"no step lowers the cost {state.cost:.6g}: the solution is not usable")
-        else:
-            damping = max(10.0 * damping, 1e-6)
+        damping = max(10.0 * damping, 1e-6)
     _LOG.warning("the adjustment did not settle in %d steps", MAX_STEPS)
     return Minimum(state, reduced, status=_status(state, "the number of steps is used up"))
 

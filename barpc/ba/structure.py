@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
 
+from barpc.ba.dissection import Dissection, dissect
 from barpc.geodesy import Array
-from barpc.scene import IntArray
+from barpc.scene import BoolArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,15 @@ class Structure:
     second: IntArray  # (Q,)
     pair_view: IntArray  # (M, 2) pairs of views i < j that share a point
     pair_bounds: IntArray  # (M + 1,) observation pairs of view pair m are pair_bounds[m] : pair_bounds[m + 1]
+    place: Array  # (N, 2) where each view stands on the ground, roughly
+    _orders: dict[bytes, Dissection] = field(default_factory=dict, repr=False)
+
+    def order(self, use: BoolArray) -> Dissection:
+        """In which order the views in use (N,) are eliminated; worked out once."""
+        key = use.tobytes()
+        if key not in self._orders:
+            self._orders[key] = dissect(self.pair_view, self.place, use)
+        return self._orders[key]
 
     def sum_points(self, rows: Array) -> Array:
         """Sums (m, P) over every point's observations of rows (m, K)."""
@@ -46,8 +56,15 @@ class Structure:
         return out
 
 
-def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: int) -> Structure:
-    """The structure of observations (K,) that are already sorted by view."""
+def make_structure(
+    view: IntArray,
+    point: IntArray,
+    num_views: int,
+    num_points: int,
+    place: Array | None = None,
+    joined: IntArray | None = None,
+) -> Structure:
+    """The structure of observations (K,) that are already sorted by view; all views `joined` are pairs, too."""
     bounds = np.searchsorted(view, np.arange(num_views + 1))
     by_point, point_bounds = counting_sort(point, num_points)
     first, second = _pairs(by_point, point_bounds)
@@ -55,10 +72,12 @@ def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: 
     order = order[counting_sort(view[first[order]], num_views)[0]]
     first, second = first[order], second[order]
     key = view[first] * num_views + view[second]
-    at = np.flatnonzero(np.diff(key, prepend=-1))
-    keys = key[at]
+    keys = key[np.flatnonzero(np.diff(key, prepend=-1))]
+    if joined is not None:
+        i, j = np.sort(joined)[np.stack(np.triu_indices(len(joined), 1))]
+        keys = np.union1d(keys, i * num_views + j)
     pair_view = np.column_stack([keys // num_views, keys % num_views])
-    pair_bounds = np.append(at, len(key))
+    pair_bounds = np.append(np.searchsorted(key, keys), len(key))
     return Structure(
         num_views,
         num_points,
@@ -71,6 +90,7 @@ def make_structure(view: IntArray, point: IntArray, num_views: int, num_points: 
         second,
         pair_view,
         pair_bounds,
+        np.zeros((num_views, 2)) if place is None else place,
     )
 
 

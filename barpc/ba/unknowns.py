@@ -7,11 +7,11 @@ unknown moves the image by about one pixel a pixel's size. Image models count pi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from barpc.geodesy import Array, ecef_from_ground
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
@@ -31,6 +31,8 @@ class Unknowns:
     distance: Array  # (N,) from the centre to the scene [m]: a rotation unknown is angle x distance
     middle: Array  # (2, N) of every image, col and row [px]
     half: Array  # (2, N) its half width and height [px]
+    # (N, 2) where its scene stands, east and north of the middle of all [m]
+    place: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def geometric(self) -> bool:
@@ -155,7 +157,9 @@ def make_unknowns(
         centers = np.array(found).reshape(-1, 3)
     scene = np.array([_middle_of_scene(view) for view in views]).reshape(-1, 3)
     distance = np.linalg.norm(centers - scene, axis=1)
-    return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0)
+    middle = scene.mean(axis=0)
+    place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
+    return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0, place)
 
 
 def _middle_of_scene(view: View) -> Array:

@@ -1,0 +1,266 @@
+"""The sparse factor against dense linear algebra, and the order of elimination against what it is for."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+
+from barpc.ba import adjust_tracks, dissection, multifrontal, normal
+from barpc.ba.adjustment import make_problem
+from barpc.ba.block import join
+from barpc.ba.dissection import Dissection, dissect
+from barpc.ba.incremental import BlockPrior
+from barpc.ba.linear import factorize_blocks
+from barpc.ba.multifrontal import Blocks
+from barpc.ba.solve import camera_step
+from barpc.geodesy import ecef_from_ground
+from barpc.options import AdjustOptions
+from barpc.scene import GroundPoints, Tracks
+from barpc.simulate import Block, simulate_block
+from tests.ba.conftest import INDEPENDENT, centers_of
+
+
+def _sites(columns: int, rows: int, a_site: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of views tied to those of the eight sites around theirs, and where all stand."""
+    row, column = np.divmod(np.arange(columns * rows * a_site) // a_site, columns)
+    i, j = np.triu_indices(len(row), 1)
+    near = (abs(row[i] - row[j]) <= 1) & (abs(column[i] - column[j]) <= 1)
+    place = np.stack([column, row], axis=1) + np.random.default_rng(0).normal(0, 0.05, (len(row), 2))
+    return np.stack([i[near], j[near]], axis=1), 1e4 * place
+
+
+def _matrix(pairs: np.ndarray, n: int, q: int, seed: int = 0) -> Blocks:
+    rng = np.random.default_rng(seed)
+    diagonal = rng.normal(size=(n, q, q))
+    return Blocks(
+        diagonal + diagonal.swapaxes(1, 2) + 30 * q * np.eye(q), rng.normal(size=(len(pairs), q, q)), pairs
+    )
+
+
+def _numbers(order: Dissection) -> int:
+    """Blocks in the factor."""
+    return sum(len(f.pivots) * (len(f.pivots) + len(f.border)) for f in order.fronts)
+
+
+def _work(order: Dissection) -> int:
+    """Products of blocks that it costs."""
+    return sum(len(f.pivots) * (len(f.pivots) + len(f.border)) ** 2 for f in order.fronts)
+
+
+@pytest.mark.parametrize("leaf", [1, 7, 32, 1000])
+@pytest.mark.parametrize(("columns", "rows", "a_site"), [(1, 1, 1), (7, 6, 3), (60, 1, 2), (4, 15, 1)])
+@pytest.mark.parametrize("kept", [0.0, 1e9])
+def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(
+    monkeypatch, leaf, columns, rows, a_site, kept
+) -> None:
+    monkeypatch.setattr(dissection, "LEAF", leaf)
+    monkeypatch.setattr(multifrontal, "IN_MEMORY", kept)
+    pairs, place = _sites(columns, rows, a_site)
+    n, q = len(place), 2
+    matrix, rng = _matrix(pairs, n, q), np.random.default_rng(leaf)
+    use = rng.random(n) < 0.9 if n > 1 else np.ones(1, dtype=bool)
+    free = np.repeat(use, q)
+    for damping, less in ((0.0, None), (0.3, rng.normal(size=(3, free.sum())) / np.sqrt(free.sum()))):
+        dense = matrix.plain()
+        dense = (dense + damping * np.diag(dense.diagonal()))[np.ix_(free, free)]
+        dense -= 0.0 if less is None else less.T @ less
+        inverse = np.zeros((n * q, n * q))
+        inverse[np.ix_(free, free)] = np.linalg.inv(dense)
+        blocks = inverse.reshape(n, q, n, q)
+        factor = factorize_blocks(matrix, dissect(pairs, place, use), damping, less)
+        rhs = rng.normal(size=(free.sum(), 3))
+        np.testing.assert_allclose(factor.solve(rhs), np.linalg.solve(dense, rhs), atol=1e-13)
+        np.testing.assert_allclose(factor.solve(rhs[:, 0]), np.linalg.solve(dense, rhs[:, 0]), atol=1e-13)
+        found = factor.inverse()
+        i, j = pairs.T
+        np.testing.assert_allclose(found.diagonal, blocks[np.arange(n), :, np.arange(n), :], atol=1e-13)
+        np.testing.assert_allclose(found.pairs, blocks[i, :, j, :], atol=1e-13)
+
+
+def test_a_matrix_that_is_not_positive_definite_is_said() -> None:
+    pairs, place = _sites(6, 6)
+    matrix = _matrix(pairs, len(place), 2)
+    matrix.diagonal[50] *= -1.0
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        factorize_blocks(matrix, dissect(pairs, place, np.ones(len(place), dtype=bool)))
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_who_is_parted_is_tied_through_the_border_only(turn) -> None:
+    pairs, place = _sites(12, 9)
+    place = place @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+    use = np.random.default_rng(1).random(len(place)) < 0.95
+    order = dissect(pairs, place, use)
+    every = np.concatenate([front.pivots for front in order.fronts])
+    assert sorted(every) == np.flatnonzero(use).tolist()
+    assert (order.rank[every] == np.arange(len(every))).all()
+    assert (order.rank[~use] == -1).all()
+    for i, j in pairs[use[pairs].all(axis=1)]:
+        early, late = (i, j) if order.rank[i] < order.rank[j] else (j, i)
+        front = order.fronts[order.owner[early]]
+        assert late in front.pivots or late in front.border
+    for number, front in enumerate(order.fronts):
+        if len(front.border):
+            assert front.parent > number
+            above = order.fronts[front.parent]
+            assert set(front.border) <= set(above.pivots) | set(above.border)
+            assert (np.diff(order.rank[front.border]) > 0).all()
+
+
+def test_little_fills_in() -> None:
+    """A line across a square of 24 sites of 3 is 72 views; a strip fills as many blocks a view however long it is."""
+    pairs, place = _sites(24, 24)
+    order = dissect(pairs, place, np.ones(len(place), dtype=bool))
+    assert 60 <= max(len(front.pivots) for front in order.fronts) <= 90
+    banded = len(place) * (3 * (24 + 2)) ** 2
+    assert 0.3 * banded < _work(order) < 0.9 * banded
+    a_view = []
+    for length in (60, 240):
+        pairs, place = _sites(length, 2)
+        a_view.append(_numbers(dissect(pairs, place, np.ones(len(place), dtype=bool))) / len(place))
+    assert 0.8 < a_view[1] / a_view[0] < 1.25
+    scattered = np.random.default_rng(0).permutation(
+        len(place)
+    )  # places that say nothing cost, but part as well
+    assert _numbers(dissect(pairs, place[scattered], np.ones(len(place), dtype=bool))) > 1.5 * a_view[
+        1
+    ] * len(place)
+
+
+def _weakly_tied(block: Block, few: int) -> Tracks:
+    """The tracks without all but a few of those that views of both halves see."""
+    tracks, half = block.tracks, len(block.views) // 2
+    last = np.zeros(tracks.num_points, dtype=bool)
+    last[tracks.point[tracks.view >= half]] = True
+    first = np.zeros_like(last)
+    first[tracks.point[tracks.view < half]] = True
+    across = np.flatnonzero(first & last)
+    keep = ~np.isin(tracks.point, across[few:])
+    renamed = np.unique(tracks.point[keep], return_inverse=True)[1].ravel()
+    return Tracks(tracks.view[keep], renamed, tracks.xy[keep], tracks.sigma[keep])
+
+
+def _reduced(block: Block, tracks: Tracks, gcps: GroundPoints | None = None, **options: Any) -> Any:
+    """The problem and its linearisation where it starts, and 1 / sigma."""
+    chosen = AdjustOptions(**{**INDEPENDENT, **options})
+    joined = join(block.views, tracks, gcps, chosen, keep_largest=True)
+    problem = make_problem(joined, chosen, centers_of(block), options.get("prior"))
+    points = joined.first_points()
+    points = np.where(np.isfinite(points), points, ecef_from_ground(block.truth.ground[0]))
+    weight = joined.use / joined.sigma
+    for _ in range(2):
+        projected = problem.project_points(problem.camera_prior.mean, points)
+        points = problem.triangulate(points, projected, weight)
+    return problem, points, weight
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "no drift": {"drift": 0},
+    "hardly held": {"sigma_attitude": 1e3, "sigma_position": 1e3},
+    "fixed": {"fixed": ("view_0003", "view_0100", "view_0101")},
+    "in the image": {"model": "affine"},
+}
+
+
+@pytest.fixture(scope="module")
+def many() -> Block:
+    """Two hundred views in a square."""
+    return simulate_block(200, 4000, seed=3, num_gcps=5, num_checks=0)
+
+
+@pytest.mark.parametrize(
+    ("case", "ties", "leaf"),
+    [
+        *((case, "all", 32) for case in CASES),
+        *((case, ties, 32) for case in ("as it is", "hardly held") for ties in ("weak", "none")),
+        ("as it is", "all", 4),
+    ],
+)
+def test_a_step_and_its_covariance_are_those_of_the_dense_solve(monkeypatch, many, case, ties, leaf) -> None:
+    monkeypatch.setattr(dissection, "LEAF", leaf)
+    tracks = many.tracks if ties == "all" else _weakly_tied(many, 6 if ties == "weak" else 0)
+    gcps = many.gcps if ties == "all" else None
+    with pytest.warns(match="not tied") if ties == "none" else nullcontext():
+        problem, points, weight = _reduced(many, tracks, gcps, **CASES[case])
+    reduced = problem.reduce(problem.camera_prior.mean, points, weight)
+    step, gain, factor = camera_step(problem, reduced)
+    assert factor.method == "multifrontal"
+    dense, free, q = reduced.plain(problem.free), problem.free, problem.cameras.unknowns.size
+    rest = dense @ step.ravel()[free] + reduced.gradient[free]
+    assert np.linalg.norm(rest) < 1e-13 * np.linalg.norm(reduced.gradient)
+    covariance = np.zeros((len(free),) * 2)
+    covariance[np.ix_(free, free)] = la.cho_solve(la.cho_factor(dense), np.eye(len(dense)))
+    sigma = np.sqrt(covariance.diagonal()).clip(1e-30)
+    bound = 1e-9 if case != "hardly held" else 1e-4  # dense ways differ by as much: a condition of 1e11
+    expected = np.zeros(len(free))
+    expected[free] = -np.linalg.solve(dense, reduced.gradient[free])
+    assert (np.abs(step.ravel() - expected) / sigma)[free].max() < 100.0 * bound
+    assert not step.ravel()[~free].any()
+    assert gain == pytest.approx(reduced.gain - reduced.gradient @ expected, rel=1e-8)
+    found, n = factor.inverse(), len(many.views)
+    blocks = (covariance / np.outer(sigma, sigma)).reshape(n, q, n, q)
+    sigma, (i, j) = sigma.reshape(n, q), found.pair_view.T
+    own = found.diagonal / (sigma[:, :, None] * sigma[:, None, :])
+    across = found.pairs / (sigma[i, :, None] * sigma[j, None, :])
+    np.testing.assert_allclose(own, blocks[np.arange(n), :, np.arange(n), :], atol=bound)
+    np.testing.assert_allclose(across, blocks[i, :, j, :], atol=bound)
+
+
+def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(monkeypatch, many) -> None:
+    """Views of an earlier run far apart, whose unknowns are correlated: in the matrix as in the dense one."""
+    names = ("view_0150", "view_0002", "view_0080")
+    root = np.random.default_rng(0).normal(size=(27, 27)) + 3.0 * np.eye(27)
+    prior = BlockPrior(
+        names,
+        "rotation+translation",
+        1,
+        np.ones((3, 9)),
+        root.T @ root,
+        np.array(centers_of(many))[[150, 2, 80]],
+    )
+    both = []
+    for most in (0, 10**6):
+        monkeypatch.setattr(normal, "DENSE_UNKNOWNS", most)
+        chosen = AdjustOptions(**INDEPENDENT)
+        joined = join(many.views, many.tracks, None, chosen)
+        problem = make_problem(joined, chosen, centers_of(many), prior)
+        points = np.vstack([ecef_from_ground(many.truth.ground)])
+        reduced = problem.reduce(problem.camera_prior.mean, points, joined.use / joined.sigma)
+        both.append((reduced.plain(problem.free), camera_step(problem, reduced)[0]))
+    np.testing.assert_allclose(both[0][0], both[1][0], rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(both[0][1], both[1][1], atol=1e-9 * np.abs(both[1][1]).max())
+    assert np.abs(both[0][0].reshape(200, 9, 200, 9)[2, :, 150]).max() > 1.0
+
+
+@pytest.mark.parametrize("options", [{}, {"dem_for_all": True}], ids=["alone", "terrain"])
+def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, options) -> None:
+    """Rounds, variances and covariance: nothing else may change. Heights held by a terrain are wrong together."""
+    made = simulate_block(110, 2200, seed=4, num_checks=0)
+    chosen = AdjustOptions(**{**INDEPENDENT, "solver": "sparse", **options})
+    dem = (lambda lon, lat: np.full(len(lon), 300.0)) if options else None
+    found = []
+    for most in (0, 10**6):
+        monkeypatch.setattr(normal, "DENSE_UNKNOWNS", most)
+        found.append(adjust_tracks(made.views, made.tracks, chosen, dem=dem, centers=centers_of(made)))
+    one, other = found
+    assert [f.covariance.factor.method for f in found] == ["multifrontal", "dense"]
+    assert (one.covariance.reduced.common is not None) == bool(options)
+    np.testing.assert_allclose(one.params, other.params, atol=1e-7)
+    assert one.cost_history[-1] == pytest.approx(other.cost_history[-1], rel=1e-9)
+    np.testing.assert_allclose(one.gauge.sigma, other.gauge.sigma, rtol=1e-7)
+    views = np.arange(110)
+    sigma = [np.sqrt(np.diag(f.covariance.view(4))) for f in found]
+    np.testing.assert_allclose(*sigma, rtol=1e-7)
+    for i, j in ((0, 0), (17, 18), (18, 17), (3, 105)):
+        expected = other.covariance.view(i, j)
+        np.testing.assert_allclose(one.covariance.view(i, j), expected, atol=1e-7 * np.abs(expected).max())
+    joint = [f.covariance.joint(views[50:53]) for f in found]
+    np.testing.assert_allclose(*joint, atol=1e-7 * np.abs(joint[1]).max())
+    index = np.array([0, 1000, 2199])
+    expected = other.covariance.points(index)
+    np.testing.assert_allclose(one.covariance.points(index), expected, atol=1e-7 * np.abs(expected).max())
