@@ -16,7 +16,8 @@ The excess is the baseline's cost over barpc's, less one.
     OMP_NUM_THREADS=1 python benchmarks/ba.py             # ratios for 3, 10, 30 (and --all: 100) views
     python benchmarks/ba.py --growth                      # CPU seconds for 5k .. 800k observations
     python benchmarks/ba.py --large 1000 200000           # views, tracks: seconds and peak memory
-    python benchmarks/ba.py --step 10000 500000           # one step of the solver
+    python benchmarks/ba.py --blocks 1000 3000 10000      # growth with views, by stage, and how far from the optimum
+    python benchmarks/ba.py --fill 1000 10000             # what other orders of elimination would cost
 """
 
 from __future__ import annotations
@@ -24,18 +25,22 @@ from __future__ import annotations
 import argparse
 import resource
 import statistics
+import subprocess
+import sys
 import time
 import warnings
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.sparse import coo_matrix
+from scipy.sparse import bsr_array, coo_matrix
+from scipy.sparse.linalg import splu
 
-from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.adjustment import make_problem
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment, structure
 from barpc.ba.block import join
-from barpc.ba.solve import State, camera_step
-from barpc.ba.weights import Observations
+from barpc.ba.multifrontal import Cholesky
+from barpc.ba.problem import Problem
+from barpc.ba.smooth import Smooth
+from barpc.ba.solve import State, camera_step, minimise
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.geometry import triangulate
@@ -180,23 +185,137 @@ def large(views: int, tracks: int) -> None:
         del found
 
 
-def step(views: int, tracks: int) -> None:
-    """One linearisation, elimination, factorisation and solution."""
-    block = simulate_block(views, tracks, seed=1, attitude=6e-6, num_checks=0)
-    centers = np.array([correction.center for correction in block.truth.corrections])
-    options = AdjustOptions(**PLAIN)
-    joined = join(block.views, block.tracks, None, options)
-    problem = make_problem(joined, options, centers, None)
-    state = State(problem.camera_prior.mean, ecef_from_ground(block.truth.ground))
-    weight = Observations(problem, joined.sigma, 0.0, joined.use).weight(joined.use, 1.0)
-    linear, reduced = timed(lambda: problem.reduce(state.params, state.points, weight))
-    solved, (_, _, factor) = timed(lambda: camera_step(problem, reduced))
+STAGES = {
+    "start": [(adjustment, "make_problem"), (adjustment, "_start")],
+    "linearise": [(Problem, "reduce")],
+    "order": [(structure, "dissect")],
+    "factorise": [(Cholesky, "factorize")],
+    "solve": [(Cholesky, "solve")],
+    "smooth": [(Smooth, "fit"), (Smooth, "test")],
+    "held out": [(adjustment, "measure")],
+}
+"""Functions whose CPU seconds are counted; those of one stage may call each other."""
+
+
+class Stages:
+    """CPU seconds in the functions of every stage, and the last linearisation asked for."""
+
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(STAGES, 0.0)
+        self.busy: list[str] = []
+        self.last: tuple = ()
+        for stage, functions in STAGES.items():
+            for owner, name in functions:
+                setattr(owner, name, self._timed(stage, getattr(owner, name)))
+
+    def _timed(self, stage, func):
+        def timed_func(*args):
+            if stage == "linearise":
+                self.last = args
+            if stage in self.busy:
+                return func(*args)
+            self.busy.append(stage)
+            start = time.process_time()
+            try:
+                return func(*args)
+            finally:
+                self.busy.remove(stage)
+                self.seconds[stage] += time.process_time() - start
+
+        return timed_func
+
+
+def one_block(views: int, tracks: int) -> None:
+    """One block with every default, by stage; then what a further step would gain, and how exactly it is solved."""
+    simulated, made = timed(lambda: simulate_block(views, tracks, seed=1, num_checks=0))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    stages = Stages()
+    centers = np.array([correction.center for correction in made.truth.corrections])
+    start = time.process_time()
+    found = adjust_tracks(made.views, made.tracks, AdjustOptions(), centers=centers)
+    all_of_it = time.process_time() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    neighbours = 2 * len(reduced.structure.pair_view) / views
+    by_stage = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in stages.seconds.items())
+    rest = all_of_it - sum(stages.seconds.values())
     print(
-        f"{views} views, {len(joined.view)} observations, {neighbours:.1f} neighbours a view: linearise and eliminate "
-        f"{linear:.1f} s, factorise ({factor.method}) and solve {solved:.1f} s, peak {peak:.2f} GB"
+        f"{views} views, {len(made.tracks)} observations: {all_of_it:.1f} s ({by_stage}, rest {rest:.1f}), "
+        f"{found.steps} linearisations, peak {peak:.2f} GB ({before:.2f} before, simulated in {simulated:.0f} s)",
+        flush=True,
     )
+    del found, made
+    problem, params, _, weight = stages.last
+    points = problem.triangulate(stages.last[2], problem.project_points(params, stages.last[2]), weight)
+    stages.last = ()
+    state = minimise(problem, State(params, points), weight, "sparse", 1e-6).state
+    reduced = problem.reduce(state.params, state.points, weight)
+    _, gain, factor = camera_step(problem, reduced)
+    i, j = reduced.matrix.pair_view.T
+    wanted = np.random.default_rng(0).normal(size=len(reduced.gradient))
+    solution = factor.solve(wanted).reshape(views, -1)
+    product = np.einsum("nij,nj->ni", reduced.matrix.diagonal, solution)
+    np.add.at(product, i, np.einsum("nij,nj->ni", reduced.matrix.pairs, solution[j]))
+    np.add.at(product, j, np.einsum("nji,nj->ni", reduced.matrix.pairs, solution[i]))
+    product = product.ravel()
+    if reduced.common is not None:
+        product -= reduced.common.by_camera.T @ (reduced.common.by_camera @ solution.ravel())
+    left = np.linalg.norm(product - wanted) / np.linalg.norm(wanted)
+    print(
+        f"    a further step would gain {gain / reduced.cost:.1e} of the cost; what is solved is left to {left:.1e}"
+    )
+    inverse, _ = timed(factor.inverse)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(
+        f"    covariance of every view and of those that share points {inverse:.1f} s, peak {peak:.2f} GB",
+        flush=True,
+    )
+
+
+def blocks(sizes: list[int], tracks: int) -> None:
+    """Blocks of some sizes, `tracks` tracks a view, each in a process of its own."""
+    for views in sizes:
+        given = ["--one-block", str(views), str(tracks * views)]
+        subprocess.run([sys.executable, __file__, *given], check=True)
+
+
+def fill(sizes: list[int]) -> None:
+    """Numbers in the factor, and CPU seconds, by SuperLU in some orders and by fronts in ours."""
+    for views in sizes:
+        made = simulate_block(views, 50 * views, seed=1, num_checks=0)
+        _fill_of(views, made)
+
+
+def _fill_of(views: int, made: Block) -> None:
+    options = AdjustOptions(**PLAIN)
+    joined = join(made.views, made.tracks, None, options)
+    centers = np.array([correction.center for correction in made.truth.corrections])
+    problem = adjustment.make_problem(joined, options, centers, None)
+    reduced = problem.reduce(
+        problem.camera_prior.mean, ecef_from_ground(made.truth.ground), 1.0 / joined.sigma
+    )
+    seconds, order = timed(lambda: problem.structure.order(np.ones(views, dtype=bool)))
+    factorised, _ = timed(lambda: reduced.factor(problem.free))
+    count = sum(len(f.pivots) * (len(f.pivots) + len(f.border)) for f in order.fronts) * 81
+    print(
+        f"{views} views, fronts: {count:.2e} numbers, {seconds:.2f} s to order, {factorised:.2f} s",
+        flush=True,
+    )
+    (i, j), pairs = reduced.matrix.pair_view.T, reduced.matrix.pairs
+    row, col = np.concatenate([np.arange(views), i, j]), np.concatenate([np.arange(views), j, i])
+    data = np.concatenate([reduced.matrix.diagonal, pairs, pairs.transpose(0, 2, 1)])
+    at = np.lexsort((col, row))
+    sparse = bsr_array((data[at], col[at], np.searchsorted(row[at], np.arange(views + 1)))).tocsc()
+    ours = (np.argsort(order.rank)[:, None] * 9 + np.arange(9)).ravel()
+    symmetric = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    for name, matrix, how in (
+        ("NATURAL", sparse[ours][:, ours], symmetric),
+        ("MMD_AT_PLUS_A", sparse, symmetric),
+        ("COLAMD", sparse, {}),
+    ):
+        try:
+            seconds, lu = timed(lambda m=matrix, n=name, h=how: splu(m, permc_spec=n, **h))
+            print(f"    SuperLU {name}: {lu.L.nnz:.2e} numbers, {seconds:.2f} s", flush=True)
+        except (MemoryError, RuntimeError) as error:
+            print(f"    SuperLU {name}: {error}", flush=True)
 
 
 def main() -> None:
@@ -207,17 +326,22 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3, help="interleaved runs, of which the median counts")
     parser.add_argument("--growth", action="store_true", help="CPU over the number of observations")
     parser.add_argument("--large", nargs=2, type=int, metavar=("VIEWS", "TRACKS"), help="a large block")
-    parser.add_argument(
-        "--step", nargs=2, type=int, metavar=("VIEWS", "TRACKS"), help="one step of a large block"
-    )
+    parser.add_argument("--blocks", nargs="+", type=int, metavar="VIEWS", help="growth with views, by stage")
+    parser.add_argument("--a-view", type=int, default=50, help="tracks a view of these blocks")
+    parser.add_argument("--one-block", nargs=2, type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--fill", nargs="+", type=int, metavar="VIEWS", help="other orders of elimination")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     if arguments.growth:
         growth(10)
     elif arguments.large:
         large(*arguments.large)
-    elif arguments.step:
-        step(*arguments.step)
+    elif arguments.one_block:
+        one_block(*arguments.one_block)
+    elif arguments.blocks:
+        blocks(arguments.blocks, arguments.a_view)
+    elif arguments.fill:
+        fill(arguments.fill)
     else:
         sizes = [(3, 2000), (10, 5000), (30, 10000), (100, 30000)]
         ratios(sizes if arguments.all else sizes[:3], arguments.repeat)
