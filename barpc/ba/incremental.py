@@ -6,12 +6,14 @@ points may observe old views; an observation that the old block has used must no
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg as la
+import scipy.sparse as sp
 
 from barpc.ba.priors import CameraPrior, JointPrior
 from barpc.errors import InputError
@@ -23,7 +25,8 @@ if TYPE_CHECKING:
     from barpc.ba.result import Adjustment
 
 PRIOR = replace(ARRAYS, words="the prior of an adjusted block")
-_FIELDS = ("params", "information", "center")
+_SPARSE = ("data", "indices", "indptr")
+_LARGEST = 20_000  # unknowns of a block that is gone on from: its matrix is dense then
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,22 +41,30 @@ class BlockPrior:
         The unknowns (see `AdjustOptions`).
     params : (n, q)
         Their values.
-    information : (n q, n q)
+    information : (n q, n q), array or csr_array
         Their joint information matrix, priors included.
     center : (n, 3)
         Camera centres [m], ECEF.
+    less : (m, n q)
+        Rows B of B^T B that is still to be taken off a sparse matrix: what heights have in common.
     """
 
     names: tuple[str, ...]
     model: str
     drift: int
     params: Array
-    information: Array
+    information: Array | sp.csr_array
     center: Array
+    less: Array | None = None
 
     def save(self, path: Path) -> None:
         """Write the prior to an .npz file."""
-        arrays = {name: getattr(self, name) for name in _FIELDS}
+        arrays = {name: getattr(self, name) for name in ("params", "center")}
+        if isinstance(self.information, np.ndarray):
+            arrays["information"] = self.information
+        else:
+            arrays |= {name: getattr(self.information, name) for name in _SPARSE}
+            arrays["less"] = np.zeros((0, self.params.size)) if self.less is None else self.less
         with Path(path).open("wb") as file:
             np.savez_compressed(
                 file, names=np.array(self.names), model=self.model, drift=self.drift, **arrays
@@ -71,7 +82,10 @@ class BlockPrior:
         file = load_npz(path, PRIOR)
         try:
             names = tuple(str(name) for name in file["names"])
-            prior = cls(names, str(file["model"]), int(file["drift"]), *(file[name] for name in _FIELDS))
+            params, sparse = file["params"], "indptr" in file
+            matrix = file["information"] if not sparse else _csr(file, params.size)
+            less = file["less"] if sparse else None
+            prior = cls(names, str(file["model"]), int(file["drift"]), params, matrix, file["center"], less)
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
         if not prior._is_whole():
@@ -87,9 +101,31 @@ class BlockPrior:
             n * q > 0
             and len(set(self.names)) == n
             and all(array.shape == shape for array, shape in zip(arrays, shapes.values(), strict=True))
-            and all(array.dtype == np.float64 and np.isfinite(array).all() for array in arrays)
-            and bool((np.diag(self.information) > 0).all())
+            and all(array.dtype == np.float64 for array in arrays)
+            and all(np.isfinite(getattr(a, "data" if sp.issparse(a) else "real")).all() for a in arrays)
+            and bool((self.information.diagonal() > 0).all())
+            and (
+                self.less is None or (self.less.shape[1:] == (n * q,) and bool(np.isfinite(self.less).all()))
+            )
         )
+
+    def dense(self) -> Array:
+        """The information matrix as an array."""
+        if isinstance(self.information, np.ndarray):
+            return self.information
+        if self.params.size > _LARGEST:
+            raise InputError(
+                f"the earlier block has {len(self.names)} views, too many to go on from: at most "
+                f"{_LARGEST // self.params.shape[1]}; adjust all images together"
+            )
+        matrix: Array = self.information.toarray()
+        return matrix if self.less is None else matrix - self.less.T @ self.less
+
+
+def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
+    matrix = sp.csr_array(tuple(file[name] for name in _SPARSE), shape=(size, size))
+    matrix.check_format()
+    return matrix
 
 
 def block_prior(adjustment: Adjustment) -> BlockPrior:
@@ -104,15 +140,18 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
     -------
     BlockPrior
     """
-    covariance, n = adjustment.covariance, len(adjustment.names)
-    views = np.flatnonzero(covariance.free.reshape(n, -1)[:, 0])
+    reduced, free, n = adjustment.covariance.reduced, adjustment.covariance.free, len(adjustment.names)
+    views, matrix = np.flatnonzero(free.reshape(n, -1)[:, 0]), reduced.matrix
     return BlockPrior(
         tuple(adjustment.names[v] for v in views),
         adjustment.cameras.unknowns.model,
         adjustment.cameras.unknowns.drift,
         adjustment.params[views],
-        covariance.reduced.plain(covariance.free),
+        reduced.plain(free) if isinstance(matrix, np.ndarray) else matrix.sparse()[free][:, free],
         adjustment.cameras.unknowns.center[views],
+        None
+        if isinstance(matrix, np.ndarray) or reduced.common is None
+        else reduced.common.by_camera[:, free],
     )
 
 
@@ -137,7 +176,7 @@ def apply_prior(
     if size != cameras.mean.shape[1]:
         raise InputError(f"the earlier block has {size} unknowns a view, not {cameras.mean.shape[1]}")
     try:
-        root = la.cholesky(prior.information)
+        root = la.cholesky(prior.dense())
     except la.LinAlgError as error:
         raise InputError(f"the earlier block's information is damaged ({error})") from error
     place = {name: i for i, name in enumerate(names)}

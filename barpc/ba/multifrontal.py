@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import IO
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf, dpotri
 
@@ -41,6 +42,16 @@ class Blocks:
         dense[i, :, j, :] = self.pairs
         dense[j, :, i, :] = self.pairs.transpose(0, 2, 1)
         return dense.reshape(n * q, n * q)
+
+    def sparse(self) -> sp.csr_array:
+        """The matrix (N q, N q) as scipy has it."""
+        n, q, _ = self.diagonal.shape
+        (i, j), every = self.pair_view.T, np.arange(n)
+        row, col = np.concatenate([every, i, j]), np.concatenate([every, j, i])
+        order = np.lexsort((col, row))
+        data = np.concatenate([self.diagonal, self.pairs, self.pairs.transpose(0, 2, 1)])[order]
+        indptr = np.searchsorted(row[order], np.arange(n + 1))
+        return sp.csr_array(sp.bsr_array((data, col[order], indptr), shape=(n * q, n * q)))
 
     def pair(self, i: int, j: int) -> int | None:
         """Where the pair i < j stands; None where the block is zero."""

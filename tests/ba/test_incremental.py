@@ -118,3 +118,24 @@ def test_a_block_leaves_what_it_knows_of_its_free_views() -> None:
     np.testing.assert_allclose(
         np.linalg.inv(prior.information), found.covariance.full[np.ix_(free, free)], rtol=1e-5, atol=1e-9
     )
+
+
+@pytest.mark.filterwarnings("ignore:.*held in height")
+def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(monkeypatch, tmp_path) -> None:
+    made = simulate_block(6, 300, seed=5)
+    dense = block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0))
+    monkeypatch.setattr("barpc.ba.normal.DENSE_UNKNOWNS", 0)
+    block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0)).save(tmp_path / "prior.npz")
+    read = BlockPrior.load(tmp_path / "prior.npz")
+    assert read.less is not None
+    assert len(read.less) == 3  # all heights are held, and wrong together
+    scale = np.sqrt(np.outer(dense.information.diagonal(), dense.information.diagonal()))
+    np.testing.assert_allclose(read.dense() / scale, dense.information / scale, atol=2e-8)
+    assert np.abs((read.information.toarray() - dense.information) / scale).max() > 5e-8
+    monkeypatch.setattr("barpc.ba.incremental._LARGEST", 44)
+    with pytest.raises(InputError, match="5 views, too many to go on from: at most 4"):
+        read.dense()
+    for name, damaged in (("less", np.full((3, 45), np.nan)), ("less", np.zeros((3, 44)))):
+        replace(read, **{name: damaged}).save(tmp_path / "damaged.npz")
+        with pytest.raises(InputError, match="do not go together"):
+            BlockPrior.load(tmp_path / "damaged.npz")
