@@ -30,7 +30,7 @@ IntArray = npt.NDArray[np.int64]
 _ROW_STEPS = 8  # a drift moves a point by thousandths of a pixel a row: each step gains three digits
 _ROW_SETTLED = 1e-6  # px: what is left is a thousandth of it
 _STEPS = 12
-_SETTLED = 1e-4  # px: Newton is quadratic, what is left after a step from there is below rounding
+_SETTLED = 1e-4  # px: what is left after a step from there is below rounding
 _TOLERANCE = 1e-7  # px: a localised point must project this near to where it was asked (plus rounding)
 
 
@@ -190,21 +190,27 @@ class Corrected:
     def localize(self, image: Array, alt: Array) -> Array:
         """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
 
-        Newton on (lon, lat) from where the uncorrected sensor puts the point; NaN where it does not settle.
+        Newton on (lon, lat) from where the uncorrected sensor puts the point, with that sensor's derivative where the
+        point is moved to: a correction turns by so little that each step gains four digits. NaN where it does not
+        settle.
         """
         ground, image = np.array(self.sensor.localize(image, alt)), np.asarray(image, dtype=np.float64)
+        row = image[..., 1] if len(self.correction.drift) else None  # where the point will be seen
+        rounding = 8 * np.finfo(float).eps * np.abs(image).max(axis=-1)
+        settled = False
         with np.errstate(all="ignore"):
             for _ in range(_STEPS):
-                value, jacobian = self.project_jacobian(ground)
+                moved = ground_from_ecef(self.correction.apply(ecef_from_ground(ground), row))
+                value, jacobian = self.sensor.project_jacobian(moved)
                 residual = image - value
+                miss = np.abs(residual).max(axis=-1)
+                if settled:
+                    break
+                settled = not (miss > _SETTLED).any()
                 a, b, c, d = (jacobian[..., i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
                 det = a * d - b * c
                 ground[..., 0] += (d * residual[..., 0] - b * residual[..., 1]) / det
                 ground[..., 1] += (a * residual[..., 1] - c * residual[..., 0]) / det
-                if not (np.abs(residual).max(initial=0.0, where=np.isfinite(residual)) > _SETTLED):
-                    break
-            miss = np.abs(self.project(ground) - image).max(axis=-1)
-            rounding = 8 * np.finfo(float).eps * np.abs(image).max(axis=-1)
             ground[~(miss <= _TOLERANCE + rounding)] = np.nan
         return ground
 
