@@ -73,7 +73,9 @@ def visible(text: str) -> str:
     >>> visible("a\x1b[31m\tb±")
     'a\\u001b[31m\\u0009b±'
     """
-    return "".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text)
+    if text.replace("\n", "").isprintable():
+        return text
+    return text.translate({ord(c): _escaped(c) for c in set(text) if not c.isprintable() and c != "\n"})
 
 
 def _escaped(char: str) -> str:

@@ -13,6 +13,7 @@ import reprlib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import cache
 from importlib import import_module
 from numbers import Integral, Real
 from pathlib import Path
@@ -96,10 +97,17 @@ class Declared:
     default: Any
 
 
-def declared(record: type[Options]) -> dict[str, Declared]:
+def declared(record: type[Options]) -> Mapping[str, Declared]:
     """Field -> what is declared of it; a nested record has an empty rule."""
+    kind: Any = record  # a class can be hashed
+    found: Mapping[str, Declared] = _declared(kind)
+    return found
+
+
+@cache
+def _declared(record: Any) -> Mapping[str, Declared]:
     hints, found = get_type_hints(record), {}
-    for one in fields(record):  # type: ignore[arg-type]  # children are dataclasses
+    for one in fields(record):
         kind, optional = hints[one.name], False
         if get_origin(kind) in (Union, UnionType):
             kind, optional = next(part for part in get_args(kind) if part is not NoneType), True

@@ -115,6 +115,23 @@ def peak_memory() -> int:
     return max(resource.getrusage(who).ru_maxrss for who in usage) * scale
 
 
+@contextmanager
+def timed(name: str, stages: list[dict[str, Any]]) -> Iterator[list[float]]:
+    """Time a stage; its seconds and the peak memory so far go to the log and to `stages`.
+
+    CPU seconds are those of this process and what is put into the list that it gives: those of workers.
+    """
+    start, cpu = time.perf_counter(), time.process_time()
+    logger.info("%s ...", name)
+    workers: list[float] = []
+    yield workers
+    seconds, cpu = time.perf_counter() - start, time.process_time() - cpu + sum(workers)
+    memory = peak_memory() / 1e6
+    rounded = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu, 3), "peak_memory_mb": round(memory, 1)}
+    stages.append({"stage": name, **rounded})
+    logger.info("%s: %.2f s, peak memory %.0f MB", name, seconds, memory)
+
+
 class Workspace:
     """A run folder, held by one run at a time.
 
@@ -148,6 +165,7 @@ class Workspace:
         self._adds = adds
         self.outputs: dict[str, str] = {}
         self.stages: list[dict[str, Any]] = []
+        self.worker_seconds = 0.0  # of CPU, spent for this run in other processes
         self._check_free(overwrite, names)
         self._start = time.perf_counter()
         self._made = [p for p in (own, self.folder, *self.folder.parents) if not p.exists()]
@@ -252,18 +270,11 @@ class Workspace:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time a stage; its seconds and the peak memory so far go to the log, state.json and summary."""
-        start, cpu = time.perf_counter(), time.process_time()
-        logger.info("%s ...", name)
-        yield
-        entry = {
-            "stage": name,
-            "seconds": round(time.perf_counter() - start, 3),
-            "cpu_seconds": round(time.process_time() - cpu, 3),
-            "peak_memory_mb": round(peak_memory() / 1e6, 1),
-        }
-        self.stages.append(entry)
-        logger.info("%s: %.2f s, peak memory %.0f MB", name, entry["seconds"], entry["peak_memory_mb"])
+        """Time a stage (see `timed`); state.json has it, too."""
+        before = self.worker_seconds
+        with timed(name, self.stages) as workers:
+            yield
+            workers.append(self.worker_seconds - before)
         self._save_state("running")
 
     @contextmanager

@@ -53,13 +53,18 @@ class CachingExecutor(Executor):
     """An executor that keeps results in a workspace.
 
     `fingerprints` holds the path and hash of every input file: results belong to contents, not to names. Without an
-    `executor` this process works on the tasks, one after the other, when their result is asked for.
+    `executor` this process works on the tasks, one after the other, when their result is asked for. With `keep` false
+    nothing is kept: of tasks that look at files.
     """
 
     def __init__(
-        self, workspace: Workspace, fingerprints: Mapping[str, str], executor: Executor | None = None
+        self,
+        workspace: Workspace,
+        fingerprints: Mapping[str, str],
+        executor: Executor | None = None,
+        keep: bool = True,
     ) -> None:
-        self.workspace, self.executor = workspace, executor
+        self.workspace, self.executor, self.keep = workspace, executor, keep
         self._fingerprints = dict(fingerprints)
         self._limit = _PER_WORKER * worker_count(executor)
         self._lock = threading.Lock()
@@ -175,10 +180,12 @@ class CachingExecutor(Executor):
 
     def _completed(self, batch: Sequence[_Task], future: Future[Any]) -> None:
         try:
-            outcomes: list[Outcome] = future.result()
+            outcomes, spent = future.result()
         except BaseException as error:  # noqa: BLE001  (goes to whoever asks for the result)
             outcomes = [(0.0, None, _explained(error))] * len(batch)
         else:
+            with self._lock:
+                self.workspace.worker_seconds += spent
             seconds = sum(outcome[0] for outcome in outcomes) / len(outcomes)
             self._seconds[batch[0].fn] = 0.5 * (self._seconds.get(batch[0].fn, seconds) + seconds)
         self._resolve(batch, outcomes)
@@ -217,7 +224,7 @@ class _Task(Future[Any]):
         """Take the outcome, and keep a result for the next time."""
         self.args = ()
         try:
-            if error is None and keep:
+            if error is None and keep and self._owner.keep:
                 self._owner.workspace.store(self._stage, self._key, to_arrays(value))
         except Exception as failed:  # noqa: BLE001  (a full disk: goes to whoever asks for the result)
             error = failed
@@ -233,6 +240,8 @@ class _Task(Future[Any]):
         return super().result(timeout)
 
     def _look_up(self) -> tuple[bool, Any]:
+        if not self._owner.keep:
+            return False, None
         self._key = self._owner.key(self.fn, self.args)
         record = self._owner.workspace.load(self._stage, self._key)
         try:
@@ -262,9 +271,10 @@ class Spilled:
         return arguments
 
 
-def run_batch(fn: Function, tasks: Sequence[tuple[Any, ...] | Spilled]) -> list[Outcome]:
-    """Work on a batch, in a worker: one task's error leaves the others their results."""
+def run_batch(fn: Function, tasks: Sequence[tuple[Any, ...] | Spilled]) -> tuple[list[Outcome], float]:
+    """Work on a batch, in a worker: one task's error leaves the others their results; CPU seconds that it took."""
     outcomes: list[Outcome] = []
+    cpu = time.thread_time()
     for task in tasks:
         start = time.perf_counter()
         value: Any = None
@@ -276,7 +286,7 @@ def run_batch(fn: Function, tasks: Sequence[tuple[Any, ...] | Spilled]) -> list[
             if not isinstance(caught, BarpcError):
                 caught.add_note("in a worker:\n" + traceback.format_exc())
         outcomes.append((time.perf_counter() - start, value, error))
-    return outcomes
+    return outcomes, time.thread_time() - cpu
 
 
 def _explained(error: BaseException) -> BaseException:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence, Set
+from concurrent.futures import Executor
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,14 +16,18 @@ from barpc.errors import OutputError
 from barpc.fit import RpcFit
 from barpc.handoff import verify
 from barpc.options import RunOptions
+from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.inputs import PRIOR
 from barpc.report import Run, Summary
-from barpc.report.page import can_render, report_html
+from barpc.report.page import REPORT, can_render, report_html
 from barpc.report.records import plain
+from barpc.report.summary import StageEntry
 from barpc.report.tables import TABLES, gcps_geojson
 from barpc.rpcio import CARRIERS, WRITABLE, sidecars, write_camera
 from barpc.scene import View
 from barpc.sensor import SensorModel
+from barpc.sensor.rpc import RPC
+from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace, own_files
 
 MATCHES = ("matches.csv", "matches.npz")
@@ -29,21 +37,68 @@ REOPENED = 1e-5
 """A reopened file may differ from P_BA by the error of the fit and this [px] more (15-digit printing)."""
 
 
-def write_view(
-    run: Workspace, view: View, fit: RpcFit, model: SensorModel, images: str, formats: Sequence[str]
-) -> dict[str, dict[str, float | str]]:
-    """Write one view's corrected RPC, and open every file again as its consumers do.
+Fitted = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA
+Written = dict[
+    str, dict[str, float | str]
+]  # file -> consumer -> difference to P_BA [px], or why it does not read it
 
-    File name -> consumer -> its largest difference to P_BA, `model` [px], or why it does not read the file. OutputError
-    where a file cannot be written, or barpc and GDAL do not read it back.
+
+def write_views(
+    run: Workspace,
+    fitted: Sequence[Fitted],
+    images: str,
+    formats: Sequence[str],
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> list[Written]:
+    """Write every view's corrected RPC, and open every file again as its consumers do.
+
+    Workers make the files in a room of the run folder, here they get their place, and workers open them again.
+    OutputError where a file cannot be written, or barpc and GDAL do not read it back.
     """
-    names = file_names(view, images, formats)
+    room = run.partial / "files"
+    with CachingExecutor(run, {}, executor, keep=False) as fresh:
+        with run.stage("write"):
+            tasks = [
+                (view, fit.rpc, images, tuple(formats), str(run.folder), str(room)) for view, fit, _ in fitted
+            ]
+            try:
+                made = ordered(fresh, make_files, tasks, "write", progress)
+                for made_here in made:
+                    for path in map(Path, made_here):
+                        with run.output(path.name) as partial:
+                            path.replace(partial)
+            finally:
+                shutil.rmtree(room, ignore_errors=True)
+        with run.stage("verify"):
+            again = [
+                (tuple(str(run.folder / Path(path).name) for path in paths), *one)
+                for paths, one in zip(made, fitted, strict=True)
+            ]
+            return ordered(fresh, verify_files, again, "verify", progress)
+
+
+def make_files(
+    view: View, rpc: RPC, images: str, formats: Sequence[str], folder: str, room: str
+) -> tuple[str, ...]:
+    """Write the files of a view that are meant for `folder` into a room; their paths there."""
+    place, names = Path(room) / view.name, file_names(view, images, formats)
     for name in names:
-        with run.output(name) as partial:
-            write_camera(fit.rpc, partial, view.path, place=run.folder / name, overwrite=True)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            write_camera(rpc, place / name, view.path, place=Path(folder) / name, overwrite=True)
+        except OSError as error:
+            if isinstance(error, OutputError) or error.errno is None:
+                raise
+            raise OutputError(f"{Path(folder) / name}: cannot be written ({error.strerror})") from error
+    return tuple(str(place / name) for name in names)
+
+
+def verify_files(paths: Sequence[str], view: View, fit: RpcFit, model: SensorModel) -> Written:
+    """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads another camera."""
     largest = float(np.linalg.norm(fit.max_ckp)) + REOPENED
-    written: dict[str, dict[str, float | str]] = {name: {} for name in names}
-    for reading in verify([run.folder / name for name in names], model, view.size, view.alt_range):
+    written: Written = {Path(path).name: {} for path in paths}
+    for reading in verify(paths, model, view.size, view.alt_range):
         own = reading.consumer in ("barpc", "gdal")
         if own and not reading.max_error <= 2 * largest:
             raise OutputError(
@@ -55,7 +110,7 @@ def write_view(
 
 
 def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
-    """The files that `write_view` writes for a view."""
+    """The files that `write_views` writes for a view."""
     ends = [CARRIERS[images].suffixes[0]] if images in CARRIERS else []
     return [view.name + end for end in (*ends, *(WRITABLE[key].beside for key in formats))]
 
@@ -82,24 +137,45 @@ def _is_pair(stem: str, names: Set[str]) -> bool:
 
 def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
     """Raise if a file in the folder, not of barpc, would be read in place of an RPC that is to be written."""
-    own = own_files(folder) if folder.is_dir() else set()
+    own = (own_files(folder) if folder.is_dir() else set()).union(names)
     for name in names if folder.is_dir() else ():
         for sidecar in sidecars(folder / name) if name.endswith((".vrt", ".tif")) else ():
             read_first = sidecar.kind == "geom" or (sidecar.before_tag and not name.endswith(".vrt"))
-            if read_first and sidecar.path.name not in own.union(names):
+            if read_first and sidecar.path.name not in own:
                 raise OutputError(
                     f"{sidecar.path}: lies beside {name} and would be read in place of the new RPC; "
                     "move it away, or give another -o"
                 )
 
 
-def write_tables(workspace: Workspace, run: Run, summary: Summary) -> None:
-    """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete."""
-    for name, content in TABLES.items():
-        with workspace.output(name) as partial:
-            partial.write_bytes(content(run, summary))
-    if run.reference is not None and run.reference.control is not None and run.adjustment is not None:
-        workspace.write_text(GCPS, gcps_geojson(run).decode())
-    if can_render():
-        workspace.write_text("report.html", report_html(summary, workspace.folder))
-    workspace.write_text("summary.json", json.dumps(plain(summary), indent=1) + "\n")
+def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
+    """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete.
+
+    Returns the summary with the stages that this took.
+    """
+    stages, start = summary.stages, len(workspace.stages)
+
+    def now() -> Summary:
+        return replace(summary, stages=(*stages, *map(StageEntry.read, workspace.stages[start:])))
+
+    with workspace.stage("tables"):
+        for name, content in TABLES.items():
+            with workspace.output(name) as partial:
+                partial.write_bytes(content(run, summary))
+        if run.reference is not None and run.reference.control is not None and run.adjustment is not None:
+            workspace.write_text(GCPS, gcps_geojson(run).decode())
+    with workspace.stage(REPORT):
+        if can_render():
+            workspace.write_text("report.html", report_html(now(), workspace.folder))
+        texts = {key: _json(value) for key, value in plain(summary).items()}
+    texts["stages"] = _json(plain(now().stages))
+    body = ",\n".join(f"{json.dumps(key)}: {text}" for key, text in texts.items())
+    workspace.write_text("summary.json", f"{{\n{body}\n}}\n")
+    return now()
+
+
+def _json(value: Any) -> str:
+    """A value as JSON, an item of a list a line."""
+    if not isinstance(value, list):
+        return json.dumps(value)
+    return "[\n" + ",\n".join(map(json.dumps, value)) + "\n]" if value else "[]"

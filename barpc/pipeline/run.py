@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,35 +17,38 @@ import numpy as np
 from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
 from barpc.ba.ground import DEM_BIAS
 from barpc.dem import Dem
-from barpc.errors import DisconnectedError, FitError, InputError
+from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.handoff import refuse_hiding, unverified
-from barpc.options import RunOptions
+from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.control import load_gcps
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.given import given_matches, given_tracks
 from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs
-from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_view
+from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.views import Image, image_path, load_views
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.report import Run, Summary, summarize
-from barpc.report.page import remake_report
+from barpc.report.page import REPORT, remake_report
 from barpc.report.records import plain
 from barpc.report.run import pair_ties
+from barpc.report.summary import StageEntry
 from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
+from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
 from barpc.tie.hook import hook_file
 from barpc.tie.reference import Registration, register
-from barpc.tie.tasks import Progress
-from barpc.workspace import Workspace, fingerprint
+from barpc.tie.tasks import Progress, ordered
+from barpc.workspace import Workspace, fingerprint, timed
 
 logger = logging.getLogger(__name__)
 
+_GROUP = 8  # views that are fitted in one task, whose result is kept
 REFERENCE_BIAS = 5.0  # m: of the heights that go with a reference, where it is known what they count from
 
 
@@ -130,9 +135,13 @@ def adjust(
     """
     options, folder = options or RunOptions(), Path(out_dir)
     plain_path(folder.absolute())
-    run = _loaded("adjust", images, options)
-    names, keep = _files(run, options, folder)
-    with Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names) as workspace:
+    stages: list[dict[str, Any]] = []
+    with timed("inputs", stages) as workers:
+        run = _loaded("adjust", images, options, executor, progress, workers)
+        names, keep = _files(run, options, folder)
+        workspace = Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names)
+    with workspace:
+        workspace.stages += stages
         with workspace.stage("fingerprints"):
             paths = [*(view.path for view in run.views), *_references(options)]
             fingerprints = {path: fingerprint(path) for path in paths}
@@ -140,20 +149,40 @@ def adjust(
                 fingerprints[options.tie.matcher] = fingerprint(code)
         with CachingExecutor(workspace, fingerprints, executor) as caching:
             run = _solve(run, options, workspace, caching, progress)
-        if run.adjustment is not None and options.stop_after == "all":
-            with workspace.stage("fit and write"):
-                run = _fit_and_write(run, options, workspace, progress)
-        if run.adjustment is not None:
-            with workspace.output(PRIOR) as partial:
-                block_prior(run.adjustment).save(partial)
-        run = replace(run, stages=workspace.stages, out_dir=str(out_dir))
-        logger.info("summary, tables and report ...")
-        summary = summarize(run)
-        write_tables(workspace, run, summary)
+            if run.adjustment is not None and options.stop_after == "all":
+                with workspace.stage("fit"):
+                    run = _fitted(run, options, caching, progress)
+        if run.fits:
+            run = _written(run, options, workspace, executor, progress)
+        with _told(workspace, "summary", progress):
+            if run.adjustment is not None:
+                with workspace.output(PRIOR) as partial:
+                    block_prior(run.adjustment).save(partial)
+            run = replace(run, out_dir=str(out_dir))
+            summary = summarize(run)
+        run = replace(run, stages=list(workspace.stages))
+        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
+        _tell(progress, REPORT, 0)
+        summary = write_tables(workspace, run, summary)
+        _tell(progress, REPORT, 1)
         workspace.remove_stale()
     sensors = run.after or run.before
     views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
     return AdjustResult(_as_given(views, images), run, summary)
+
+
+def _tell(progress: Progress | None, stage: str, done: int) -> None:
+    if progress is not None:
+        progress(stage, done, 1)
+
+
+@contextmanager
+def _told(workspace: Workspace, stage: str, progress: Progress | None) -> Iterator[None]:
+    """A stage that is one task."""
+    _tell(progress, stage, 0)
+    with workspace.stage(stage):
+        yield
+    _tell(progress, stage, 1)
 
 
 def check(
@@ -165,7 +194,7 @@ def check(
 ) -> AdjustResult:
     """Measure how well the cameras of overlapping images agree; nothing is adjusted or written."""
     options = options or RunOptions()
-    run = _with_ties(_loaded("check", images, options), options, executor, progress)
+    run = _with_ties(_loaded("check", images, options, executor, progress), options, executor, progress)
     return AdjustResult(_as_given(run.views, images), run, summarize(run))
 
 
@@ -174,11 +203,28 @@ def _as_given(views: Iterable[View], images: Sequence[Image]) -> tuple[View, ...
     return tuple(sorted(views, key=lambda view: place[view.path]))
 
 
-def _loaded(kind: Literal["adjust", "check"], images: Sequence[Image], options: RunOptions) -> Run:
+def _loaded(
+    kind: Literal["adjust", "check"],
+    images: Sequence[Image],
+    options: RunOptions,
+    executor: Executor | None,
+    progress: Progress | None,
+    workers: list[float] | None = None,
+) -> Run:
+    """The run with its views; CPU seconds of other processes go to `workers`."""
     for path in input_files(options):
         plain_path(path)
     least = 1 if options.gcp or options.reference else 2  # one image and control are enough
-    loaded = load_views(images, min_views=least, keep_going=options.keep_going, band=options.tie.band)
+    loaded = load_views(
+        images,
+        min_views=least,
+        keep_going=options.keep_going,
+        band=options.tie.band,
+        executor=executor,
+        progress=progress,
+    )
+    if workers is not None:
+        workers.append(loaded.worker_seconds)
     none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
     return Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options)
 
@@ -213,7 +259,7 @@ def _solve(
         if run.reference is None and given[0] is not None and options.reference:
             with workspace.stage("reference"):
                 run = replace(run, reference=_registered(run, options, given[0], executor, progress))
-        with workspace.stage("adjustment" + again):
+        with _told(workspace, "adjustment" + again, progress):
             run = _adjusted(run, options, *given)
     return run
 
@@ -322,29 +368,57 @@ def _center(view: View) -> CameraCenter:
     return center
 
 
-def _fit_and_write(run: Run, options: RunOptions, workspace: Workspace, progress: Progress | None) -> Run:
-    """Refit every P_BA first, and write only when all can be written."""
+def _fitted(run: Run, options: RunOptions, executor: Executor, progress: Progress | None) -> Run:
+    """Refit every P_BA: only when all can be written is any."""
     assert run.adjustment is not None
-    pairs = list(zip(run.views, run.adjustment.sensors, strict=True))
-    told = progress or (lambda _stage, _done, _total: None)
     # what is known of the place afterwards is the error common to the image; the noise of a point is the vendor's
     bias = float(np.sqrt((run.adjustment.gauge.sigma[:2] ** 2).mean()))
     known = bias if np.isfinite(bias) and bias > 0 else None
+    cameras = [
+        (model, view.size, view.alt_range)
+        for view, model in zip(run.views, run.adjustment.sensors, strict=True)
+    ]
+    strict, num = not options.keep_going, len(cameras)
+    tasks = [(tuple(cameras[at : at + _GROUP]), options.fit, strict) for at in range(0, num, _GROUP)]
+    told = progress and (lambda stage, done, _: progress(stage, min(done * _GROUP, num), num))
+    found = [one for group in ordered(executor, fit_group, tasks, "fit", told) for one in group]
     fits: list[RpcFit] = []
-    for view, model in pairs:
-        try:
-            fit = fit_rpc(
-                model, view.size, view.alt_range, options=options.fit, strict=not options.keep_going
-            )
-        except FitError as error:
-            raise FitError(f"{view.name}: {error}") from error
+    for view, (fit, error, warned) in zip(run.views, found, strict=True):
+        if fit is None:
+            raise FitError(f"{view.name}: {error}")
+        for message in warned:
+            warnings.warn(f"{view.name}: {message}", BarpcWarning, stacklevel=2)
         rand = view.sensor.err_rand if isinstance(view.sensor, RPC) else None
         fits.append(replace(fit, rpc=replace(fit.rpc, err_bias=known, err_rand=rand)))
-        told("fit", len(fits), len(pairs))
-    written: list[Any] = []
-    for (view, model), fit in zip(pairs, fits, strict=True):
-        written.append(write_view(workspace, view, fit, model, options.images, options.rpc_formats))
-        told("write", len(written), len(pairs))
+    return replace(run, fits=tuple(fits))
+
+
+def fit_group(
+    cameras: Sequence[tuple[SensorModel, tuple[int, int], tuple[float, float]]],
+    options: FitOptions,
+    strict: bool,
+) -> list[tuple[RpcFit | None, str, tuple[str, ...]]]:
+    """Fit RPCs to some cameras, in a worker: the fit, or None and why, and what was warned of."""
+    out: list[tuple[RpcFit | None, str, tuple[str, ...]]] = []
+    for model, size, alt_range in cameras:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", BarpcWarning)
+            fit, error = None, ""
+            try:
+                fit = fit_rpc(model, size, alt_range, options=options, strict=strict)
+            except FitError as failed:
+                error = str(failed)
+        out.append((fit, error, tuple(str(one.message) for one in caught)))
+    return out
+
+
+def _written(
+    run: Run, options: RunOptions, workspace: Workspace, executor: Executor | None, progress: Progress | None
+) -> Run:
+    """Write the refitted RPCs, and open them again."""
+    assert run.adjustment is not None
+    fitted = list(zip(run.views, run.fits, run.adjustment.sensors, strict=True))
+    written = write_views(workspace, fitted, options.images, options.rpc_formats, executor, progress)
     for sentence in unverified([workspace.folder / name for name in written[0]]):
         logger.warning(sentence)
-    return replace(run, fits=tuple(fits), written=tuple(written))
+    return replace(run, written=tuple(written))

@@ -6,7 +6,9 @@ The same image twice ties itself to itself, perfectly and uselessly.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Hashable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
@@ -22,6 +24,7 @@ from barpc.raster import open_raster
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import plain_path
+from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +38,8 @@ _SAMPLES = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.75))  # of width and height: wher
 _MORE = tuple((x / 5, y / 5) for x in range(6) for y in range(6))  # where nothing varies there
 _SAMPLE_SIDE = (256, 16)  # px: many columns and few rows, so that few strips are decoded
 _CHUNK = 1 << 20  # px that are hashed at a time
+_GROUP = 16  # images that are read in one task
+_MANY = 64  # images from which on they are read by other processes
 
 Image = str | Path | View
 
@@ -46,6 +51,20 @@ class LoadedViews:
     views: tuple[View, ...]
     sources: tuple[Camera, ...]
     left_out: tuple[tuple[str, str], ...] = ()
+    worker_seconds: float = 0.0  # of CPU, spent in other processes
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """An image that was opened, or why it was not; the mark of its sampled pixels (see `Twins`)."""
+
+    view: View | None = None
+    camera: Camera | None = None
+    sampled: bytes | None = None
+    error: BarpcError | None = None
+
+
+_Given = tuple[str, Path, Image]  # name, file, and what was given
 
 
 def image_path(image: Image) -> Path:
@@ -60,6 +79,8 @@ def load_views(
     keep_going: bool = False,
     band: int = 1,
     distinct: bool = True,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
 ) -> LoadedViews:
     """Read the camera of every image, in the order of their names, whatever order they are given in.
 
@@ -70,6 +91,7 @@ def load_views(
     keep_going : bool, leave a bad file (ImageError, RpcError) out instead of stopping
     band : int, the band that will be read, from 1
     distinct : bool, refuse an image that is there twice, also as other files or under another RPC (see `Twins`)
+    executor, progress : as of `barpc.adjust`
 
     Raises
     ------
@@ -82,26 +104,53 @@ def load_views(
         raise InputError(
             f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed"
         )
-    loaded: list[tuple[View, Camera]] = []
+    views: list[View] = []
+    sources: list[Camera] = []
     left_out: list[tuple[str, str]] = []
     twins = Twins(band)
-    given = zip(unique_names(files), files, images, strict=True)
-    for name, file, image in sorted(given, key=lambda row: row[:2]):
+    given = sorted(zip(unique_names(files), files, images, strict=True), key=lambda row: row[:2])
+    images_read, spent = _read_all(given, band, distinct, executor if len(given) >= _MANY else None, progress)
+    for (_, file, _), read in zip(given, images_read, strict=True):
         try:
-            view, source = _load(name, file, image, band)
+            if read.error is not None:
+                raise read.error
+            assert read.view is not None
+            assert read.camera is not None
             if distinct:
-                twins.add(view)
-            loaded.append((view, source))
+                twins.add(read.view, read.sampled)
+            views.append(read.view)
+            sources.append(read.camera)
         except BarpcError as error:
             if not keep_going:
                 raise
             logger.warning("%s is left out: %s", file, error)
             left_out.append((str(file), str(error)))
-    if len(loaded) < min_views:
-        raise InputError(f"{len(loaded)} of {len(files)} images can be used: at least {min_views} are needed")
-    return LoadedViews(
-        tuple(view for view, _ in loaded), tuple(source for _, source in loaded), tuple(left_out)
-    )
+    if len(views) < min_views:
+        raise InputError(f"{len(views)} of {len(files)} images can be used: at least {min_views} are needed")
+    return LoadedViews(tuple(views), tuple(sources), tuple(left_out), spent)
+
+
+def _read_all(
+    given: list[_Given], band: int, distinct: bool, executor: Executor | None, progress: Progress | None
+) -> tuple[list[_Read], float]:
+    """Every image as it was read, and CPU seconds of other processes."""
+    tasks = [(given[at : at + _GROUP], band, distinct) for at in range(0, len(given), _GROUP)]
+    told = progress and (lambda stage, done, _: progress(stage, min(done * _GROUP, len(given)), len(given)))
+    groups = ordered(executor, read_group, tasks, "cameras", told)
+    spent = 0.0 if executor is None else sum(seconds for _, seconds in groups)
+    return [read for group, _ in groups for read in group], spent
+
+
+def read_group(given: Sequence[_Given], band: int, distinct: bool) -> tuple[list[_Read], float]:
+    """Read some images, in a worker: one that is bad leaves the others theirs; CPU seconds that it took."""
+    start, out = time.thread_time(), []
+    for name, file, image in given:
+        try:
+            view, camera = _load(name, file, image, band)
+            out.append(_Read(view, camera, _sampled(view, band) if distinct else None))
+        except BarpcError as error:
+            out.append(_Read(error=error))
+    return out, time.thread_time() - start
 
 
 def _load(name: str, file: Path, image: Image, band: int) -> tuple[View, Camera]:
@@ -144,15 +193,15 @@ class Twins:
         self._known: dict[Hashable, str] = {}
         self._alike: dict[Hashable, str | None] = {}
 
-    def add(self, view: View) -> None:
-        """Take a view in; InputError names both where it was taken in before."""
+    def add(self, view: View, sampled: bytes | None) -> None:
+        """Take in a view with the mark of its samples; InputError names both where it was taken in before."""
         file = Path(view.path).stat()
         marks: dict[Hashable, str] = {
             (file.st_dev, file.st_ino): "is the same file as {}",
             (view.size, view.sensor): "is the same size and the same RPC as {}",
         }
         self._refuse(view, marks)
-        pixels = self._pixels(view)
+        pixels = None if sampled is None else self._pixels(view, sampled)
         if pixels is not None:
             marks[pixels] = "shows the same pixels as {} under another RPC"
             self._refuse(view, marks)
@@ -163,18 +212,13 @@ class Twins:
             if mark in self._known:
                 raise InputError(f"{view.path}: {what.format(self._known[mark])}; give each image once")
 
-    def _pixels(self, view: View) -> Hashable | None:
+    def _pixels(self, view: View, sampled: bytes) -> Hashable | None:
         """A mark of the whole image where another is like it in the samples; None for the first of its like."""
+        like = (view.size, sampled)
+        if like not in self._alike:
+            self._alike[like] = view.path
+            return None
         with open_raster(view.path) as image:
-            sampled = _digest(image, self._band, _samples(*view.size))
-            if sampled is None:  # fill, perhaps: the rest is asked before anything is read whole
-                sampled = _digest(image, self._band, _samples(*view.size, _MORE))
-            if sampled is None:
-                return None
-            like = (view.size, sampled)
-            if like not in self._alike:
-                self._alike[like] = view.path
-                return None
             mark = _whole(image, self._band)
         first, self._alike[like] = self._alike[like], None
         if first is not None:
@@ -183,6 +227,13 @@ class Twins:
             if before is not None:
                 self._known[view.size, before] = first
         return None if mark is None else (view.size, mark)
+
+
+def _sampled(view: View, band: int) -> bytes | None:
+    """A mark of the pixels in a few windows; None where nothing varies in them."""
+    with open_raster(view.path) as image:
+        # fill, perhaps: more is asked before anything is read whole
+        return _digest(image, band, _samples(*view.size)) or _digest(image, band, _samples(*view.size, _MORE))
 
 
 def _samples(width: int, height: int, at: Sequence[tuple[float, float]] = _SAMPLES) -> list[Window]:

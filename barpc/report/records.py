@@ -5,6 +5,7 @@ A field with a default is optional: it is left out of the file while it is None,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
@@ -141,19 +142,27 @@ def _either(parts: Sequence[Any]) -> dict[str, Any]:
 
 def plain(value: Any) -> Any:
     """A value as JSON holds it: arrays as lists, records as mappings, what is not finite as null."""
+    if isinstance(value, float) and not isinstance(value, np.generic):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
     if is_dataclass(value) and not isinstance(value, type):
-        unset = {f.name for f in fields(value) if f.default is None and isinstance(value, Record)}
-        held = {f.name: getattr(value, f.name) for f in fields(value) if f.name[0] != "_"}
-        return plain({key: item for key, item in held.items() if item is not None or key not in unset})
+        held = ((name, getattr(value, name), optional) for name, optional in _held(type(value)))
+        return {name: plain(item) for name, item, optional in held if item is not None or not optional}
     if isinstance(value, (np.ndarray, np.generic)):
         return plain(value.tolist())
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(v) for v in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    return value if value is None or isinstance(value, (bool, int, str)) else str(value)
+    return str(value)
+
+
+@cache
+def _held(kind: Any) -> list[tuple[str, bool]]:
+    """The fields of a dataclass, and whether they are left out while None."""
+    of_record = issubclass(kind, Record)
+    return [(f.name, of_record and f.default is None) for f in fields(kind) if f.name[0] != "_"]
 
 
 # --- tables -----------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from barpc.fit import RpcFit
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import CameraCenter, Triangulation, triangulate
+from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
 from barpc.tie import PairReport, Registration
 
 MAX_TRACKS = 200_000
@@ -62,27 +62,32 @@ class Run:
     check_points: GroundPoints | None = None
     reference: Registration | None = None
 
-    @property
+    @cached_property
     def before(self) -> tuple[SensorModel, ...]:
         """The cameras as delivered."""
         return tuple(view.sensor for view in self.views)
 
-    @property
+    @cached_property
     def after(self) -> tuple[SensorModel, ...] | None:
         """The refitted cameras; P_BA where they were not refitted; None for a check."""
         if self.fits:
             return tuple(fit.rpc for fit in self.fits)
         return None if self.adjustment is None else self.adjustment.sensors
 
-    @property
+    @cached_property
     def keep(self) -> BoolArray:
         """The observations (K,) that count: all of them, or those that the adjustment kept."""
         return np.ones(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.inlier
 
-    @property
+    @cached_property
     def held_out(self) -> BoolArray:
         """The observations (K,) that took no part in the adjustment, to be measured on."""
         return np.zeros(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.held_out
+
+    @cached_property
+    def number(self) -> dict[str, int]:
+        """Name of a view -> its index."""
+        return {view.name: i for i, view in enumerate(self.views)}
 
     @cached_property
     def pairs(self) -> list[PairTies]:
@@ -182,7 +187,8 @@ def triangulate_tracks(
     residuals = np.full((len(tracks), 2), np.nan)
     residuals[keep] = found.residuals
     ground = ground_from_ecef(points)
-    for i in np.unique(tracks.view[~keep]):
-        rows = np.flatnonzero(~keep & (tracks.view == i))
-        residuals[rows] = sensors[i].project(ground[tracks.point[rows]]) - tracks.xy[rows]
+    rest = np.flatnonzero(~keep)
+    residuals[rest] = (
+        Several(sensors, tracks.view[rest]).project(ground[tracks.point[rest]]) - tracks.xy[rest]
+    )
     return Triangulation(points, residuals, np.isfinite(points).all(axis=1))

@@ -21,19 +21,18 @@ from barpc.ba.gauge import MOTIONS, Mode
 from barpc.fit import RpcFit
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report.records import Cell, Column, Number, Record, plain, said, value_of
-from barpc.report.run import PairTies, Run
-from barpc.scene import GroundPoints, IntArray
+from barpc.report.run import Run
+from barpc.scene import IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import (
+    Several,
     base_to_height,
     convergence_angle,
     epipolar_offset,
     ground_sample_distance,
     view_angles,
 )
-from barpc.tie import PairReport
-from barpc.tie.epipolar import robust_spread
 
 SCHEMA = 2  # Version of summary.json
 MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken
@@ -590,7 +589,6 @@ def _fit_entry(fit: RpcFit) -> FitEntry:
 
 def measure(run: Run) -> Summary:
     """The summary of a run, without the verdict on it. Numbers may be NaN here."""
-    reports = {report.names: report for report in run.matched}
     usable, written = int(np.isfinite(run.ground).all(axis=1).sum()), len(run.written_tracks)
     lengths = np.bincount(np.bincount(run.tracks.point))
     names = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely")
@@ -606,7 +604,7 @@ def measure(run: Run) -> Summary:
         out_dir=run.out_dir,
         altitude_m=run.altitude,
         views=_views(run),
-        pairs=tuple(_pair(run, ties, reports) for ties in run.pairs),
+        pairs=_pairs(run),
         left_out=tuple(LeftOutEntry(path, reason) for path, reason in run.left_out),
         tracks=TracksEntry(
             num_tracks=run.tracks.num_points,
@@ -626,33 +624,35 @@ def measure(run: Run) -> Summary:
 
 def _views(run: Run) -> tuple[ViewEntry, ...]:
     num, tracks, keep, adjustment = len(run.views), run.tracks, run.keep, run.adjustment
-    count, after = np.bincount(tracks.view[keep], minlength=num), run.ties_after
+    after = run.ties_after
     first = rmse_by_view(run.ties_before.residuals[keep], tracks.view[keep], num)
     last = None if after is None else rmse_by_view(after.residuals[keep], tracks.view[keep], num)
+    count, lost = (np.bincount(tracks.view[rows], minlength=num) for rows in (keep, ~(keep | run.held_out)))
+    gcps = np.zeros(num, np.int64) if run.gcps is None else np.bincount(run.gcps.view, minlength=num)
+    covered, middle = _coverage(run), _middles(run)
+    incidence, azimuth = view_angles(Several(run.before, np.arange(num)), middle)
+    pixel = ground_sample_distance(Several(run.before, np.arange(num)), middle)[1]
     entries = []
     for i, view in enumerate(run.views):
-        of_view = tracks.view == i
-        middle = view.sensor.localize((np.array(view.size) - 1) / 2, np.array(run.altitude))
-        incidence, azimuth = view_angles(view.sensor, middle)
         entry = ViewEntry(
             name=view.name,
             path=view.path,
             size=view.size,
             alt_range_m=view.alt_range,
             rpc_source=SourceEntry(*_SOURCE(run.sources[i])) if run.sources else None,
-            gsd_m=float(ground_sample_distance(view.sensor, middle)[1]),
-            incidence_deg=float(incidence),
-            azimuth_deg=float(azimuth),
+            gsd_m=float(pixel[i]),
+            incidence_deg=float(incidence[i]),
+            azimuth_deg=float(azimuth[i]),
             num_observations=int(count[i]),
-            num_rejected=int((~(keep | run.held_out) & of_view).sum()),
-            num_gcps=0 if run.gcps is None else int((run.gcps.view == i).sum()),
-            tie_coverage=len(np.unique(cell_numbers(tracks.xy[keep & of_view], view.size))) / CELLS**2,
+            num_rejected=int(lost[i]),
+            num_gcps=int(gcps[i]),
+            tie_coverage=float(covered[i]),
             rmse_before=first[i],
             rmse_after=None if last is None else last[i],
             held_out_px=None if adjustment is None else adjustment.held_out_rms[i],
             smooth_px=None if adjustment is None else adjustment.smooth.rms[i],
             prior_scale=None if adjustment is None else adjustment.prior.scale[i],
-            correction=None if adjustment is None else _correction(adjustment, i, middle),
+            correction=None if adjustment is None else _correction(adjustment, i, middle[i]),
             camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
             fit=_fit_entry(run.fits[i]) if run.fits else None,
             outputs=dict(run.written[i]) if run.written else {},
@@ -663,6 +663,19 @@ def _views(run: Run) -> tuple[ViewEntry, ...]:
     return tuple(entries)
 
 
+def _middles(run: Run) -> Array:
+    """The ground (N, 3) in the middle of each image, at the altitude of the scene."""
+    at = (np.array([view.size for view in run.views]) - 1) / 2
+    return Several(run.before, np.arange(len(at))).localize(at, np.full(len(at), run.altitude))
+
+
+def _coverage(run: Run) -> Array:
+    """Share (N,) of the cells of each image that hold a tie point."""
+    view, size = run.tracks.view[run.keep], np.array([view.size for view in run.views])
+    cells = cell_numbers(run.tracks.xy[run.keep], size[view]) + view * CELLS**2
+    return np.bincount(np.unique(cells) // CELLS**2, minlength=len(size)) / CELLS**2
+
+
 def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
     """RMS of each view (N,) [px]: sqrt(mean(dcol^2 + drow^2)) over those residuals (K, 2) that are not NaN."""
     use = np.isfinite(residuals).all(axis=1)
@@ -671,58 +684,89 @@ def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
         return np.asarray(np.sqrt(squares / np.bincount(view[use], minlength=num_views)))
 
 
-def cell_numbers(xy: Array, size: Sequence[int]) -> IntArray:
-    """Which of the `CELLS` x `CELLS` cells of an image points (n, 2) [px] lie in, row by row."""
-    col, row = ((xy + 0.5) / np.array(size) * CELLS).astype(np.int64).clip(0, CELLS - 1).T
+def cell_numbers(xy: Array, size: Sequence[int] | IntArray) -> IntArray:
+    """Which of the `CELLS` x `CELLS` cells of an image, or each of its own (n, 2), points (n, 2) [px] lie in."""
+    col, row = ((xy + 0.5) / np.asarray(size) * CELLS).astype(np.int64).clip(0, CELLS - 1).T
     number: IntArray = row * CELLS + col
     return number
 
 
-def _pair(run: Run, ties: PairTies, reports: Mapping[tuple[str, str], PairReport]) -> PairEntry:
-    i, j = ties.views
-    names = (run.views[i].name, run.views[j].name)
-    report = reports.get(names)
-    at = run.ground[run.tracks.point[ties.a[:: max(1, len(ties.a) // 100)]]]
-    convergence, base, height = _pair_geometry(run.before[i], run.before[j], at[np.isfinite(at).all(axis=1)])
-    return PairEntry(
-        a=names[0],
-        b=names[1],
-        num_matches=len(ties.a),
-        convergence_deg=convergence,
-        base_to_height=base,
-        height_m_per_px=height,
-        epipolar_before=_pair_offset(run, ties, run.before, run.altitudes_before),
-        epipolar_after=None if run.after is None else _pair_offset(run, ties, run.after, run.ground[:, 2]),
-        matching=None if report is None else plain(report),
+def _pairs(run: Run) -> tuple[PairEntry, ...]:
+    reports = {report.names: report for report in run.matched}
+    geometry, before = _pair_geometry(run), _pair_offsets(run, run.before, run.altitudes_before)
+    after: list[OffsetEntry | None] = [None] * len(before)
+    if run.after is not None:
+        after = _pair_offsets(run, run.after, run.ground[:, 2])
+    entries = []
+    for ties, (angle, base, height), first, last in zip(run.pairs, geometry, before, after, strict=True):
+        names = (run.views[ties.views[0]].name, run.views[ties.views[1]].name)
+        report = reports.get(names)
+        matching = None if report is None else plain(report)
+        entries.append(PairEntry(*names, len(ties.a), angle, base, height, first, last, matching))
+    return tuple(entries)
+
+
+def _pair_geometry(run: Run) -> list[list[float]]:
+    """Medians over about a hundred of each pair's points: convergence angle [deg], B/H, height of a pixel [m]."""
+    picks = [slice(None, None, max(1, len(ties.a) // 100)) for ties in run.pairs]
+    a, b, pair = _rows(run, picks)
+    seen = np.isfinite(run.ground[run.tracks.point[a]]).all(axis=1)
+    a, b, pair = a[seen], b[seen], pair[seen]
+    at = run.ground[run.tracks.point[a]]
+    first, second = (Several(run.before, run.tracks.view[rows]) for rows in (a, b))
+    base = base_to_height(first, second, at)
+    finer = np.minimum(ground_sample_distance(first, at)[1], ground_sample_distance(second, at)[1])
+    with np.errstate(divide="ignore"):
+        values = (convergence_angle(first, second, at), base, finer / base)
+    found = np.array([medians(value, pair, len(run.pairs)) for value in values]).T
+    return [list(row) for row in found.tolist()]
+
+
+def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[OffsetEntry | None]:
+    """The epipolar offsets of each pair's matches.
+
+    The tracks' altitudes (P,) [m] through these cameras are so near to where a pair's own rays pass each other that
+    two steps from there arrive.
+    """
+    counts = [len(ties.a) for ties in run.pairs]
+    picks = [np.linspace(0, n - 1, min(n, MAX_PER_PAIR)).astype(np.int64) for n in counts]
+    a, b, pair = _rows(run, picks)
+    height = alt[run.tracks.point[a]]
+    seen = np.isfinite(height)
+    a, b, pair = a[seen], b[seen], pair[seen]
+    first, second = (Several(sensors, run.tracks.view[rows]) for rows in (a, b))
+    offset, _ = epipolar_offset(first, second, run.tracks.xy[a], run.tracks.xy[b], height[seen], steps=2)
+    known = np.isfinite(offset)
+    offset, pair, num = offset[known], pair[known], len(counts)
+    center = medians(offset, pair, num)
+    spread = 1.4826 * medians(np.abs(offset - center[pair]), pair, num)
+    count, square = np.bincount(pair, minlength=num), np.bincount(pair, offset**2, minlength=num)
+    rms = np.sqrt(square / np.maximum(count, 1))
+    rows = zip(center.tolist(), spread.tolist(), rms.tolist(), count.tolist(), strict=True)
+    return [OffsetEntry(*row) if row[3] else None for row in rows]
+
+
+def _rows(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArray, IntArray]:
+    """Of all pairs together, those matches that are picked: their observations in both views, and which pair it is."""
+    none = np.empty(0, dtype=np.int64)
+    a = [ties.a[pick] for ties, pick in zip(run.pairs, picks, strict=True)]
+    b = [ties.b[pick] for ties, pick in zip(run.pairs, picks, strict=True)]
+    return (
+        np.concatenate([none, *a]),
+        np.concatenate([none, *b]),
+        np.repeat(np.arange(len(a)), [len(rows) for rows in a]),
     )
 
 
-def _pair_geometry(a: SensorModel, b: SensorModel, at: Array) -> tuple[float, float, float]:
-    """Medians over ground points (n, 3): convergence angle [deg], B/H, height of a pixel of the finer image [m]."""
-    if not len(at):
-        return (float("nan"),) * 3
-    base = base_to_height(a, b, at)
-    finer = np.minimum(ground_sample_distance(a, at)[1], ground_sample_distance(b, at)[1])
-    with np.errstate(divide="ignore"):
-        medians = np.median([convergence_angle(a, b, at), base, finer / base], axis=1)
-    return tuple(medians.tolist())
-
-
-def _pair_offset(run: Run, ties: PairTies, sensors: Sequence[SensorModel], alt: Array) -> OffsetEntry | None:
-    """The epipolar offset of a pair's matches.
-
-    The tracks' altitudes (P,) [m] through these cameras are so near to where the pair's own rays pass each other that
-    two steps from there arrive.
-    """
-    pick = np.linspace(0, len(ties.a) - 1, min(len(ties.a), MAX_PER_PAIR)).astype(np.int64)
-    pick = pick[np.isfinite(alt[run.tracks.point[ties.a[pick]]])]
-    (i, j), (a, b), xy = ties.views, (ties.a[pick], ties.b[pick]), run.tracks.xy
-    offset, _ = epipolar_offset(sensors[i], sensors[j], xy[a], xy[b], alt[run.tracks.point[a]], steps=2)
-    offset = offset[np.isfinite(offset)]
-    if not len(offset):
-        return None
-    center, rms = float(np.median(offset)), float(np.sqrt((offset**2).mean()))
-    return OffsetEntry(center, robust_spread(offset, center), rms, len(offset))
+def medians(values: Array, group: IntArray, num: int) -> Array:
+    """The median (num,) of each group of values (n,); NaN without any."""
+    ordered = values[np.lexsort((values, group))]
+    count = np.bincount(group, minlength=num)
+    start, some = np.cumsum(count) - count, count > 0
+    out = np.full(num, np.nan)
+    low, high = ((start + (count - odd) // 2)[some] for odd in (1, 0))
+    out[some] = 0.5 * (ordered[low] + ordered[high])
+    return out
 
 
 def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
@@ -836,9 +880,10 @@ def _gcps(run: Run) -> tuple[GcpEntry, ...]:
     tested = None if run.adjustment is None else run.adjustment.control
     left = np.full_like(points.sigma, np.nan) if tested is None else tested.residual
     entries = []
+    seen = _grouped(points.point, len(points.names))
     places, sigmas = points.lonlatalt.tolist(), points.sigma.tolist()
     for g, (name, (lon, lat, alt), sigma) in enumerate(zip(points.names, places, sigmas, strict=True)):
-        images = tuple(run.views[i].name for i in points.view[points.point == g])
+        images = tuple(run.views[i].name for i in points.view[seen[g]])
         status = "not seen" if not images else "used" if tested is None else tested.status(g)
         entries.append(
             GcpEntry(
@@ -853,21 +898,24 @@ def _gcps(run: Run) -> tuple[GcpEntry, ...]:
                 images=images,
                 w=None if tested is None else tested.w[g],
                 redundancy=None if tested is None else tested.redundancy[g],
-                residual_px=_in_images(run, points, g, left[g]),
+                residual_px=_in_images(run, points.lonlatalt[g], points.view[seen[g]], left[g]),
             )
         )
     return tuple(entries)
 
 
-def _in_images(run: Run, points: GroundPoints, g: int, residual: Array) -> float:
+def _grouped(index: IntArray, num: int) -> list[IntArray]:
+    """The places in `index` (n,) of each number below `num`."""
+    order = np.argsort(index, kind="stable")
+    return np.split(order, np.searchsorted(index[order], np.arange(1, num)))[:num]
+
+
+def _in_images(run: Run, given: Array, views: IntArray, residual: Array) -> float:
     """How far a residual (3,), east, north, up [m], of a ground point moves it in the images that show it, RMS [px]."""
     if run.after is None or not np.isfinite(residual).all():
         return float("nan")
-    given = points.lonlatalt[g]
     moved = ground_from_ecef(ecef_from_ground(given) + residual @ enu_basis(given))
-    moves = [
-        run.after[v].project(moved) - run.after[v].project(given) for v in points.view[points.point == g]
-    ]
+    moves = [run.after[v].project(moved) - run.after[v].project(given) for v in views]
     return float(np.sqrt(np.mean(np.square(moves).sum(axis=1)))) if moves else float("nan")
 
 
@@ -904,9 +952,7 @@ def _check_points(run: Run) -> tuple[CheckPointEntry, ...]:
         return ()
     left = check_residuals(run.before if run.after is None else run.after, points)
     seen = [SeenEntry(run.views[i].name, r) for i, r in zip(points.view, left.image.tolist(), strict=True)]
-    seen_of = [
-        tuple(seen[row] for row in np.flatnonzero(points.point == i)) for i in range(len(points.names))
-    ]
+    seen_of = [tuple(seen[row] for row in rows) for rows in _grouped(points.point, len(points.names))]
     rows = zip(points.names, points.lonlatalt.tolist(), left.ground.tolist(), seen_of, strict=True)
     return tuple(
         CheckPointEntry(name, lon, lat, alt, miss, found) for name, (lon, lat, alt), miss, found in rows

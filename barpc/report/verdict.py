@@ -183,7 +183,7 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
     "bad" when an image was not adjusted or a file left out; else "look". What is not good ends with exit code 3.
     """
     bad = [view for view in views if view.status == "failed"]
-    look = [view for view in views if view.advice and view not in bad]
+    look = [view for view in views if view.advice and view.status != "failed"]
     reasons = [f"{view.name}: {STATUS_WORDS[view.status]}: {view.advice}." for view in bad + look]
     reasons += [f"{path} was left out: {reason}" for path, reason in run.left_out]
     whole, points = _block_reasons(run), _control_reasons(run)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -127,12 +130,25 @@ def write_camera(
         write_text(path, _writer(place, None)(rpc), overwrite=overwrite)
 
 
-def files_of(folder: Path) -> dict[str, Path]:
-    """What is in a folder, by its name in lower case; nothing where it cannot be read."""
+_SETTLED = 2_000_000_000  # ns: after so long a change shows in a folder's time
+
+
+def files_of(folder: Path) -> Mapping[str, str]:
+    """The names in a folder by themselves in lower case; none where it cannot be read.
+
+    A folder of ten thousand images is asked for each of them: it is listed once while its time stays the same.
+    """
     try:
-        return {entry.name.lower(): entry for entry in sorted(folder.iterdir())}
+        changed = folder.stat().st_mtime_ns
+        settled = time.time_ns() - changed > _SETTLED
+        return (_listed if settled else _listed.__wrapped__)(folder, changed)
     except OSError:
         return {}
+
+
+@lru_cache(maxsize=4)
+def _listed(folder: Path, _changed: int) -> Mapping[str, str]:
+    return {name.lower(): name for name in sorted(entry.name for entry in os.scandir(folder))}
 
 
 def find_rpc(folder: Path, image: Path) -> Path:
@@ -142,7 +158,7 @@ def find_rpc(folder: Path, image: Path) -> Path:
     ends += [row.beside for row in WRITABLE.values()]
     for name in (image.name, *(image.stem + end for end in dict.fromkeys(ends))):
         if name.lower() in present:
-            return present[name.lower()]
+            return folder / present[name.lower()]
     tried = ", ".join(row.suffixes[0] for row in _rows())
     raise InputError(f"{folder}: no RPC of {image.name} there (looked for {image.stem} with {tried})")
 

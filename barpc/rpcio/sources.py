@@ -52,8 +52,9 @@ def sidecars(image: Path | str) -> list[Sidecar]:
     found: list[Sidecar] = []
     metadata_only = f"{image.stem}.imd".lower() in present  # with it GDAL takes the image for Maxar's
     for kind, name, before_tag in _names(image.name):
-        path = present.get(name.lower())
-        if path is None or not path.is_file() or path.name == image.name:
+        found_name = present.get(name.lower())
+        path = image.parent / (found_name or "")
+        if found_name in (None, image.name) or not path.is_file():
             continue
         if kind in ("xml", "dimap", "pam") and not _holds_rpc(path, kind):
             continue
@@ -225,7 +226,7 @@ def _tile_origin(image: Path, path: Path) -> tuple[_Window, str]:
         return _WHOLE, ""
     product = path.name[4:]
     dim = files_of(image.parent).get(f"dim_{product}".lower())
-    text = decode(read_bytes(dim, RPC_FILE)) if dim else ""
+    text = decode(read_bytes(image.parent / dim, RPC_FILE)) if dim else ""
     width, height = (
         re.search(rf"<NTILES_SIZE\b[^<>]*\b{key}=\"(\d{{1,9}})\"", text) for key in ("ncols", "nrows")
     )

@@ -151,6 +151,40 @@ def base_to_height(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) 
     return np.asarray(np.linalg.norm(a[..., :2] / a[..., 2:] - b[..., :2] / b[..., 2:], axis=-1))
 
 
+class Several:
+    """Many cameras as one, each point with its own: row n of what is asked belongs to camera `view[n]`.
+
+    So what is asked of one camera is asked of a block with one call a camera, not one a pair.
+    """
+
+    def __init__(self, sensors: Sequence[SensorModel], view: npt.ArrayLike) -> None:
+        of_row = np.asarray(view, dtype=np.int64)
+        order = np.argsort(of_row, kind="stable")
+        starts = np.flatnonzero(np.diff(of_row[order], prepend=-1))
+        self._parts = [(sensors[of_row[rows[0]]], rows) for rows in np.split(order, starts)[1:]]
+
+    def project(self, ground: Array) -> Array:
+        """Image points (N, 2) [px] of ground points (N, 3) [deg, deg, m]."""
+        image = np.empty((len(ground), 2))
+        for sensor, rows in self._parts:
+            image[rows] = sensor.project(ground[rows])
+        return image
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Image points (N, 2) [px] and their derivative (N, 2, 3) [px/deg, px/deg, px/m]."""
+        image, jacobian = np.empty((len(ground), 2)), np.empty((len(ground), 2, 3))
+        for sensor, rows in self._parts:
+            image[rows], jacobian[rows] = sensor.project_jacobian(ground[rows])
+        return image, jacobian
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Ground points (N, 3) seen at image points (N, 2) [px] at altitudes (N,) [m]."""
+        ground = np.empty((len(image), 3))
+        for sensor, rows in self._parts:
+            ground[rows] = sensor.localize(image[rows], alt[rows])
+        return ground
+
+
 @dataclass(frozen=True, eq=False)
 class CameraCenter:
     """Where a camera stands."""

@@ -121,8 +121,15 @@ class Rational:
         bad = np.flatnonzero(long | ~(out <= REACH))
         ok = np.ones(len(z), dtype=bool)
         if len(bad):
+            near = np.abs(self.value(x[:, bad]) - target[:, bad]) <= self._tolerance(target[:, bad])
+            bad = bad[
+                ~(near.all(axis=0) & self._regular(x[:, bad]))
+            ]  # most have arrived, out of the box or not
             ok[bad] = self._solve_with_care(target[:, bad], x, bad)
         return x, ok
+
+    def _tolerance(self, target: Array) -> Array:
+        return np.asarray(self.accuracy[:, None] + 32 * np.finfo(float).eps * np.abs(target))
 
     def _step(self, target: Array, x: Array, work: Array | None = None) -> Array:
         """One Newton step on `x[:2]`, in place; its length (N,)."""
@@ -174,8 +181,7 @@ class Rational:
         state[2] = z
         usable = np.isfinite(target).all(axis=0) & np.isfinite(z)
         error = self._damped_newton(target, state)
-        tolerance = self.accuracy[:, None] + 32 * np.finfo(float).eps * np.abs(target)
-        ok = np.asarray(usable & (error <= tolerance).all(axis=0) & self._regular(state))
+        ok = np.asarray(usable & (error <= self._tolerance(target)).all(axis=0) & self._regular(state))
         x[:2, index] = state[:2]
         return ok
 
