@@ -23,13 +23,15 @@ from barpc.report.tables import Observations, RunFiles
 WIDTH = 420.0  # Units of a chart from left to right
 ROW = 17.0  # Units from one row of a list chart to the next
 MAX_ROWS = 24  # A list chart shows so many rows, the most telling ones
+MAX_DRAWN = 400  # Images, and ground points, on the map and the graph
 _NAMES = 128.0  # units kept free for names on the left
 _RIGHT = WIDTH - 12.0
 _BINS = 48
 _MOST_LINKS = 1500
 _MARGIN = 34.0
-_DOTS = 1500
+MAX_DOTS = 1500
 _APART = 26.0
+_AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 _MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
@@ -258,6 +260,11 @@ def most_telling(rows: Sequence[Any], order: Any) -> list[Any]:
     return list(rows) if len(rows) <= MAX_ROWS else sorted(rows, key=order)[:MAX_ROWS]
 
 
+def evenly(rows: Sequence[Any], most: int) -> Sequence[Any]:
+    """All rows, or so many of them as they come at even steps."""
+    return rows[:: max(1, -(-len(rows) // most))]
+
+
 def connections(files: RunFiles) -> str:
     """The images on a circle, numbered as in the table; a line for each pair, thicker with more matches."""
     views, pairs, index = files.summary.views, files.summary.pairs, files.number
@@ -308,7 +315,7 @@ def convergence(pairs: Sequence[PairEntry]) -> str:
     for value in y.ticks:
         parts += [line(44, y(value), _RIGHT, y(value), "grid"), label(40, y(value) + 4, f"{value:g}", "end")]
     parts.append(label(4, 12, "matches", class_="axis"))
-    for pair, angle in zip(pairs, angles, strict=True):
+    for pair, angle in evenly(list(zip(pairs, angles, strict=True)), MAX_DOTS):
         dot = tag("circle", cx=x(angle), cy=y(pair.num_matches), r=4.5, class_="dot after see")
         parts.append(titled(dot, f"{pair.a} - {pair.b}: {angle:.1f} deg, {pair.num_matches} matches"))
     described = f"{len(pairs)} pairs, up to {high:.1f} degrees."
@@ -395,9 +402,9 @@ def ground_map(files: RunFiles) -> str:
     }
     plane = _plane_of(np.concatenate([*rings, files.points[:, :2], *known.values()]))
     grid, degrees = _graticule(plane)
-    points = plane(files.points[:: max(1, -(-len(files.points) // _DOTS)), :2])
+    points = plane(files.points[:: max(1, -(-len(files.points) // MAX_DOTS)), :2])
     parts = [*grid, *(tag("circle", cx=x, cy=y, r=1.1, class_="point") for x, y in points)]
-    for view, outline in zip(summary.views, files.outlines, strict=True):
+    for view, outline in evenly(list(zip(summary.views, files.outlines, strict=True)), MAX_DRAWN):
         shape = "".join(path(plane(ring[:-1]), f"outline {view.status}", closed=True) for ring in outline)
         parts.append(titled(shape, f"{view.name}: {view.num_observations} tie points"))
     stacks = _stacks(plane, files.outlines)
@@ -408,7 +415,7 @@ def ground_map(files: RunFiles) -> str:
         ]
     for kind, places in known.items():
         up = 1 if kind == "gcps" else -1
-        for point, (x, y) in zip(points_of[kind], plane(places), strict=True):
+        for point, (x, y) in evenly(list(zip(points_of[kind], plane(places), strict=True)), MAX_DRAWN):
             ends = [(x, y - 6 * up), (x + 5, y + 4 * up), (x - 5, y + 4 * up)]
             parts.append(titled(path(ends, kind, closed=True), point.name))
     described = (
@@ -437,13 +444,17 @@ class Stack:
 def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
     """Images whose middles stand nearer than their numbers are wide."""
     stacks: list[Stack] = []
+    cells: dict[tuple[int, int], list[int]] = {}  # of a width of _APART: their stacks
     for k, outline in ((k, outline) for k, outline in enumerate(outlines) if outline):
         place = plane(np.concatenate([ring[:-1] for ring in outline])).mean(axis=0)
-        near = next((stack for stack in stacks if np.hypot(*(stack.place - place)) < _APART), None)
+        col, row = (place // _APART).astype(int).tolist()
+        around = [n for i, j in _AROUND for n in cells.get((col + i, row + j), ())]
+        near = min((n for n in around if math.dist(stacks[n].place, place) < _APART), default=None)
         if near is None:
+            cells.setdefault((col, row), []).append(len(stacks))
             stacks.append(Stack([k], place))
         else:
-            near.views.append(k)
+            stacks[near].views.append(k)
     return stacks
 
 
@@ -534,7 +545,9 @@ def residual_panels(
     norm = np.hypot(*residuals[use].T)
     longest = (float(np.quantile(norm, 0.95)) if len(norm) else 0.0) or 1.0
     most = min(_VECTORS // min(max(len(views), 20), _MOST), 300)
-    rows_of = [np.flatnonzero(use & (observations.view == k)) for k in range(len(views))]
+    order = np.flatnonzero(use)
+    order = order[np.argsort(observations.view[order], kind="stable")]
+    rows_of = np.split(order, np.searchsorted(observations.view[order], np.arange(1, len(views))))
     grids = [
         cells_of(observations.xy[rows], residuals[rows], view.size)
         for view, rows in zip(views, rows_of, strict=True)

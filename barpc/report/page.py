@@ -41,6 +41,7 @@ from barpc.scene import connected_groups
 from barpc.workspace import Workspace
 
 NAME = "report.html"
+_MOST_LINES = 200  # sentences of the verdict
 REPORT = "report"  # the stage that makes the page, which cannot tell how long it took
 
 
@@ -66,7 +67,7 @@ def report_html(summary: Summary, folder: Path | str) -> str:
     )
     shown = [section for make in SECTIONS if (section := make(files)) is not None]
     template = environment.get_template("template.html.j2")
-    return visible(template.render(summary=summary, sections=shown, words=STATUS_WORDS))
+    return visible(template.render(summary=summary, sections=shown, words=STATUS_WORDS, most_lines=_MOST_LINES))
 
 
 def remake_report(folder: Path | str) -> Path:
@@ -136,7 +137,13 @@ def _map(files: RunFiles) -> Section | None:
         if files.summary.gcps or files.summary.check_points:
             caption += " Triangles are GCPs, those on their tip check points."
         shown.append((ground_map(files), caption))
-    if pairs and len(views) > 2:
+    if shown and len(views) > charts.MAX_DRAWN:
+        shown[0] = (
+            shown[0][0],
+            f"{shown[0][1]} At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, evenly taken, and no graph of"
+            " the pairs; all are in footprints.geojson and pairs.csv.",
+        )
+    if pairs and 2 < len(views) <= charts.MAX_DRAWN:
         caption = "Numbers as in the table of images; a thicker line is a pair with more matches."
         shown.append((charts.connections(files), caption))
     return Section("map", "Where are the images, and which hold together?", _bonds(files), shown)
@@ -220,6 +227,7 @@ def _pairs(files: RunFiles) -> Section | None:
     seen = [pair for pair in pairs if None not in (pair.convergence_deg, pair.base_to_height)]
     if seen:
         caption = "One dot a pair. Small angles give weak heights; beyond about 35 degrees images look too different."
+        caption += f" Of {len(seen)} pairs some are left out, evenly." * (len(seen) > charts.MAX_DOTS)
         shown.append((charts.convergence(seen), caption))
         answer += _heights(seen)
     caption = "Pairs: distance of matches from the epipolar line, median ± spread (1.4826 MAD)"

@@ -167,7 +167,7 @@ def _held(kind: Any) -> list[tuple[str, bool]]:
 
 # --- tables -----------------------------------------------------------------------------------------------
 
-MAX_TABLE_ROWS = 1000  # A table of the page shows so many rows; the files beside it have all
+MAX_TABLE_ROWS = 400  # A table of the page shows so many rows; the files beside it have all
 
 
 @dataclass(frozen=True)
