@@ -17,11 +17,13 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import rasterio
+from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.pointio.matches import write_matches
 from barpc.rpcio.tiff import put_tag
@@ -60,6 +62,7 @@ def write_block(folder: Path, num_views: int, tracks: int) -> Path:
 def _write_image(folder: Path, number: int, view: View) -> Path:
     path = folder / f"{view.name}.tif"
     ramp = np.add.outer(np.arange(SIDE), np.arange(SIDE)) + number
+    warnings.simplefilter("ignore", NotGeoreferencedWarning)
     profile = {"driver": "GTiff", "width": SIDE, "height": SIDE, "count": 1, "dtype": "uint16"}
     with rasterio.open(path, "w", compress="deflate", predictor=2, **profile) as image:
         image.write(ramp.astype(np.uint16), 1)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.cli.options import ADJUSTMENT, MATCH, RUN, TIE, image_paths, run_options, with_flags
-from barpc.cli.progress import executor_for, progress_bars
+from barpc.cli.progress import executor_for, progress_told
 from barpc.cli.terminal import echo, print_comparison, print_summary, tell_gate
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def _run(
     """Run an entry of the pipeline with what the command line says and what the verb has `fixed`, and tell."""
     paths = image_paths(images, flags["image_list"])
     options = replace(run_options(flags, flags["options_file"]), **(fixed or {}))
-    with executor_for(flags["jobs"]) as executor, progress_bars(obj["quiet"]) as progress:
+    with executor_for(flags["jobs"]) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
         result = work(paths, options=options, executor=executor, progress=progress, **where)
     if flags["as_json"]:
         echo(json.dumps(result.summary, indent=1))

@@ -98,7 +98,7 @@ def verify_files(paths: Sequence[str], view: View, fit: RpcFit, model: SensorMod
     """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads another camera."""
     largest = float(np.linalg.norm(fit.max_ckp)) + REOPENED
     written: Written = {Path(path).name: {} for path in paths}
-    for reading in verify(paths, model, view.size, view.alt_range):
+    for reading in verify([Path(path) for path in paths], model, view.size, view.alt_range):
         own = reading.consumer in ("barpc", "gdal")
         if own and not reading.max_error <= 2 * largest:
             raise OutputError(

@@ -67,7 +67,9 @@ def report_html(summary: Summary, folder: Path | str) -> str:
     )
     shown = [section for make in SECTIONS if (section := make(files)) is not None]
     template = environment.get_template("template.html.j2")
-    return visible(template.render(summary=summary, sections=shown, words=STATUS_WORDS, most_lines=_MOST_LINES))
+    return visible(
+        template.render(summary=summary, sections=shown, words=STATUS_WORDS, most_lines=_MOST_LINES)
+    )
 
 
 def remake_report(folder: Path | str) -> Path:
@@ -138,11 +140,8 @@ def _map(files: RunFiles) -> Section | None:
             caption += " Triangles are GCPs, those on their tip check points."
         shown.append((ground_map(files), caption))
     if shown and len(views) > charts.MAX_DRAWN:
-        shown[0] = (
-            shown[0][0],
-            f"{shown[0][1]} At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, evenly taken, and no graph of"
-            " the pairs; all are in footprints.geojson and pairs.csv.",
-        )
+        more = f"At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, evenly taken, and no graph of the pairs"
+        shown[0] = (shown[0][0], f"{shown[0][1]} {more}; all are in footprints.geojson and pairs.csv.")
     if pairs and 2 < len(views) <= charts.MAX_DRAWN:
         caption = "Numbers as in the table of images; a thicker line is a pair with more matches."
         shown.append((charts.connections(files), caption))

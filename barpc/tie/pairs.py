@@ -20,7 +20,7 @@ from barpc.errors import DisconnectedError, InputError, TiePointError
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, View, connected_groups
-from barpc.sensor.geometry import convergence_angle, footprint
+from barpc.sensor.geometry import Several, convergence_angle, footprint
 from barpc.sidefile import GEOJSON, read_json
 from barpc.tie.epipolar import common_range
 from barpc.tie.raster import Box, tiles
@@ -157,9 +157,9 @@ class Footprints:
         lon = wrap_longitude(lonlat[..., 0], self._origin[0])
         return (np.stack([lon, lonlat[..., 1]], axis=-1) - self._origin) * self._scale
 
-    def ground(self, point: shapely.Point) -> Array:
-        """lon, lat [deg], alt [m] of a point of the plane."""
-        return np.array([*(np.array([point.x, point.y]) / self._scale + self._origin), self.alt])
+    def ground(self, points: Array) -> Array:
+        """lon, lat [deg], alt [m] (N, 3) of points (N, 2) of the plane [m]."""
+        return np.column_stack([points / self._scale + self._origin, np.full(len(points), self.alt)])
 
 
 def _levels(views: Sequence[View]) -> tuple[float, float, float]:
@@ -182,20 +182,18 @@ def _overlapping(
 
 def _overlapping_at(prints: Footprints, views: Sequence[View], options: TieOptions) -> list[Pair]:
     outlines = np.array(prints.outlines, dtype=object)
-    first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
-    pairs = []
-    for i, j in zip(first.tolist(), second.tolist(), strict=True):
-        if i >= j:
-            continue
-        common = shapely.intersection(outlines[i], outlines[j])
-        overlap = common.area / max(min(outlines[i].area, outlines[j].area), 1e-9)
-        if not overlap >= max(options.min_overlap, 1e-9):
-            continue
-        ground = prints.ground(common.point_on_surface())
-        angle = float(convergence_angle(views[i].sensor, views[j].sensor, ground))
-        if options.angles[0] <= angle <= options.angles[1]:
-            pairs.append(Pair((i, j), float(overlap), angle))
-    return pairs
+    ends = shapely.STRtree(outlines).query(outlines, predicate="intersects")
+    first, second = ends[:, ends[0] < ends[1]]
+    common, area = shapely.intersection(outlines[first], outlines[second]), shapely.area(outlines)
+    overlap = shapely.area(common) / np.maximum(np.minimum(area[first], area[second]), 1e-9)
+    enough = overlap >= max(options.min_overlap, 1e-9)
+    first, second, overlap = first[enough], second[enough], overlap[enough]
+    ground = prints.ground(shapely.get_coordinates(shapely.point_on_surface(common[enough])))
+    sensors = [view.sensor for view in views]
+    angle = convergence_angle(Several(sensors, first), Several(sensors, second), ground)
+    useful = (options.angles[0] <= angle) & (angle <= options.angles[1])
+    found = (part[useful].tolist() for part in (first, second, overlap, angle))
+    return [Pair((i, j), share, turn) for i, j, share, turn in zip(*found, strict=True)]
 
 
 def select_pairs(

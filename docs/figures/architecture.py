@@ -22,7 +22,7 @@ JOURNEYS = {
         ("tie/tracks.py", "find_tracks", "views -> tracks"),
         ("ba/adjustment.py", "adjust_tracks", "tracks -> cameras P_BA"),
         ("fit/rpc.py", "fit_rpc", "P_BA -> RPC and its certificate"),
-        ("pipeline/outputs.py", "write_view", "RPC -> files, read again and compared"),
+        ("pipeline/outputs.py", "write_views", "RPCs -> files, read again and compared"),
         ("pipeline/outputs.py", "write_tables", "the run -> summary, tables, report"),
     ),
     "tracks -> correction": (

@@ -13,7 +13,7 @@ import pytest
 
 from barpc.cli import main
 from barpc.cli.main import MOVED
-from barpc.cli.progress import progress_bars
+from barpc.cli.progress import Lines, progress_told
 from barpc.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.geometry import base_to_height, triangulate
@@ -200,7 +200,7 @@ class Terminal(io.StringIO):
 @pytest.mark.parametrize("quiet", [False, True])
 def test_progress_is_drawn_for_a_terminal_only(quiet, monkeypatch):
     monkeypatch.setattr("sys.stderr", Terminal() if not quiet else io.StringIO())
-    with progress_bars(False) as progress:
+    with progress_told(False, 0) as progress:
         for stage, total in (("detect", 3), ("match", 2), ("detect", 3)):  # a second pass begins again
             for done in range(1, total + 1):
                 progress(stage, done, total)
@@ -208,6 +208,30 @@ def test_progress_is_drawn_for_a_terminal_only(quiet, monkeypatch):
     assert [f"{stage:<22}" in drawn for stage in ("detect", "match")] == [not quiet] * 2
     assert [drawn.count("3/3") > 0, drawn.count("2/2") > 0] == [not quiet] * 2
     assert drawn.count("\n") == (0 if quiet else 3)
+
+
+@pytest.mark.parametrize("groups", [False, True])
+def test_in_a_pipe_a_line_a_minute_says_where_the_run_is(groups):
+    now, said = [0.0], []
+    progress = Lines(groups, clock=lambda: now[0], say=said.append)
+    progress.look()  # nothing has begun
+    progress("match", 0, 40)
+    for second in range(1, 31):
+        now[0] = 10.0 * second
+        progress("match", second, 40)
+    minutes = [f"match: {n} of 40, about {left} left" for n, left in
+               ((6, "5.7 min"), (12, "4.7 min"), (18, "3.7 min"), (24, "2.7 min"), (30, "1.7 min"))]  # fmt: skip
+    tenths = [f"match: {n} of 40" for n in range(4, 31, 4)]
+    assert said == minutes if not groups else [line.split(",")[0] for line in said] == tenths
+    said.clear()
+    progress("adjustment", 0, 1)  # one task: only the clock tells
+    now[0] += 39.0
+    progress.look()
+    assert said == []
+    now[0] += 62.0
+    progress.look()
+    progress.look()
+    assert said == ["adjustment: at work for 1.7 min"]
 
 
 def test_general_flags_stand_before_and_after_the_verb(image, tmp_path, capsys, monkeypatch):

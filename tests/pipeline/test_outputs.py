@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +19,9 @@ from barpc.handoff import CONSUMERS, Consumer, Reading, control_grid, difference
 from barpc.options import RunOptions
 from barpc.pipeline import outputs
 from barpc.pipeline.inputs import PRIOR
-from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, write_view
+from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, write_views
 from barpc.report.page import can_render
+from barpc.report.summary import StageEntry
 from barpc.report.tables import TABLES
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import View
@@ -33,6 +36,18 @@ ALL = ("txt", "rpb", "geom", "json", "xml")
 @pytest.fixture(scope="module")
 def fit() -> RpcFit:
     return fit_rpc(make_rpc(), SIZE, ALTITUDES, options=FitOptions(grid=(6, 6, 4)))
+
+
+def write_view(
+    run: Workspace, view: View, fit: RpcFit, model: Any, images: str, formats: Sequence[str]
+) -> dict[str, dict[str, float | str]]:
+    return write_views(run, [(view, fit, model)], images, formats)[0]
+
+
+@dataclass(frozen=True)
+class Said:
+    of: str
+    stages: tuple[StageEntry, ...] = ()
 
 
 @pytest.fixture
@@ -262,20 +277,23 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
         outputs, "TABLES", {"a.csv": lambda run, summary: b"1", "b.csv": lambda run, summary: b"2"}
     )
     monkeypatch.setattr(outputs, "can_render", lambda: page)
-    monkeypatch.setattr(outputs, "report_html", lambda summary, folder: f"<p>{summary} in {folder.name}</p>")
-    monkeypatch.setattr(outputs, "plain", lambda summary: {"of": summary})
+    monkeypatch.setattr(
+        outputs, "report_html", lambda summary, folder: f"<p>{summary.of} in {folder.name}</p>"
+    )
     for method in ("write_text", "output"):
         real = getattr(Workspace, method)
         watched = lambda self, name, *given, real=real: (written.append(name), real(self, name, *given))[1]  # noqa: E731
         monkeypatch.setattr(Workspace, method, watched)
     with Workspace(tmp_path / "out") as run:
         plain = SimpleNamespace(reference=None)
-        outputs.write_tables(run, plain, "what was found")  # type: ignore[arg-type]
+        told = outputs.write_tables(run, plain, Said("what was found"))  # type: ignore[arg-type]
     names = ["a.csv", "b.csv", *(["report.html"] if page else []), "summary.json"]
     assert list(dict.fromkeys(written)) == names
     folder = tmp_path / "out"
     assert [(folder / name).read_bytes() for name in names[:2]] == [b"1", b"2"]
     if page:
         assert (folder / "report.html").read_text() == "<p>what was found in out</p>"
-    assert json.loads((folder / "summary.json").read_text()) == {"of": "what was found"}
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary == {"of": "what was found", "stages": [asdict(stage) for stage in told.stages]}
+    assert [stage["stage"] for stage in summary["stages"]] == ["tables", "report"]
     assert (folder / "summary.json").read_text().endswith("\n")

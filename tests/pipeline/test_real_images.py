@@ -205,7 +205,13 @@ def test_the_summary_is_plain_json_and_says_what_was_reached(triplet):
             assert "barpc" in consumers
     for pair in summary["pairs"]:
         assert abs(pair["epipolar_after"]["median"]) < 0.03 < abs(pair["epipolar_before"]["median"])
-    assert {stage["stage"] for stage in summary["stages"]} >= {"tie points", "adjustment", "fit and write"}
+    assert {stage["stage"] for stage in summary["stages"]} >= {
+        "tie points",
+        "adjustment",
+        "fit",
+        "write",
+        "verify",
+    }
     assert "scene" in summary["verdict"][2]
 
 

@@ -66,7 +66,7 @@ def written(run: Run, folder: Path) -> dict[str, Any]:
     """Tables, RPC files, report and summary of a run in a folder; the summary as the file holds it."""
     summary = report.summarize(run)
     with Workspace(folder, overwrite=True) as workspace:
-        write_tables(workspace, run, summary)
+        summary = write_tables(workspace, run, summary)
         for view, fit in zip(run.views, run.fits, strict=bool(run.fits)):
             write_rpc(fit.rpc, folder / f"{view.name}_RPC.TXT", overwrite=True)
     return plain(summary)

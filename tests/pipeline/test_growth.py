@@ -1,0 +1,170 @@
+"""What a run costs for each image does not grow with their number: calls are counted, not seconds."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from barpc import report
+from barpc.errors import BarpcError
+from barpc.options import RunOptions
+from barpc.pipeline import adjust, load_views, outputs, run, views
+from barpc.pointio.matches import write_matches
+from barpc.report import Run
+from barpc.rpcio import formats
+from barpc.rpcio.tiff import put_tag
+from barpc.sensor.geometry import Several, epipolar_offset
+from barpc.sensor.rpc import RPC
+from barpc.simulate import Block, simulate_block
+
+SIDE = 256
+LAYOUT = {"size": (SIDE, SIDE), "gsd": 40.0, "attitude": 5e-5}
+
+
+def write_block(folder: Path, num: int) -> tuple[Block, list[Path]]:
+    """A block with small images, which differ."""
+    block = simulate_block(num, 40 * num, seed=3, num_checks=0, **LAYOUT)
+    paths = [folder / f"{view.name}.tif" for view in block.views]
+    for n, (path, view) in enumerate(zip(paths, block.views, strict=True)):
+        ramp = (np.add.outer(np.arange(SIDE), np.arange(SIDE)) + n).astype(np.uint16)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(
+                path, "w", "GTiff", SIDE, SIDE, 1, dtype="uint16", compress="deflate"
+            ) as image:
+                image.write(ramp, 1)
+        put_tag(path, view.sensor)
+    write_matches(folder / "matches.npz", block.tracks, [view.name for view in block.views])
+    os.utime(folder, (1e9, 1e9))  # nothing was written there for long
+    return block, paths
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("block")
+
+
+@pytest.fixture(scope="module")
+def block(folder) -> tuple[Block, list[Path]]:
+    return write_block(folder, 12)
+
+
+def counted(monkeypatch, owner: object, name: str, counts: Counter[str]) -> None:
+    real = getattr(owner, name)
+
+    def watched(*given, **options):
+        counts[name] += 1
+        return real(*given, **options)
+
+    monkeypatch.setattr(owner, name, watched)
+
+
+def test_a_folder_is_listed_once_for_all_its_images_and_again_when_it_changes(block, folder, monkeypatch):
+    counts: Counter[str] = Counter()
+    formats._listed.cache_clear()
+    counted(monkeypatch, formats.os, "scandir", counts)
+    assert len(load_views(block[1]).views) == 12
+    assert counts["scandir"] == 1
+    names = set(formats.files_of(folder))
+    (folder / "NEW.txt").touch()
+    assert set(formats.files_of(folder)) == names | {"new.txt"}
+    (folder / "NEW.txt").unlink()
+    assert set(formats.files_of(folder)) == names
+    os.utime(folder, (1e9, 1e9))
+
+
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_other_workers_read_the_same_views_and_the_first_error_counts(block, folder, monkeypatch, keep_going):
+    monkeypatch.setattr(views, "_MANY", 2)
+    monkeypatch.setattr(views, "_GROUP", 3)
+    told = []
+    given = [*block[1], folder / "missing.tif", folder / "none.tif"]
+    with ThreadPoolExecutor(2) as executor:
+        options = {"executor": executor, "progress": lambda *state: told.append(state)}
+        if not keep_going:
+            with pytest.raises(BarpcError, match=r"missing\.tif"):
+                load_views(given, **options)
+            return
+        found = load_views(given, keep_going=True, **options)
+    alone = load_views(block[1])
+    assert found.views == alone.views
+    assert [Path(path).name for path, _ in found.left_out] == ["missing.tif", "none.tif"]
+    assert told == [("cameras", done, 14) for done in (3, 6, 9, 12, 14)]
+    assert (alone.worker_seconds, found.worker_seconds > 0) == (0.0, True)
+
+
+def test_a_summary_asks_each_camera_as_often_in_a_large_block_as_in_a_small_one(monkeypatch):
+    calls = []
+    for num in (12, 48):
+        block = simulate_block(num, 40 * num, seed=3, num_checks=0, **LAYOUT)
+        counts: Counter[str] = Counter()
+        with monkeypatch.context() as patch:
+            for name in ("localize", "project", "project_jacobian"):
+                counted(patch, RPC, name, counts)
+            summary = report.summarize(Run("check", block.views, (), block.tracks))
+        assert len(summary.pairs) > 3 * num
+        calls.append(counts.total() / num)
+    assert calls[1] < 1.3 * calls[0] < 100
+
+
+def test_pairs_measured_together_are_as_measured_alone(block):
+    found = Run("check", block[0].views, (), block[0].tracks)
+    entries = {(pair.a, pair.b): pair for pair in report.summarize(found).pairs}
+    xy, point = found.tracks.xy, found.tracks.point
+    for ties in found.pairs:
+        i, j = ties.views
+        alt = found.altitudes_before[point[ties.a]]
+        pair = entries[found.views[i].name, found.views[j].name]
+        alone, _ = epipolar_offset(found.before[i], found.before[j], xy[ties.a], xy[ties.b], alt, steps=2)
+        alone = alone[np.isfinite(alone)]
+        assert pair.epipolar_before.median == pytest.approx(np.median(alone), rel=1e-9)
+        spread = 1.4826 * np.median(np.abs(alone - np.median(alone)))
+        assert pair.epipolar_before.spread == pytest.approx(spread, rel=1e-9)
+        assert pair.epipolar_before.rms == pytest.approx(np.sqrt(np.mean(alone**2)), rel=1e-9)
+        assert pair.epipolar_before.count == len(alone)
+
+
+def test_several_cameras_are_each_their_own(block):
+    sensors = [view.sensor for view in block[0].views[:3]]
+    of = np.array([2, 0, 2, 1, 0])
+    ground = block[0].truth.ground[:5]
+    many = Several(sensors, of)
+    image, jacobian = many.project_jacobian(ground)
+    back = many.localize(image, ground[:, 2])
+    for n, v in enumerate(of):
+        alone = sensors[v].project_jacobian(ground[n])
+        np.testing.assert_allclose(image[n], alone[0], rtol=1e-12)
+        np.testing.assert_allclose(many.project(ground)[n], alone[0], rtol=1e-12)
+        np.testing.assert_allclose(jacobian[n], alone[1], rtol=1e-9)
+        np.testing.assert_allclose(back[n], ground[n], rtol=1e-11)
+    assert not len(Several(sensors, of[:0]).project(ground[:0]))
+
+
+def test_a_run_that_was_stopped_in_writing_goes_on_after_the_fits(block, folder, tmp_path, monkeypatch):
+    """The fits are kept, and the files are opened again whatever was kept."""
+    counts: Counter[str] = Counter()
+    for name in ("fit_rpc", "write_views"):
+        counted(monkeypatch, run, name, counts)
+    options = RunOptions(matches=str(folder / "matches.npz"))
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("barpc.pipeline.outputs.make_files", stop)
+        adjust(block[1], tmp_path / "out", options)
+    assert (counts["fit_rpc"], counts["write_views"]) == (12, 1)
+    told: Counter[str] = Counter()
+    counted(monkeypatch, outputs, "verify", told)
+    result = adjust(block[1], tmp_path / "out", options)
+    assert (counts["fit_rpc"], counts["write_views"], told["verify"]) == (12, 2, 12)
+    assert all(view.outputs for view in result.record.views)
+    assert not any((tmp_path / "out" / ".barpc" / "partial").glob("**/*"))
