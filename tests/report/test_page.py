@@ -18,7 +18,7 @@ from barpc.errors import BarpcError, InputError
 from barpc.pipeline import outputs
 from barpc.report import Run, charts, page, records, summarize
 from barpc.report.summary import metres
-from barpc.report.tables import TABLES
+from barpc.report.tables import TABLES, Observations, RunFiles
 from barpc.scene import Tracks
 from tests.report.conftest import run_of_block, written
 
@@ -133,6 +133,43 @@ def test_fifty_images_make_less_than_3_mb_in_seconds(tmp_path):
     html = page.report_html(summary, tmp_path)
     assert time.process_time() - start < 25.0  # CPU s; some 3 on a machine of its own
     assert len(html.encode()) < 3e6
+
+
+def many_times(found: RunFiles, copies: int) -> RunFiles:
+    """A run's files as if its scene lay there many times, side by side, every image with a reservation."""
+    summary, seen, num = found.summary, found.observations, len(found.summary.views)
+    views, pairs, outlines, points = [], [], [], []
+    for copy in range(copies):
+        step = [0.4 * (copy % 40), 0.4 * (copy // 40)]
+        for view in summary.views:
+            outputs = {f"{copy}_{name}": value for name, value in view.outputs.items()}
+            views.append(replace(view, name=f"{copy}_{view.name}", status="doubtful", outputs=outputs))
+        pairs += [replace(pair, a=f"{copy}_{pair.a}", b=f"{copy}_{pair.b}") for pair in summary.pairs]
+        outlines += [[ring + step for ring in rings] for rings in found.outlines]
+        points.append(found.points + [*step, 0.0, 0.0])
+    lines = [f"{view.name}: doubtful: look for clouds, water, change, or wrong matches." for view in views]
+    columns = (seen.xy, seen.before, seen.after, seen.used)
+    observations = Observations(
+        np.concatenate([seen.view + copy * num for copy in range(copies)]),
+        *(np.concatenate([column] * copies) for column in columns),
+    )
+    told = replace(summary, views=tuple(views), pairs=tuple(pairs), verdict=tuple(lines))
+    return RunFiles(told, observations, np.concatenate(points), outlines)
+
+
+@pytest.mark.parametrize("num", [300, 1000])
+def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_run, monkeypatch, num):
+    files = many_times(page.read_tables(block_run.record, block_run.folder), -(-num // 9))
+    monkeypatch.setattr(page, "read_tables", lambda *_: files)
+    html = page.report_html(files.summary, "")
+    views = len(files.summary.views)
+    assert 1e6 < len(html.encode()) < 3e6
+    assert f"And {views - 200} more; all are in summary.json." in html
+    assert html.count('class="outline doubtful"') == (views if num == 300 else views // 3)
+    assert ("At most 400 of 1008 outlines are drawn, evenly taken" in html) == (num == 1000)
+    assert ('id="graph-chart-t"' in html) == (num == 300)
+    shown = len(files.summary.pairs) if num == 300 else -(-len(files.summary.pairs) // 2)
+    assert html.count('class="dot after see"') == shown
 
 
 def test_a_run_without_a_single_tie_point_still_has_a_page(block_run, tmp_path):
