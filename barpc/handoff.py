@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -196,7 +197,12 @@ class Consumer:
     @property
     def installed(self) -> bool:
         """Whether its package can be imported."""
-        return find_spec(self.package) is not None
+        return _is_installed(self.package)
+
+
+@cache
+def _is_installed(package: str) -> bool:
+    return find_spec(package) is not None
 
 
 def _transformer(rpcs: Any) -> Projection:

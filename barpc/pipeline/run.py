@@ -125,7 +125,7 @@ def adjust(
         dataclass, so that its results can be kept).
     out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``
     options : RunOptions, optional, None: the defaults
-    executor : concurrent.futures.Executor, optional, works on images, tiles, pairs and fits; the result does not depend on it
+    executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it
     progress : callable, optional, `progress(stage, done, total)`
 
     Raises

@@ -74,7 +74,8 @@ def _doubt(view: ViewEntry, run: Run) -> str:
     if view.name in run.copies:
         return f"shows the same pixels as {run.copies[view.name]}: give each image once"
     if run.adjustment is not None:
-        found = _oddity(view.name, run.adjustment) or _left(view.name, run.adjustment)
+        i = run.number[view.name]
+        found = _oddity(i, run.adjustment) or _left(i, run.adjustment)
         if found:
             return found
     error = _known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
@@ -91,9 +92,9 @@ def _doubt(view: ViewEntry, run: Run) -> str:
     return ""
 
 
-def _oddity(name: str, adjustment: Adjustment) -> str:
-    """What is wrong with a view beside the others: its RPC, or something smooth that no correction follows."""
-    i, prior, smooth = adjustment.names.index(name), adjustment.prior, adjustment.smooth
+def _oddity(i: int, adjustment: Adjustment) -> str:
+    """What is wrong with view i beside the others: its RPC, or something smooth that no correction follows."""
+    prior, smooth = adjustment.prior, adjustment.smooth
     if prior.odd[i]:
         others = [adjustment.names[j] for j in np.flatnonzero(prior.odd) if j != i]
         either = f" (or that of {listed(others)}: the tie points cannot tell)" if others else ""
@@ -111,9 +112,8 @@ def _oddity(name: str, adjustment: Adjustment) -> str:
     return ""
 
 
-def _left(name: str, adjustment: Adjustment) -> str:
-    """What tie points say that took no part: the others were chosen to agree."""
-    i = adjustment.names.index(name)
+def _left(i: int, adjustment: Adjustment) -> str:
+    """What tie points of view i say that took no part: the others were chosen to agree."""
     noise, error = adjustment.held_out_noise[i], adjustment.held_out_rms[i]
     if not noise > NOISE_LIMIT:
         return ""
@@ -146,7 +146,7 @@ def _block_reasons(run: Run) -> list[str]:
     names = run.adjustment.names
     for group in run.adjustment.two_groups:
         i, j = group.views
-        if not (_oddity(names[i], run.adjustment) or _oddity(names[j], run.adjustment)):
+        if not (_oddity(i, run.adjustment) or _oddity(j, run.adjustment)):
             out.append(
                 f"Tie points of {names[i]} and {names[j]} fall into two groups, {100 * group.share:.0f} % lying "
                 f"{group.apart:.2f} px from the others: there are two solutions, and this is the one between them. "

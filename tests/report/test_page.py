@@ -168,7 +168,8 @@ def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_ru
     assert html.count('class="outline doubtful"') == (views if num == 300 else views // 3)
     assert ("At most 400 of 1008 outlines are drawn, evenly taken" in html) == (num == 1000)
     assert ('id="graph-chart-t"' in html) == (num == 300)
-    shown = len(files.summary.pairs) if num == 300 else -(-len(files.summary.pairs) // 2)
+    pairs = len(files.summary.pairs)
+    shown = -(-pairs // -(-pairs // 1500))
     assert html.count('class="dot after see"') == shown
 
 
