@@ -154,10 +154,10 @@ def adjust(
                     run = _fitted(run, options, caching, progress)
         if run.fits:
             run = _written(run, options, workspace, executor, progress)
+        if run.adjustment is not None:
+            with _told(workspace, "block", progress), workspace.output(PRIOR) as partial:
+                block_prior(run.adjustment).save(partial)
         with _told(workspace, "summary", progress):
-            if run.adjustment is not None:
-                with workspace.output(PRIOR) as partial:
-                    block_prior(run.adjustment).save(partial)
             run = replace(run, out_dir=str(out_dir))
             summary = summarize(run)
         run = replace(run, stages=list(workspace.stages))
