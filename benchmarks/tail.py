@@ -75,7 +75,7 @@ def run(listed: Path, out: Path, jobs: int) -> Trial:
     matches = listed.parent / "matches.npz"
     command = [sys.executable, "-m", "barpc", "-q", "adjust", "--image-list", listed, "--matches", matches]
     start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    words = [str(word) for word in (*command, "-o", out, "--overwrite", "-j", jobs)]
+    words = [str(word) for word in (*command, "--matches-only", "-o", out, "--overwrite", "-j", jobs)]
     done = subprocess.run(words, capture_output=True, text=True, env=os.environ | THREADS, check=False)
     wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode not in (0, 3):

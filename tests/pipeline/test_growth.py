@@ -153,7 +153,7 @@ def test_a_run_that_was_stopped_in_writing_goes_on_after_the_fits(block, folder,
     counts: Counter[str] = Counter()
     for name in ("fit_rpc", "write_views"):
         counted(monkeypatch, run, name, counts)
-    options = RunOptions(matches=str(folder / "matches.npz"))
+    options = RunOptions(matches=str(folder / "matches.npz"), matches_only=True)
 
     def stop(*_):
         raise KeyboardInterrupt
