@@ -3,8 +3,9 @@
 `CachingExecutor` looks a task (a tile, a pair) up among the kept results, gives the rest to the executor behind it, and
 keeps what comes back at once: an interrupted run goes on where it was, and a thousand pairs do not stand pickled in a
 queue. Quick tasks travel in batches: the way (0.2 ms to a process, 10 ms over dask) is paid once for half a second of
-work. Large arrays (the keypoints of a view go to all its pairs) are spilled once into the run folder, which all workers
-see as they see the images: what dask scatters dies with the worker that holds it.
+work. What goes to many tasks lies in the run folder, which all workers see as they see the images (what dask scatters
+dies with the worker that holds it): workers write the keypoints of a tile into the executor's store and read there what
+a pair needs, and large arrays among the arguments are spilled once.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 
 from barpc.errors import AdjustError, BarpcError, InputError
 from barpc.frozen import Arrays, from_arrays, to_arrays
+from barpc.tie.store import Store
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
@@ -65,7 +67,9 @@ class CachingExecutor(Executor):
         keep: bool = True,
     ) -> None:
         self.workspace, self.executor, self.keep = workspace, executor, keep
-        self._fingerprints = dict(fingerprints)
+        self.store = Store(str(workspace.cache), str(workspace.partial))
+        places = {self.store.folder: "cache", self.store.room: "partial"}  # wherever the run folder lies
+        self._fingerprints = {**fingerprints, **places}
         self._limit = _PER_WORKER * worker_count(executor)
         self._lock = threading.Lock()
         self._storing = threading.RLock()  # while results are kept: `shutdown` waits for it
@@ -206,6 +210,8 @@ class _Task(Future[Any]):
         super().__init__()
         self._owner, self.fn, self.args = owner, fn, args
         self._key, self._stage = "", fn.__name__.strip("_")
+        # a task that is given the store keeps there itself what it makes
+        self._kept_here = owner.keep and not (args and isinstance(args[0], Store))
 
     def begin(self) -> bool:
         """Whether there is work to do: it was not cancelled, and no result is kept."""
@@ -224,7 +230,7 @@ class _Task(Future[Any]):
         """Take the outcome, and keep a result for the next time."""
         self.args = ()
         try:
-            if error is None and keep and self._owner.keep:
+            if error is None and keep and self._kept_here:
                 self._owner.workspace.store(self._stage, self._key, to_arrays(value))
         except Exception as failed:  # noqa: BLE001  (a full disk: goes to whoever asks for the result)
             error = failed
@@ -240,7 +246,7 @@ class _Task(Future[Any]):
         return super().result(timeout)
 
     def _look_up(self) -> tuple[bool, Any]:
-        if not self._owner.keep:
+        if not self._kept_here:
             return False, None
         self._key = self._owner.key(self.fn, self.args)
         record = self._owner.workspace.load(self._stage, self._key)

@@ -1,11 +1,10 @@
-"""Keypoints: found tile by tile, the strongest of every cell kept."""
+"""Keypoints: found tile by tile, evenly by a quota, kept in files that the matching of a pair reads."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
-from itertools import islice
 from typing import Any
 
 import cv2
@@ -16,7 +15,8 @@ from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairs import Area, Pair, shared_tiles
-from barpc.tie.raster import CELL, Box, ByteImage, Stretch, grow, read_pixels, sample_stretch, tiles
+from barpc.tie.raster import CELL, ZOOM, Box, ByteImage, Survey, grow, read_picture, survey, tiles
+from barpc.tie.store import Store, names_of, store_of
 from barpc.tie.tasks import Progress, ordered
 
 PER_CELL = 40
@@ -24,7 +24,11 @@ PER_CELL = 40
 CONTRAST = 0.01
 """SIFT's contrast threshold."""
 _DEFAULTS = TieOptions()
-_MARGIN = 48  # px read around a tile, so that keypoints at its border are those of the whole image
+_MARGIN = 48  # px around what is searched at a time, so that keypoints at its border are those of the whole picture
+_FEW = 8  # keypoints of a cell, about, where an image's are few: its cells are larger
+_AMPLE = 5  # keypoints for each tie point wanted
+_DENSE = 2e-3  # keypoints a px above which every pixel is looked at; half as many a side hold fewer
+_SPARE = 1.25  # of a tile's share: what poor tiles leave goes to the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +64,12 @@ class Sift:
     def __init__(self) -> None:
         self._sift: Any = cv2.SIFT.create(contrastThreshold=CONTRAST)
 
-    def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], BoolArray]) -> Keypoints:
-        """Keypoints for which `keep(xy, scale, response)` is true; only those are described."""
+    def detect(self, picture: ByteImage, keep: Callable[[Array, Array, Array], IntArray]) -> Keypoints:
+        """Keypoints of which `keep(xy, scale, response)` gives the indices; only those are described."""
         found = self._sift.detect(picture, None)
         if not found:  # OpenCV fails where there is nothing to describe
             return join([])
-        kept = np.flatnonzero(keep(*_table(found)))
+        kept = keep(*_table(found))
         described, raw = self._sift.compute(picture, [found[i] for i in kept])
         if raw is None:
             return join([])
@@ -80,59 +84,215 @@ def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
     return table[:, :2], table[:, 2], table[:, 3]
 
 
-def detect_tile(
-    path: str, size: tuple[int, int], box: Box, stretch: Stretch, options: TieOptions
-) -> Keypoints:
-    """Keypoints of one tile of an image of `size` (width, height), at most a quota a cell, sorted by row and column.
+@dataclass(frozen=True)
+class Share:
+    """What a tile's keypoints are taken for."""
 
-    Coordinates and `stretch` are those of the whole image.
+    density: float  # keypoints a px of the image
+    zoom: int = 1  # px of the image a side of a pixel that is looked at
+
+    @staticmethod
+    def of(size: tuple[int, int], options: TieOptions) -> Share:
+        """That of a whole image of `size` (width, height)."""
+        area = size[0] * size[1]
+        most = min(options.keypoints_per_image, _AMPLE * options.points_per_image)
+        coarse = most < _DENSE * area and min(size) > ZOOM * options.tile
+        return Share(options.keypoints_per_image / area, ZOOM if coarse else 1)
+
+    def within(self, used: float) -> Share:
+        """The same where only a share of the image is used: by powers of two, so that it is not another one each time."""
+        return replace(self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0)))))
+
+    def most(self, box: Box) -> int:
+        """How many a box may hold."""
+        return int(np.ceil(_SPARE * self.density * box[2] * box[3]))
+
+    @property
+    def cell(self) -> int:
+        """Side of the cells that take their strongest in turns [px]."""
+        return CELL * max(1, round(float(np.sqrt(_FEW / self.density)) / CELL))
+
+
+def detect_tile(
+    path: str, size: tuple[int, int], box: Box, found: Survey, share: Share, options: TieOptions
+) -> Keypoints:
+    """Keypoints of one tile of an image of `size` (width, height), those first that count first.
+
+    Coordinates and `found` are those of the whole image.
     """
     cv2.setNumThreads(1)
-    window = grow(box, _MARGIN, size)
-    pixels, valid = read_pixels(path, window, options.band)
-    if not valid.any():
-        return join([])
-    distance = cv2.distanceTransform(np.pad(valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    origin = np.array(window[:2], dtype=np.float64)
+    zoom = share.zoom
+    window = box if found.levels else grow(box, zoom * _MARGIN, size)
+    picture, valid = read_picture(path, window, found, zoom, options.band)
+    middle = 0.0 if found.levels else 0.5 * (zoom - 1)  # a wavelet's level holds the even pixels
+    parts, side = [], zoom * options.tile
+    for row in range(box[1], box[1] + box[3], side):
+        for col in range(box[0], box[0] + box[2], side):
+            part = (col, row, min(side, box[0] + box[2] - col), min(side, box[1] + box[3] - row))
+            near = grow((col - window[0], row - window[1], *part[2:]), zoom * _MARGIN, window[2:])
+            left, top, right, below = (n // zoom for n in (near[0], near[1], near[0] + near[2], near[1] + near[3]))
+            place = slice(top, below), slice(left, right)
+            if valid[place].any():
+                origin = np.array([window[0] + zoom * left + middle, window[1] + zoom * top + middle])
+                parts.append(_detect_part(picture[place], valid[place], part, origin, share))
+    every = join(parts)
+    return every.select(ranked(every.xy, every.response, share.cell, len(every)))
 
-    def keep(xy: Array, scale: Array, response: Array) -> BoolArray:
-        col, row = np.rint(xy).astype(int).T
-        place = xy + origin
-        inside = ((place >= np.array(box[:2]) - 0.5) & (place < np.add(box[:2], box[2:]) - 0.5)).all(axis=1)
-        inside &= distance[row.clip(0, window[3] - 1), col.clip(0, window[2] - 1)] > np.maximum(3.0, scale)
-        index = np.flatnonzero(inside)
-        strongest = quota(place[index], response[index], CELL, PER_CELL)
-        return np.isin(np.arange(len(xy)), index[strongest])
 
-    found = Sift().detect(stretch.apply(pixels, valid), keep)
-    found = found.select(np.lexsort((found.angle, found.xy[:, 0], found.xy[:, 1])))
-    return replace(found, xy=found.xy + origin)
+def _detect_part(picture: ByteImage, valid: BoolArray, part: Box, origin: Array, share: Share) -> Keypoints:
+    """Keypoints inside a part of an image; the first pixel's centre is at `origin` [px]."""
+    inner = np.array(part[:2]) - 0.5, np.add(part[:2], part[2:]) - 0.5
+    distance = None
+    if not valid.all():
+        distance = cv2.distanceTransform(np.pad(valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+
+    def keep(xy: Array, scale: Array, response: Array) -> IntArray:
+        place = share.zoom * xy + origin
+        inside = ((place >= inner[0]) & (place < inner[1])).all(axis=1)
+        end = np.array(picture.shape[::-1]) - 1
+        away = np.minimum(xy, end - xy).min(axis=1) + 1.0
+        if distance is not None:
+            col, row = np.rint(xy).astype(int).clip(0, end).T
+            away = distance[row, col]
+        index = np.flatnonzero(inside & (away > np.maximum(3.0, scale)))
+        index = index[quota(place[index], response[index], CELL, PER_CELL)]
+        return index[ranked(place[index], response[index], share.cell, share.most(part))]
+
+    found = Sift().detect(picture, keep)
+    return replace(found, xy=share.zoom * found.xy + origin, scale=share.zoom * found.scale)
+
+
+def _cell_ranks(xy: Array, response: Array, cell: float) -> IntArray:
+    """Place of every point (N, 2) [px] among those of its cell, the strongest first, from 0."""
+    cells = np.floor((xy + 0.5) / cell).astype(np.int64)
+    cells -= cells.min(axis=0, initial=0)
+    key = cells[:, 1] * (cells[:, 0].max(initial=0) + 1) + cells[:, 0]
+    order = np.lexsort((xy[:, 0], xy[:, 1], -response, key))
+    starts = np.diff(key[order], prepend=-1) != 0
+    rank = np.empty(len(order), dtype=np.int64)
+    each = np.arange(len(order))
+    rank[order] = each - np.maximum.accumulate(np.where(starts, each, 0))
+    return rank
 
 
 def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
     """Indices of the strongest of points (N, 2) [px] in every cell of a side [px], at most so many each, ascending."""
-    if not len(xy):
-        return np.empty(0, dtype=np.int64)
-    cells = np.floor((xy + 0.5) / cell).astype(np.int64)
-    cells -= cells.min(axis=0)
-    key = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
-    order = np.lexsort((xy[:, 0], xy[:, 1], -response, key))
-    starts = np.r_[True, key[order][1:] != key[order][:-1]]
-    rank = np.arange(len(order)) - np.maximum.accumulate(np.where(starts, np.arange(len(order)), 0))
-    kept: IntArray = np.sort(order[rank < most])
-    return kept
+    return np.flatnonzero(_cell_ranks(xy, response, cell) < most)
 
 
-def bounded(keypoints: Keypoints, options: TieOptions) -> Keypoints:
-    """At most `keypoints_per_image` keypoints, the strongest of every cell, evenly."""
-    most = PER_CELL
-    while len(keypoints) > options.keypoints_per_image and most > 1:
-        most = max(1, int(most * options.keypoints_per_image / len(keypoints)))
-        keypoints = keypoints.select(quota(keypoints.xy, keypoints.response, CELL, most))
-    if len(keypoints) > options.keypoints_per_image:
-        strongest = np.argsort(-keypoints.response, kind="stable")[: options.keypoints_per_image]
-        keypoints = keypoints.select(np.sort(strongest))
-    return keypoints
+def ranked(xy: Array, response: Array, cell: float, most: int) -> IntArray:
+    """Indices of at most so many points (N, 2) [px]: the strongest of every cell, then the second ones, and so on."""
+    order = np.lexsort((xy[:, 0], xy[:, 1], -response, _cell_ranks(xy, response, cell)))
+    return order[:most]
+
+
+@dataclass(frozen=True)
+class KeypointFiles:
+    """Keypoints of a view by reference: the first so many of every tile's file count."""
+
+    store: Store
+    boxes: tuple[Box, ...] = ()
+    names: tuple[str, ...] = ()
+    counts: tuple[int, ...] = ()
+
+    def __len__(self) -> int:
+        """Number of keypoints."""
+        return sum(self.counts)
+
+    def load(self, wanted: Sequence[Box] | None = None) -> tuple[Keypoints, IntArray]:
+        """Keypoints of some tiles (None: of all), by row and column in a tile, and their numbers within the view."""
+        parts, numbers, first = [], [np.empty(0, dtype=np.int64)], 0
+        chosen = set(self.boxes if wanted is None else wanted)
+        for box, name, count in zip(self.boxes, self.names, self.counts, strict=True):
+            if count and box in chosen:
+                kept = _unpacked(self.store.need(name), box).select(np.arange(count))
+                order = np.lexsort((kept.angle, kept.xy[:, 0], kept.xy[:, 1]))
+                parts.append(kept.select(order))
+                numbers.append(first + order)
+            first += count
+        return join(parts), np.concatenate(numbers)
+
+
+def keep_tile(
+    store: Store,
+    name: str,
+    path: str,
+    size: tuple[int, int],
+    box: Box,
+    found: Survey,
+    share: Share,
+    options: TieOptions,
+) -> int:
+    """Find the keypoints of a tile (`detect_tile`) and keep them in the store; their number."""
+    known = store.read(name)
+    if known is not None and "xy" in known:
+        return len(known["xy"])
+    keypoints = detect_tile(path, size, box, found, share, options)
+    store.write(name, _packed(keypoints, box))
+    return len(keypoints)
+
+
+def _packed(keypoints: Keypoints, box: Box) -> dict[str, npt.NDArray[Any]]:
+    """Arrays of 148 bytes a keypoint; places count from the tile's corner."""
+    local = replace(keypoints, xy=keypoints.xy - np.array(box[:2]))
+    values = {field.name: getattr(local, field.name) for field in fields(Keypoints)}
+    return {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in values.items()}
+
+
+def _unpacked(arrays: dict[str, npt.NDArray[Any]], box: Box) -> Keypoints:
+    columns = (arrays[f.name].astype(np.uint8 if f.name == "descriptors" else np.float64) for f in fields(Keypoints))
+    found = Keypoints(*columns)
+    return replace(found, xy=found.xy + np.array(box[:2]))
+
+
+def allotted(found: IntArray, area: Array, most: int) -> IntArray:
+    """How many keypoints (T,) of the tiles count, `most` together: alike by area, poor tiles leaving theirs to the rest."""
+    if found.sum() <= most:
+        return found
+    order = np.argsort(found / area, kind="stable")
+    poorer = np.cumsum(found[order]) - found[order]
+    level = (most - poorer) / np.cumsum(area[order][::-1])[::-1]  # if all from this tile on are cut alike
+    first = int(np.flatnonzero(level * area[order] <= found[order])[0])
+    return np.minimum(found, np.floor(level[first] * area).astype(np.int64))
+
+
+def locate(
+    views: Sequence[View],
+    options: TieOptions,
+    store: Store,
+    *,
+    pairs: Sequence[Pair] | None = None,
+    area: Area | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> list[KeypointFiles]:
+    """Keypoints of every view, in files of a store; none in an image in which nothing varies.
+
+    With `pairs`, tiles that no partner may see are not read, nor those outside `area`; the rest as for `find_tracks`.
+    """
+    found = ordered(executor, survey, [(v.path, options.band) for v in views], "read", progress)
+    shares = [Share.of(view.size, options) for view in views]
+    each = zip(views, found, shares, strict=True)
+    boxes = [tiles(v.size, options, share.zoom, known) if known else [] for v, known, share in each]
+    if pairs is not None:
+        boxes = shared_tiles(views, pairs, options, area, boxes)
+    used = [sum(b[2] * b[3] for b in some) / (v.size[0] * v.size[1]) for v, some in zip(views, boxes, strict=True)]
+    shares = [share.within(part) for share, part in zip(shares, used, strict=True)]
+    tasks = [
+        (view.path, view.size, box, known, share, options)
+        for view, known, share, of_view in zip(views, found, shares, boxes, strict=True)
+        for box in of_view
+    ]
+    names = names_of(executor, detect_tile, tasks)
+    keeping = [(store, name, *task) for name, task in zip(names, tasks, strict=True)]
+    counts = np.array(ordered(executor, keep_tile, keeping, "detect", progress), dtype=np.int64)
+    files, first = [], 0
+    for of_view, share in zip(boxes, shares, strict=True):
+        part = slice(first, first := first + len(of_view))
+        areas = np.array([float(box[2] * box[3]) for box in of_view])
+        kept = allotted(counts[part], areas, int(share.density * areas.sum() + 1e-6))
+        files.append(KeypointFiles(store, tuple(of_view), tuple(names[part]), tuple(kept.tolist())))
+    return files
 
 
 def detect(
@@ -144,18 +304,7 @@ def detect(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Keypoints]:
-    """Keypoints of every view; none in an image in which nothing varies.
-
-    With `pairs`, tiles that no partner may see are not read, nor those outside `area`; the rest as for `find_tracks`.
-    """
-    stretches = ordered(executor, sample_stretch, [(v.path, options.band) for v in views], "read", progress)
-    boxes = [tiles(view.size, options) for view in views]
-    if pairs is not None:
-        boxes = shared_tiles(views, pairs, options, area)
-    boxes = [of_view if stretch else [] for of_view, stretch in zip(boxes, stretches, strict=True)]
-    each = zip(views, stretches, boxes, strict=True)
-    tasks = [
-        (view.path, view.size, box, stretch, options) for view, stretch, of_view in each for box in of_view
-    ]
-    found = iter(ordered(executor, detect_tile, tasks, "detect", progress))
-    return [bounded(join(list(islice(found, len(of_view)))), options) for of_view in boxes]
+    """Keypoints of every view, in memory; the rest as for `locate`."""
+    with store_of(executor) as store:
+        files = locate(views, options, store, pairs=pairs, area=area, executor=executor, progress=progress)
+        return [of_view.load()[0] for of_view in files]

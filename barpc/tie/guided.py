@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,7 +12,7 @@ import numpy.typing as npt
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import IntArray, View
-from barpc.tie.epipolar import Frame, grouped
+from barpc.tie.epipolar import Frame
 from barpc.tie.features import Keypoints
 from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
 
@@ -22,10 +23,11 @@ _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expecte
 _MAX_ZOOM = np.log(1.8)  # the same for the scale
 _APART = 2.0  # px; nearer candidates are the same point
 _NONE = np.float32(-2.0)  # below every cosine
+_CANDIDATES = 400_000  # looked at together
 
 
 class Guided:
-    """Mutual best descriptors of like scale and orientation, cell by cell of the predicted positions."""
+    """Mutual best descriptors of like scale and orientation among the candidates inside the bands."""
 
     detects: ClassVar[bool] = True
 
@@ -43,14 +45,14 @@ class Guided:
             self._prepared = _Strips(where.turn(self._b.xy)), *described
         strips, first, second = self._prepared
         best = _Best(len(self._a), len(self._b))
-        side = float(np.clip(across, 64.0, 512.0))
-        for rows in _cells(where, prediction.chosen(len(self._a)), side):
-            cols = strips.near(where, across, rows)
-            if len(cols):
-                du, dw = strips.apart(where, rows, cols)
-                allowed = np.abs(dw) <= across
-                allowed &= (du >= where.before[rows, None]) & (du <= where.after[rows, None])
-                best.update(rows, cols, first.likeness(rows, second, cols, allowed), du, dw)
+        for row, col in strips.near(where, across, prediction.chosen(len(self._a))):
+            du, dw = strips.apart(where, row, col)
+            allowed = (np.abs(dw) <= across) & (du >= where.before[row]) & (du <= where.after[row])
+            row, col, du, dw = (x[allowed] for x in (row, col, du, dw))
+            alike = first.alike(row, second, col)
+            row, col, du, dw = (x[alike] for x in (row, col, du, dw))
+            if len(row):
+                best.update(row, col, first.likeness(row, second, col), du, dw)
         index, distance, ambiguity = best.mutual()
         clear = ambiguity <= (self._ratio if prediction.probes is None else min(self._ratio, _CLEAR_RATIO))
         xy = np.stack([self._a.xy[index[:, 0]], self._b.xy[index[:, 1]]], axis=1)
@@ -74,19 +76,21 @@ class _Described:
         zoom = np.log(keypoints.scale * np.sqrt(np.abs(np.linalg.det(linear))))
         return _Described(values / norm, turned.astype(np.float32), zoom.astype(np.float32))
 
-    def likeness(
-        self, rows: IntArray, other: _Described, cols: IntArray, allowed: npt.NDArray[np.bool_]
-    ) -> FloatArray:
-        """Cosines (rows, cols) of the descriptors; `_NONE` where not allowed or not alike."""
-        allowed &= self.direction[rows] @ other.direction[cols].T >= np.float32(np.cos(_MAX_TURN))
-        allowed &= np.abs(other.zoom[cols] - self.zoom[rows, None]) <= np.float32(_MAX_ZOOM)
-        cosine: FloatArray = self.unit[rows] @ other.unit[cols].T
-        cosine[~allowed] = _NONE
-        return cosine
+    def alike(self, row: IntArray, other: _Described, col: IntArray) -> npt.NDArray[np.bool_]:
+        """Which candidates have about the orientation and the scale that they should have."""
+        turned = np.einsum("ij,ij->i", self.direction[row], other.direction[col])
+        out: npt.NDArray[np.bool_] = turned >= np.float32(np.cos(_MAX_TURN))
+        out &= np.abs(other.zoom[col] - self.zoom[row]) <= np.float32(_MAX_ZOOM)
+        return out
+
+    def likeness(self, row: IntArray, other: _Described, col: IntArray) -> FloatArray:
+        """Cosines of the descriptors, pair by pair."""
+        out: FloatArray = np.einsum("ij,ij->i", self.unit[row], other.unit[col])
+        return out
 
 
 class _Best:
-    """Best and second best counterpart of every point of A, best of every point of B, as cells come in."""
+    """Best and second best counterpart of every point of A, best of every point of B, as candidates come in."""
 
     def __init__(self, size_a: int, size_b: int) -> None:
         self._of_a = np.full(size_a, -1)
@@ -94,20 +98,19 @@ class _Best:
         self._of_b = np.full(size_b, -1)
         self._top_b = np.full(size_b, _NONE)
 
-    def update(
-        self, rows: IntArray, cols: IntArray, likeness: FloatArray, du: FloatArray, dw: FloatArray
-    ) -> None:
-        """Take in the cosines (rows, cols), and the positions (rows, cols) of the candidates."""
-        back = likeness.argmax(axis=0)
-        value = likeness[back, np.arange(len(cols))]
-        better = value > self._top_b[cols]
-        self._of_b[cols[better]], self._top_b[cols[better]] = rows[back[better]], value[better]
-        each, pick = np.arange(len(rows)), likeness.argmax(axis=1)
-        self._of_a[rows], self._top[rows] = cols[pick], likeness[each, pick]
-        same = np.abs(du - du[each, pick][:, None]) <= _APART
-        same &= np.abs(dw - dw[each, pick][:, None]) <= _APART
-        likeness[same] = _NONE
-        self._second[rows] = likeness.max(axis=1)
+    def update(self, row: IntArray, col: IntArray, likeness: FloatArray, du: Array, dw: Array) -> None:
+        """Take in all candidates of some points of A: their cosines and their places about the predicted ones."""
+        order = np.lexsort((row, -likeness, col))
+        back = order[np.unique(col[order], return_index=True)[1]]
+        back = back[likeness[back] > self._top_b[col[back]]]
+        self._of_b[col[back]], self._top_b[col[back]] = row[back], likeness[back]
+        order = np.lexsort((col, -likeness, row))
+        rows, start, number = np.unique(row[order], return_index=True, return_inverse=True)
+        pick = order[start]
+        self._of_a[rows], self._top[rows] = col[pick], likeness[pick]
+        same = np.abs(du[order] - du[pick][number]) <= _APART
+        same &= np.abs(dw[order] - dw[pick][number]) <= _APART
+        self._second[rows] = np.maximum.reduceat(np.where(same, _NONE, likeness[order]), start)
 
     def mutual(self) -> tuple[IntArray, Array, Array]:
         """Mutual best pairs (M, 2), their distances, and these over those to the second best (M,).
@@ -125,39 +128,44 @@ class _Best:
 class _Strips:
     """Points of B sorted into strips across the epipolar direction, and along it within a strip."""
 
-    height = 32.0
+    height = 16.0
 
     def __init__(self, turned: Array) -> None:
         self._turned = turned
-        self._first = float(turned[:, 1].min())
-        strip = np.floor((turned[:, 1] - self._first) / self.height).astype(np.int64)
-        self._order = np.lexsort((turned[:, 0], strip))
-        self._along = turned[self._order, 0]
-        self._starts = np.searchsorted(strip[self._order], np.arange(strip.max() + 2))
+        self._corner = turned.min(axis=0)
+        self._length = float(np.ptp(turned[:, 0])) + 3.0
+        strip = np.floor((turned[:, 1] - self._corner[1]) / self.height)
+        key = strip * self._length + turned[:, 0] - self._corner[0] + 1.0
+        self._order = np.argsort(key, kind="stable")
+        self._key, self._last = key[self._order], int(strip.max())
 
-    def near(self, where: Frame, across: float, rows: IntArray) -> IntArray:
-        """Indices of the points in strips that the bands of some points of A touch, ascending."""
+    def near(self, where: Frame, across: float, wanted: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+        """Points of A and the points of B in the strips that their bands touch, all of a point of A together."""
+        rows = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
         before, after, u, w = (x[rows] for x in (where.before, where.after, where.along, where.across))
-        tilt = np.abs(where.slope[rows]).max() * max(-before.min(), after.max(), 0.0)
-        low, high = w.min() - (across + tilt), w.max() + (across + tilt)
-        first = max(0, int((low - self._first) // self.height))
-        last = min(len(self._starts) - 2, int((high - self._first) // self.height))
-        parts = []
-        for strip in range(first, last + 1):
-            start, stop = self._starts[strip], self._starts[strip + 1]
-            begin, end = np.searchsorted(self._along[start:stop], [(u + before).min(), (u + after).max()])
-            parts.append(self._order[start + begin : start + end])
-        return np.sort(np.concatenate(parts)) if parts else np.empty(0, dtype=np.int64)
+        reach = across + np.abs(where.slope[rows]) * np.maximum(np.abs(before), np.abs(after))
+        ends = ((end - self._corner[1]) / self.height for end in (w - reach, w + reach))
+        first, last = (np.floor(end).clip(-1, self._last + 1).astype(np.int64) for end in ends)
+        first, last = first.clip(0), last.clip(None, self._last)
+        point, strip = _expanded(first, (last - first + 1).clip(0))
+        span = ((u + end - self._corner[0])[point].clip(-1.0, self._length - 2.0) + 1.0 for end in (before, after))
+        low, high = (strip * self._length + end for end in span)
+        begin, end = np.searchsorted(self._key, low, side="left"), np.searchsorted(self._key, high, side="right")
+        count = (end - begin).clip(0)
+        of_point = np.bincount(point, weights=count, minlength=len(rows))
+        cuts = np.searchsorted(point, np.flatnonzero(np.diff(np.cumsum(of_point) // _CANDIDATES)) + 1)
+        for part in np.split(np.arange(len(point)), cuts):
+            number, place = _expanded(begin[part], count[part])
+            yield rows[point[part][number]], self._order[place]
 
-    def apart(self, where: Frame, rows: IntArray, cols: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Distances along and across (rows, cols) of points of B from the predicted ones of A."""
-        du = (self._turned[cols, 0] - where.along[rows, None]).astype(np.float32)
-        dw = (self._turned[cols, 1] - where.across[rows, None]).astype(np.float32)
-        return du, dw - where.slope[rows, None].astype(np.float32) * du
+    def apart(self, where: Frame, row: IntArray, col: IntArray) -> tuple[Array, Array]:
+        """Distances along and across of points of B from the predicted ones of A, pair by pair."""
+        du = self._turned[col, 0] - where.along[row]
+        return du, self._turned[col, 1] - where.across[row] - where.slope[row] * du
 
 
-def _cells(where: Frame, wanted: IntArray, side: float) -> list[IntArray]:
-    """The wanted points of A, cell by cell of B; points without a prediction are left out."""
-    usable = wanted[np.isfinite(where.along + where.across + where.slope)[wanted]]
-    cell = np.floor(np.stack([where.across[usable], where.along[usable]]) / side)
-    return [usable[rows] for rows in grouped(*cell)]
+def _expanded(first: IntArray, count: IntArray) -> tuple[IntArray, IntArray]:
+    """Ranges that begin at `first` and hold `count` numbers: the number of its range, and each number in it."""
+    which = np.repeat(np.arange(len(first)), count)
+    within = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+    return which, first[which] + within

@@ -19,9 +19,9 @@ from scipy.spatial import cKDTree
 
 from barpc.geodesy import Array
 from barpc.options import TieOptions
-from barpc.scene import View
+from barpc.scene import IntArray, View
 from barpc.tie.epipolar import Frame, agreeing, frame, robust_affine, robust_spread
-from barpc.tie.features import Keypoints
+from barpc.tie.features import KeypointFiles, Keypoints
 from barpc.tie.guided import Guided
 from barpc.tie.hook import Hook, hooked
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
@@ -69,7 +69,10 @@ class PairReport:
 
 
 def match_pair(
-    views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions
+    views: tuple[View, View],
+    keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
+    pair: Pair,
+    options: TieOptions,
 ) -> tuple[Matches, PairReport]:
     """Match two views; keypoints are empty for a matcher that wants none. No matches: the report says why."""
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
@@ -77,7 +80,8 @@ def match_pair(
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
-    search = _Search(views, keypoints, options)
+    loaded, numbers = _loaded(views, keypoints, options)
+    search = _Search(views, loaded, options)
     coarse = search.offset()
     if coarse is None:
         return NO_MATCHES, replace(report, status=f"no common offset within {options.search:g} px")
@@ -94,12 +98,29 @@ def match_pair(
     spread, share = robust_spread(residual[keep]), report.verified / len(found)
     along, across = np.median(errors[keep], axis=0).tolist()
     report = replace(report, inlier_share=share, offset=(along, across), spread=spread)
+    if numbers is not None:
+        index = np.stack([number[column] for number, column in zip(numbers, found.index.T, strict=True)], axis=-1)
+        found = replace(found, index=index)
     return replace(found.select(keep), sigma=max(spread, 0.05)), report
+
+
+def _loaded(
+    views: tuple[View, View], keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles], options: TieOptions
+) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray] | None]:
+    """Keypoints of the tiles that both views may see, and their numbers within the views; None: as they stand."""
+    a, b = keypoints
+    if isinstance(a, Keypoints) or isinstance(b, Keypoints):
+        assert isinstance(a, Keypoints)
+        assert isinstance(b, Keypoints)
+        return (a, b), None
+    seen = shared_tiles(views, [Pair((0, 1), 1.0, 0.0)], options, boxes=(a.boxes, b.boxes))
+    first, second = a.load(seen[0]), b.load(seen[1])
+    return (first[0], second[0]), (first[1], second[1])
 
 
 def match(
     views: Sequence[View],
-    keypoints: Sequence[Keypoints],
+    keypoints: Sequence[Keypoints | KeypointFiles],
     pairs: Sequence[Pair],
     options: TieOptions = _DEFAULTS,
     *,

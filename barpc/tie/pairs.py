@@ -294,10 +294,14 @@ def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], w
 
 
 def shared_tiles(
-    views: Sequence[View], pairs: Sequence[Pair], options: TieOptions, area: Area | None = None
+    views: Sequence[View],
+    pairs: Sequence[Pair],
+    options: TieOptions,
+    area: Area | None = None,
+    boxes: Sequence[Sequence[Box]] | None = None,
 ) -> list[list[Box]]:
-    """The tiles of every view that a partner may see in the area, though cameras be wrong by `options.search`."""
-    boxes = [tiles(view.size, options) for view in views]
+    """The tiles (or given `boxes`) of every view that a partner may see in the area, cameras wrong by `options.search`."""
+    boxes = boxes or [tiles(view.size, options) for view in views]
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]
     for pair in pairs:

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from rasterio.enums import MaskFlags
 from rasterio.windows import Window
 
 from barpc.errors import ImageError
@@ -26,6 +27,10 @@ Box = tuple[int, int, int, int]
 
 CELL = 64
 """Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""
+ZOOM = 2
+"""Pixels a side of a picture's pixel where an image has more detail than its quota of keypoints needs."""
+_ROWS = 512  # px read at a time, at least one row of blocks
+_WIDE = 2  # tiles that an image is wide, above which its strips are read whole
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
 _SAMPLE_SIDE = 128  # px
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
@@ -93,20 +98,35 @@ def _check_band(dataset: Any, path: str | os.PathLike[str], band: int) -> None:
         raise ImageError(f"{os.fspath(path)}: band {band} is complex; give its amplitude as an image")
 
 
-def _read(dataset: Any, box: Box, band: int) -> tuple[Pixels, BoolArray]:
+def _read(dataset: Any, box: Box, band: int, zoom: int = 1) -> tuple[Pixels, BoolArray]:
+    """Pixels of a window, of every `zoom` a side one; above 1 only where the file holds that level."""
     window = Window(*box)
-    raw = dataset.read(band, window=window)
+    more: dict[str, Any] = {"out_shape": (box[3] // zoom, box[2] // zoom)} if zoom > 1 else {}
+    raw = dataset.read(band, window=window, **more)
+    whole = raw.dtype.kind in "iu"
     single = raw.dtype.kind != "f" and np.can_cast(raw.dtype, np.float32)
     pixels: Pixels = raw.astype(np.float32 if single else np.float64)
-    valid: BoolArray = dataset.read_masks(band, window=window) != 0
-    valid &= np.isfinite(pixels)
-    if np.issubdtype(raw.dtype, np.integer):
-        valid &= raw < np.iinfo(raw.dtype).max
-        if dataset.nodata is None:  # zeros without a name: a border where they stand together
-            cv2.setNumThreads(1)  # the work is spread by processes
-            zeros = cv2.morphologyEx((raw == 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-            valid &= zeros == 0
-    return np.where(valid, pixels, pixels.dtype.type(0.0)), valid
+    valid = _mask(dataset, band, raw) if whole else None
+    if valid is None:
+        valid = dataset.read_masks(band, window=window, **more) != 0
+    valid &= raw < np.iinfo(raw.dtype).max if whole else np.isfinite(pixels)
+    if whole and dataset.nodata is None and not raw.all():
+        # zeros without a name: a border where they stand together
+        cv2.setNumThreads(1)  # the work is spread by processes
+        zeros = cv2.morphologyEx((raw == 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+        valid &= zeros == 0
+    if not valid.all():
+        pixels[~valid] = 0.0
+    return pixels, valid
+
+
+def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
+    """Which whole numbers mean something, where they say so themselves: GDAL would decode the window again."""
+    flags = dataset.mask_flag_enums[band - 1]
+    if getattr(dataset, "driver", None) is None or flags not in ([MaskFlags.nodata], [MaskFlags.all_valid]):
+        return None
+    out: BoolArray = raw != dataset.nodatavals[band - 1] if MaskFlags.nodata in flags else np.ones(raw.shape, bool)
+    return out
 
 
 def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | None:
@@ -128,6 +148,60 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | Non
     return Stretch(float(low), float(high))
 
 
+@dataclass(frozen=True)
+class Survey:
+    """What is known of a raster before its tiles are searched."""
+
+    stretch: Stretch
+    block: tuple[int, int]  # width and height of what is decoded at a time [px]
+    levels: bool  # decoding is dear, and every second pixel costs a quarter (JPEG 2000)
+
+
+def survey(path: str | os.PathLike[str], band: int = 1) -> Survey | None:
+    """The stretch of a raster, and how it is stored; None where nothing varies."""
+    stretch = sample_stretch(path, band)
+    with open_raster(path) as dataset:
+        height, width = dataset.block_shapes[band - 1]
+        levels = getattr(dataset, "driver", "") == "JP2OpenJPEG" and ZOOM in dataset.overviews(band)
+    return None if stretch is None else Survey(stretch, (width, height), levels)
+
+
+def read_picture(
+    path: str | os.PathLike[str], box: Box, found: Survey, zoom: int = 1, band: int = 1
+) -> tuple[ByteImage, BoolArray]:
+    """8-bit picture of a window and its valid pixels, each of `zoom` px a side; `read_pixels` says which count.
+
+    `box` begins at whole multiples of `zoom`. Blocks are decoded once, row by row of them.
+    """
+    col, row, width, height = box[0], box[1], box[2] // zoom * zoom, box[3] // zoom * zoom
+    picture = np.empty((height // zoom, width // zoom), np.uint8)
+    valid = np.empty(picture.shape, dtype=bool)
+    level = zoom if found.levels else 1
+    with open_raster(path) as dataset:
+        _check_band(dataset, path, band)
+        step = zoom * found.block[1]
+        step *= max(1, _ROWS // step)
+        top = row
+        while top < row + height:
+            stop = min(row + height, (top // step + 1) * step)
+            pixels, known = _read(dataset, (col, top, width, stop - top), band, level)
+            part = slice((top - row) // zoom, (stop - row) // zoom)
+            picture[part], valid[part] = _reduced(found.stretch.apply(pixels, known), known, zoom // level)
+            top = stop
+    return picture, valid
+
+
+def _reduced(picture: ByteImage, valid: BoolArray, zoom: int) -> tuple[ByteImage, BoolArray]:
+    """A picture of every `zoom` pixels a side one; valid are those of which all are."""
+    if zoom == 1:
+        return picture, valid
+    size = picture.shape[1] // zoom, picture.shape[0] // zoom
+    small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if valid.all():
+        return small, np.ones(small.shape, bool)
+    return small, valid.reshape(size[1], zoom, size[0], zoom).all(axis=(1, 3))
+
+
 def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
     """A box with a margin on every side, cut at an image of `size` (width, height); a pixel at least."""
     col, row, width, height = box
@@ -136,11 +210,24 @@ def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
-def tiles(size: tuple[int, int], options: TieOptions) -> list[Box]:
-    """Boxes that cover an image of `size` (width, height) without overlap, cut at whole cells."""
+def tiles(
+    size: tuple[int, int], options: TieOptions, zoom: int = 1, found: Survey | None = None
+) -> list[Box]:
+    """Boxes that cover an image of `size` (width, height) without overlap, cut at whole cells.
+
+    A side is `options.tile` times `zoom` px; strips of a wide image are taken whole, and so are blocks that are dear to
+    decode.
+    """
+    sides = [zoom * options.tile] * 2
+    if found is not None and found.block[0] >= size[0] > _WIDE * sides[0]:
+        sides[0] = size[0]
+    if found is not None and found.levels:
+        sides = [max(2, side // (zoom * block)) * zoom * block for side, block in zip(sides, found.block, strict=True)]
     edges = []
-    for length in size:
-        step = -(-length // -(-length // options.tile))  # equal tiles, none larger than asked
-        step = -(-step // CELL) * CELL
+    for length, side in zip(size, sides, strict=True):
+        step = side
+        if not (found is not None and found.levels):
+            step = -(-length // -(-length // side))  # equal tiles, none larger than asked
+            step = -(-step // CELL) * CELL
         edges.append([(start, min(step, length - start)) for start in range(0, length, step)])
     return [(col, row, width, height) for row, height in edges[1] for col, width in edges[0]]

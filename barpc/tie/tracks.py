@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +16,13 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
-from barpc.tie.features import detect, join
+from barpc.tie.features import KeypointFiles, locate
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
 from barpc.tie.matching import PairReport, match, matcher_named
 from barpc.tie.pairs import Area, Pair, require_connected, select_pairs
 from barpc.tie.register import refine
+from barpc.tie.store import store_of
 from barpc.tie.tasks import Progress
 
 logger = logging.getLogger(__name__)
@@ -81,11 +83,13 @@ def find_tracks(
     matcher = matcher_named(options.matcher)
     pairs = select_pairs(views, options, only=only, area=area, given=given)
     known, others = ([p for p in pairs if (p.views in given) is there] for there in (True, False))
-    keypoints = [join([])] * len(views)
-    if matcher.detects and others:
-        keypoints = detect(views, options, pairs=others, area=area, executor=executor, progress=progress)
-    own = iter(match(views, keypoints, others, options, executor=executor, progress=progress))
-    theirs = iter(verify(views, given, known, options, executor=executor, progress=progress))
+    work: dict[str, Any] = {"executor": executor, "progress": progress}
+    with store_of(executor) as store:
+        keypoints = [KeypointFiles(store)] * len(views)
+        if matcher.detects and others:
+            keypoints = locate(views, options, store, pairs=others, area=area, **work)
+        own = iter(match(views, keypoints, others, options, **work))
+    theirs = iter(verify(views, given, known, options, **work))
     matched = [next(theirs if pair.views in given else own) for pair in pairs]
     found, reports = [matches for matches, _ in matched], tuple(report for _, report in matched)
     require_matches(views, pairs, reports)
@@ -93,7 +97,7 @@ def find_tracks(
     linked = inside(views, link([pair.views for pair in pairs], found), area)
     spreads = {p.views: r.spread for p, r in zip(pairs, reports, strict=True) if r.status == "ok"}
     linked = thin(linked, sizes, int(_SPARE * most))
-    tracks = refine(views, linked, spreads, options, executor=executor, progress=progress)
+    tracks = refine(views, linked, spreads, options, **work)
     verified = {p.views: m for p, m in zip(pairs, found, strict=True) if p.views in given and len(m)}
     tracks = _with_unregistered(views, tracks, verified, options)
     tracks = thin(inside(views, tracks, area), sizes, most)

@@ -9,10 +9,10 @@ import pytest
 
 from barpc.tie import TieOptions
 from barpc.tie.epipolar import Frame
-from barpc.tie.features import Keypoints, Sift, bounded, detect_tile, join, quota
+from barpc.tie.features import Keypoints, Share, Sift, allotted, detect_tile, join, quota
 from barpc.tie.guided import Guided, _Strips
 from barpc.tie.matcher import Matches, Prediction
-from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch, tiles
+from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch, survey, tiles
 from tests.constants import chosen
 from tests.tie.conftest import write_image
 
@@ -252,20 +252,27 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(
     """Bands that rise or fall by some strips along their length, to one side of the prediction or to both."""
     rng = np.random.default_rng(0)
     turned = rng.uniform(0, 2000, (4000, 2))
-    strips = _Strips(turned)
+    strips, every = _Strips(turned), np.arange(4000)
     for _ in range(30):
-        rows = np.arange(5)
-        place = rng.uniform(300, 1700, 2) + rng.uniform(0, 30, (5, 2))
+        place = rng.uniform(300, 1700, 2) + rng.uniform(-400, 400, (5, 2))
         where = Frame(np.array([1.0, 0.0]), place[:, 0], place[:, 1], np.full(5, slope), np.full(5, reach[0]),
                       np.full(5, reach[1]), np.eye(2))  # fmt: skip
-        du, dw = strips.apart(where, rows, np.arange(4000))
-        inside = (du >= reach[0]) & (du <= reach[1]) & (np.abs(dw) <= 3.0)
-        found = strips.near(where, 3.0, rows)
-        assert (np.diff(found) > 0).all()
-        assert np.isin(np.flatnonzero(inside.any(axis=0)), found).all()
-        # the box about the bands, a strip more on either side
-        u, w = turned[found].T
-        assert ((u >= (place[:, 0] + reach[0]).min()) & (u <= (place[:, 0] + reach[1]).max())).all()
-        tilt = 0.4 * 150.0 if slope in (0.4, -0.4) else 3.0
-        assert w.min(initial=1e9) > place[:, 1].min() - 3.0 - tilt - strips.height - 1
-        assert w.max(initial=-1e9) < place[:, 1].max() + 3.0 + tilt + strips.height + 1
+        found = [np.concatenate(part) for part in zip(*strips.near(where, 3.0, np.arange(5)), strict=True)]
+        for row in range(5):
+            du, dw = strips.apart(where, np.full(4000, row), every)
+            inside = (du >= reach[0]) & (du <= reach[1]) & (np.abs(dw) <= 3.0)
+            near = found[1][found[0] == row]
+            assert len(set(near)) == len(near)
+            assert np.isin(np.flatnonzero(inside), near).all()
+            assert ((du[near] >= reach[0]) & (du[near] <= reach[1])).all()
+            tilt = abs(slope) * max(abs(end) for end in reach)
+            assert (np.abs(turned[near, 1] - place[row, 1]) <= 3.0 + tilt + strips.height).all()
+
+
+def test_candidates_come_in_portions_that_hold_all_of_a_point(pair, monkeypatch) -> None:
+    a, b, where = pair
+    whole = guided(a, b, where, 0.85)
+    monkeypatch.setattr("barpc.tie.guided._CANDIDATES", 50)
+    parts = guided(a, b, where, 0.85)
+    np.testing.assert_array_equal(whole.index, parts.index)
+    assert len(whole) > 40
