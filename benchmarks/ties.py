@@ -2,8 +2,8 @@
 
     python benchmarks/ties.py IMG IMG [IMG...]          this project, stage by stage, and OpenCV's SIFT + FLANN
     python benchmarks/ties.py IMG IMG --cars PYTHON     and cars-bundleadjustment, run by that interpreter
-    python benchmarks/ties.py --memory SIDE             peak memory on a made-up pair of SIDE x SIDE pixels
-    python benchmarks/ties.py --memory SIDE --area 0.3  the same with an area of interest, so much of a side wide
+    python benchmarks/ties.py --size SIDE               evenness, memory, CPU on a made-up pair of SIDE x SIDE pixels
+    python benchmarks/ties.py --size SIDE --area 0.3    the same with an area of interest, so much of a side wide
 
 Ratios are of CPU seconds, measured in the same run, one thread.
 """
@@ -18,6 +18,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -28,6 +30,7 @@ import numpy as np  # noqa: E402
 import rasterio  # noqa: E402
 from rasterio.windows import Window  # noqa: E402
 
+from barpc.pipeline.executor import CachingExecutor  # noqa: E402
 from barpc.pipeline.views import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor.rpc import RPC  # noqa: E402
@@ -45,6 +48,7 @@ from barpc.tie import (  # noqa: E402
 )
 from barpc.tie.epipolar import agreeing, frame, robust_spread  # noqa: E402
 from barpc.tie.raster import read_pixels, sample_stretch  # noqa: E402
+from barpc.workspace import Workspace  # noqa: E402
 
 
 def stages(views: list[View]) -> float:
@@ -176,36 +180,80 @@ def middle(share: float, degrees: float, folder: str) -> Area:
     return read_area(path)
 
 
-def memory(side: int, share: float | None) -> None:
-    """Peak memory of a pair of `side` x `side` images, textured in spots, empty between them."""
+def scene(side: int, folder: str, layout: dict[str, object]) -> list[View]:
+    """A pair of `side` x `side` px: crops of one texture, turned, side by side, the left half with a third of the contrast."""
     rng = np.random.default_rng(0)
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / f"{k}.tif" for k in range(2)]
-        profile = {
-            "driver": "GTiff", "width": side, "height": side, "count": 1, "dtype": "uint16", "tiled": True,
-            "blockxsize": 256, "blockysize": 256, "compress": "deflate", "SPARSE_OK": True,
-        }  # fmt: skip
-        files = [rasterio.open(path, "w", **profile) for path in paths]
-        for _ in range(max(4, side * side // 20_000_000)):
-            noise = cv2.GaussianBlur(rng.uniform(0, 4000, (1100, 1100)).astype(np.float32), (0, 0), 2.0)
-            col, row = rng.integers(0, side - 1200, 2).tolist()
-            for k, file in enumerate(files):
-                file.write(noise.astype(np.uint16), 1, window=Window(col + 3 * k, row + 2 * k, 1100, 1100))
-        for file in files:
-            file.close()
-        views = [
-            View(path.stem, str(path), (side, side), linear_rpc(side, 0.1 * k), (0.0, 200.0))
-            for k, path in enumerate(paths)
-        ]
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        start = time.process_time()
+    paths = [Path(folder) / f"{k}.tif" for k in range(2)]
+    profile = {"driver": "GTiff", "width": side, "height": side, "count": 1, "dtype": "uint16", **layout}
+    files = [rasterio.open(path, "w", BIGTIFF="YES", **profile) for path in paths]
+    fine, coarse = (cv2.GaussianBlur(rng.normal(0, 1, (1500, 1500)).astype(np.float32), (0, 0), s) for s in (1.2, 5.0))
+    texture = 150 * fine / fine.std() + 250 * coarse / coarse.std()
+    noise = rng.normal(0, 10, (1024 + 64, side + 64)).astype(np.float32)
+    quiet = np.where(np.arange(side) < side / 2, 1 / 3, 1.0).astype(np.float32)
+    above = None
+    for row in range(0, side, 1024):
+        blocks = [texture[r : r + 1024, c : c + 1024] for r, c in rng.integers(0, 470, (-(-side // 1024) + 1, 2))]
+        turned = [np.rot90(block, n) for block, n in zip(blocks, rng.integers(0, 4, len(blocks)), strict=True)]
+        band = np.hstack(turned)
+        both = np.vstack([band[:8] if above is None else above[-8:], band])
+        above = band
+        for k, file in enumerate(files):
+            height, (right, down) = min(1024, side - row), rng.integers(0, 64, 2)
+            part = both[8 - 2 * k :][:height, 8 - 3 * k :][:, :side]
+            part = 900 + quiet * part + noise[down : down + height, right : right + side]
+            file.write(part.clip(1, 4095).astype(np.uint16), 1, window=Window(0, row, side, height))
+    for file in files:
+        file.close()
+    return [
+        View(path.stem, str(path), (side, side), linear_rpc(side, 0.1 * k), (0.0, 200.0))
+        for k, path in enumerate(paths)
+    ]
+
+
+LAYOUTS: dict[str, dict[str, object]] = {
+    "tiles": {"tiled": True, "blockxsize": 512, "blockysize": 512, "compress": "zstd", "zstd_level": 1},
+    "strips": {"compress": "deflate", "zlevel": 1, "blockysize": 16},
+}
+
+
+def size(side: int, share: float | None, layout: str) -> None:
+    """Evenness, memory, files and CPU seconds of a pair of `side` x `side` images, in a run folder with one worker."""
+    with tempfile.TemporaryDirectory() as folder, Workspace(Path(folder) / "run") as workspace:
+        views = scene(side, folder, LAYOUTS[layout])
         area = None if share is None else middle(share, 0.25 * side / 111000.0, folder)
-        result = find_tracks(views, area=area)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(f"{side} x {side}: {result.keypoints} keypoints, {result.tracks.num_points} tracks")
-    print(
-        f"peak {peak / 1024:.0f} MB ({before / 1024:.0f} MB before), {time.process_time() - start:.1f} CPU s"
-    )
+        kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        start = [resource.getrusage(kind) for kind in kinds]
+        fresh = resident()
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            with CachingExecutor(workspace, {}, pool) as caching:
+                result = find_tracks(views, area=area, executor=caching)
+            worker = peak(next(iter(pool._processes)))
+        seconds = [u.ru_utime + u.ru_stime for u in (resource.getrusage(kind) for kind in kinds)]
+        seconds = [now - was.ru_utime - was.ru_stime for now, was in zip(seconds, start, strict=True)]
+        kept = sum(file.stat().st_size for file in workspace.cache.rglob("*.npz"))
+    tracks = result.tracks
+    left = np.mean(tracks.xy[tracks.view == 0, 0] < side / 2)
+    print(f"{side} x {side}, {layout}: {result.keypoints} keypoints, {tracks.num_points} tracks")
+    print(f"  {left:.3f} of them in the half with a third of the contrast")
+    print(f"  {sum(seconds):.0f} CPU s (caller {seconds[0]:.0f}), {sum(seconds) / (2e-6 * side * side):.3f} s a Mpx")
+    print(f"  caller grew by {peak(os.getpid()) - fresh:.0f} MB to its peak, worker's peak {worker:.0f} MB")
+    print(f"  {kept / 2e6:.1f} MB an image in the run folder")
+
+
+def peak(process: int) -> float:
+    """Peak resident memory [MB]."""
+    return _status(process, "VmHWM")
+
+
+def resident() -> float:
+    """Resident memory of this process, from which its peak counts from now on [MB]."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return _status(os.getpid(), "VmRSS")
+
+
+def _status(process: int, name: str) -> float:
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(name)) / 1e3
 
 
 def main() -> int:
@@ -215,11 +263,12 @@ def main() -> int:
     )
     parser.add_argument("images", nargs="*", type=Path, metavar="IMG")
     parser.add_argument("--cars", metavar="PYTHON", help="interpreter of an environment with cars")
-    parser.add_argument("--memory", type=int, metavar="SIDE", help="measure memory on a made-up pair")
+    parser.add_argument("--size", type=int, metavar="SIDE", help="evenness, memory and time of a made-up pair")
+    parser.add_argument("--layout", choices=LAYOUTS, default="tiles", help="how that pair is stored")
     parser.add_argument("--area", type=float, metavar="SHARE", help="only in the middle of that pair")
     given = parser.parse_args()
-    if given.memory:
-        memory(given.memory, given.area)
+    if given.size:
+        size(given.size, given.area, given.layout)
     if given.images:
         views = list(load_views(given.images).views)
         start = time.process_time()
@@ -234,7 +283,7 @@ def main() -> int:
             seconds = cars(given.cars, given.images)
             print(f"barpc adjust, all of it   {(ours := adjust(given.images)):7.2f} s")
             print(f"cars-bundleadjustment     {seconds:7.2f} s   x {seconds / ours:.1f}")
-    elif not given.memory:
+    elif not given.size:
         parser.print_usage(sys.stderr)
         return 2
     return 0

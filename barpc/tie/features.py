@@ -28,7 +28,7 @@ _MARGIN = 48  # px around what is searched at a time, so that keypoints at its b
 _FEW = 8  # keypoints of a cell, about, where an image's are few: its cells are larger
 _AMPLE = 5  # keypoints for each tie point wanted
 _DENSE = 2e-3  # keypoints a px above which every pixel is looked at; half as many a side hold fewer
-_SPARE = 1.25  # of a tile's share: what poor tiles leave goes to the others
+_SPARE = 1.2  # of a tile's share: what poor tiles leave goes to the others
 
 
 @dataclass(frozen=True, eq=False)

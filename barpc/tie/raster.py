@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,9 +87,25 @@ def read_pixels(path: str | os.PathLike[str], box: Box, band: int = 1) -> tuple[
     Those at nodata, masked, non-finite, saturated or in undeclared zero borders do not. ImageError: the file cannot
     be read, has no such band (from 1), or holds complex numbers.
     """
-    with open_raster(path) as dataset:
-        _check_band(dataset, path, band)
-        return _read(dataset, box, band)
+    with PixelReader(path, band) as reader:
+        return reader.read(box)
+
+
+class PixelReader(ExitStack):
+    """`read_pixels` for many windows: a block that two of them share is decoded once."""
+
+    def __init__(self, path: str | os.PathLike[str], band: int = 1) -> None:
+        super().__init__()
+        self._band, self._dataset = band, self.enter_context(open_raster(path))
+        try:
+            _check_band(self._dataset, path, band)
+        except ImageError:
+            self.close()
+            raise
+
+    def read(self, box: Box) -> tuple[Pixels, BoolArray]:
+        """Pixels of a window, and which of them mean something."""
+        return _read(self._dataset, box, self._band)
 
 
 def _check_band(dataset: Any, path: str | os.PathLike[str], band: int) -> None:

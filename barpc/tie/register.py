@@ -15,12 +15,13 @@ from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
 from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, robust_spread
-from barpc.tie.raster import FloatImage, grow, levelled, read_pixels
+from barpc.tie.raster import FloatImage, PixelReader, grow, levelled
 from barpc.tie.tasks import Progress, ordered
 
 MIN_CORRELATION = 0.8
@@ -28,6 +29,8 @@ MIN_CORRELATION = 0.8
 PATCH = 21
 """Side of the patches that are registered [px], odd."""
 _CHUNK = 256  # patches worked on at a time: they stay in cache
+_BAND = 512  # rows that are swept by columns where points are few: strips and blocks are decoded once
+_TOGETHER = 512  # such points of a task
 _STEPS = 12
 _SETTLED = 0.003  # px; a step below it is the last
 _SMALLER = 0.7  # side of the patch of the second try and of the check
@@ -41,7 +44,8 @@ _LEAST_SIGMA = 1e-3  # px, of a registration
 _TAPS = 6  # samples on either side in the interpolation
 _RIDGE = 1e-6
 _FLOOR = 0.1  # px across the epipolar line that are always tolerated
-_DISTORTED = 2.0  # times the median sigma: the patch lies across a step of the ground
+_DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
+_ABOUT = 64  # nearest points that tell it: contrast and noise are not alike all over a scene
 _LEAST_END_SIGMA = 0.02  # px, of an observation
 _LEAST_REACH = 5.0  # px of half a segment, below which altitudes are not compared
 _FEW = 20  # observations of a pair of views below which their sigmas are not scaled by their errors
@@ -81,17 +85,55 @@ def register_places(
     """Read what is needed of two images, each a path and its size, and register as `register` does."""
     cv2.setNumThreads(1)
     margin = patch + _TAPS + int(_REACH)
-    images, valid, origins = [], [], []
-    for (path, size), xy in zip(files, (reference, start), strict=True):
-        low, high = np.floor(xy.min(axis=0)).astype(int), np.ceil(xy.max(axis=0)).astype(int)
-        box = grow((low[0], low[1], *(high - low + 1)), margin, size)
-        pixels, usable = read_pixels(path, box, band)
-        images.append(levelled(pixels, usable))
-        valid.append(usable)
-        origins.append(np.array(box[:2], dtype=np.float64))
-    places = reference - origins[0], start - origins[1]
-    found = register((images[0], images[1]), (valid[0], valid[1]), *places, linear, patch)
-    return replace(found, xy=found.xy + origins[1])
+    read = _mosaics if _sparse(reference, margin) else _window
+    reads = zip(files, (reference, start), strict=True)
+    (first, valid_a, shift_a), (second, valid_b, shift_b) = (read(file, band, xy, margin) for file, xy in reads)
+    found = register((first, second), (valid_a, valid_b), reference - shift_a, start - shift_b, linear, patch)
+    return replace(found, xy=found.xy + shift_b)
+
+
+Read = tuple[FloatImage, BoolArray, Array]  # pixels, which are valid, place of the image's origin (2,) or (N, 2) [px]
+
+
+def _sparse(xy: Array, margin: int) -> bool:
+    """Whether windows about single points (N, 2) are less than half of the window about all."""
+    return len(xy) * (2 * margin + 1) ** 2 < 0.5 * float(np.prod(np.ptp(xy, axis=0) + 2 * margin + 1))
+
+
+def _window(file: tuple[str, tuple[int, int]], band: int, xy: Array, margin: int) -> Read:
+    """The pixels about all points."""
+    low, high = np.floor(xy.min(axis=0)).astype(int), np.ceil(xy.max(axis=0)).astype(int)
+    box = grow((low[0], low[1], *(high - low + 1)), margin, file[1])
+    with PixelReader(file[0], band) as reader:
+        pixels, usable = reader.read(box)
+    return levelled(pixels, usable), usable, np.array(box[:2], dtype=np.float64)
+
+
+def _mosaics(file: tuple[str, tuple[int, int]], band: int, xy: Array, margin: int) -> Read:
+    """The pixels about every point, side by side in one picture: what lies between points is not worked on."""
+    side = 2 * margin + 1
+    columns = int(np.ceil(np.sqrt(len(xy))))
+    shape = -(-len(xy) // columns) * side, columns * side
+    picture, usable = np.zeros(shape, np.float32), np.zeros(shape, dtype=bool)
+    shift = np.empty((len(xy), 2))
+    with PixelReader(file[0], band) as reader:
+        for number, corner in enumerate(np.rint(xy).astype(np.int64) - margin):
+            col, row = number % columns * side, number // columns * side
+            shift[number] = corner - (col, row)
+            low, high = corner.clip(0), np.minimum(corner + side, file[1])
+            if (high > low).all():
+                pixels, known = reader.read((int(low[0]), int(low[1]), *(high - low).tolist()))
+                (left, top), (right, below) = low - corner + (col, row), high - corner + (col, row)
+                picture[top:below, left:right], usable[top:below, left:right] = levelled(pixels, known), known
+    return picture, usable, shift
+
+
+def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
+    """Links that are registered together: those of a tile, or, where they are few, of a band of rows."""
+    if not _sparse(origin, PATCH + _TAPS + int(_REACH)):
+        return [links[rows] for rows in grouped(*np.floor(origin[:, ::-1] / tile).astype(np.int64).T)]
+    order = np.lexsort((origin[:, 0], origin[:, 1] // _BAND))
+    return [links[order[first : first + _TOGETHER]] for first in range(0, len(order), _TOGETHER)]
 
 
 def _usable(valid: BoolArray, patch: int) -> BoolArray:
@@ -308,7 +350,7 @@ class _Links:
             linear[group] = linear_map(*self.of(group), origin[group])
         rounding = (origin - self.tracks.xy[self.reference])[:, :, None]
         start = self.tracks.xy[self.other] + (linear @ rounding)[:, :, 0]
-        parts = self.groups(*np.floor(origin[:, ::-1] / options.tile).astype(np.int64).T)
+        parts = [part for group in self.groups() for part in _parts(origin[group], group, options.tile)]
         tasks = []
         for part in parts:
             first, second = self.of(part)
@@ -332,7 +374,8 @@ class _Links:
         for group in self.groups():
             group = group[good[group]]
             if len(group):
-                group = group[found.sigma[group] <= _DISTORTED * np.median(found.sigma[group])]
+                usual = _usual(self.origin[group], found.sigma[group])
+                group = group[found.sigma[group] <= _DISTORTED * usual]
                 errors, reach[group] = self.errors(found, group)
                 verified[group] = agreeing(self.origin[group], errors[:, 1], _FLOOR)[0]
                 altitude[group] = errors[:, 0] / np.maximum(reach[group], 1e-9)
@@ -366,6 +409,13 @@ class _Links:
                 residual = agreeing(self.origin[group], across, _FLOOR)[1]
                 sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
         return sigma
+
+
+def _usual(places: Array, sigma: Array) -> Array:
+    """Median of the sigmas (N,) of the nearest places (N, 2)."""
+    near = cKDTree(places).query(places, k=min(_ABOUT, len(places)))[1]
+    out: Array = np.median(sigma[near.reshape(len(places), -1)], axis=1)
+    return out
 
 
 def _shared(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma: Array) -> Tracks:
