@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from barpc.ba.structure import Structure
 from barpc.ba.unknowns import Unknowns
@@ -99,7 +99,7 @@ class Smooth:
             left = float((residual[:, rows] ** 2).sum()) - explained
             terms = 2.0 * TERMS
             scatter = max(left / (count - terms), 1e-30)
-            significance[v] = float(f_distribution.sf(explained / terms / scatter, terms, count - terms))
+            significance[v] = float(fdtrc(terms, count - terms, explained / terms / scatter))
             rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / (0.5 * count))
             along = (coefficients[:, :SPLINES] @ basis[:SPLINES]) * weight[rows]
             by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)

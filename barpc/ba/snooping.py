@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from barpc.ba.covariance import Covariance
 from barpc.ba.heldout import enu_offsets
@@ -130,4 +130,4 @@ def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[floa
     if freedom < 1.0:
         return np.nan, True
     squares = float((whitened[used & (redundancy > 0)] ** 2).sum())
-    return float(np.sqrt(squares / freedom)), bool(squares <= chi2.isf(_CHANCE, freedom))
+    return float(np.sqrt(squares / freedom)), bool(squares <= chdtri(freedom, _CHANCE))

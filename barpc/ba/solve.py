@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as la
-from scipy.optimize import least_squares
 
 from barpc.ba.cameras import Projected
 from barpc.ba.covariance import Covariance
@@ -226,6 +225,8 @@ class _Compressed:
 def _scipy(
     problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
 ) -> Minimum:
+    from scipy.optimize import least_squares  # a quarter of a second, and most runs end before they come here
+
     compressed = _Compressed(problem, state, weight, projected)
     found = least_squares(
         compressed.residual,

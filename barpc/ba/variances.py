@@ -13,7 +13,7 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc, gammaincinv
 
 from barpc.ba.covariance import Covariance
 from barpc.ba.linear import factorize
@@ -188,7 +188,7 @@ class Variances:
     def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
         """Whether the corrections are larger than chance allows."""
         total, freedom = (float(part.sum()) for part in self._squares(params, known, scale))
-        return freedom > _LEAST and float(chi2.sf(total, freedom)) < _LEVEL
+        return freedom > _LEAST and float(chdtrc(freedom, total)) < _LEVEL
 
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
         """By how much each view's prior is to be widened (N,), and which views are odd."""
@@ -211,7 +211,7 @@ class Variances:
         if n > 2 and not around.small:  # one view of many is seen at once
             own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
             factor = max((_STRENGTH + own * freedom.sum()) / (_STRENGTH + freedom.sum()), 1.0)
-            odd = np.asarray(chi2.sf(total / factor, np.maximum(freedom, _LEAST)) < _LEVEL / n)
+            odd = np.asarray(chdtrc(np.maximum(freedom, _LEAST), total / factor) < _LEVEL / n)
         alone = (_STRENGTH * factor + total) / (_STRENGTH + freedom)
         return np.sqrt(np.where(odd, np.maximum(alone, factor), factor)), odd
 
@@ -252,14 +252,14 @@ class Variances:
         for degree in range(self._degrees):
             total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
             factors[degree] = (_STRENGTH + total) / (_STRENGTH + freedom)
-            if self.cautious and freedom > _LEAST and chi2.sf(total, freedom) < _UNEXPECTED:
+            if self.cautious and freedom > _LEAST and chdtrc(freedom, total) < _UNEXPECTED:
                 factors[degree] = max(factors[degree], _possible(total, freedom))
         return np.sqrt(factors)
 
 
 def _possible(total: float, freedom: float) -> float:
     """A variance, in units of the one given, that still makes such a sum of squares likely enough."""
-    return float(total / chi2.ppf(_LOW, freedom))
+    return float(total / (2.0 * gammaincinv(0.5 * freedom, _LOW)))
 
 
 def same_prior(a: CameraPrior, b: CameraPrior, share: float) -> bool:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import chebyshev
-from scipy.interpolate import make_interp_spline
-from scipy.spatial.transform import Rotation
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 EXTRAPOLATION = 1.0  # seconds beyond its knots that a curve is still believed
 MARGIN = 70.0  # state vectors so far before and after the image take part in the fit of an orbit [s]
@@ -65,6 +67,8 @@ class Curve(Frozen):
             raise RpcError(f"curve: {values.shape} values at {times.shape} times; two samples or more needed")
         if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
             raise RpcError("curve: sample times must ascend and all numbers must be finite")
+        from scipy.interpolate import make_interp_spline  # a third of a second, which RPCs do not need
+
         order = min(degree, len(times) - 1)
         spline = make_interp_spline(times, values, k=order - (order + 1) % 2)
         knots = np.unique(spline.t)
@@ -125,6 +129,8 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
     RpcError for a quaternion that is zero or not finite, an attitude that turns by more than 2 rad from the middle.
     """
+    from scipy.spatial.transform import Rotation
+
     q = np.asarray(quaternions, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != 4 or not (np.isfinite(q).all() and q.any(axis=1).all()):
         raise RpcError(f"attitude: quaternions {q.shape} must be finite, not zero, four numbers each")

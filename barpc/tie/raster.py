@@ -31,7 +31,7 @@ CELL = 64
 ZOOM = 2
 """Pixels a side of a picture's pixel where an image has more detail than its quota of keypoints needs."""
 _ROWS = 512  # px read at a time, at least one row of blocks
-_WIDE = 2  # tiles that an image is wide, above which its strips are read whole
+_WIDE = 4096  # px, and two tiles: strips of wider images are read whole
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
 _SAMPLE_SIDE = 128  # px
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
@@ -236,7 +236,7 @@ def tiles(
     decode.
     """
     sides = [zoom * options.tile] * 2
-    if found is not None and found.block[0] >= size[0] > _WIDE * sides[0]:
+    if found is not None and found.block[0] >= size[0] > max(_WIDE, 2 * sides[0]):
         sides[0] = size[0]
     if found is not None and found.levels:
         sides = [max(2, side // (zoom * block)) * zoom * block for side, block in zip(sides, found.block, strict=True)]

@@ -123,8 +123,10 @@ def _mosaics(file: tuple[str, tuple[int, int]], band: int, xy: Array, margin: in
             low, high = corner.clip(0), np.minimum(corner + side, file[1])
             if (high > low).all():
                 pixels, known = reader.read((int(low[0]), int(low[1]), *(high - low).tolist()))
-                (left, top), (right, below) = low - corner + (col, row), high - corner + (col, row)
-                picture[top:below, left:right], usable[top:below, left:right] = levelled(pixels, known), known
+                (left, top), (right, below) = low - corner, corner + side - high
+                place, border = np.s_[row : row + side, col : col + side], (top, below, left, right)
+                picture[place] = cv2.copyMakeBorder(levelled(pixels, known), *border, cv2.BORDER_REFLECT_101)
+                usable[place] = np.pad(known, ((top, below), (left, right)))
     return picture, usable, shift
 
 

@@ -60,7 +60,7 @@ def test_a_failing_decomposition_inside_scipy_is_survived(block, adjusted, monke
     def fails(*_, **__):
         raise la.LinAlgError("SVD did not converge")
 
-    monkeypatch.setattr(solve, "least_squares", fails)
+    monkeypatch.setattr("scipy.optimize.least_squares", fails)
     found = adjust(block, solver="scipy")
     np.testing.assert_allclose(found.params, adjusted.params, atol=1e-4)
 

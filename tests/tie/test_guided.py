@@ -9,7 +9,7 @@ import pytest
 
 from barpc.tie import TieOptions
 from barpc.tie.epipolar import Frame
-from barpc.tie.features import Keypoints, Share, Sift, allotted, detect_tile, join, quota
+from barpc.tie.features import Keypoints, Share, Sift, allotted, detect_tile, join, quota, ranked
 from barpc.tie.guided import Guided, _Strips
 from barpc.tie.matcher import Matches, Prediction
 from barpc.tie.raster import Stretch, grow, read_pixels, sample_stretch, survey, tiles
@@ -134,14 +134,26 @@ def test_a_cell_keeps_its_strongest_and_cells_begin_at_the_corner_of_a_pixel() -
     assert quota(tied, np.ones(3), 10.0, 2).tolist() == [1, 2]
 
 
-def test_an_image_holds_at_most_its_bound(pair) -> None:
-    a = pair[0]
-    for most in (400, 120, 30, 3):
-        found = bounded(a, TieOptions(keypoints_per_image=most))
-        assert 0.4 * most <= len(found) <= most
-    assert bounded(a, TieOptions(keypoints_per_image=500)) is a
-    few = bounded(a, TieOptions(keypoints_per_image=3))  # fewer than there are cells: the strongest
-    assert sorted(few.response) == sorted(np.sort(a.response)[-3:])
+@pytest.mark.parametrize(
+    ("found", "most", "kept"),
+    [
+        ([10, 10, 10], 30, [10, 10, 10]), ([10, 10, 10], 29, [9, 9, 9]), ([10, 0, 2], 8, [6, 0, 2]),
+        ([100, 100, 5], 105, [50, 50, 5]), ([40, 40], 30, [15, 15]), ([0, 0], 3, [0, 0]),
+    ],
+)  # fmt: skip
+def test_tiles_share_what_an_image_may_hold_and_poor_ones_leave_theirs(found, most, kept) -> None:
+    assert allotted(np.array(found), np.ones(len(found)), most).tolist() == kept
+
+
+def test_a_larger_tile_has_a_larger_share() -> None:
+    assert allotted(np.array([100, 100, 100]), np.array([1.0, 2.0, 3.0]), 60).tolist() == [10, 20, 30]
+    assert allotted(np.array([100, 100, 6]), np.array([1.0, 2.0, 3.0]), 60).tolist() == [18, 36, 6]
+
+
+def test_cells_take_their_strongest_in_turns() -> None:
+    xy = np.array([[1.0, 1.0], [2.0, 1.0], [3.0, 1.0], [70.0, 1.0], [80.0, 1.0]])
+    assert ranked(xy, np.array([9.0, 8.0, 7.0, 2.0, 1.0]), 64, 5).tolist() == [0, 3, 1, 4, 2]
+    assert ranked(xy, np.array([9.0, 8.0, 7.0, 2.0, 1.0]), 64, 3).tolist() == [0, 3, 1]
 
 
 @pytest.mark.parametrize(
@@ -164,13 +176,13 @@ def test_tiles_are_equal_and_cut_at_whole_cells(size, tile, cell, edges) -> None
 def test_descriptors_are_square_roots_of_shares_and_angles_are_radians(tmp_path) -> None:
     picture = np.full((200, 200), 40, np.uint8)
     picture[90:112, 95:107] = 220
-    everything = Sift().detect(picture, lambda xy, scale, response: np.ones(len(xy), bool))
+    everything = Sift().detect(picture, lambda xy, scale, response: np.arange(len(xy)))
     assert len(everything)
     np.testing.assert_allclose((everything.descriptors.astype(float) ** 2).sum(axis=1), 255.0**2, rtol=0.03)
     assert (everything.angle >= 0).all()
     assert (everything.angle < 2 * np.pi + 1e-6).all()
     assert everything.angle.max() > 1.0
-    nothing = Sift().detect(picture, lambda xy, scale, response: np.zeros(len(xy), bool))
+    nothing = Sift().detect(picture, lambda xy, scale, response: np.arange(0))
     assert len(nothing) == 0
     assert join([]).descriptors.shape == (0, 128)
 
@@ -180,15 +192,14 @@ def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path)
     data = (rng.integers(0, 2, (40, 40)).repeat(8, 0).repeat(8, 1) * 800 + 100).astype(np.uint16)
     data[:, 250:] = 0
     path = write_image(tmp_path / "a.tif", data, nodata=0)
-    stretch = sample_stretch(path)
-    assert stretch is not None
+    stored = survey(path)
+    assert stored is not None
     with chosen(TieOptions, keypoints_per_cell=10_000, tile=160, cell=32) as options:
         boxes = tiles((320, 320), options)
-        found = [detect_tile(str(path), (320, 320), box, stretch, options) for box in boxes]
+        found = [detect_tile(str(path), (320, 320), box, stored, Share(0.1), options) for box in boxes]
     for (col, row, width, height), part in zip(boxes, found, strict=True):
         assert (part.xy >= [col - 0.5, row - 0.5]).all()
         assert (part.xy < [col + width - 0.5, row + height - 0.5]).all()
-        assert np.lexsort((part.xy[:, 0], part.xy[:, 1])).tolist() == list(range(len(part)))
     every = join(found)
     assert (250 - every.xy[:, 0] > 2.9).all()
     assert (250 - every.xy[:, 0] > every.scale - 1.5).all()

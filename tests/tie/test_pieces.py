@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import pytest
 
@@ -25,12 +26,21 @@ from barpc.tie.epipolar import (
     robust_affine,
     robust_spread,
 )
-from barpc.tie.features import detect_tile, join
+from barpc.tie.features import Share, detect_tile, join
 from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.matching import MATCHERS, PairReport, _latest, _Search
 from barpc.tie.pairs import Pair
-from barpc.tie.raster import sample_stretch, tiles
-from barpc.tie.register import Registration, _at, _Links, _shared, references
+from barpc.tie.raster import survey, tiles
+from barpc.tie.register import (
+    Registration,
+    _at,
+    _Links,
+    _parts,
+    _shared,
+    _sparse,
+    references,
+    register_places,
+)
 from barpc.tie.tracks import require_tracks, thin
 from tests.constants import CONSTANTS, chosen
 from tests.tie.conftest import Rendered, write_image
@@ -162,8 +172,9 @@ def test_tiles_are_as_large_as_asked_for(scene: Rendered) -> None:
     assert max(w for _, _, w, _ in boxes) == 256
     assert sum(w * h for _, _, w, h in boxes) == 700_000
     view = scene.views[0]
-    stretch = sample_stretch(view.path, 1)
-    small = detect_tile(view.path, view.size, (0, 0, 128, 128), stretch, TieOptions(tile=128))
+    stored = survey(view.path, 1)
+    assert stored is not None
+    small = detect_tile(view.path, view.size, (0, 0, 128, 128), stored, Share(0.1), TieOptions(tile=128))
     assert (small.xy < 128).all()
 
 
@@ -510,6 +521,39 @@ def test_what_is_verified_is_on_its_line_at_its_altitude_and_no_less_certain_tha
     assert np.flatnonzero(~left).tolist() == [20, 50, 51, 80]
 
 
+def test_few_points_are_registered_in_bands_of_rows_swept_by_columns() -> None:
+    places = np.random.default_rng(0).uniform(0, 40_000, (1300, 2))
+    links = np.arange(1300) + 7
+    parts = _parts(places, links, 1024)
+    assert [len(part) for part in parts] == [512, 512, 276]
+    assert sorted(np.concatenate(parts)) == links.tolist()
+    swept = places[np.concatenate(parts) - 7]
+    assert (np.diff(swept[:, 1] // 512) >= 0).all()
+    same = np.diff(swept[:, 1] // 512) == 0
+    assert (np.diff(swept[:, 0])[same] >= 0).all()
+
+
+@pytest.mark.parametrize("integers", [True, False])
+def test_places_far_apart_are_found_as_in_one_window(tmp_path, monkeypatch, integers: bool) -> None:
+    """Some of them near the border; the second image shows the first one moved."""
+    noise = np.random.default_rng(0).uniform(100, 3000, (700, 600)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    moved = np.ascontiguousarray(np.roll(smooth, (3, -2), axis=(0, 1)))
+    data = [image.astype(np.uint16) if integers else image.astype(np.float64) for image in (smooth, moved)]
+    files = tuple((str(write_image(tmp_path / f"{k}.tif", image)), (600, 700)) for k, image in enumerate(data))
+    reference = np.array([[100.0, 150.0], [9, 300], [400, 690], [300, 400], [585, 20], [50, 680], [250, 250]])
+    start = reference + [-1.6, 3.3]
+    linear = np.tile(np.eye(2), (len(start), 1, 1))
+    assert _sparse(reference, 28)
+    apart = register_places(files, 1, reference, start, linear, 21)
+    monkeypatch.setattr("barpc.tie.register._sparse", lambda *_: False)
+    together = register_places(files, 1, reference, start, linear, 21)
+    np.testing.assert_array_equal(apart.ok, together.ok)
+    assert 4 <= apart.ok.sum() < len(start)  # a patch that reaches beyond the border is not registered
+    np.testing.assert_allclose(apart.xy[apart.ok], together.xy[apart.ok], atol=0.002)
+    np.testing.assert_allclose(apart.xy[apart.ok], (reference + [-2, 3])[apart.ok], atol=0.01)
+
+
 def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
     links, seen = links_of(80, 3), []
 
@@ -518,6 +562,7 @@ def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
         return [Registration.none(task[3]) for task in tasks]
 
     monkeypatch.setattr("barpc.tie.register.ordered", ordered)
+    monkeypatch.setattr("barpc.tie.register._sparse", lambda *_: False)
     found = links.register(TieOptions(tile=256), None, None)
     assert len(found.xy) == 160
     for _, band, origin, start, linear, patch in seen:
