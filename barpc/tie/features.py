@@ -24,7 +24,9 @@ PER_CELL = 40
 CONTRAST = 0.01
 """SIFT's contrast threshold."""
 _DEFAULTS = TieOptions()
-_MARGIN = 48  # px around what is searched at a time, so that keypoints at its border are those of the whole picture
+_MARGIN = (
+    48  # px around what is searched at a time, so that keypoints at its border are those of the whole picture
+)
 _FEW = 8  # keypoints of a cell, about, where an image's are few: its cells are larger
 _AMPLE = 5  # keypoints for each tie point wanted
 _DENSE = 2e-3  # keypoints a px above which every pixel is looked at; half as many a side hold fewer
@@ -101,7 +103,9 @@ class Share:
 
     def within(self, used: float) -> Share:
         """The same where only a share of the image is used: by powers of two, so that it is not another one each time."""
-        return replace(self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0)))))
+        return replace(
+            self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0))))
+        )
 
     def most(self, box: Box) -> int:
         """How many a box may hold."""
@@ -130,7 +134,9 @@ def detect_tile(
         for col in range(box[0], box[0] + box[2], side):
             part = (col, row, min(side, box[0] + box[2] - col), min(side, box[1] + box[3] - row))
             near = grow((col - window[0], row - window[1], *part[2:]), zoom * _MARGIN, window[2:])
-            left, top, right, below = (n // zoom for n in (near[0], near[1], near[0] + near[2], near[1] + near[3]))
+            left, top, right, below = (
+                n // zoom for n in (near[0], near[1], near[0] + near[2], near[1] + near[3])
+            )
             place = slice(top, below), slice(left, right)
             if valid[place].any():
                 origin = np.array([window[0] + zoom * left + middle, window[1] + zoom * top + middle])
@@ -240,7 +246,9 @@ def _packed(keypoints: Keypoints, box: Box) -> dict[str, npt.NDArray[Any]]:
 
 
 def _unpacked(arrays: dict[str, npt.NDArray[Any]], box: Box) -> Keypoints:
-    columns = (arrays[f.name].astype(np.uint8 if f.name == "descriptors" else np.float64) for f in fields(Keypoints))
+    columns = (
+        arrays[f.name].astype(np.uint8 if f.name == "descriptors" else np.float64) for f in fields(Keypoints)
+    )
     found = Keypoints(*columns)
     return replace(found, xy=found.xy + np.array(box[:2]))
 
@@ -276,7 +284,9 @@ def locate(
     boxes = [tiles(v.size, options, share.zoom, known) if known else [] for v, known, share in each]
     if pairs is not None:
         boxes = shared_tiles(views, pairs, options, area, boxes)
-    used = [sum(b[2] * b[3] for b in some) / (v.size[0] * v.size[1]) for v, some in zip(views, boxes, strict=True)]
+    used = [
+        sum(b[2] * b[3] for b in some) / (v.size[0] * v.size[1]) for v, some in zip(views, boxes, strict=True)
+    ]
     shares = [share.within(part) for share, part in zip(shares, used, strict=True)]
     tasks = [
         (view.path, view.size, box, known, share, options)

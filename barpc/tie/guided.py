@@ -148,9 +148,14 @@ class _Strips:
         first, last = (np.floor(end).clip(-1, self._last + 1).astype(np.int64) for end in ends)
         first, last = first.clip(0), last.clip(None, self._last)
         point, strip = _expanded(first, (last - first + 1).clip(0))
-        span = ((u + end - self._corner[0])[point].clip(-1.0, self._length - 2.0) + 1.0 for end in (before, after))
+        span = (
+            (u + end - self._corner[0])[point].clip(-1.0, self._length - 2.0) + 1.0 for end in (before, after)
+        )
         low, high = (strip * self._length + end for end in span)
-        begin, end = np.searchsorted(self._key, low, side="left"), np.searchsorted(self._key, high, side="right")
+        begin, end = (
+            np.searchsorted(self._key, low, side="left"),
+            np.searchsorted(self._key, high, side="right"),
+        )
         count = (end - begin).clip(0)
         of_point = np.bincount(point, weights=count, minlength=len(rows))
         cuts = np.searchsorted(point, np.flatnonzero(np.diff(np.cumsum(of_point) // _CANDIDATES)) + 1)

@@ -99,13 +99,17 @@ def match_pair(
     along, across = np.median(errors[keep], axis=0).tolist()
     report = replace(report, inlier_share=share, offset=(along, across), spread=spread)
     if numbers is not None:
-        index = np.stack([number[column] for number, column in zip(numbers, found.index.T, strict=True)], axis=-1)
+        index = np.stack(
+            [number[column] for number, column in zip(numbers, found.index.T, strict=True)], axis=-1
+        )
         found = replace(found, index=index)
     return replace(found.select(keep), sigma=max(spread, 0.05)), report
 
 
 def _loaded(
-    views: tuple[View, View], keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles], options: TieOptions
+    views: tuple[View, View],
+    keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
+    options: TieOptions,
 ) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray] | None]:
     """Keypoints of the tiles that both views may see, and their numbers within the views; None: as they stand."""
     a, b = keypoints

@@ -142,7 +142,9 @@ def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
     flags = dataset.mask_flag_enums[band - 1]
     if getattr(dataset, "driver", None) is None or flags not in ([MaskFlags.nodata], [MaskFlags.all_valid]):
         return None
-    out: BoolArray = raw != dataset.nodatavals[band - 1] if MaskFlags.nodata in flags else np.ones(raw.shape, bool)
+    out: BoolArray = (
+        raw != dataset.nodatavals[band - 1] if MaskFlags.nodata in flags else np.ones(raw.shape, bool)
+    )
     return out
 
 
@@ -239,7 +241,10 @@ def tiles(
     if found is not None and found.block[0] >= size[0] > max(_WIDE, 2 * sides[0]):
         sides[0] = size[0]
     if found is not None and found.levels:
-        sides = [max(2, side // (zoom * block)) * zoom * block for side, block in zip(sides, found.block, strict=True)]
+        sides = [
+            max(2, side // (zoom * block)) * zoom * block
+            for side, block in zip(sides, found.block, strict=True)
+        ]
     edges = []
     for length, side in zip(size, sides, strict=True):
         step = side

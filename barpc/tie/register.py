@@ -87,12 +87,16 @@ def register_places(
     margin = patch + _TAPS + int(_REACH)
     read = _mosaics if _sparse(reference, margin) else _window
     reads = zip(files, (reference, start), strict=True)
-    (first, valid_a, shift_a), (second, valid_b, shift_b) = (read(file, band, xy, margin) for file, xy in reads)
+    (first, valid_a, shift_a), (second, valid_b, shift_b) = (
+        read(file, band, xy, margin) for file, xy in reads
+    )
     found = register((first, second), (valid_a, valid_b), reference - shift_a, start - shift_b, linear, patch)
     return replace(found, xy=found.xy + shift_b)
 
 
-Read = tuple[FloatImage, BoolArray, Array]  # pixels, which are valid, place of the image's origin (2,) or (N, 2) [px]
+Read = tuple[
+    FloatImage, BoolArray, Array
+]  # pixels, which are valid, place of the image's origin (2,) or (N, 2) [px]
 
 
 def _sparse(xy: Array, margin: int) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
-from barpc.ba import linear, normal, solve
+from barpc.ba import linear, normal
 from barpc.ba.dissection import dissect
 from barpc.ba.multifrontal import Blocks
 from barpc.ba.structure import counting_sort

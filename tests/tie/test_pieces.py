@@ -540,7 +540,9 @@ def test_places_far_apart_are_found_as_in_one_window(tmp_path, monkeypatch, inte
     smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
     moved = np.ascontiguousarray(np.roll(smooth, (3, -2), axis=(0, 1)))
     data = [image.astype(np.uint16) if integers else image.astype(np.float64) for image in (smooth, moved)]
-    files = tuple((str(write_image(tmp_path / f"{k}.tif", image)), (600, 700)) for k, image in enumerate(data))
+    files = tuple(
+        (str(write_image(tmp_path / f"{k}.tif", image)), (600, 700)) for k, image in enumerate(data)
+    )
     reference = np.array([[100.0, 150.0], [9, 300], [400, 690], [300, 400], [585, 20], [50, 680], [250, 250]])
     start = reference + [-1.6, 3.3]
     linear = np.tile(np.eye(2), (len(start), 1, 1))
