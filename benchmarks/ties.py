@@ -181,7 +181,7 @@ def middle(share: float, degrees: float, folder: str) -> Area:
 
 
 def scene(side: int, folder: str, layout: dict[str, object]) -> list[View]:
-    """A pair of `side` x `side` px: crops of one texture, turned, side by side, the left half with a third of the contrast."""
+    """A pair of `side` x `side` px: turned crops of one texture, the left half with a third of the contrast."""
     rng = np.random.default_rng(0)
     paths = [Path(folder) / f"{k}.tif" for k in range(2)]
     profile = {"driver": "GTiff", "width": side, "height": side, "count": 1, "dtype": "uint16", **layout}

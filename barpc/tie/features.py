@@ -15,7 +15,7 @@ from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairs import Area, Pair, shared_tiles
-from barpc.tie.raster import CELL, ZOOM, Box, ByteImage, Survey, grow, read_picture, survey, tiles
+from barpc.tie.raster import CELL, Box, ByteImage, Survey, grow, read_picture, survey, tiles
 from barpc.tie.store import Store, names_of, store_of
 from barpc.tie.tasks import Progress, ordered
 
@@ -29,7 +29,8 @@ _MARGIN = (
 )
 _FEW = 8  # keypoints of a cell, about, where an image's are few: its cells are larger
 _AMPLE = 5  # keypoints for each tie point wanted
-_DENSE = 2e-3  # keypoints a px above which every pixel is looked at; half as many a side hold fewer
+_ZOOMS = ((1.25e-4, 4), (2e-3, 2))
+"""Keypoints wanted a px below which so many pixels a side are looked at as one: real images then hold 1200e-6, 4500e-6."""
 _SPARE = 1.2  # of a tile's share: what poor tiles leave goes to the others
 
 
@@ -97,9 +98,9 @@ class Share:
     def of(size: tuple[int, int], options: TieOptions) -> Share:
         """That of a whole image of `size` (width, height)."""
         area = size[0] * size[1]
-        most = min(options.keypoints_per_image, _AMPLE * options.points_per_image)
-        coarse = most < _DENSE * area and min(size) > ZOOM * options.tile
-        return Share(options.keypoints_per_image / area, ZOOM if coarse else 1)
+        wanted = min(options.keypoints_per_image, _AMPLE * options.points_per_image) / area
+        zooms = (zoom for below, zoom in _ZOOMS if wanted < below and min(size) > zoom * options.tile)
+        return Share(options.keypoints_per_image / area, next(zooms, 1))
 
     def within(self, used: float) -> Share:
         """The same where only a share of the image is used: by powers of two, so that it is not another one each time."""
@@ -246,22 +247,23 @@ def _packed(keypoints: Keypoints, box: Box) -> dict[str, npt.NDArray[Any]]:
 
 
 def _unpacked(arrays: dict[str, npt.NDArray[Any]], box: Box) -> Keypoints:
-    columns = (
-        arrays[f.name].astype(np.uint8 if f.name == "descriptors" else np.float64) for f in fields(Keypoints)
+    described = np.asarray(arrays["descriptors"], np.uint8)
+    xy, scale, angle, response = (
+        np.asarray(arrays[field.name], np.float64) for field in fields(Keypoints)[:4]
     )
-    found = Keypoints(*columns)
-    return replace(found, xy=found.xy + np.array(box[:2]))
+    return Keypoints(xy + np.array(box[:2]), scale, angle, response, described)
 
 
 def allotted(found: IntArray, area: Array, most: int) -> IntArray:
-    """How many keypoints (T,) of the tiles count, `most` together: alike by area, poor tiles leaving theirs to the rest."""
+    """How many keypoints (T,) of the tiles count, `most` together: by area; poor tiles leave theirs to the rest."""
     if found.sum() <= most:
         return found
     order = np.argsort(found / area, kind="stable")
     poorer = np.cumsum(found[order]) - found[order]
     level = (most - poorer) / np.cumsum(area[order][::-1])[::-1]  # if all from this tile on are cut alike
     first = int(np.flatnonzero(level * area[order] <= found[order])[0])
-    return np.minimum(found, np.floor(level[first] * area).astype(np.int64))
+    kept: IntArray = np.minimum(found, np.floor(level[first] * area).astype(np.int64))
+    return kept
 
 
 def locate(

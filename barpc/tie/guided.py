@@ -48,11 +48,10 @@ class Guided:
         for row, col in strips.near(where, across, prediction.chosen(len(self._a))):
             du, dw = strips.apart(where, row, col)
             allowed = (np.abs(dw) <= across) & (du >= where.before[row]) & (du <= where.after[row])
-            row, col, du, dw = (x[allowed] for x in (row, col, du, dw))
-            alike = first.alike(row, second, col)
-            row, col, du, dw = (x[alike] for x in (row, col, du, dw))
-            if len(row):
-                best.update(row, col, first.likeness(row, second, col), du, dw)
+            allowed[allowed] = first.alike(row[allowed], second, col[allowed])
+            if allowed.any():
+                a_of, b_of = row[allowed], col[allowed]
+                best.update(a_of, b_of, first.likeness(a_of, second, b_of), du[allowed], dw[allowed])
         index, distance, ambiguity = best.mutual()
         clear = ambiguity <= (self._ratio if prediction.probes is None else min(self._ratio, _CLEAR_RATIO))
         xy = np.stack([self._a.xy[index[:, 0]], self._b.xy[index[:, 1]]], axis=1)

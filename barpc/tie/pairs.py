@@ -300,7 +300,7 @@ def shared_tiles(
     area: Area | None = None,
     boxes: Sequence[Sequence[Box]] | None = None,
 ) -> list[list[Box]]:
-    """The tiles (or given `boxes`) of every view that a partner may see in the area, cameras wrong by `options.search`."""
+    """The tiles (or `boxes`) of every view that a partner may see in the area, though cameras be wrong by `search`."""
     boxes = boxes or [tiles(view.size, options) for view in views]
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]

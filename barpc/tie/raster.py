@@ -28,8 +28,6 @@ Box = tuple[int, int, int, int]
 
 CELL = 64
 """Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""
-ZOOM = 2
-"""Pixels a side of a picture's pixel where an image has more detail than its quota of keypoints needs."""
 _ROWS = 512  # px read at a time, at least one row of blocks
 _WIDE = 4096  # px, and two tiles: strips of wider images are read whole
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
@@ -173,7 +171,7 @@ class Survey:
 
     stretch: Stretch
     block: tuple[int, int]  # width and height of what is decoded at a time [px]
-    levels: bool  # decoding is dear, and every second pixel costs a quarter (JPEG 2000)
+    levels: bool  # decoding is dear, and every second or fourth pixel costs less (JPEG 2000)
 
 
 def survey(path: str | os.PathLike[str], band: int = 1) -> Survey | None:
@@ -181,7 +179,7 @@ def survey(path: str | os.PathLike[str], band: int = 1) -> Survey | None:
     stretch = sample_stretch(path, band)
     with open_raster(path) as dataset:
         height, width = dataset.block_shapes[band - 1]
-        levels = getattr(dataset, "driver", "") == "JP2OpenJPEG" and ZOOM in dataset.overviews(band)
+        levels = getattr(dataset, "driver", "") == "JP2OpenJPEG" and {2, 4} <= set(dataset.overviews(band))
     return None if stretch is None else Survey(stretch, (width, height), levels)
 
 
