@@ -30,7 +30,7 @@ _MARGIN = (
 _FEW = 8  # keypoints of a cell, about, where an image's are few: its cells are larger
 _AMPLE = 5  # keypoints for each tie point wanted
 _ZOOMS = ((1.25e-4, 4), (2e-3, 2))
-"""Keypoints wanted a px below which so many pixels a side are looked at as one: real images then hold 1200e-6, 4500e-6."""
+"""Keypoints wanted a px, below which so many pixels a side are looked at as one: real images hold 1200e-6, 4500e-6."""
 _SPARE = 1.2  # of a tile's share: what poor tiles leave goes to the others
 
 
@@ -103,7 +103,7 @@ class Share:
         return Share(options.keypoints_per_image / area, next(zooms, 1))
 
     def within(self, used: float) -> Share:
-        """The same where only a share of the image is used: by powers of two, so that it is not another one each time."""
+        """The same where only a part of the image is used: by powers of two, not to be another one each time."""
         return replace(
             self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0))))
         )

@@ -214,9 +214,8 @@ def _reduced(picture: ByteImage, valid: BoolArray, zoom: int) -> tuple[ByteImage
         return picture, valid
     size = picture.shape[1] // zoom, picture.shape[0] // zoom
     small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    if valid.all():
-        return small, np.ones(small.shape, bool)
-    return small, valid.reshape(size[1], zoom, size[0], zoom).all(axis=(1, 3))
+    known: BoolArray = np.asarray(valid.reshape(size[1], zoom, size[0], zoom).all(axis=(1, 3)))
+    return small, known
 
 
 def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:

@@ -1,0 +1,253 @@
+"""Large images: an even quota, keypoints by reference, blocks decoded once."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from barpc.errors import InputError
+from barpc.pipeline.executor import CachingExecutor
+from barpc.scene import View
+from barpc.tie import TieOptions, features, find_tracks
+from barpc.tie.features import KeypointFiles, Share, detect_tile, keep_tile, locate
+from barpc.tie.raster import Survey, read_picture, survey, tiles
+from barpc.tie.register import _usual
+from barpc.tie.store import Store
+from barpc.workspace import Workspace
+
+from .conftest import write_image
+from .test_pairs import camera
+
+SIDE = 1000
+BLOCKS = {"tiled": True, "blockxsize": 64, "blockysize": 64, "compress": "deflate"}
+
+
+def quiet(noise: float, move: int = 0) -> np.ndarray:
+    """A picture whose left half has a third of the contrast of the right one."""
+    rng = np.random.default_rng(7)
+    fine, coarse = (cv2.GaussianBlur(rng.normal(0, 1, (SIDE, SIDE)), (0, 0), s) for s in (1.2, 5.0))
+    texture = 150 * fine / fine.std() + 250 * coarse / coarse.std()
+    texture[:, : SIDE // 2] /= 3
+    grain = np.random.default_rng(move).normal(0, noise, texture.shape)
+    return (900 + np.roll(texture, (move, move), axis=(0, 1)) + grain).clip(1, 4000).astype(np.uint16)
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> list[View]:
+    folder = tmp_path_factory.mktemp("quiet")
+    paths = [write_image(folder / f"{k}.tif", quiet(10.0, 2 * k), **BLOCKS) for k in range(2)]
+    sensors = camera(0.0, lean=0.0), camera(0.0, lean=0.1)
+    each = zip(paths, sensors, strict=True)
+    return [View(path.stem, str(path), (SIDE, SIDE), sensor, (0.0, 100.0)) for path, sensor in each]
+
+
+def left(xy: np.ndarray) -> float:
+    return float(np.mean(xy[:, 0] < SIDE / 2))
+
+
+@pytest.mark.parametrize(
+    ("most", "wanted", "zoom"), [(4000, 1000, 1), (900, 300, 2), (250, 24, 4), (150, 24, 4)]
+)
+def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_hold(
+    pair, most: int, wanted: int, zoom: int
+) -> None:
+    """16 to 0.6 keypoints a cell of 64 px, as images of 2,000 to 13,000 px a side have."""
+    options = TieOptions(keypoints_per_image=most, points_per_image=wanted, tile=128)
+    assert Share.of((SIDE, SIDE), options).zoom == zoom
+    for found in features.detect(pair, options):
+        assert 0.9 * most <= len(found) <= most
+        assert 0.4 <= left(found.xy) <= 0.6
+    tracks = find_tracks(pair, options).tracks
+    assert tracks.num_points >= 0.6 * min(wanted, 0.3 * most)
+    assert 0.3 <= left(tracks.xy[tracks.view == 0]) <= 0.7
+
+
+def test_a_sigma_is_judged_beside_those_about_it() -> None:
+    places = np.random.default_rng(0).uniform(0, SIDE, (2000, 2))
+    sigma = np.where(places[:, 0] < 500, 0.04, 0.01)
+    sigma[:20] *= 3
+    inner = np.abs(places[:, 0] - 500) > 150
+    np.testing.assert_array_equal(
+        _usual(places, sigma)[inner], np.where(places[:, 0] < 500, 0.04, 0.01)[inner]
+    )
+    assert _usual(places[:1], sigma[:1]).tolist() == sigma[:1].tolist()
+
+
+def test_what_a_poor_tile_leaves_goes_to_the_others(tmp_path) -> None:
+    data = quiet(10.0)
+    data[:560, :560] = 900  # nothing is found in the first of four tiles
+    view = View("a", str(write_image(tmp_path / "a.tif", data, **BLOCKS)), (SIDE, SIDE), None, (0.0, 1.0))  # type: ignore[arg-type]
+    found = features.detect([view], TieOptions(keypoints_per_image=400, points_per_image=200, tile=256))[0]
+    assert not (found.xy < 511).all(axis=1).any()
+    assert 340 < len(found) <= 360  # three quarters of it, and a fifth more
+
+
+def test_a_share_lasts_when_the_cameras_move_a_little() -> None:
+    share = Share.of((4000, 4000), TieOptions())
+    assert share.within(0.9) == share.within(0.6) == share.within(1.0)
+    assert share.within(0.2).density == 4 * share.density
+    assert share.within(0.0).density > share.density
+
+
+# --- by reference ------------------------------------------------------------------------------------------
+
+
+def test_the_caller_never_loads_keypoints(pair, monkeypatch) -> None:
+    inside, load = [], KeypointFiles.load
+
+    def watched(self: KeypointFiles, wanted=None):
+        inside.append(threading.current_thread() is threading.main_thread())
+        return load(self, wanted)
+
+    monkeypatch.setattr(KeypointFiles, "load", watched)
+    with ThreadPoolExecutor(1) as pool:
+        find_tracks(pair, TieOptions(keypoints_per_image=900), executor=pool)
+    assert inside == [False, False]
+
+
+def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path) -> None:
+    store = Store(str(tmp_path), str(tmp_path))
+    files = locate(pair[:1], TieOptions(keypoints_per_image=900, tile=256), store)[0]
+    assert 890 < len(files) <= 900
+    every, numbers = files.load()
+    assert sorted(numbers) == list(range(len(files)))
+    some, few = files.load(files.boxes[3:5])
+    assert len(some) == len(few) == sum(files.counts[3:5])
+    np.testing.assert_array_equal(some.xy, every.xy[np.isin(numbers, few)])
+    assert (few >= sum(files.counts[:3])).all()
+    box = files.boxes[3]
+    assert (some.xy[: files.counts[3]] >= np.array(box[:2]) - 0.5).all()
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "other", "gone"])
+def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path, damage: str) -> None:
+    store, view, box = Store(str(tmp_path / "kept"), str(tmp_path)), pair[0], (0, 0, 256, 256)
+    found, options = survey(view.path), TieOptions()
+    task = (store, "tile/a", view.path, view.size, box, found, Share(0.002), options)
+    count = keep_tile(*task)
+    path = tmp_path / "kept/tile/a.npz"
+    whole = path.read_bytes()
+    other = np.savez(tmp_path / "b.npz", a=np.zeros(3)) or (tmp_path / "b.npz").read_bytes()
+    if damage == "gone":
+        path.unlink()
+        with pytest.raises(InputError, match=r"a\.npz: a worker cannot read it"):
+            KeypointFiles(store, (box,), ("tile/a",), (count,)).load()
+    else:
+        path.write_bytes({"cut": whole[:-300], "empty": b"", "other": other}[damage])
+    assert keep_tile(*task) == count
+    assert path.read_bytes() == whole
+    assert [p.name for p in tmp_path.iterdir() if p.name != "b.npz"] == ["kept"]
+
+
+def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_folder(
+    pair, tmp_path, monkeypatch
+) -> None:
+    options, keys = TieOptions(keypoints_per_image=900, tile=256), []
+    for number in range(2):
+        with Workspace(tmp_path / f"run{number}") as workspace, CachingExecutor(workspace, {}) as executor:
+            files = locate(pair, options, executor.store, executor=executor)
+            keys.append(executor.key(find_tracks, (files[0], files[1])))
+            count = len(list(workspace.cache.rglob("*.npz")))
+            with monkeypatch.context() as patch:
+                patch.setattr(features, "Sift", None)
+                assert locate(pair, options, executor.store, executor=executor) == files
+            tiles_of = [box for of_view in files for box in of_view.boxes]
+            assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles_of) == 8
+            assert len(list(workspace.cache.rglob("*.npz"))) == count  # and nothing is kept twice
+            assert not list(workspace.partial.glob("*"))
+    assert keys[0] == keys[1]
+
+
+# --- reading -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("zoom", [1, 2, 4])
+@pytest.mark.parametrize("profile", [BLOCKS, {"blockysize": 7}, {"blockysize": 1000, "compress": "deflate"}])
+def test_a_picture_is_the_same_however_the_file_is_stored(
+    tmp_path, zoom: int, profile: dict[str, object]
+) -> None:
+    data = quiet(10.0)[:702, :801]
+    data[100:130, 200:260] = 0
+    path = write_image(tmp_path / "a.tif", data, nodata=0, **profile)
+    known = survey(path)
+    assert known is not None
+    picture, valid = read_picture(path, (64, 64, 737, 638), known, zoom)
+    assert picture.shape == valid.shape == (638 // zoom, 737 // zoom)
+    hole = np.zeros((638, 737), bool)
+    hole[36:66, 136:196] = True
+    part = valid.shape[0] * zoom, valid.shape[1] * zoom
+    each = (part[0] // zoom, zoom, part[1] // zoom, zoom)
+    np.testing.assert_array_equal(valid, ~hole[: part[0], : part[1]].reshape(each).any(axis=(1, 3)))
+    low, high = known.stretch.low, known.stretch.high
+    stretched = ((data[64:, 64:].astype(float) - low) * 255 / (high - low)).clip(0, 255)
+    mean = stretched[: part[0], : part[1]].reshape(each).mean(axis=(1, 3))
+    assert np.abs(picture - mean)[valid].max() <= 1.01
+
+
+@pytest.mark.parametrize("zoom", [2, 4])
+def test_the_levels_of_a_jpeg_2000_show_the_same_places(tmp_path, zoom: int) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    data = quiet(0.0)[:960, :960]
+    paths = [write_image(tmp_path / "a.tif", data, **BLOCKS), tmp_path / "a.jp2"]
+    lossless = {"driver": "JP2OpenJPEG", "QUALITY": "100", "REVERSIBLE": "YES", "RESOLUTIONS": "4"}
+    warnings.simplefilter("ignore")
+    with rasterio.open(paths[1], "w", width=960, height=960, count=1, dtype="uint16", **lossless) as out:
+        out.write(data, 1)
+    found = [survey(path) for path in paths]
+    assert [known and known.levels for known in found] == [False, True]
+    options, share = TieOptions(), Share(1.0, zoom)
+    at = [
+        detect_tile(str(p), (960, 960), (0, 0, 960, 960), f, share, options)
+        for p, f in zip(paths, found, strict=True)
+    ]  # type: ignore[arg-type]
+    apart = at[0].xy[:, None] - at[1].xy
+    near = np.hypot(*apart.T).T
+    mutual = [(i, j) for i, j in enumerate(near.argmin(axis=1)) if near[i, j] < zoom]
+    offset = np.median([apart[i, j] for i, j in mutual], axis=0)
+    assert len(mutual) > 0.5 * len(at[0])
+    assert np.abs(offset).max() < 0.1 * zoom
+
+
+@pytest.mark.parametrize(
+    ("size", "zoom", "found", "widths", "heights"),
+    [
+        ((9000, 3000), 1, Survey(None, (9000, 8), False), {9000}, {1024, 952}),  # type: ignore[arg-type]
+        ((9000, 3000), 1, Survey(None, (512, 512), False), {1024, 808}, {1024, 952}),  # type: ignore[arg-type]
+        ((4000, 3000), 1, Survey(None, (4000, 8), False), {1024, 928}, {1024, 952}),  # type: ignore[arg-type]
+        ((9000, 9000), 2, Survey(None, (1024, 1024), True), {4096, 808}, {4096, 808}),  # type: ignore[arg-type]
+        ((9000, 9000), 1, Survey(None, (640, 640), True), {1280, 40}, {1280, 40}),  # type: ignore[arg-type]
+    ],
+)  # fmt: skip
+def test_tiles_are_whole_strips_of_wide_images_and_whole_blocks_where_decoding_is_dear(
+    size, zoom, found, widths, heights
+) -> None:
+    boxes = tiles(size, TieOptions(), zoom, found)
+    assert {w for _, _, w, _ in boxes} == widths
+    assert {h for _, _, _, h in boxes} == heights
+    assert sum(w * h for _, _, w, h in boxes) == size[0] * size[1]
+
+
+def test_a_wide_tile_is_searched_in_parts_without_a_seam(pair) -> None:
+    found, options = survey(pair[0].path), TieOptions(tile=128)
+    assert found is not None
+    wide = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, Share(0.1), options)
+    whole = detect_tile(
+        pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, Share(0.1), replace(options, tile=1024)
+    )
+    small = whole.scale < 8
+    seen = {tuple(p) for p in np.round(wide.xy, 1)}
+    assert np.mean([tuple(p) in seen for p in np.round(whole.xy[small], 1)]) > 0.95
+    assert len(wide) == len({(*p, a) for p, a in zip(map(tuple, wide.xy), wide.angle, strict=True)})
+
+
+def test_the_store_goes_with_the_run_folder(tmp_path) -> None:
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as executor:
+        assert Path(executor.store.folder) == workspace.cache
+        assert Path(executor.store.room) == workspace.partial
