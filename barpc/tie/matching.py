@@ -98,7 +98,7 @@ def match_pair(
     spread, share = robust_spread(residual[keep]), report.verified / len(found)
     along, across = np.median(errors[keep], axis=0).tolist()
     report = replace(report, inlier_share=share, offset=(along, across), spread=spread)
-    if numbers is not None:
+    if kind.detects and numbers is not None:
         index = np.stack(
             [number[column] for number, column in zip(numbers, found.index.T, strict=True)], axis=-1
         )

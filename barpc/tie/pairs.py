@@ -312,7 +312,9 @@ def shared_tiles(
         prints = Footprints(views, alt, options.search, area)
         for i, of_view in enumerate(boxes):
             partly = shapely.union_all([prints.outlines[j] for j in partners[i]])
-            corners = np.array([[(c, r), (c + w, r), (c + w, r + h), (c, r + h)] for c, r, w, h in of_view])
+            corners = np.array(
+                [[(c, r), (c + w, r), (c + w, r + h), (c, r + h)] for c, r, w, h in of_view]
+            ).reshape(-1, 4, 2)
             ground = views[i].sensor.localize(corners - 0.5, np.array(alt))
             unknown = ~np.isfinite(ground).all(axis=(1, 2))
             ground[unknown] = 0.0
