@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 from barpc.errors import ImageError, InputError
 from barpc.pointio.ground import Correspondences, correspondence_kind, read_correspondences, read_grid
 from barpc.raster import driver_of, open_raster
+from barpc.remote import Place, located, place
 from barpc.rpcio import read_rpc_source
 from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import DirectGrid
@@ -31,7 +32,7 @@ class Camera:
     """A camera and where it came from."""
 
     model: SensorModel
-    path: Path
+    path: Place
     """The file that holds it: what was given, or a file beside it."""
     format: str
     """What that file is: ``tag``, ``nitf``, a row of `barpc.rpcio.FORMATS`, or another row of `OPENERS`."""
@@ -73,7 +74,7 @@ Reader = Callable[[str], Any]
 class Opener:
     """One kind of camera files."""
 
-    sniff: Callable[[Path, bytes, Mapping[str, Any]], bool]
+    sniff: Callable[[Any, bytes, Mapping[str, Any]], bool]
     """(path, its first 4096 bytes - none of a folder -, choices) -> whether it is of this kind."""
     open: Callable[..., Camera]
     """(path, **choices) -> Camera."""
@@ -100,9 +101,14 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
     ImageError, RpcError
         No such file, none of the kinds, or a damaged one.
     """
-    path, texts = split_spec(spec)
+    return open_split(*split_spec(spec), **choices)
+
+
+def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
+    """As `open_camera`, of a file and the choices behind it (see `split_spec`)."""
+    texts = dict(texts)
     size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
-    file = path if holder is None else Path(holder)
+    file = path if holder is None else place(holder)
     head = b"" if file.is_dir() else read_head(file, IMAGE, _HEAD)
     name, opener = next(
         (n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, {**texts, **choices})
@@ -120,15 +126,17 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
     return camera if size is None else replace(camera, size=size)
 
 
-def split_spec(spec: str | Path) -> tuple[Path, dict[str, str]]:
-    """A file and the choices given behind it, as texts."""
+def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[Place, dict[str, str]]:
+    """A file and the choices given behind it, as texts; files on other hosts where these are allowed (ImageError)."""
     name, texts = os.fspath(spec), dict[str, str]()
     known = {"camera", "size", *(key for opener in OPENERS.values() for key in opener.choices)}
     last = re.compile(rf"(.*),({'|'.join(sorted(known))})=(.*)", re.DOTALL)
     while not os.path.lexists(name) and (found := last.fullmatch(name)):
         name, key, text = found.groups()
         texts.setdefault(key, text)
-    return Path(name), texts
+    if "camera" in texts:
+        texts["camera"] = os.fspath(located(texts["camera"], hosts))
+    return located(name, hosts), texts
 
 
 def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, int] | None]:
@@ -143,7 +151,7 @@ def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, in
     return read_correspondences(path, altitudes=altitudes), size
 
 
-def _read(reader: Reader, key: str, text: str, file: Path) -> Any:
+def _read(reader: Reader, key: str, text: str, file: Place) -> Any:
     try:
         return reader(text)
     except (ValueError, KeyError) as error:
@@ -157,7 +165,7 @@ def _size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _pixels(path: Path) -> tuple[int, int] | None:
+def _pixels(path: Place) -> tuple[int, int] | None:
     try:
         with open_raster(path) as dataset:
             return int(dataset.width), int(dataset.height)
@@ -165,28 +173,30 @@ def _pixels(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def _open_rpc(path: Path, first_pixel: float | None = None, band: int = 1) -> Camera:
+def _open_rpc(path: Place, first_pixel: float | None = None, band: int = 1) -> Camera:
     source = read_rpc_source(path, first_pixel=first_pixel, band=band)
     return Camera(source.rpc, source.path, source.format, None, altitude_range(source.rpc), source.notes)
 
 
-def _is_sentinel1(path: Path, head: bytes, _choices: Mapping[str, Any]) -> bool:
+def _is_sentinel1(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
     """A product folder or zip, its manifest, or an annotation."""
     return path.is_dir() or path.suffix.lower() in (".safe", ".zip") or b"<adsHeader>" in head
 
 
-def _open_sentinel1(path: Path, pol: str | None = None, **choices: Any) -> Camera:
+def _open_sentinel1(path: Place, pol: str | None = None, **choices: Any) -> Camera:
     from barpc.sensor.sentinel1 import open_product
 
+    if not isinstance(path, Path):
+        raise ImageError(f"{path}: a radar product is read from disk only")
     model = open_product(path, polarisation=pol, **choices)
     return Camera(model, path, "sentinel-1", model.size, model.alt_range)
 
 
-def _is_grid(path: Path, head: bytes, choices: Mapping[str, Any]) -> bool:
+def _is_grid(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
     return driver_of(head) == "GTiff" and ("altitudes" in choices or correspondence_kind(path) == "grid")
 
 
-def _open_grid(path: Path, altitudes: list[float] | None = None) -> Camera:
+def _open_grid(path: Place, altitudes: list[float] | None = None) -> Camera:
     nodes = read_grid(path, altitudes)
     grid = DirectGrid.from_points(nodes.ground, nodes.image)
     size = (max(1, int(grid.cols[-1]) + 1), max(1, int(grid.rows[-1]) + 1))  # an image that begins at (0, 0)

@@ -25,8 +25,9 @@ from rasterio.windows import Window
 from barpc.errors import BarpcWarning, ImageError, InputError
 from barpc.geodesy import Array
 from barpc.raster import open_raster
+from barpc.remote import Place, place
 from barpc.sensor import SensorModel
-from barpc.sidefile import GRID, read_head
+from barpc.sidefile import GRID, opened
 
 HEIGHTS = {".hgt": ("SRTMHGT", "EGM96 height"), ".gtx": ("GTX", "ellipsoid")}
 """Suffix -> the driver that may open it (its first bytes say nothing), and what its heights count from."""
@@ -39,7 +40,7 @@ _VERTICAL = re.compile(r'(?:VERTCRS|VERT_CS|VERTICALCRS)\s*\[\s*"([^"]+)"')
 class HeightGrid:
     """Heights at the nodes of a regular grid, read when they are asked for."""
 
-    path: Path
+    path: Place
     driver: str | None
     shape: tuple[int, int]  # number of nodes: rows, cols
     crs: CRS
@@ -51,15 +52,16 @@ class HeightGrid:
     @classmethod
     def open(cls, path: Path | str) -> HeightGrid:
         """A grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA's geoid grids) or any raster with a CRS; or InputError."""
-        path = Path(path)
-        read_head(path, GRID, 0)  # a regular file
+        path = place(path)
+        with opened(path, GRID) as file:
+            length = file.seek(0, 2)
         driver, reference = HEIGHTS.get(path.suffix.lower(), (None, None))
         try:
             with open_raster(path, driver) as dataset:
                 crs, shape, forward, extent = dataset.crs, dataset.shape, dataset.transform, dataset.bounds
                 if crs is None:
                     raise InputError(f"{path}: a DEM or geoid grid needs a CRS, and this raster has none")
-                if driver == "GTX" and path.stat().st_size != 40 + 4 * shape[0] * shape[1]:
+                if driver == "GTX" and length != 40 + 4 * shape[0] * shape[1]:
                     raise ImageError(f"{path}: its header does not go with its size")
         except ImageError as error:
             if driver is None:
@@ -143,7 +145,7 @@ def _snapped(index: Array) -> Array:
     return np.where(np.abs(index - node) < 1e-6, node, index)
 
 
-def _inverse(forward: Affine, path: Path) -> Affine:
+def _inverse(forward: Affine, path: Place) -> Affine:
     """From coordinates to pixels, where the way there has one."""
     numbers = np.array(forward[:6])
     area = abs(forward.determinant)
@@ -183,13 +185,13 @@ class Dem:
             raise InputError(f"{path}: its heights are ellipsoidal already; leave out the geoid {geoid}")
         done, advice = "ellipsoidal", ""
         if geoid is not None:
-            done = f"made ellipsoidal with {Path(geoid).name}"
+            done = f"made ellipsoidal with {place(geoid).name}"
         elif known != "ellipsoid":
             done, advice = (
                 "TAKEN AS ELLIPSOIDAL",
                 "; give a geoid grid, or expect errors up to 100 m in height",
             )
-        description = f"{Path(path).name}: vertical reference {known}, {done}"
+        description = f"{place(path).name}: vertical reference {known}, {done}"
         if advice or known == "unknown":
             warnings.warn(f"DEM {description}{advice}", BarpcWarning, stacklevel=2)
         return cls(grid, None if geoid is None else HeightGrid.open(geoid), description, not advice)

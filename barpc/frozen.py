@@ -16,6 +16,7 @@ import numpy.typing as npt
 from numpy.lib import format as npy
 
 from barpc.errors import BarpcError, InputError
+from barpc.remote import Remote
 from barpc.sidefile import ARRAYS, Kind, opened
 
 
@@ -106,16 +107,21 @@ def to_arrays(value: Any) -> Arrays:
     return arrays
 
 
-def from_arrays(arrays: Mapping[str, npt.NDArray[Any]]) -> Any:
-    """The value that `to_arrays` took apart; ValueError where it is damaged or names no loaded dataclass of barpc."""
+def from_arrays(arrays: Mapping[str, npt.NDArray[Any]], *, sent: bool = False) -> Any:
+    """The value that `to_arrays` took apart; ValueError where it is damaged or names no loaded dataclass of barpc.
+
+    A Remote is taken of arrays that were `sent` by our own process only: those of a file may be anybody's.
+    """
     try:
         frame = json.loads(np.asarray(arrays[_FRAME], dtype=np.uint8).tobytes())
-        return _decode(frame, arrays)
+        return _decode(frame, arrays, sent)
     except (KeyError, TypeError, AttributeError, IndexError, RecursionError, UnicodeDecodeError) as error:
         raise ValueError(f"not a stage result: {error!r}") from error
 
 
 def _encode(value: Any, arrays: Arrays) -> Any:
+    if isinstance(value, Remote):
+        return {"remote": [str(value), value.size, value.tag]}
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, np.generic):
@@ -136,22 +142,26 @@ def _encode(value: Any, arrays: Arrays) -> Any:
     raise TypeError(f"a {type(value).__name__} cannot be kept")
 
 
-def _decode(frame: Any, arrays: Mapping[str, npt.NDArray[Any]]) -> Any:
+def _decode(frame: Any, arrays: Mapping[str, npt.NDArray[Any]], sent: bool = False) -> Any:
     if not isinstance(frame, dict):
         return frame
     if "array" in frame:
         return arrays[frame["array"]]
+    if "remote" in frame:
+        if not sent:
+            raise ValueError("a Remote in a file")
+        return Remote(*frame["remote"])
     if "tuple" in frame:
-        return tuple(_decode(v, arrays) for v in frame["tuple"])
+        return tuple(_decode(v, arrays, sent) for v in frame["tuple"])
     if "list" in frame:
-        return [_decode(v, arrays) for v in frame["list"]]
+        return [_decode(v, arrays, sent) for v in frame["list"]]
     if "map" in frame:
-        return {k: _decode(v, arrays) for k, v in frame["map"]}
+        return {k: _decode(v, arrays, sent) for k, v in frame["map"]}
     module, name = frame["class"]
     kind = getattr(sys.modules.get(module), name, None)
     if module.split(".")[0] != "barpc" or not (isinstance(kind, type) and is_dataclass(kind)):
         raise ValueError(f"{module}.{name} is not a record of barpc")
-    return kind(**{k: _decode(v, arrays) for k, v in frame["fields"].items()})
+    return kind(**{k: _decode(v, arrays, sent) for k, v in frame["fields"].items()})
 
 
 _DEFLATE = 1032  # bytes at most that one byte of a deflated stream stands for

@@ -21,6 +21,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from barpc.errors import InputError
+from barpc.remote import HOST
 from barpc.sidefile import OPTIONS, read_text
 
 T = TypeVar("T")
@@ -48,6 +49,7 @@ class Rule:
     below: float | None = None  # not reached
     rows: str = ""  # the table whose keys are the values allowed, as module and name
     hook: bool = False  # or `module:name`, of a user's own
+    spoken: bool = False  # said by a person: no options file may set it
 
     def holds(self, number: float) -> bool:
         """Whether a number lies within the bounds; NaN and the infinities do not."""
@@ -401,6 +403,14 @@ class RunOptions(Options):
         3.""",
     )
     overwrite: bool = option(False, "Replace the results of an earlier run in the same folder.")
+    allow_remote: tuple[str, ...] = option(
+        (),
+        """A host from which images, the files beside them, the DEM and the reference may be read by URL; none
+        without. `HOST` is that of `https://HOST/...`; a bucket is given as `s3://BUCKET` (or gs, az). Never taken from
+        an options file.""",
+        unit="host",
+        spoken=True,
+    )
     matches: str | None = option(
         None,
         """Matches of pairs (CSV, npz, COLMAP, hloc, ASP), to be verified and registered; the other pairs are matched. A
@@ -457,6 +467,9 @@ class RunOptions(Options):
             raise InputError("reference_sigma is given without reference")
         if self.matches_only and self.matches is None:
             raise InputError("matches_only is given without matches: there would be no tie points")
+        for host in self.allow_remote:
+            if not HOST.fullmatch(host):
+                raise InputError(f"allow_remote {host!r} is no HOST, HOST:PORT or s3://BUCKET")
         for name in ("overlap_list", "aoi"):
             if self.matches_only and getattr(self, name) is not None:
                 raise InputError(
@@ -497,6 +510,11 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a date or a number that is none is not its own class
         raise InputError(f"{path}: not an options file (TOML): {error}") from error
+    for name in data:
+        if (one := declared(RunOptions).get(name)) is not None and one.rule.spoken:
+            raise InputError(
+                f"{path}: {name} is not taken from a file, which may be anybody's; give the flag"
+            )
     return with_values(options or RunOptions(), data, str(path))
 
 
@@ -506,7 +524,7 @@ def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
     for name, one in declared(record).items():
         if isinstance(one.default, Options):
             properties[name] = schema(type(one.default))
-        else:
+        elif not one.rule.spoken:
             properties[name] = {**_schema(one.kind, one.rule), "description": one.rule.help}
             if one.default is not None:
                 listed = isinstance(one.default, tuple)

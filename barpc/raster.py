@@ -1,8 +1,9 @@
-"""Opening a raster: one regular local file, one driver, nothing fetched.
+"""Opening a raster: one regular file, one driver, nothing fetched by GDAL.
 
 GDAL decides by content what a file is, and some contents (a VRT, a web service description) make it read other
 files or the network. So the first bytes choose the one driver that may open a file, GDAL does not look at the files
-beside it, and a VRT is never shown to it: `barpc.vrt` reads it, and `Mosaic` puts the pixels together.
+beside it, and a VRT is never shown to it: `barpc.vrt` reads it, and `Mosaic` puts the pixels together. Of a file on
+another host GDAL asks this process for bytes, and it alone speaks with the host.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from rasterio.transform import array_bounds
 from rasterio.windows import Window
 
 from barpc.errors import ImageError
+from barpc.remote import Place, Remote, RemoteFile, place
 from barpc.scene import BoolArray
 from barpc.sidefile import IMAGE, read_head
 from barpc.vrt import INDIRECT, MAGIC, Band, Rect, Source, Vrt, read_vrt
@@ -70,7 +72,7 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
     `barpc.vrt` or points at anything else than plain local rasters.
     """
     name = os.fspath(path)
-    file, driver = identify(name, driver)
+    file, driver = identify(path, driver)
     try:
         with (
             rasterio.Env(**GDAL_OPTIONS, **_ALONE),
@@ -82,14 +84,61 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
         raise ImageError(f"{name}: cannot be read as {driver}: {reason}") from error
 
 
-def _opened(file: Path, driver: str) -> Any:
+def _opened(file: Place, driver: str) -> Any:
+    if isinstance(file, Remote):
+        return _opened_remote(file, driver)
     with _WARNINGS, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         return rasterio.open(file, driver=driver)
 
 
-def _mosaic(file: Path, name: str) -> Mosaic:
+class _Asked(RemoteFile):
+    """What GDAL reads from: it takes an exception for nothing, so failures are kept for `_opened_remote`."""
+
+    def __init__(self, at: Remote, failures: list[OSError]) -> None:
+        super().__init__(at)
+        self._failures = failures
+
+    def readinto(self, buffer: Any) -> int:
+        if self._failures:
+            return 0
+        try:
+            return super().readinto(buffer)
+        except OSError as error:
+            self._failures.append(error)
+            return 0
+
+
+_SHOWN = "remote"  # the one file that GDAL finds
+
+
+@contextmanager
+def _opened_remote(file: Remote, driver: str) -> Iterator[Any]:
+    """Some drivers make pixels of a file that ends too early: whatever they say, no failed reading ends well."""
+    failures: list[OSError] = []
+
+    def opener(name: str, _mode: str = "rb", **_given: Any) -> _Asked:
+        if name != _SHOWN:
+            raise FileNotFoundError(name)
+        return _Asked(file, failures)
+
+    try:
+        with _WARNINGS, warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            dataset = rasterio.open(_SHOWN, driver=driver, opener=opener)
+        with dataset:
+            yield dataset
+    except RasterioError:
+        if not failures:
+            raise
+    if failures:
+        raise ImageError(f"{file}: cannot be read ({failures[0]})") from failures[0]
+
+
+def _mosaic(file: Place, name: str) -> Mosaic:
     """A VRT whose sources are all rasters that are read here."""
+    if isinstance(file, Remote):
+        raise ImageError(f"{name}: a VRT is read from disk only; give the images it is made of")
     vrt = read_vrt(file, name=name)
     drivers: dict[Path, str] = {}
     for source in vrt.sources:
@@ -100,19 +149,19 @@ def _mosaic(file: Path, name: str) -> Mosaic:
     return Mosaic(name, vrt, lambda source: _opened(source, drivers[source]))
 
 
-def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[Path, str]:
-    """The absolute path of a raster and the only driver that may open it, given or by its first bytes (ImageError)."""
+def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[Place, str]:
+    """Absolute path (or Remote) of a raster and the only driver that may open it, given or by its first bytes."""
     name = os.fspath(path)
-    if INDIRECT.match(name) and not os.path.lexists(name):
+    if not isinstance(path, Remote) and INDIRECT.match(name) and not os.path.lexists(name):
         raise ImageError(f"{name}: remote and virtual paths are not read")
-    head = read_head(name, IMAGE, 64)
+    head = read_head(name, IMAGE, 64)  # (os.fspath leaves a Remote as it is)
     if not head:
         raise ImageError(f"{name}: the file is empty")
     driver = driver or driver_of(head)
     if driver is None:
         known = ", ".join(sorted(set(DRIVERS.values())))
         raise ImageError(f"{name}: not a raster that is read here (kinds known: {known})")
-    return Path(name).absolute(), driver
+    return place(path).absolute(), driver
 
 
 def driver_of(head: bytes) -> str | None:

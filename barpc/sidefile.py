@@ -21,6 +21,7 @@ from typing import Any, BinaryIO, NoReturn, TextIO
 from xml.etree import ElementTree
 
 from barpc.errors import BarpcError, ImageError, InputError, RpcFormatError, visible
+from barpc.remote import BLOCK, Place, Remote, RemoteFile, pinned, place
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +78,23 @@ def opened(path: Path | str, kind: Kind) -> Iterator[BinaryIO]:
         raise kind.error(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
+def versioned(path: Place, kind: Kind) -> Place:
+    """A Remote with the version that its file has now, which all who are given it read; a Path as it is."""
+    if not isinstance(path, Remote):
+        return path
+    try:
+        return pinned(path)
+    except FileNotFoundError as error:
+        raise kind.error(f"{path}: no such file ({error}); {kind.words} is needed") from error
+    except OSError as error:
+        raise kind.error(f"{path}: cannot be read ({error})") from error
+
+
 def _regular(path: Path | str, kind: Kind) -> BinaryIO:
+    if isinstance(path, Remote):
+        elsewhere = RemoteFile(versioned(path, kind))
+        kind.check(path, elsewhere.size)
+        return io.BufferedReader(elsewhere, BLOCK)
     try:
         descriptor = os.open(path, _FLAGS)
     except (FileNotFoundError, NotADirectoryError):
@@ -151,8 +168,8 @@ def read_names(path: Path | str, words: str) -> list[str]:
 _REFUSED = "\ufffe\uffff" + ("\\" if os.sep == "/" else "")
 
 
-def plain_path(path: str | os.PathLike[str]) -> Path:
-    """A path as it is, once every file that barpc writes can carry it.
+def plain_path(path: str | os.PathLike[str]) -> Place:
+    """A path or a Remote as it is, once every file that barpc writes can carry it.
 
     InputError for a control character, an end of line, bytes that are no text, a backslash that separates no folders.
     """
@@ -164,7 +181,7 @@ def plain_path(path: str | os.PathLike[str]) -> Path:
                 f"{visible(name)}: its path holds {what}, which not every file and tool takes;"
                 " rename it, or give a link to it"
             )
-    return Path(name)
+    return place(path)
 
 
 # --- JSON -------------------------------------------------------------------------------------------------

@@ -38,6 +38,7 @@ from barpc import __version__
 from barpc.atomic import replacing
 from barpc.errors import BarpcError, OutputError
 from barpc.frozen import Arrays, load_npz
+from barpc.remote import Remote
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +67,12 @@ def code_version() -> str:
 
 
 def fingerprint(path: str | Path) -> str:
-    """A hash of a file's content; of files above 64 MiB 64 samples, the size and the time of change."""
+    """A hash of a file's content; of files above 64 MiB 64 samples, the size and the time of change.
+
+    Of a file on another host its URL and the version that the host names: nothing is read for it.
+    """
+    if isinstance(path, Remote):
+        return hashlib.sha256(f"{path} {path.size} {path.tag}".encode()).hexdigest()
     path = Path(path)
     found = path.stat()
     digest = hashlib.sha256(str(found.st_size).encode())

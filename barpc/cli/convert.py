@@ -93,7 +93,7 @@ def convert(
     if len(files) != 2 or rpcs or carrier:
         raise click.UsageError("give SOURCE and TARGET, or images and -o DIR (with it: --rpc, --images)")
     source, target = files
-    camera, image, cut = open_camera(source), split_spec(source)[0], bool(window or bbox)
+    camera, image, cut = open_camera(source), Path(split_spec(source)[0]), bool(window or bbox)
     check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
     if cut:
         window = _window(camera, window, bbox, alt)
@@ -139,7 +139,7 @@ def check_target(
     RPC, and that is said; where it is the `rpc` that the file will hold, nothing changes for it.
     """
     target = Path(target)
-    inputs = {p.resolve() for s in sources for p in (Path(s), *(sidecar.path for sidecar in sidecars(s)))}
+    inputs = {Path(p).resolve() for s in sources for p in (s, *(sidecar.path for sidecar in sidecars(s)))}
     if os.path.lexists(target) and target.resolve() in inputs:
         raise OutputError(f"{target}: belongs to the input and is never replaced; give another name")
     text = FORMATS["txt"].write
@@ -187,7 +187,7 @@ def _hand_off(
     as_json: bool,
 ) -> int:
     """Write images with their RPCs, open every file as its readers do, and say what they see."""
-    files = [split_spec(image)[0] for image in images]
+    files = [Path(split_spec(image)[0]) for image in images]
     _check(files, folder, formats)
     if rpcs is not None:
         images = tuple(str(find_rpc(Path(rpcs), f)) if Path(rpcs).is_dir() else rpcs for f in files)
@@ -195,7 +195,7 @@ def _hand_off(
     ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
     names = [[file.stem + end for end in ends] for file in files]
     together = [name for row in names for name in row]
-    inputs = [*files, *(camera.path for camera in cameras)]
+    inputs = [*files, *(Path(camera.path) for camera in cameras)]
     refuse_hiding(folder, together, inputs)
     readings: list[Reading] = []
     reasons: list[str] = []

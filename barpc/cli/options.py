@@ -15,6 +15,7 @@ from barpc.options import Declared, RunOptions, checked, declared, read_options,
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+REMOTE = "allow_remote"
 TIE = (
     "tie.band",
     "tie.matcher",
@@ -102,7 +103,7 @@ def with_flags(*targets: str) -> Callable[[Function], Function]:
     """Give a verb the flags of these fields, and those of every run: image and options files, workers, JSON."""
 
     def decorate(function: Function) -> Function:
-        for option in (*_RUN_OPTIONS[::-1], *map(flag, targets[::-1])):
+        for option in (*_RUN_OPTIONS[::-1], *map(flag, (*targets, REMOTE)[::-1])):
             function = option(function)
         return function
 
@@ -135,12 +136,14 @@ _RUN_OPTIONS = (
 
 def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
     """Images of the command line, then those of a list file (blank lines and # comments are skipped)."""
+    from barpc.remote import is_url
     from barpc.sidefile import read_names
 
     paths = list(images)
     if image_list is not None:
         folder, lines = Path(image_list).parent, read_names(image_list, "a list of images")
-        paths += [str(folder / line.strip()) for line in lines if line.strip() and not line.startswith("#")]
+        named = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
+        paths += [name if is_url(name) else str(folder / name) for name in named]
     return paths
 
 
@@ -148,7 +151,7 @@ def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOption
     """Defaults, then the options file, then the flags that were given."""
     options = RunOptions() if options_file is None else read_options(options_file)
     values: dict[str, Any] = {}
-    for target in (*TIE, *ADJUSTMENT, *RUN, "fit.tolerance", "fit.localisation"):
+    for target in (*TIE, *ADJUSTMENT, *RUN, REMOTE, "fit.tolerance", "fit.localisation"):
         value = flags.get("flag_" + target.replace(".", "_"))
         if value is None:
             continue

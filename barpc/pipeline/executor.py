@@ -273,7 +273,7 @@ class Spilled:
                 f"{error.filename}: a worker cannot read it; images and run folder must be on a disk that all "
                 "workers see under the same path"
             ) from error
-        arguments: tuple[Any, ...] = from_arrays({**self.small, **arrays})
+        arguments: tuple[Any, ...] = from_arrays({**self.small, **arrays}, sent=True)
         return arguments
 
 

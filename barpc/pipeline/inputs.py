@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import shlex
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,10 @@ from barpc.errors import InputError
 from barpc.options import RunOptions, declared
 from barpc.pipeline.control import load_gcps
 from barpc.pointio.names import ViewNames
+from barpc.remote import Remote, located
 from barpc.scene import BoolArray, Tracks, View
 from barpc.sensor.geometry import footprint
-from barpc.sidefile import read_names
+from barpc.sidefile import IMAGE, read_names, versioned
 from barpc.tie.ortho import Sheet
 
 logger = logging.getLogger(__name__)
@@ -55,13 +58,26 @@ def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
         )
 
 
+def with_located(options: RunOptions) -> RunOptions:
+    """The options with the rasters that may lie on other hosts found there; others are refused (ImageError)."""
+    if not options.allow_remote:
+        return options
+
+    def at(path: str) -> str:
+        return os.fspath(versioned(located(path, options.allow_remote), IMAGE))
+
+    dem, geoid = (path if path is None else at(path) for path in (options.dem, options.geoid))
+    return replace(options, dem=dem, geoid=geoid, reference=tuple(map(at, options.reference)))
+
+
 def input_files(options: RunOptions) -> list[Path]:
-    """Every file that the options name; none of them is ever written."""
+    """Every file of this machine that the options name; none of them is ever written."""
     found = [] if options.fixed_run is None else [Path(options.fixed_run) / PRIOR]
     for name, one in declared(RunOptions).items():
         value = getattr(options, name)
         if one.rule.unit == "file" and value is not None:
-            found += [Path(path) for path in (value if isinstance(value, tuple) else (value,))]
+            paths = value if isinstance(value, tuple) else (value,)
+            found += [Path(path) for path in paths if not isinstance(path, Remote)]
     return found
 
 
@@ -99,17 +115,21 @@ def _finder(
     """Index of the view that a list calls by its path or its name; None if it was left out, InputError if unknown."""
     names = ViewNames([view.name for view in views], "the list of pairs")
     without = ViewNames([Path(path).name for path in left_out], "")
-    places: dict[Path, int | None] = {Path(path).resolve(): None for path in left_out}
-    places |= {Path(view.path).resolve(): index for index, view in enumerate(views)}
+    places: dict[object, int | None] = {_resolved(path): None for path in left_out}
+    places |= {_resolved(view.path): index for index, view in enumerate(views)}
 
     def find(word: str) -> int | None:
-        for place in ((start / word).resolve() for start in (folder, Path())):
-            if place in places:
-                return places[place]
+        for at in (word, *((start / word).resolve() for start in (folder, Path()))):
+            if at in places:
+                return places[at]
         unused = names.find(word) is None and without.find(word) is not None
         return None if unused else names.index(word)
 
     return find
+
+
+def _resolved(path: str | Path) -> object:
+    return str(path) if isinstance(path, Remote) else Path(path).resolve()
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -21,14 +22,16 @@ from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.handoff import refuse_hiding, unverified
 from barpc.options import FitOptions, RunOptions
+from barpc.pipeline.cluster import watched
 from barpc.pipeline.control import load_gcps
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.given import given_matches, given_tracks
-from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs
+from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs, with_located
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.views import Image, image_path, load_views
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
+from barpc.remote import Remote, place
 from barpc.report import Run, Summary, summarize
 from barpc.report.page import REPORT, remake_report
 from barpc.report.records import plain
@@ -133,14 +136,14 @@ def adjust(
     BarpcError
         See `barpc.errors`; nothing is written then.
     """
-    options, folder = options or RunOptions(), Path(out_dir)
+    options, folder = with_located(options or RunOptions()), Path(out_dir)
     plain_path(folder.absolute())
     stages: list[dict[str, Any]] = []
-    with timed("inputs", stages) as workers:
+    with watched(executor), timed("inputs", stages) as workers:
         run = _loaded("adjust", images, options, executor, progress, workers)
         names, keep = _files(run, options, folder)
         workspace = Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names)
-    with workspace:
+    with watched(executor), workspace:
         workspace.stages += stages
         with workspace.stage("fingerprints"):
             paths = [*(view.path for view in run.views), *_references(options)]
@@ -168,7 +171,7 @@ def adjust(
         workspace.remove_stale()
     sensors = run.after or run.before
     views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
-    return AdjustResult(_as_given(views, images), run, summary)
+    return AdjustResult(_as_given(views, images, options), run, summary)
 
 
 def _tell(progress: Progress | None, stage: str, done: int) -> None:
@@ -193,13 +196,13 @@ def check(
     progress: Progress | None = None,
 ) -> AdjustResult:
     """Measure how well the cameras of overlapping images agree; nothing is adjusted or written."""
-    options = options or RunOptions()
+    options = with_located(options or RunOptions())
     run = _with_ties(_loaded("check", images, options, executor, progress), options, executor, progress)
-    return AdjustResult(_as_given(run.views, images), run, summarize(run))
+    return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
 
 
-def _as_given(views: Iterable[View], images: Sequence[Image]) -> tuple[View, ...]:
-    place = {str(image_path(image)): number for number, image in enumerate(images)}
+def _as_given(views: Iterable[View], images: Sequence[Image], options: RunOptions) -> tuple[View, ...]:
+    place = {str(image_path(image, options.allow_remote)): number for number, image in enumerate(images)}
     return tuple(sorted(views, key=lambda view: place[view.path]))
 
 
@@ -220,6 +223,7 @@ def _loaded(
         min_views=least,
         keep_going=options.keep_going,
         band=options.tie.band,
+        hosts=options.allow_remote,
         executor=executor,
         progress=progress,
     )
@@ -234,10 +238,11 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
     views = run.views
     if options.stop_after == "matching":
         require_pair_names([view.name for view in views])
-    if options.images == "vrt":
+    if options.images == "vrt" and options.stop_after == "all":
         for view in views:
             plain_source(view.path)
-    keep = {Path(view.path) for view in views} | {Path(source.path) for source in run.sources}
+    inputs = (*(view.path for view in views), *(source.path for source in run.sources))
+    keep = {Path(path) for path in inputs if not isinstance(path, Remote)}
     keep |= set(input_files(options))
     names = output_names(views, options, folder)
     refuse_hiding(folder, names, keep)
@@ -265,7 +270,7 @@ def _solve(
 
 
 def _references(options: RunOptions) -> list[str]:
-    return [str(Path(path).absolute()) for path in options.reference]
+    return [os.fspath(place(path).absolute()) for path in options.reference]
 
 
 def _registered(

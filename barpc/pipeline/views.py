@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 from rasterio.windows import Window
 
-from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cameras import Camera, open_split, split_spec
 from barpc.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
+from barpc.remote import Place, Remote, located
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
-from barpc.sidefile import plain_path
+from barpc.sidefile import IMAGE, plain_path, versioned
 from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
@@ -64,12 +65,13 @@ class _Read:
     error: BarpcError | None = None
 
 
-_Given = tuple[str, Path, Image]  # name, file, and what was given
+_Given = tuple[str, Place, Image]  # name, file, and what was given
 
 
-def image_path(image: Image) -> Path:
-    """The file with the pixels, absolute."""
-    return (Path(image.path) if isinstance(image, View) else split_spec(image)[0]).absolute()
+def image_path(image: Image, hosts: Sequence[str] = ()) -> Place:
+    """The file with the pixels, absolute; on another host where it is one of `hosts`."""
+    path = located(image.path, hosts) if isinstance(image, View) else split_spec(image, hosts)[0]
+    return path.absolute()
 
 
 def load_views(
@@ -81,6 +83,7 @@ def load_views(
     distinct: bool = True,
     executor: Executor | None = None,
     progress: Progress | None = None,
+    hosts: Sequence[str] = (),
 ) -> LoadedViews:
     """Read the camera of every image, in the order of their names, whatever order they are given in.
 
@@ -92,13 +95,14 @@ def load_views(
     band : int, the band that will be read, from 1
     distinct : bool, refuse an image that is there twice, also as other files or under another RPC (see `Twins`)
     executor, progress : as of `barpc.adjust`
+    hosts : sequence of str, other hosts from which files may be read (`RunOptions.allow_remote`)
 
     Raises
     ------
     InputError
         Too few images, the same image twice, or a name that the files of a run cannot carry.
     """
-    files = [plain_path(image_path(image)) for image in images]
+    files = [plain_path(image_path(image, hosts)) for image in images]
     if len(files) < min_views:
         found = files[0] if files else "none"
         raise InputError(
@@ -109,7 +113,9 @@ def load_views(
     left_out: list[tuple[str, str]] = []
     twins = Twins(band)
     given = sorted(zip(unique_names(files), files, images, strict=True), key=lambda row: row[:2])
-    images_read, spent = _read_all(given, band, distinct, executor if len(given) >= _MANY else None, progress)
+    images_read, spent = _read_all(
+        given, (band, distinct, tuple(hosts)), executor if len(given) >= _MANY else None, progress
+    )
     for (_, file, _), read in zip(given, images_read, strict=True):
         try:
             if read.error is not None:
@@ -131,29 +137,35 @@ def load_views(
 
 
 def _read_all(
-    given: list[_Given], band: int, distinct: bool, executor: Executor | None, progress: Progress | None
+    given: list[_Given],
+    how: tuple[int, bool, tuple[str, ...]],
+    executor: Executor | None,
+    progress: Progress | None,
 ) -> tuple[list[_Read], float]:
     """Every image as it was read, and CPU seconds of other processes."""
-    tasks = [(given[at : at + _GROUP], band, distinct) for at in range(0, len(given), _GROUP)]
+    tasks = [(given[at : at + _GROUP], *how) for at in range(0, len(given), _GROUP)]
     told = progress and (lambda stage, done, _: progress(stage, min(done * _GROUP, len(given)), len(given)))
     groups = ordered(executor, read_group, tasks, "cameras", told)
     spent = 0.0 if executor is None else sum(seconds for _, seconds in groups)
     return [read for group, _ in groups for read in group], spent
 
 
-def read_group(given: Sequence[_Given], band: int, distinct: bool) -> tuple[list[_Read], float]:
+def read_group(
+    given: Sequence[_Given], band: int, distinct: bool, hosts: Sequence[str] = ()
+) -> tuple[list[_Read], float]:
     """Read some images, in a worker: one that is bad leaves the others theirs; CPU seconds that it took."""
     start, out = time.thread_time(), []
     for name, file, image in given:
         try:
-            view, camera = _load(name, file, image, band)
+            view, camera = _load(name, file, image, band, hosts)
             out.append(_Read(view, camera, _sampled(view, band) if distinct else None))
         except BarpcError as error:
             out.append(_Read(error=error))
     return out, time.thread_time() - start
 
 
-def _load(name: str, file: Path, image: Image, band: int) -> tuple[View, Camera]:
+def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str]) -> tuple[View, Camera]:
+    file = versioned(file, IMAGE)
     with open_raster(file) as dataset:
         size = (int(dataset.width), int(dataset.height))
         if not 1 <= band <= dataset.count:
@@ -163,8 +175,9 @@ def _load(name: str, file: Path, image: Image, band: int) -> tuple[View, Camera]
         if image.size != size:
             raise InputError(f"{file}: is {size} px large, but its view says {image.size}")
     else:
-        camera = open_camera(image, size=size)
-    view = View(name, str(file), size, camera.model, _altitudes(camera))
+        path, choices = split_spec(image, hosts)
+        camera = open_split(file if isinstance(file, Remote) else path, choices, size=size)
+    view = View(name, file if isinstance(file, Remote) else str(file), size, camera.model, _altitudes(camera))
     ring = footprint(view.sensor, size, view.altitude)
     if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
         raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
@@ -195,9 +208,8 @@ class Twins:
 
     def add(self, view: View, sampled: bytes | None) -> None:
         """Take in a view with the mark of its samples; InputError names both where it was taken in before."""
-        file = Path(view.path).stat()
         marks: dict[Hashable, str] = {
-            (file.st_dev, file.st_ino): "is the same file as {}",
+            _identity(view.path): "is the same file as {}",
             (view.size, view.sensor): "is the same size and the same RPC as {}",
         }
         self._refuse(view, marks)
@@ -234,6 +246,13 @@ def _sampled(view: View, band: int) -> bytes | None:
     with open_raster(view.path) as image:
         # fill, perhaps: more is asked before anything is read whole
         return _digest(image, band, _samples(*view.size)) or _digest(image, band, _samples(*view.size, _MORE))
+
+
+def _identity(path: str) -> Hashable:
+    if isinstance(path, Remote):
+        return str(path)
+    file = Path(path).stat()
+    return file.st_dev, file.st_ino
 
 
 def _samples(width: int, height: int, at: Sequence[tuple[float, float]] = _SAMPLES) -> list[Window]:

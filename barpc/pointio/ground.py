@@ -20,6 +20,7 @@ from barpc.frozen import load_npz
 from barpc.geodesy import Array
 from barpc.pointio.names import ViewNames, from_cell
 from barpc.raster import driver_of, open_raster
+from barpc.remote import Place
 from barpc.scene import GroundPoints
 from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
 
@@ -264,7 +265,7 @@ def read_correspondences(path: Path | str, *, altitudes: Sequence[float] | None 
     return {"csv": _read_table, "npz": _read_npz, "geojson": _read_features}[kind](path)
 
 
-def correspondence_kind(path: Path, altitudes: Sequence[float] | None = None) -> str | None:
+def correspondence_kind(path: Place, altitudes: Sequence[float] | None = None) -> str | None:
     """What a file is: "csv", "npz", "geojson", "grid", or None for neither (an image or an RPC file)."""
     head = read_head(path, TABLE, 65536)
     if driver_of(head) == "GTiff":
@@ -396,7 +397,7 @@ def _feature(feature: dict[str, Any], needed: Sequence[str]) -> tuple[list[float
     return [float(value) for value in (lon, lat, alt, col, row)], properties
 
 
-def read_grid(path: Path, altitudes: Sequence[float] | None = None) -> Correspondences:
+def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspondences:
     """A direct-localisation grid: bands lon, lat of each altitude layer, nodes by the geotransform.
 
     The geotransform counts from the corner of the first pixel, as GDAL does; half a pixel is taken off. Altitudes of

@@ -10,16 +10,17 @@ import unicodedata
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path, PurePath
+from pathlib import PurePath
 
 from barpc.errors import InputError
+from barpc.remote import Place, Remote
 
 MAX_NAME = 120
 """Bytes of a view's name: the file of a pair's matches carries two, and 255 are what a file system takes."""
 _FORMULA = frozenset("=+-@＝＋－＠\t\r")
 
 
-def unique_names(files: Sequence[Path]) -> list[str]:
+def unique_names(files: Sequence[Place]) -> list[str]:
     """A name for each file: its stem, with as many folders before it as it takes to tell them apart.
 
     Names that differ in case or composition only are taken for one, as file systems and GDAL do; two files of one
@@ -33,7 +34,7 @@ def unique_names(files: Sequence[Path]) -> list[str]:
     >>> unique_names([Path("a/img.tif"), Path("a/img.jp2")])
     ['img.tif', 'img.jp2']
     """
-    places = list(dict.fromkeys(files))
+    places = [file.pure if isinstance(file, Remote) else file for file in dict.fromkeys(files)]
     stems = Counter((file.parent, _folded(file.stem)) for file in places)
     ends = [file.stem if stems[file.parent, _folded(file.stem)] == 1 else file.name for file in places]
     depth = [1] * len(places)
@@ -59,7 +60,7 @@ def unique_names(files: Sequence[Path]) -> list[str]:
                 f"{file}: its name in this run has more than {MAX_NAME} bytes, too long for the files that carry it;"
                 " rename it, or give a link with a shorter name"
             )
-    found = dict(zip(places, names, strict=True))
+    found = dict(zip(dict.fromkeys(files), names, strict=True))
     return [found[file] for file in files]
 
 

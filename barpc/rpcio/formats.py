@@ -13,6 +13,7 @@ from typing import Literal
 
 from barpc.atomic import write_text
 from barpc.errors import InputError, RpcFormatError
+from barpc.remote import Place, Remote
 from barpc.rpcio import text, xml
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.images import rpc_vrt, write_rpc_copy, write_rpc_nitf
@@ -77,22 +78,22 @@ class Carrier:
     """A raster that carries an RPC."""
 
     suffixes: tuple[str, ...]
-    write: Callable[[RPC, Path, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
+    write: Callable[[RPC, Place, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
     consumers: tuple[str, ...] = ("gdal", "rpcm", "shareloc", "orthority")
     precision: Literal["nitf"] | None = (
         None  # whose digits it holds (`barpc.fit.precision`); None: all of them
     )
 
 
-def _vrt(rpc: RPC, image: Path, path: Path, place: Path, overwrite: bool) -> None:
+def _vrt(rpc: RPC, image: Place, path: Path, place: Path, overwrite: bool) -> None:
     write_text(path, rpc_vrt(rpc, image, place), overwrite=overwrite)
 
 
-def _copy(rpc: RPC, image: Path, path: Path, _place: Path, overwrite: bool) -> None:
+def _copy(rpc: RPC, image: Place, path: Path, _place: Path, overwrite: bool) -> None:
     write_rpc_copy(rpc, image, path, overwrite=overwrite)
 
 
-def _nitf(rpc: RPC, image: Path, path: Path, _place: Path, overwrite: bool) -> None:
+def _nitf(rpc: RPC, image: Place, path: Path, _place: Path, overwrite: bool) -> None:
     write_rpc_nitf(rpc, image, path, overwrite=overwrite)
 
 
@@ -125,7 +126,7 @@ def write_camera(
     place = Path(path if place is None else place)
     row = row_of(place)
     if isinstance(row, Carrier):
-        row.write(rpc, Path(image), Path(path), place, overwrite)
+        row.write(rpc, image if isinstance(image, Remote) else Path(image), Path(path), place, overwrite)
     else:
         write_text(path, _writer(place, None)(rpc), overwrite=overwrite)
 

@@ -22,14 +22,16 @@ from rasterio.windows import Window
 from barpc.atomic import replacing, write_text
 from barpc.errors import ImageError, OutputError
 from barpc.raster import Mosaic, identify, open_raster
+from barpc.remote import Place, Remote
 from barpc.rpcio.text import nitf_record
 from barpc.rpcio.tiff import printable, put_tag
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import plain_path
+from barpc.sidefile import IMAGE, opened, plain_path
 from barpc.vrt import GDAL_TYPES
 
 _TIFF = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
+_COPIED = 4 << 20  # bytes at a time
 _FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk
 
 
@@ -56,8 +58,9 @@ def write_rpc_vrt(
 
 def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative: bool = True) -> str:
     """The text that `write_rpc_vrt` writes."""
-    source = plain_path(plain_source(image_path))
-    target = plain_path(Path(vrt_path).absolute())
+    source, target = plain_source(image_path), Path(vrt_path).absolute()
+    plain_path(source)
+    plain_path(target)
     _refuse_same(source, target)
     name = os.path.relpath(source.resolve(), target.parent.resolve()) if relative else str(source)
     with open_raster(source) as dataset:
@@ -102,6 +105,10 @@ def _vrt_source(dataset: Any, name: str, relative: bool, band: str) -> list[str]
 def plain_source(image_path: Path | str) -> Path:
     """The file that holds an image's pixels: itself, or what a VRT written here points at (or ImageError)."""
     source, driver = identify(image_path)
+    if not isinstance(source, Path):
+        raise ImageError(
+            f"{source}: a VRT points at files on disk only; have copies written, or no images (--images copy, none)"
+        )
     if driver != "VRT":
         return source
     with open_raster(source) as mosaic:
@@ -143,10 +150,18 @@ def write_rpc_copy(
     """
     with _copying(image_path, copy_path, overwrite) as (dataset, partial):
         if not isinstance(dataset, Mosaic) and dataset.driver == "GTiff":
-            shutil.copyfile(image_path, partial)
+            _copy_bytes(image_path, partial)
         else:
             _convert(dataset, partial, Path(copy_path), **_TIFF)
         put_tag(partial, printable(rpc), placed=dataset.crs is not None)
+
+
+def _copy_bytes(source: Path | str, target: Path) -> None:
+    if not isinstance(source, Remote):
+        shutil.copyfile(source, target)
+        return
+    with opened(source, IMAGE) as file, target.open("wb") as copy:
+        shutil.copyfileobj(file, copy, _COPIED)
 
 
 def write_rpc_nitf(
@@ -261,6 +276,6 @@ def _unwritten(target: Path, reason: str) -> OutputError:
     return OutputError(f"{target}: cannot be written ({os.strerror(errno.ENOSPC) if full else reason})")
 
 
-def _refuse_same(source: Path, target: Path) -> None:
-    if target.exists() and target.resolve() == source.resolve():
+def _refuse_same(source: Place, target: Path) -> None:
+    if isinstance(source, Path) and target.exists() and target.resolve() == source.resolve():
         raise OutputError(f"{target}: is the input image, which is never written to; choose another name")

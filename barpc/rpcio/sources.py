@@ -7,12 +7,13 @@ barpc sees the camera that every other tool sees. What it found, and what it pas
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from barpc.errors import BarpcError, ImageError, RpcError, RpcFormatError
 from barpc.raster import driver_of, identify, open_raster
+from barpc.remote import Place, Remote, beside, place
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import FORMATS, files_of, parse
 from barpc.rpcio.text import decode, read_nitf
@@ -29,7 +30,7 @@ class RpcSource:
 
     rpc: RPC
     format: str  # tag, nitf, or a row of FORMATS
-    path: Path  # the file that holds it: the image, or one beside it
+    path: Place  # the file that holds it: the image, or one beside it
     notes: tuple[str, ...] = ()  # what the user should know: an origin that was applied, files passed over
 
 
@@ -38,7 +39,7 @@ class Sidecar:
     """A file beside an image that may hold an RPC."""
 
     kind: str  # rpb, txt, xml, dimap, alos, pam or geom
-    path: Path
+    path: Place
     before_tag: bool  # whether GDAL and its users read it instead of the image's own RPC
 
 
@@ -47,20 +48,32 @@ def sidecars(image: Path | str) -> list[Sidecar]:
 
     Names are compared without regard to case, as GDAL does. XML files count only where their content is an RPC.
     """
-    image = Path(image)
-    present = files_of(image.parent)
+    image = place(image)
+    present = _present(image)
     found: list[Sidecar] = []
     metadata_only = f"{image.stem}.imd".lower() in present  # with it GDAL takes the image for Maxar's
     for kind, name, before_tag in _names(image.name):
         found_name = present.get(name.lower())
         path = image.parent / (found_name or "")
-        if found_name in (None, image.name) or not path.is_file():
+        if found_name in (None, image.name) or not (isinstance(path, Remote) or path.is_file()):
             continue
         if kind in ("xml", "dimap", "pam") and not _holds_rpc(path, kind):
             continue
         if path not in [sidecar.path for sidecar in found]:
             found.append(Sidecar(kind, path, before_tag and (kind in ("rpb", "xml") or not metadata_only)))
     return found
+
+
+def _present(image: Place) -> Mapping[str, str]:
+    """The files beside an image, by name in lower case; on another host those that count."""
+    if isinstance(image, Path):
+        return files_of(image.parent)
+    try:
+        return beside(image, [f"{image.stem}.IMD", *(name for _, name, _ in _names(image.name))])
+    except OSError as error:
+        raise ImageError(
+            f"{image}: its host does not say what lies beside it ({error}); name its camera: IMAGE,camera=URL"
+        ) from error
 
 
 def _names(name: str) -> Iterator[tuple[str, str, bool]]:
@@ -80,7 +93,7 @@ def _names(name: str) -> Iterator[tuple[str, str, bool]]:
     yield "geom", f"{stem}.geom", False
 
 
-def _holds_rpc(path: Path, kind: str) -> bool:
+def _holds_rpc(path: Place, kind: str) -> bool:
     row = FORMATS["gdal" if kind == "pam" else kind]
     try:
         return row.sniff(decode(read_bytes(path, RPC_FILE)))
@@ -94,7 +107,7 @@ def shadows(image: Path | str) -> list[Sidecar]:
     A VRT answers for itself in GDAL; what is beside a TIFF goes before its tag. A ``.geom`` is what OTB and CARS are
     given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
     """
-    image = Path(image)
+    image = place(image)
     head = read_head(image, IMAGE, 64)
     vrt = _is_vrt(head)
     own = vrt or _own_rpc(image, head) is not None
@@ -146,12 +159,12 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     ImageError
         No such file, or an image without an RPC.
     """
-    path = Path(path)
+    path = place(path)
     options = ReadOptions(first_pixel, band)
     head = read_head(path, IMAGE, 64)
     if b"\0" in head or driver_of(head) not in (None, "VRT"):  # no RPC text holds a zero byte near its start
         return _image_source(path, head, options)
-    if _is_vrt(head):
+    if _is_vrt(head) and isinstance(path, Path):
         items = read_vrt(path).metadata.get("RPC")
         if items is None:
             return _image_source(path, head, options)
@@ -164,18 +177,18 @@ def _is_vrt(head: bytes) -> bool:
     return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(MAGIC)
 
 
-def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:
-    beside = sidecars(path)
-    first = next((sidecar for sidecar in beside if sidecar.before_tag), None)
+def _image_source(path: Place, head: bytes, options: ReadOptions) -> RpcSource:
+    found = sidecars(path)
+    first = next((sidecar for sidecar in found if sidecar.before_tag), None)
     own: RPC | None = None
     try:
         own = _own_rpc(path, head)
     except RpcError:
         if first is None:
             raise
-    if first is None and own is None and beside:
-        first = beside[0]
-    ignored = [s.path.name for s in beside if s is not first]
+    if first is None and own is None and found:
+        first = found[0]
+    ignored = [s.path.name for s in found if s is not first]
     if first is not None:
         source = _sidecar_source(path, first, options)
         ignored = ["the image's own RPC"] * (own is not None) + ignored
@@ -188,12 +201,12 @@ def _image_source(path: Path, head: bytes, options: ReadOptions) -> RpcSource:
     return replace(source, notes=source.notes + ((f"not used: {', '.join(ignored)}",) if ignored else ()))
 
 
-def _own_rpc(path: Path, head: bytes) -> RPC | None:
+def _own_rpc(path: Place, head: bytes) -> RPC | None:
     reader = {"GTiff": read_tag, "NITF": read_nitf}.get(driver_of(head) or "")
     return reader(path) if reader else None
 
 
-def _sidecar_source(image: Path, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
+def _sidecar_source(image: Place, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
     rpc, name = parse(read_bytes(sidecar.path, RPC_FILE), str(sidecar.path), options)
     origin = {"geom": _crop_origin, "dimap": _tile_origin}.get(sidecar.kind)
     window, note = origin(image, sidecar.path) if origin else (_WHOLE, "")
@@ -206,7 +219,7 @@ _Window = tuple[float, float, float, float]
 _WHOLE: _Window = (0.0, 0.0, 1.0, 1.0)  # corner, steps
 
 
-def _crop_origin(image: Path, _path: Path) -> tuple[_Window, str]:
+def _crop_origin(image: Place, _path: Place) -> tuple[_Window, str]:
     """A ``.geom`` speaks of the full image; a geotransform without CRS says where the crop is."""
     with open_raster(image) as dataset:
         step_x, _, x, _, step_y, y = dataset.transform[:6]
@@ -219,13 +232,14 @@ def _crop_origin(image: Path, _path: Path) -> tuple[_Window, str]:
     return (x, row, step_x, abs(step_y)), f"crop origin ({x:g}, {row:g}) of the geotransform applied"
 
 
-def _tile_origin(image: Path, path: Path) -> tuple[_Window, str]:
+def _tile_origin(image: Place, path: Place) -> tuple[_Window, str]:
     """A DIMAP product in tiles: the RPC is the whole image's, ``DIM_*.XML`` gives the size of a tile."""
     tile = re.search(r"_R(\d+)C(\d+)$", image.stem.upper())
     if tile is None or tile.groups() == ("1", "1"):
         return _WHOLE, ""
     product = path.name[4:]
-    dim = files_of(image.parent).get(f"dim_{product}".lower())
+    near = files_of(image.parent) if isinstance(image, Path) else beside(image, [f"DIM_{product}"])
+    dim = near.get(f"dim_{product}".lower())
     text = decode(read_bytes(image.parent / dim, RPC_FILE)) if dim else ""
     width, height = (
         re.search(rf"<NTILES_SIZE\b[^<>]*\b{key}=\"(\d{{1,9}})\"", text) for key in ("ncols", "nrows")

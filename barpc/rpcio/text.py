@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 from barpc.errors import RpcFormatError
+from barpc.remote import Place
 from barpc.rpcio.fields import (
     COEFFICIENTS,
     DIRECT,
@@ -247,7 +247,7 @@ def _columns(text: str, widths: dict[str, int], name: str) -> Fields:
     return fields
 
 
-def read_nitf(path: Path) -> RPC | None:
+def read_nitf(path: Place) -> RPC | None:
     """The RPC in a NITF's RPC00B (or RPC00A) extension, None without one; RpcFormatError where it is not valid."""
     data = read_head(path, IMAGE, _SCAN_LIMIT)
     match = re.search(rb"RPC00([AB])01041", data)

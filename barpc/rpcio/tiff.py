@@ -17,6 +17,7 @@ import numpy as np
 
 from barpc.errors import ImageError, RpcFormatError
 from barpc.geodesy import Array
+from barpc.remote import Place
 from barpc.rpcio.fields import COEFFICIENTS, SINGLE, fields_from_rpc, rpc_from_fields
 from barpc.sensor.rational import DERIVATIVE, MONOMIALS
 from barpc.sensor.rpc import RPC
@@ -101,7 +102,7 @@ def read_values(file: BinaryIO, directory: Directory, entry: Entry, name: str) -
     return data
 
 
-def read_tag(path: Path) -> RPC | None:
+def read_tag(path: Place) -> RPC | None:
     """The RPC in a TIFF's tag, None without such a tag; RpcFormatError where it does not hold 92 usable doubles."""
     with opened(path, IMAGE) as file:
         directory = read_directory(file, str(path))

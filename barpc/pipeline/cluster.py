@@ -1,0 +1,60 @@
+"""A cluster's workers come and go: whether any is left is said while a run waits."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from typing import Any
+
+logger = logging.getLogger(__name__)
+
+POLL, REMIND = 5.0, 60.0
+"""How often the workers are counted, and how often it is said that there is none [s]."""
+
+
+@contextmanager
+def watched(executor: Executor | None) -> Iterator[None]:
+    """Say when a dask cluster has no worker, once a minute that one is waited for, and when work goes on."""
+    client = getattr(executor, "_client", None)
+    if client is None:
+        yield
+        return
+    end = threading.Event()
+    threading.Thread(target=_watch, args=(client, end), daemon=True).start()
+    try:
+        yield
+    finally:
+        end.set()
+
+
+def _watch(client: Any, end: threading.Event) -> None:
+    since = said = None
+    while not end.wait(POLL):
+        number, now = _workers(client), time.monotonic()
+        if number:
+            if since is not None:
+                logger.warning("the cluster has %d worker(s), after %.0f s without", number, now - since)
+            since = said = None
+        elif said is None or now - said >= REMIND:
+            since, said = since or now, now
+            what = "has no worker" if number == 0 else "does not answer"
+            logger.warning(
+                "the cluster %s since %.0f s: waiting; what is finished is kept, Ctrl-C ends the run and the "
+                "same command goes on with it",
+                what,
+                now - since,
+            )
+
+
+def _workers(client: Any) -> int | None:
+    """How many there are; None where the scheduler does not say."""
+    if client.status != "running":
+        return None
+    try:
+        return len(client.nthreads())
+    except Exception:  # noqa: BLE001  (of many classes; the run's own calls tell what it was)
+        return None

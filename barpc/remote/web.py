@@ -1,0 +1,180 @@
+"""Parts of files from web servers, by range requests of the standard library.
+
+The server is not trusted: it answers for the bytes that were asked or not at all, within a time, and sends nobody on.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import re
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
+from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
+from itertools import chain
+from urllib.parse import quote, urljoin, urlsplit
+
+from barpc.errors import visible
+from barpc.remote import Part, Remote
+
+WAITS = (0.0, 0.5, 2.0)
+"""Before each new attempt [s]."""
+TIMEOUT = 30.0  # s without a byte, and for an answer without its bytes
+_SLOWEST = 10_000  # bytes a second, on top of TIMEOUT
+_AGAIN = (408, 425, 429, 500, 502, 503, 504)
+_ELSEWHERE = (301, 302, 303, 307, 308)
+_MOVES = 3
+_PIECE = 1 << 16
+_TOGETHER = 8  # requests for side files at a time
+
+_idle: dict[
+    tuple[int, str, str], list[HTTPConnection]
+] = {}  # process (a fork shares no socket), scheme, host
+_lock = threading.Lock()
+
+
+class _PassingError(OSError):
+    """What may be over at the next attempt."""
+
+
+def fetch(at: Remote, start: int, stop: int) -> Part:
+    """Bytes `start` to `stop` of a file, or to its end; OSError where the server does not hand them out."""
+    for wait in (*WAITS, None):
+        try:
+            return _moved(at, start, stop)
+        except _PassingError as error:
+            if wait is None:
+                raise OSError(f"{error}; asked {len(WAITS) + 1} times") from error
+            time.sleep(wait)
+    raise AssertionError
+
+
+def _moved(at: str, start: int, stop: int) -> Part:
+    """As `fetch`, once; a server may send us on within itself."""
+    url = at
+    for _ in range(_MOVES):
+        found = _once(url, start, stop)
+        if isinstance(found, Part):
+            return found
+        url = urljoin(url, found)
+        if urlsplit(url)[:2] != urlsplit(at)[:2]:
+            raise OSError(
+                f"its host sends us on to {visible(url[:200])}, which is not followed; give that address"
+            )
+    raise OSError("its host sends us on and on")
+
+
+def _once(url: str, start: int, stop: int) -> Part | str:
+    """The part, or the address where it is said to be."""
+    scheme, host, path = urlsplit(url)[:3]
+    connection = _connection(scheme, host)
+    limit = threading.Timer(TIMEOUT + (stop - start) / _SLOWEST, _cut, (connection.sock,))
+    limit.start()
+    again = False
+    try:
+        connection.request(
+            "GET",
+            quote(path, safe="/%:@!$&'()*+,;=~"),
+            headers={"Range": f"bytes={start}-{stop - 1}", "Accept-Encoding": "identity"},
+        )
+        with closing(connection.getresponse()) as answer:
+            found = _answered(answer, start, stop)
+            again = answer.isclosed() and not answer.will_close
+    except (HTTPException, TimeoutError, ConnectionError, ssl.SSLError) as error:
+        raise _PassingError(f"its host broke off ({type(error).__name__})") from error
+    finally:
+        limit.cancel()
+        if again:
+            with _lock:
+                _idle.setdefault((os.getpid(), scheme, host), []).append(connection)
+        else:
+            connection.close()
+    if found is None:
+        raise FileNotFoundError(f"its host answers {answer.status}")
+    return found
+
+
+def _cut(connected: socket.socket) -> None:
+    with suppress(OSError):
+        connected.shutdown(socket.SHUT_RDWR)
+
+
+@atexit.register
+def _close() -> None:
+    for connection in chain(*_idle.values()):
+        connection.close()
+
+
+def _connection(scheme: str, host: str) -> HTTPConnection:
+    with _lock:
+        if kept := _idle.get((os.getpid(), scheme, host)):
+            return kept.pop()
+    connection = (HTTPConnection if scheme == "http" else HTTPSConnection)(host, timeout=TIMEOUT)
+    try:
+        connection.connect()
+    except ssl.SSLCertVerificationError as error:
+        raise OSError(f"its host has no certificate that holds ({error.verify_message})") from error
+    except OSError as error:
+        raise _PassingError(f"no answer from its host ({error.strerror or error})") from error
+    return connection
+
+
+def _answered(answer: HTTPResponse, start: int, stop: int) -> Part | str | None:
+    """What a server hands out, the address that it sends us on to, None where there is no such file."""
+    status, length = answer.status, answer.headers.get("Content-Length", "")
+    tag = answer.headers.get("ETag") or answer.headers.get("Last-Modified") or ""
+    if status in _AGAIN:
+        raise _PassingError(f"its host answers {status}")
+    if status in _ELSEWHERE:
+        return answer.headers.get("Location", "")
+    if status in (404, 410):
+        answer.read(_PIECE)  # so that the connection can be used again
+        return None
+    if answer.headers.get("Content-Encoding", "identity") != "identity":
+        raise OSError("its host sends it compressed, though that was not asked")
+    if status == 416 and answer.headers.get("Content-Range", "").replace(" ", "") == "bytes*/0":
+        return Part(b"", 0, tag)
+    if status == 200 and start == 0 and re.fullmatch(r"\d{1,9}", length) and int(length) <= stop:
+        return Part(_body(answer, int(length)), int(length), tag)
+    if status == 200:
+        raise OSError("its host hands out no parts of files (range requests); fetch it, and give the copy")
+    if status != 206:
+        raise OSError(f"its host answers {status}")
+    found = re.fullmatch(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18})", answer.headers.get("Content-Range", ""))
+    first, last, size = map(int, found.groups()) if found else (0, 0, 0)
+    wanted = min(stop, size) - start
+    if (first, last + 1) != (start, start + wanted) or wanted < 1 or length not in ("", str(wanted)):
+        raise OSError("its host answers with other bytes than were asked")
+    return Part(_body(answer, wanted), size, tag)
+
+
+def _body(answer: HTTPResponse, wanted: int) -> bytes:
+    """So many bytes, and no more."""
+    data = answer.read(wanted)
+    if len(data) < wanted:
+        raise _PassingError(f"its host sent {len(data)} of {wanted} bytes")
+    return data
+
+
+def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
+    """See `barpc.remote.beside`."""
+    tried: dict[str, str] = {}
+    for name in dict.fromkeys(names):
+        cut = name.rfind("_RPC.") if "_RPC." in name else name.rfind(".")
+        tried |= dict.fromkeys((name, name[:cut] + name[cut:].lower()), name.lower())
+    with ThreadPoolExecutor(_TOGETHER) as pool:
+        found = dict(zip(tried, pool.map(lambda name: _there(image.parent / name), tried), strict=True))
+    return {tried[name]: name for name, there in reversed(found.items()) if there}
+
+
+def _there(at: Remote) -> bool:
+    try:
+        fetch(at, 0, 1)
+    except FileNotFoundError:
+        return False
+    return True
