@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -174,17 +174,22 @@ def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
     What the archive claims is added up before anything is unpacked: a few kilobytes can hold gigabytes of zeros.
     """
     with opened(path, kind) as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                members = archive.infolist()
-                kind.check(f"{path}, unpacked", sum(member.file_size for member in members))
-                return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
-        except BarpcError:
-            raise
-        except Exception as error:
-            raise kind.error(
-                f"{path}: not {kind.words} (.npz) that can be read ({type(error).__name__}: {error})"
-            ) from error
+        return unpack(file, path, kind)
+
+
+def unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
+    """As `load_npz`, of an open file."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            kind.check(f"{path}, unpacked", sum(member.file_size for member in members))
+            return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+    except BarpcError:
+        raise
+    except Exception as error:
+        raise kind.error(
+            f"{path}: not {kind.words} (.npz) that can be read ({type(error).__name__}: {error})"
+        ) from error
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:

@@ -21,7 +21,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from barpc.errors import InputError
-from barpc.remote import HOST
+from barpc.remote import BUCKET, HOST
 from barpc.sidefile import OPTIONS, read_text
 
 T = TypeVar("T")
@@ -411,6 +411,14 @@ class RunOptions(Options):
         unit="host",
         spoken=True,
     )
+    store: str | None = option(
+        None,
+        """Folder of an object store (`s3://BUCKET/...`, gs, az) where workers keep what they read from each other, in
+        place of the run folder: with images by URL they need no disk of the caller. Never taken from an options
+        file.""",
+        unit="url",
+        spoken=True,
+    )
     matches: str | None = option(
         None,
         """Matches of pairs (CSV, npz, COLMAP, hloc, ASP), to be verified and registered; the other pairs are matched. A
@@ -467,6 +475,8 @@ class RunOptions(Options):
             raise InputError("reference_sigma is given without reference")
         if self.matches_only and self.matches is None:
             raise InputError("matches_only is given without matches: there would be no tie points")
+        if self.store is not None and not BUCKET.fullmatch(self.store):
+            raise InputError(f"store {self.store!r} is no s3://BUCKET/FOLDER")
         for host in self.allow_remote:
             if not HOST.fullmatch(host):
                 raise InputError(f"allow_remote {host!r} is no HOST, HOST:PORT or s3://BUCKET")

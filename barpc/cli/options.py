@@ -39,7 +39,7 @@ GROUND = (
     "reference_sigma",
 )
 ADJUSTMENT = (*CAMERA, *GROUND)
-MATCH = ("overwrite", "keep_going")
+MATCH = ("overwrite", "keep_going", "store")
 RUN = (*MATCH, "images", "rpc_formats")
 """Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
 _NAMES = {"tie.keypoints_per_image": "--ip-per-image", "rpc_formats": "--rpc-format"}

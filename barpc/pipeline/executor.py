@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import shutil
 import threading
 import time
 import traceback
@@ -26,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.errors import AdjustError, BarpcError, InputError
+from barpc.errors import AdjustError, BarpcError
 from barpc.frozen import Arrays, from_arrays, to_arrays
 from barpc.tie.store import Store
 from barpc.workspace import Workspace, key_of
@@ -65,9 +64,10 @@ class CachingExecutor(Executor):
         fingerprints: Mapping[str, str],
         executor: Executor | None = None,
         keep: bool = True,
+        store: Store | None = None,
     ) -> None:
         self.workspace, self.executor, self.keep = workspace, executor, keep
-        self.store = Store(str(workspace.cache), str(workspace.partial))
+        self.store = store or Store(str(workspace.cache), str(workspace.partial))
         places = {self.store.folder: "cache", self.store.room: "partial"}  # wherever the run folder lies
         self._fingerprints = {**fingerprints, **places}
         self._limit = _PER_WORKER * worker_count(executor)
@@ -77,7 +77,7 @@ class CachingExecutor(Executor):
         self._in_flight, self._open = 0, True
         self._seconds: dict[Function, float] = {}
         self._digests: dict[int, tuple[object, str]] = {}
-        self._spilled = workspace.cache / "arrays"
+        self._spilled: set[str] = set()
 
     def submit(self, fn: Function, /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Hand in `fn(*args)`; its result is looked up, or made when its turn comes."""
@@ -96,7 +96,8 @@ class CachingExecutor(Executor):
             self._open = False
             self._waiting.clear()
             self._digests.clear()
-            shutil.rmtree(self._spilled, ignore_errors=True)
+            if self._spilled:
+                self.store.clear()
 
     def key(self, fn: Function, args: tuple[Any, ...]) -> str:
         """The key under which the result of a task is kept."""
@@ -145,14 +146,15 @@ class CachingExecutor(Executor):
         for name, array in record.items():
             if array.nbytes >= LARGE:
                 digest = hashlib.sha256(self._digest(array).encode()).hexdigest()
-                path = self._spilled / f"{digest[:32]}.npy"
-                if not path.exists():
-                    with self.workspace.keeping(path) as partial_file, partial_file.open("wb") as file:
-                        np.save(file, array, allow_pickle=False)
-                large[name] = str(path)
+                large[name] = place = f"{self.store.scratch}/{digest[:32]}"
+                if place not in self._spilled:
+                    self.store.write(place, {"array": array})
+                    self._spilled.add(place)
         if not large:
             return args
-        return Spilled({name: array for name, array in record.items() if name not in large}, large)
+        return Spilled(
+            {name: array for name, array in record.items() if name not in large}, large, self.store
+        )
 
     def _next_batch(self) -> list[_Task]:
         """Waiting tasks of one function that have no kept result; they count as in flight, empty does not."""
@@ -259,20 +261,15 @@ class _Task(Future[Any]):
 
 @dataclass(frozen=True)
 class Spilled:
-    """The arguments of a task whose large arrays lie in files: what `to_arrays` made of them, name -> file."""
+    """The arguments of a task whose large arrays lie in a store: what `to_arrays` made of them, name -> place."""
 
     small: Arrays
     large: Mapping[str, str]
+    store: Store
 
     def load(self) -> tuple[Any, ...]:
-        """The arguments; InputError where the worker does not see the run folder."""
-        try:
-            arrays = {name: np.load(path, allow_pickle=False) for name, path in self.large.items()}
-        except OSError as error:
-            raise InputError(
-                f"{error.filename}: a worker cannot read it; images and run folder must be on a disk that all "
-                "workers see under the same path"
-            ) from error
+        """The arguments; InputError where the worker does not see the store."""
+        arrays = {name: self.store.need(place)["array"] for name, place in self.large.items()}
         arguments: tuple[Any, ...] = from_arrays({**self.small, **arrays}, sent=True)
         return arguments
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
+from uuid import uuid4
 
 import numpy as np
 
@@ -46,6 +47,7 @@ from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
 from barpc.tie.hook import hook_file
 from barpc.tie.reference import Registration, register
+from barpc.tie.store import Bucket, Store
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace, fingerprint, timed
 
@@ -150,13 +152,16 @@ def adjust(
             fingerprints = {path: fingerprint(path) for path in paths}
             if (code := hook_file(options.tie.matcher)) is not None:
                 fingerprints[options.tie.matcher] = fingerprint(code)
-        with CachingExecutor(workspace, fingerprints, executor) as caching:
+        with CachingExecutor(workspace, fingerprints, executor, store=_store(options)) as caching:
             run = _solve(run, options, workspace, caching, progress)
             if run.adjustment is not None and options.stop_after == "all":
                 with workspace.stage("fit"):
                     run = _fitted(run, options, caching, progress)
         if run.fits:
-            run = _written(run, options, workspace, executor, progress)
+            seen = (
+                executor if options.store is None else None
+            )  # of the run folder: else this process writes alone
+            run = _written(run, options, workspace, seen, progress)
         if run.adjustment is not None:
             with _told(workspace, "block", progress), workspace.output(PRIOR) as partial:
                 block_prior(run.adjustment).save(partial)
@@ -267,6 +272,10 @@ def _solve(
         with _told(workspace, "adjustment" + again, progress):
             run = _adjusted(run, options, *given)
     return run
+
+
+def _store(options: RunOptions) -> Store | None:
+    return None if options.store is None else Bucket(options.store, uuid4().hex)
 
 
 def _references(options: RunOptions) -> list[str]:
