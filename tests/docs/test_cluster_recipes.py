@@ -79,7 +79,7 @@ def test_the_parts_of_the_manifest_find_each_other():
     for name, pod in pods.items():
         mounted = {mount["name"] for mount in pod["spec"]["containers"][0].get("volumeMounts", [])}
         assert mounted == {volume["name"] for volume in pod["spec"].get("volumes", [])}, name
-    parses([word.replace("/shared/urls.txt", "none.txt") for word in commands["barpc"][1:]])
+    parses([word.replace("/run/barpc/urls.txt", "none.txt") for word in commands["barpc"][1:]])
 
 
 @pytest.mark.parametrize("command", ["scheduler", "worker"])
