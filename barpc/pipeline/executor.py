@@ -96,8 +96,7 @@ class CachingExecutor(Executor):
             self._open = False
             self._waiting.clear()
             self._digests.clear()
-            if self._spilled:
-                self.store.clear()
+            self.store.clear()
 
     def key(self, fn: Function, args: tuple[Any, ...]) -> str:
         """The key under which the result of a task is kept."""

@@ -237,7 +237,7 @@ def test_large_arrays_are_sent_as_paths_and_taken_away(tmp_path):
         with CachingExecutor(workspace, {}, pool) as caching:
             futures = [caching.submit(square, n, pad) for n in range(4)]
             assert [float(future.result()["square"]) for future in futures] == [0, 1, 4, 9]
-            assert len(list(workspace.cache.glob("arrays/*.npy"))) == 1
+            assert len(list(workspace.cache.glob("arrays/*.npz"))) == 1
         assert not (workspace.cache / "arrays").exists()
     assert all(isinstance(task, Spilled) for task in sent)
     assert sum(array.nbytes for array in sent[0].small.values()) < 2000
