@@ -262,7 +262,7 @@ def _solve(
     for number in range(1 if options.matches_only else options.num_passes):
         again = f" (pass {number + 1})" if number else ""
         with workspace.stage("tie points" + again):
-            run = _with_ties(run, options, executor, progress)
+            run = _with_ties(run, options, executor, progress, given[0])
         if options.stop_after == "matching":
             _write_matches(run, workspace)
             return replace(run, kind="match")
@@ -321,7 +321,13 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment)
 
 
-def _with_ties(run: Run, options: RunOptions, executor: Executor | None, progress: Progress | None) -> Run:
+def _with_ties(
+    run: Run,
+    options: RunOptions,
+    executor: Executor | None,
+    progress: Progress | None,
+    terrain: Dem | None = None,
+) -> Run:
     """The run with tie points: from a file, or matched, with the corrected cameras in a later pass."""
     views = run.views
     if options.matches is not None and options.matches_only:
@@ -331,7 +337,7 @@ def _with_ties(run: Run, options: RunOptions, executor: Executor | None, progres
     if run.adjustment is not None:
         corrected = zip(views, run.adjustment.sensors, strict=True)
         views = tuple(replace(view, sensor=sensor) for view, sensor in corrected)
-    given: dict[str, Any] = {"executor": executor, "progress": progress}
+    given: dict[str, Any] = {"executor": executor, "progress": progress, "terrain": terrain}
     if options.overlap_list is not None:
         given["only"] = read_pairs(options.overlap_list, views, [path for path, _ in run.left_out])
     if options.aoi is not None:
@@ -345,7 +351,7 @@ def _with_ties(run: Run, options: RunOptions, executor: Executor | None, progres
             raise
         kept = _only(run, frozenset(error.groups[0]))
         logger.warning("%d of %d images are tied together and kept", len(kept.views), len(views))
-        return _with_ties(kept, options, executor, progress)
+        return _with_ties(kept, options, executor, progress, terrain)
     return replace(run, tracks=ties.tracks, matched=ties.pairs)
 
 

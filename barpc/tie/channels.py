@@ -116,12 +116,12 @@ def margin(half: int, search: int) -> int:
 
 def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search: int) -> Found:
     n, wide = len(at), 2 * search + 1
-    template = _cut(first, at, half, half)
+    template = cut(first, at, half, half)
     right = (
         np.arange(n) % 2 > 0
     )  # where the decoy lies; areas to the left are turned about, so that all are alike
     aside = np.where(right, 1, -1)[:, None] * [search + (_GAP + 1) // 2, 0]
-    areas = _cut(second, at + aside, half + 2 * search + (_GAP + 1) // 2, half + search)
+    areas = cut(second, at + aside, half + 2 * search + (_GAP + 1) // 2, half + search)
     surface = correlation(template, areas)
     surface[~right] = surface[~right, :, ::-1]
     true, decoy = surface[:, :, :wide].reshape(n, -1), surface[:, :, -wide:].reshape(n, -1)
@@ -129,10 +129,10 @@ def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search
     inside = (x > 0) & (x < wide - 1) & (y > 0) & (y < wide - 1)
     whole = np.stack([np.where(right, x - search, search - x), y - search], axis=1)
     there = at + whole
-    around = _cut(second, there, half + 2, half + 2)
+    around = cut(second, there, half + 2, half + 2)
     found = around[:, :, 2:-2, 2:-2]
     pictures = [(np.abs(part).sum(axis=1) > 0).mean(axis=(1, 2)) > _SHOWN for part in (template, found)]
-    back = correlation(found, _cut(first, at, half + search, half + search)).reshape(n, -1)
+    back = correlation(found, cut(first, at, half + search, half + search)).reshape(n, -1)
     back_y, back_x = np.divmod(back.argmax(axis=1), wide)
     part, still = _registered(template, around)
     return Found(
@@ -144,7 +144,7 @@ def _find(first: FloatImage, second: FloatImage, at: IntArray, half: int, search
     )
 
 
-def _cut(picture: FloatImage, at: IntArray, wide: int, high: int) -> FloatImage:
+def cut(picture: FloatImage, at: IntArray, wide: int, high: int) -> FloatImage:
     """Windows (n, C, 2 high + 1, 2 wide + 1) around whole px x, y (n, 2)."""
     view = np.lib.stride_tricks.sliding_window_view(picture, (2 * high + 1, 2 * wide + 1), axis=(1, 2))
     return np.moveaxis(view[:, at[:, 1] - high, at[:, 0] - wide], 0, 1)

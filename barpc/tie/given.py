@@ -69,6 +69,7 @@ def verify(
         if report.status != "ok":
             words = "%s - %s: the matches given are not used: %s (matches_only takes them as they are)"
             logger.warning(words, *report.names, report.status)
+        report = replace(report, matcher="given")
         verified.append((replace(found, index=given[pair.views].index[found.index[:, 0]]), report))
     return verified
 

@@ -20,15 +20,19 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import IntArray, View
-from barpc.tie.epipolar import Frame, agreeing, frame, robust_affine, robust_spread
-from barpc.tie.features import KeypointFiles, Keypoints
+from barpc.tie.epipolar import Frame, agreeing, common_range, frame, robust_affine, robust_spread
+from barpc.tie.features import KeypointFiles, Keypoints, join
 from barpc.tie.guided import Guided
 from barpc.tie.hook import Hook, hooked
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
+from barpc.tie.ortho import Terrain
 from barpc.tie.pairs import Pair, shared_tiles
+from barpc.tie.structure import Structure
 from barpc.tie.tasks import Progress, ordered
 
-MATCHERS: dict[str, type[Matcher]] = {"guided": Guided}
+STRUCTURE = "structure"
+"""What tries again where another matcher finds few."""
+MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: Structure}
 """Name -> matcher."""
 
 
@@ -37,6 +41,8 @@ def matcher_named(name: str) -> type[Matcher] | Hook:
     return MATCHERS[name] if name in MATCHERS else hooked(name)
 
 
+THIN = 100
+"""Verified matches of a pair below which it is tried again."""
 TOLERANCE = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
 _DEFAULTS = TieOptions()
@@ -48,6 +54,10 @@ _SIGNIFICANT = 6.0  # standard deviations
 _CLEAR = 0.4  # share of the matches that makes wider passes needless
 _FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
+_LOOSE = 0.95, 0.05  # ratio and false share of the second attempt
+_LEAST_REACH = 5.0  # px of half a segment, below which matches say nothing of altitudes
+_MARGIN = 150.0  # m beyond known altitudes: how wrong cameras make them
+_PROBES = 12  # pixels along a side at which the terrain is asked
 
 
 @dataclass(frozen=True)
@@ -66,6 +76,8 @@ class PairReport:
     spread: float = float("nan")  # robust, across the epipolar line after the affine fit [px]
     angle: float = float("nan")  # of convergence [deg]
     overlap: float = float("nan")  # common area over that of the smaller footprint
+    matcher: str = "guided"  # that found the matches
+    loosened: bool = False  # whether with loosened thresholds, in a second attempt
 
 
 def match_pair(
@@ -74,9 +86,41 @@ def match_pair(
     pair: Pair,
     options: TieOptions,
 ) -> tuple[Matches, PairReport]:
-    """Match two views; keypoints are empty for a matcher that wants none. No matches: the report says why."""
+    """Match two views; keypoints are empty for a matcher that wants none. No matches: the report says why.
+
+    Where few or none are found, loosened thresholds are tried, and what finds more counts.
+    """
+    first = _attempt(views, keypoints, pair, options)
+    if _enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
+        return first
+    loose = replace(
+        options,
+        ratio=max(options.ratio, _LOOSE[0]),
+        false_share=max(options.false_share, _LOOSE[1]),
+        min_matches=min(options.min_matches, 8),
+    )
+    found, report = _attempt(views, keypoints, pair, loose)
+    return _better(first, (found, replace(report, loosened=True)))
+
+
+def _enough(report: PairReport) -> bool:
+    return report.status == "ok" and report.verified >= THIN
+
+
+def _better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
+    """The attempt with most verified matches, of those that count; the earlier one of equals."""
+    return max(attempts, key=lambda attempt: attempt[1].verified if attempt[1].status == "ok" else -1)
+
+
+def _attempt(
+    views: tuple[View, View],
+    keypoints: tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles],
+    pair: Pair,
+    options: TieOptions,
+) -> tuple[Matches, PairReport]:
+    """All passes over a pair with one matcher and its thresholds."""
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
-    report = PairReport(names, "ok", counts, angle=pair.angle, overlap=pair.overlap)
+    report = PairReport(names, "ok", counts, angle=pair.angle, overlap=pair.overlap, matcher=options.matcher)
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
@@ -128,13 +172,64 @@ def match(
     pairs: Sequence[Pair],
     options: TieOptions = _DEFAULTS,
     *,
+    terrain: Terrain | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
-    """Matches of every pair, each with its report: `match_pair` over all pairs."""
+    """Matches of every pair, each with its report: `match_pair` over all pairs, and `STRUCTURE` where it finds few.
+
+    `terrain`, or else the matches of other pairs, tell the altitudes at which that one looks.
+    """
     ends = [(pair, *pair.views) for pair in pairs]
     tasks = [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
-    return ordered(executor, match_pair, tasks, "match", progress)
+    found: list[tuple[Matches, PairReport]] = ordered(executor, match_pair, tasks, "match", progress)
+    thin = [k for k, (_, report) in enumerate(found) if not _enough(report)]
+    if options.matcher == STRUCTURE or options.matcher not in MATCHERS or not thin:
+        return found
+    known = _altitudes(
+        [(tasks[k][0], matches) for k, (matches, report) in enumerate(found) if _enough(report)]
+    )
+    none, other = join([]), replace(options, matcher=STRUCTURE)
+    again = [
+        (_within(tasks[k][0], terrain, known), (none, none), pairs[k], other)
+        for k in thin
+        if "keypoints" not in found[k][1].status
+    ]
+    tried: list[tuple[Matches, PairReport]] = ordered(executor, match_pair, again, STRUCTURE, progress)
+    of_pair = dict(zip((task[2].views for task in again), tried, strict=True))
+    return [
+        _better(one, of_pair[pair.views]) if pair.views in of_pair else one
+        for pair, one in zip(pairs, found, strict=True)
+    ]
+
+
+def _altitudes(ties: Sequence[tuple[tuple[View, View], Matches]]) -> tuple[float, float] | None:
+    """The lowest and the highest altitude [m] that most matches of some pairs lie at."""
+    found = []
+    for views, matches in ties:
+        where, (low, high) = frame(*views, matches.xy[:, 0]), common_range(*views)
+        if np.median(where.after) >= _LEAST_REACH:
+            along = where.errors(matches.xy[:, 1])[:, 0] / where.after
+            found.append(0.5 * (low + high) + 0.5 * (high - low) * np.percentile(along, [2, 98]))
+    return (float(np.min(found)), float(np.max(found))) if found else None
+
+
+def _within(
+    views: tuple[View, View], terrain: Terrain | None, known: tuple[float, float] | None
+) -> tuple[View, View]:
+    """Two views used for fewer altitudes: those of the terrain, or else known ones, with a margin."""
+    low, high = common_range(*views)
+    if terrain is not None:
+        axes = (np.linspace(0.0, length - 1.0, _PROBES) for length in views[0].size)
+        xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        ground = views[0].sensor.localize(xy, np.full(len(xy), 0.5 * (low + high)))
+        heights = terrain(ground[:, 0], ground[:, 1])
+        heights = heights[np.isfinite(heights)]
+        known = (float(heights.min()), float(heights.max())) if len(heights) else known
+    if known is None or known[0] - _MARGIN > high or known[1] + _MARGIN < low:
+        return views
+    within = max(low, known[0] - _MARGIN), min(high, known[1] + _MARGIN)
+    return replace(views[0], alt_range=within), replace(views[1], alt_range=within)
 
 
 def _latest(where: Callable[[Array], Frame]) -> Callable[[Array], Frame]:

@@ -68,20 +68,21 @@ class Patch(Frozen):
         return np.asarray(np.einsum("nr,rck,nc->nk", rows, self.image(view), cols))
 
 
-def _ticks(count: int) -> Array:
+def ticks(count: int) -> Array:
+    """Where the nodes of an axis of `count` px lie [px]."""
     return np.linspace(0.0, count - 1.0, -(-(count - 1) // _NODE) + 1)
 
 
 def _between(at: Array, count: int) -> Array:
     """Weights (n, nodes) of the nodes along an axis of `count` px for places (n,)."""
-    ticks = _ticks(count)
-    return np.stack([np.interp(at, ticks, row) for row in np.eye(len(ticks))], axis=1)
+    nodes = ticks(count)
+    return np.stack([np.interp(at, nodes, row) for row in np.eye(len(nodes))], axis=1)
 
 
 def _nodes(lonlat: Array, step: float, shape: tuple[int, int]) -> Array:
     metres = metres_per_unit(np.append(lonlat, 0.0))[:2]
-    lon = lonlat[0] + step * _ticks(shape[1]) / metres[0]
-    lat = lonlat[1] - step * _ticks(shape[0]) / metres[1]
+    lon = lonlat[0] + step * ticks(shape[1]) / metres[0]
+    lat = lonlat[1] - step * ticks(shape[0]) / metres[1]
     return np.stack(np.meshgrid(lon, lat), axis=2)
 
 
@@ -131,7 +132,7 @@ class Sheet:
 
 def of_image(view: View, band: int, patch: Patch) -> FloatImage:
     """Channels (C, H, W) of an image on a patch, through its camera."""
-    return channels(*_picture(view.path, (band,), view.size, patch.image(view), patch.shape))
+    return channels(*picture(view.path, (band,), view.size, patch.image(view), patch.shape))
 
 
 def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
@@ -139,9 +140,9 @@ def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
     nodes, whole = patch.nodes(), np.zeros((ORIENTATIONS, *patch.shape), np.float32)
     for path in paths:
         sheet = Sheet.read(path)
-        picture, valid = _picture(path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape)
+        seen, valid = picture(path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape)
         if valid.any():
-            whole = np.where(np.abs(whole).sum(axis=0) > 0, whole, channels(picture, valid))
+            whole = np.where(np.abs(whole).sum(axis=0) > 0, whole, channels(seen, valid))
     return whole
 
 
@@ -150,7 +151,7 @@ def shown(picture: FloatImage) -> float:
     return float((np.abs(picture).sum(axis=0) > 0).mean())
 
 
-def _picture(
+def picture(
     path: str, bands: Sequence[int], size: tuple[int, int], nodes: Array, shape: tuple[int, int]
 ) -> tuple[FloatImage, BoolArray]:
     """A raster on a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px], and which pixels mean something.

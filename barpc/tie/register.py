@@ -9,7 +9,7 @@ one small pseudo-inverse a match serves all iterations.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 
@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View
+from barpc.tie import structure
 from barpc.tie.epipolar import agreeing, frame, grouped, linear_map, robust_spread
 from barpc.tie.raster import FloatImage, PixelReader, grow, levelled
 from barpc.tie.tasks import Progress, ordered
@@ -140,6 +141,22 @@ def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
         return [links[rows] for rows in grouped(*np.floor(origin[:, ::-1] / tile).astype(np.int64).T)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // _BAND))
     return [links[order[first : first + _TOGETHER]] for first in range(0, len(order), _TOGETHER)]
+
+
+def register_part(
+    structural: bool,
+    files: tuple[tuple[str, tuple[int, int]], tuple[str, tuple[int, int]]],
+    band: int,
+    reference: Array,
+    start: Array,
+    linear: Array,
+) -> Registration:
+    """Patches registered on their grey values, or on channels of oriented gradients; `ok` where they are alike."""
+    if structural:
+        xy, ok, correlation = structure.register_places(files, band, reference, start, linear)
+        return Registration(xy, correlation, np.full(len(xy), structure.SIGMA), ok)
+    found = register_places(files, band, reference, start, linear, PATCH)
+    return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
 
 
 def _usable(valid: BoolArray, patch: int) -> BoolArray:
@@ -300,10 +317,13 @@ def refine(
     spreads: Mapping[tuple[int, int], float],
     options: TieOptions,
     *,
+    structural: Collection[tuple[int, int]] = (),
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Tracks:
     """Register every observation to its track's reference patch, and verify the result.
+
+    Views of `structural` pairs are compared on channels of oriented gradients, all others on grey values.
 
     `spreads`, `PairReport.spread` of the pairs of views, tell which view of a track makes the best reference. Its
     observation is given at a whole pixel, the others as registered, without what did not correlate or left its
@@ -313,9 +333,9 @@ def refine(
         return tracks
     of_track = references(tracks, spreads, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
-    links = _Links(views, tracks, of_track[tracks.point[other]], other)
+    links = _Links(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
     found = links.register(options, executor, progress)
-    good = links.verified(found, found.ok & (found.correlation >= MIN_CORRELATION))
+    good = links.verified(found, found.ok)
     sigma = links.scaled(found, good)
     return _shared(tracks, of_track, other[good], found.xy[good], sigma[good])
 
@@ -328,6 +348,7 @@ class _Links:
     tracks: Tracks
     reference: IntArray
     other: IntArray
+    structural: frozenset[tuple[int, int]] = frozenset()
 
     def __len__(self) -> int:
         return len(self.other)
@@ -361,12 +382,21 @@ class _Links:
         for part in parts:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
-            tasks.append((images, options.band, origin[part], start[part], linear[part], PATCH))
-        done: list[Registration] = ordered(executor, register_places, tasks, "refine", progress)
+            tasks.append(
+                (self._is_structural(part), images, options.band, origin[part], start[part], linear[part])
+            )
+        done: list[Registration] = ordered(executor, register_part, tasks, "refine", progress)
         found = Registration.none(start)
         for part, one in zip(parts, done, strict=True):
             found.put(part, one)
         return found
+
+    def _is_structural(self, part: IntArray) -> bool:
+        """Whether links that have their views in common are of a structural pair."""
+        ends = sorted(
+            (int(self.tracks.view[self.reference[part[0]]]), int(self.tracks.view[self.other[part[0]]]))
+        )
+        return (ends[0], ends[1]) in self.structural
 
     def errors(self, found: Registration, group: IntArray) -> tuple[Array, Array]:
         """Along and across the epipolar lines (M, 2) [px] between two views; half the segments' length (M,)."""

@@ -19,7 +19,8 @@ from barpc.sensor.geometry import triangulate
 from barpc.tie.features import KeypointFiles, locate
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
-from barpc.tie.matching import PairReport, match, matcher_named
+from barpc.tie.matching import STRUCTURE, PairReport, match, matcher_named
+from barpc.tie.ortho import Terrain
 from barpc.tie.pairs import Area, Pair, require_connected, select_pairs
 from barpc.tie.register import refine
 from barpc.tie.store import store_of
@@ -52,6 +53,7 @@ def find_tracks(
     only: Sequence[tuple[int, int]] = (),
     area: Area | None = None,
     given: GivenMatches = _NOTHING,
+    terrain: Terrain | None = None,
 ) -> TieResult:
     """Find the tie points of overlapping images.
 
@@ -70,6 +72,8 @@ def find_tracks(
     given : mapping of (int, int), ascending, to Matches
         Pairs that others have matched: verified and registered as the rest, which is matched here. Where too few can be
         registered (radar against optical, other seasons) they are taken at their places, as exact as they were found.
+    terrain : callable, optional
+        lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside: where structure is looked for.
 
     Raises
     ------
@@ -88,7 +92,7 @@ def find_tracks(
         keypoints = [KeypointFiles(store)] * len(views)
         if matcher.detects and others:
             keypoints = locate(views, options, store, pairs=others, area=area, **work)
-        own = iter(match(views, keypoints, others, options, **work))
+        own = iter(match(views, keypoints, others, options, terrain=terrain, **work))
     theirs = iter(verify(views, given, known, options, **work))
     matched = [next(theirs if pair.views in given else own) for pair in pairs]
     found, reports = [matches for matches, _ in matched], tuple(report for _, report in matched)
@@ -97,7 +101,8 @@ def find_tracks(
     linked = inside(views, link([pair.views for pair in pairs], found), area)
     spreads = {p.views: r.spread for p, r in zip(pairs, reports, strict=True) if r.status == "ok"}
     linked = thin(linked, sizes, int(_SPARE * most))
-    tracks = refine(views, linked, spreads, options, **work)
+    structural = [p.views for p, r in zip(pairs, reports, strict=True) if r.matcher == STRUCTURE]
+    tracks = refine(views, linked, spreads, options, structural=structural, **work)
     verified = {p.views: m for p, m in zip(pairs, found, strict=True) if p.views in given and len(m)}
     tracks = _with_unregistered(views, tracks, verified, options)
     tracks = thin(inside(views, tracks, area), sizes, most)

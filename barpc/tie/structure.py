@@ -1,0 +1,314 @@
+"""Dense matching of structure, where grey values say nothing: another season, sun or sensor.
+
+Both images are brought onto the pixels of A, B by the cameras' local derivative, as channels of oriented gradients
+(`barpc.tie.channels`). Templates on a regular grid of A are correlated with all that the band of a prediction covers
+and with as much to both sides of it, so that bands moved aside compete with the true one point by point; the way back
+must end where it began. A search for the cameras' error sums what neighbours see, then goes from coarse to fine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from barpc.geodesy import Array
+from barpc.options import TieOptions
+from barpc.scene import BoolArray, IntArray, View
+from barpc.tie.channels import channels, correlation, cut
+from barpc.tie.epipolar import Frame, grouped, linear_map
+from barpc.tie.features import Keypoints
+from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
+from barpc.tie.ortho import picture, ticks
+from barpc.tie.raster import Box, FloatImage
+
+Files = Sequence[tuple[str, tuple[int, int]]]
+"""Path and size (width, height) of two images."""
+
+PATCH = 24
+"""How far a patch reaches to each side when matches are registered [px]."""
+SIGMA = 0.15
+"""Standard deviation of a coordinate after that, at least [px]."""
+_HALF = 16  # px: a template reaches so far to each side
+_PAD = 8  # px around what is compared, where channels do not know what lies beyond
+_TILE = 256  # px: points of a tile share a picture
+_BATCH = 32  # templates that are correlated at a time
+_PITCH = 8  # px between points, at least
+_POINTS = 200, 300, 500  # looked for: of the cameras' error, in long bands, in short ones
+_LONG, _LONGER = 48.0, 130.0  # px of half a band
+_SMALLEST = 60  # px of a side of the common part, in the coarsest picture
+_SHOWN = 0.9  # of a template must be a picture
+_BACK = 1.5  # px that the way back may miss by
+_FINER = 3  # px to each side that a finer picture is searched
+
+
+class Structure:
+    """The place in each point's band that looks most alike, where nothing beside the band is more alike."""
+
+    detects: ClassVar[bool] = False
+
+    def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None:
+        self._band = options.band
+        self._known: tuple[Callable[[Array], Frame], Matches] | None = None
+
+    def match(self, a: View, b: View, prediction: Prediction) -> Matches:
+        """Points of a grid whose best place, in the band and to both sides of it, lies in the band.
+
+        All bands of a prediction, moved aside or not, are looked at at once; the next calls ask of what was found.
+        """
+        if self._known is None or self._known[0] is not prediction.where:
+            self._known = prediction.where, _Search(a, b, self._band, prediction).matches()
+        found = self._known[1]
+        if not len(found):
+            return NO_MATCHES
+        across = prediction.at(found.xy[:, 0]).errors(found.xy[:, 1])[:, 1]
+        return found.select(np.abs(across) <= max(prediction.half_width, 1.5))
+
+
+class _Search:
+    """One look at all points of a grid."""
+
+    def __init__(self, a: View, b: View, band: int, prediction: Prediction) -> None:
+        self._views, self._band, self._prediction = (a, b), band, prediction
+        self._files = (a.path, a.size), (b.path, b.size)
+        windows = prediction.windows()
+        middles = np.array([(col + 0.5 * w, row + 0.5 * h) for col, row, w, h in windows]).reshape(-1, 2)
+        where = prediction.at(middles)
+        with np.errstate(invalid="ignore"):
+            lengths = 0.5 * (where.after - where.before)[np.isfinite(where.after)]
+        self._least = _resolution(where.linear)
+        self._step, self._points = self._level(float(np.median(lengths)) if len(lengths) else 0.0, windows)
+
+    def _level(self, half: float, windows: Sequence[Box]) -> tuple[int, Array]:
+        """Step of the picture for bands of half a length [px of B], and the points of the grid."""
+        if not windows:
+            return 1, np.empty((0, 2))
+        if self._prediction.probes is None:
+            wanted, count = (4, _POINTS[1]) if half > _LONGER else (2, _POINTS[1 + (half < _LONG)])
+        else:
+            width = self._prediction.half_width  # a twentieth of the image, or the altitudes, may be wide
+            wanted, count = int(max(width / 10.0, min(half / 60.0, 4.0), 2.0)), _POINTS[0]
+        boxes = np.array(windows)
+        side = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) - boxes[:, :2].min(axis=0)
+        step = 1 << int(np.ceil(np.log2(wanted)))
+        while step > 2 and side.min() < _SMALLEST * step:
+            step //= 2
+        step *= self._least
+        area = float((boxes[:, 2] * boxes[:, 3]).sum())
+        pitch = step * max(_PITCH, int((area / count) ** 0.5 / step))
+        return step, np.concatenate([_lattice(box, pitch) for box in windows])
+
+    def matches(self) -> Matches:
+        """The best place of every point, on whole bands; found again in finer pictures."""
+        a, b = self._views
+        where = self._prediction.where(self._points)
+        middle = 0.5 * (where.before + where.after)
+        ends = np.stack([where.place(where.before), where.place(where.after)])
+        with np.errstate(invalid="ignore"):
+            seen = (ends.max(axis=0) > 0).all(axis=1) & (ends.min(axis=0) < np.array(b.size)).all(axis=1)
+        rows = np.flatnonzero(seen & np.isfinite(where.along + where.across + middle))
+        parts = [
+            self._tile(where, rows[group])
+            for group in grouped(*np.floor(self._points[rows][:, ::-1] / (self._step * _TILE)).T)
+        ]
+        if not parts:
+            return NO_MATCHES
+        at, xy, score = (np.concatenate(column) for column in zip(*parts, strict=True))
+        step = self._step
+        while len(at) and step > 2 * self._least:
+            step //= 2
+            found = [
+                (
+                    group,
+                    *_found(
+                        self._files,
+                        self._band,
+                        step,
+                        at[group],
+                        xy[group],
+                        linear_map(a, b, at[group].mean(axis=0)),
+                    ),
+                )
+                for group in grouped(*np.floor(at[:, ::-1] / (step * _TILE)).T)
+            ]
+            group, place, ok = (
+                np.concatenate(column) for column in zip(*[f[:3] for f in found], strict=True)
+            )
+            at, xy, score = at[group[ok]], place[ok], score[group[ok]]
+        return Matches.of_places(np.stack([at, xy], axis=1), score)
+
+    def _tile(self, where: Frame, rows: IntArray) -> tuple[Array, Array, Array]:
+        """Points of A, their best places in B and how unlike these look, of some rows."""
+        at, asked = self._points[rows], self._prediction
+        before, after, slope = where.before[rows], where.after[rows], where.slope[rows]
+        middle = 0.5 * (where.before + where.after)
+        linear = linear_map(*self._views, at.mean(axis=0))
+        axes = np.stack([where.axis, [-where.axis[1], where.axis[0]]])
+        half = max(asked.half_width, 0.75 * self._step)
+        wide = half if asked.probes else 2.0 * asked.half_width + 6.0 + half
+        turned = np.abs(np.linalg.inv(self._step * linear) @ axes.T)
+        reach = np.ceil(turned @ [0.5 * float((after - before).max()), wide]).astype(np.int64) + 1
+        tile = Tile.of(
+            self._files, self._band, self._step, at, where.place(middle)[rows], linear, reach, _HALF
+        )
+        surface = tile.surfaces()
+        if asked.probes:  # neighbours are moved alike
+            apart = np.abs(at[:, None] - at[None]).max(axis=2)
+            near = (apart <= 1.5 * max(float(apart[apart > 0].min(initial=np.inf)), 1.0)).astype(np.float32)
+            surface = np.tensordot(near, surface, axes=1) / near.sum(axis=1)[:, None, None]
+        off = tile.offsets() @ axes.T  # along, across
+        part = (tile.left @ tile.matrix.T @ axes.T)[:, None, None]
+        along, across = off[..., 0] - part[..., 0], off[..., 1] - part[..., 1]
+        across = across - slope[:, None, None] * along
+        inside = (np.abs(along) <= 0.5 * (after - before)[:, None, None]) & (np.abs(across) <= wide)
+        place, score = tile.peaks(np.where(inside, surface, np.float32(-1.0)))
+        ok = (score > 0.0) & tile.shown()
+        if not asked.probes:
+            ok &= tile.returns(place)
+        return at[ok], tile.in_b(place)[ok], 1.0 - score[ok]
+
+
+def _resolution(linear: Array) -> int:
+    """Pixels of A in one of B, where these are larger, as a power of two."""
+    return 1 << int(np.rint(np.log2(max(1.0, abs(float(np.linalg.det(linear))) ** -0.5))).clip(0, 6))
+
+
+def _lattice(box: Box, pitch: int) -> Array:
+    """Points (n, 2) in a box whose coordinates are multiples of the pitch."""
+    axes = [
+        np.arange(-(-first // pitch) * pitch, first + length, pitch)
+        for first, length in zip(box[:2], box[2:], strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2).astype(np.float64)
+
+
+def _found(
+    files: Files, band: int, step: int, at: Array, xy: Array, linear: Array, half: int = _HALF
+) -> tuple[Array, BoolArray, Array]:
+    """Places (n, 2) near those given, whether they stand out and the way back ends at its start; correlations."""
+    tile = Tile.of(files, band, step, at, xy, linear, np.array([_FINER, _FINER]), half)
+    surface = tile.surfaces()
+    place, score = tile.peaks(surface)
+    edge = np.abs(np.rint(place) - tile.whole).max(axis=1) < _FINER
+    return tile.in_b(place), edge & tile.shown() & tile.returns(place), score
+
+
+def register_places(
+    files: Files, band: int, reference: Array, start: Array, linear: Array
+) -> tuple[Array, BoolArray, Array]:
+    """Patches of A at `reference` found again about `start` (n, 2) [px] of B: places, whether, correlations.
+
+    On the channels, at the coarser of the two resolutions; a parabola through the correlations is as exact as least
+    squares on the channels and takes a quarter of the time.
+    """
+    turned = np.median(linear, axis=0)
+    return _found(files, band, _resolution(turned), reference, start, turned, PATCH)
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """Points of A and where in B they are looked for, in pictures of the same resolution and orientation."""
+
+    pictures: tuple[FloatImage, FloatImage]  # channels (C, H, W) of A and of B
+    at: IntArray  # (n, 2) in the first
+    whole: IntArray  # (n, 2) in the second: whole px next to what is predicted
+    left: Array  # (n, 2) what that leaves [px]
+    reach: IntArray  # (2,) how far to look, x, y [px]
+    half: int  # how far templates reach [px]
+    matrix: Array  # (2, 2) d(B)/d(second picture)
+    origin: Array  # (2,) of the second picture, in B
+
+    @classmethod
+    def of(
+        cls,
+        files: Files,
+        band: int,
+        step: int,
+        at: Array,
+        xy: Array,
+        linear: Array,
+        reach: IntArray,
+        half: int,
+    ) -> Tile:
+        """The pictures of two images about points of A and B (n, 2) [px]."""
+        matrix, pad = step * linear, half + _PAD
+        corner = np.floor(at.min(axis=0) / step) * step - pad * step
+        first = np.rint((at - corner) / step).astype(np.int64)
+        middle = np.median(xy, axis=0)
+        place = (xy - middle) @ np.linalg.inv(matrix).T
+        low = np.floor(place.min(axis=0)) - pad - reach - 1
+        place -= low
+        whole = np.rint(place).astype(np.int64)
+        origin = middle + matrix @ low
+        pictures = (
+            _seen(files[0], band, corner, step * np.eye(2), first.max(axis=0) + pad + 1),
+            _seen(files[1], band, origin, matrix, whole.max(axis=0) + pad + reach + 2),
+        )
+        return cls(pictures, first, whole, place - whole, reach, half, matrix, origin)
+
+    def surfaces(self) -> FloatImage:
+        """Correlations (n, y, x) at all places within reach."""
+        x, y = (self.half + self.reach).tolist()
+        parts = [
+            correlation(
+                cut(self.pictures[0], self.at[i], self.half, self.half),
+                cut(self.pictures[1], self.whole[i], x, y),
+            )
+            for i in self._batches()
+        ]
+        return np.concatenate(parts)
+
+    def _batches(self) -> list[slice]:
+        return [slice(i, i + _BATCH) for i in range(0, len(self.at), _BATCH)]
+
+    def offsets(self) -> Array:
+        """How far in B (y, x, 2) [px] the places of a surface lie from the whole px."""
+        axes = (np.arange(-n, n + 1) for n in self.reach.tolist())
+        return np.stack(np.meshgrid(*axes), axis=-1) @ self.matrix.T
+
+    def peaks(self, surface: FloatImage) -> tuple[Array, Array]:
+        """Best places (n, 2) in the second picture, to a part of a pixel, and correlations there (n,)."""
+        n, height, width = surface.shape
+        flat = surface.reshape(n, -1).argmax(axis=1)
+        y, x = np.divmod(flat, width)
+        part = np.zeros((n, 2))
+        inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
+        i, row, col = np.flatnonzero(inside), y[inside], x[inside]
+        for k, (dy, dx) in enumerate(((0, 1), (1, 0))):
+            low, here, high = (surface[i, row + s * dy, col + s * dx].astype(np.float64) for s in (-1, 0, 1))
+            bend = np.minimum(low - 2.0 * here + high, -1e-6)
+            part[i, k] = (0.5 * (low - high) / bend).clip(-0.5, 0.5)
+        score = surface.reshape(n, -1)[np.arange(n), flat].astype(np.float64)
+        return self.whole + np.stack([x, y], axis=1) - self.reach + part, score
+
+    def returns(self, place: Array) -> BoolArray:
+        """Whether what is at places of the second picture is found where it is looked for from."""
+        search, missed = 4, []
+        for i in self._batches():
+            there = cut(self.pictures[1], np.rint(place[i]).astype(np.int64), self.half, self.half)
+            back = correlation(
+                there, cut(self.pictures[0], self.at[i], self.half + search, self.half + search)
+            )
+            y, x = np.divmod(back.reshape(len(back), -1).argmax(axis=1), back.shape[2])
+            missed.append(np.hypot(x - search, y - search))
+        return np.asarray(np.concatenate(missed) <= _BACK)
+
+    def shown(self) -> BoolArray:
+        """Templates that are pictures."""
+        known = (np.abs(self.pictures[0]).sum(axis=0, keepdims=True) > 0).astype(np.float32)
+        return np.asarray(cut(known, self.at, self.half, self.half).mean(axis=(1, 2, 3)) > _SHOWN)
+
+    def in_b(self, place: Array) -> Array:
+        """Places (n, 2) of the second picture in B [px]."""
+        return np.asarray(self.origin + place @ self.matrix.T)
+
+
+def _seen(
+    file: tuple[str, tuple[int, int]], band: int, origin: Array, matrix: Array, size: IntArray
+) -> FloatImage:
+    """Channels (C, H, W) of an image on a grid: pixel k at `origin` + `matrix` k."""
+    shape = int(size[1]), int(size[0])
+    nodes = np.stack(np.meshgrid(ticks(shape[1]), ticks(shape[0])), axis=-1)
+    return channels(*picture(file[0], (band,), file[1], origin + nodes @ matrix.T, shape))
