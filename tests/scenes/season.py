@@ -136,3 +136,28 @@ def write_dem(
     ) as file:
         file.write(heights.astype(np.float32), 1)
     return path
+
+
+SEASONS = {"mild": (0.0, 0.1), "winter": (0.25, 0.4), "extreme": (0.5, 0.6)}
+"""Level -> share of the classes of grey that are turned over, share of the ground under snow."""
+
+
+def disguised(pixels: np.ndarray, seed: int, inverted: float, snow: float) -> np.ndarray:
+    """A picture on another date, uint16: classes of grey with other tones, `inverted` of them turned over; snow.
+
+    Everything keeps its place; snow hides what is beneath.
+    """
+    rng = np.random.default_rng([seed, 79])
+    low, high = np.percentile(pixels, [0.5, 99.5])
+    grey = np.clip((pixels.astype(np.float32) - low) / (high - low), 0, 1)
+    local = cv2.medianBlur(cv2.medianBlur((grey * 255).astype(np.uint8), 5), 5).astype(np.float32) / 255
+    kind = np.digitize(local, np.quantile(local[::7, ::7], np.linspace(0, 1, CLASSES + 1)[1:-1]))
+    tone = np.linspace(0.1, 0.7, CLASSES)
+    tone = rng.permutation(tone) if inverted else np.sort(tone + rng.normal(0, 0.05, CLASSES))
+    sign = rng.permutation(np.where(np.arange(CLASSES) < inverted * CLASSES, -1.0, 1.0))
+    today = tone[kind] + (sign * rng.uniform(0.6, 1.2, CLASSES))[kind] * (grey - local)
+    if snow:
+        cover = _part(rng, grey.shape, snow, 60.0)
+        today = np.where(cover, 0.85 + 0.02 * fractal(rng, grey.shape, 0.9), today)
+    today = cv2.GaussianBlur(today.astype(np.float32), (0, 0), 0.6) + rng.normal(0, 0.004, grey.shape)
+    return np.clip(100 + 1500 * today, 1, 4000).astype(np.uint16)

@@ -1,0 +1,189 @@
+"""Pairs whose grey values do not compare: what ties them, and how well their cameras agree afterwards.
+
+    python benchmarks/seasons.py DATA                      the table (DATA: the folder of the shared test data)
+    python benchmarks/seasons.py DATA --judge TOOL.py      judged by another program: TOOL IMAGE_A IMAGE_B TIES.csv
+    python benchmarks/seasons.py DATA --seeds 1 --only winter
+
+The second image of a real pair is disguised (`tests/scenes/season.py`), and the pair adjusted. Judged on check points
+of the pair as it was: the RMS distance from the epipolar lines [px], as delivered, after the adjustment of the pair as
+it was (the floor), and of the disguised one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import cv2  # noqa: E402  (the thread counts come first)
+import numpy as np  # noqa: E402
+import rasterio  # noqa: E402
+
+from barpc.errors import BarpcError  # noqa: E402
+from barpc.options import RunOptions, TieOptions  # noqa: E402
+from barpc.pipeline import adjust  # noqa: E402
+from barpc.rpcio import read_rpc  # noqa: E402
+from barpc.scene import View  # noqa: E402
+from barpc.sensor.geometry import altitude_range, epipolar_offset  # noqa: E402
+from barpc.tie import match, select_pairs  # noqa: E402
+from barpc.tie.epipolar import robust_affine  # noqa: E402
+from barpc.tie.features import join  # noqa: E402
+from barpc.tie.structure import register_places  # noqa: E402
+from tests.scenes.season import SEASONS, _part, disguised  # noqa: E402
+
+warnings.simplefilter("ignore")
+TRIPLET = [("img_01", "img_02"), ("img_01", "img_03"), ("img_02", "img_03")]
+Change = Callable[[np.ndarray, int], np.ndarray]
+
+
+def covered(share: float) -> Change:
+    """Clouds over a share of the image."""
+
+    def change(pixels: np.ndarray, seed: int) -> np.ndarray:
+        rng = np.random.default_rng([seed, 80])
+        return np.where(_part(rng, pixels.shape, share, 60.0), 3000, pixels).astype(np.uint16)
+
+    return change
+
+
+def speckled(pixels: np.ndarray, seed: int) -> np.ndarray:
+    """Classes of grey in other tones under the speckle of four looks: no radar image, but as noisy as one."""
+    rng = np.random.default_rng([seed, 81])
+    return (
+        (disguised(pixels, seed, 0.5, 0.0) * rng.gamma(4.0, 0.25, pixels.shape))
+        .clip(1, 9e3)
+        .astype(np.uint16)
+    )
+
+
+def season(level: str) -> Change:
+    return lambda pixels, seed: disguised(pixels, seed, *SEASONS[level])
+
+
+CASES: dict[str, tuple[Change, int]] = {level: (season(level), 1) for level in SEASONS}
+CASES |= {f"clouds {share:.0%}": (covered(share), 1) for share in (0.1, 0.4)}
+CASES |= {"winter, x2 coarser": (season("winter"), 2), "as it was, x4 coarser": (lambda p, _: p, 4)}
+CASES |= {"mild, x4 coarser": (season("mild"), 4), "4-look speckle": (speckled, 1)}
+
+
+def write(source: Path, target: Path, change: Change, seed: int, coarser: int) -> None:
+    """An image disguised, perhaps averaged, with its RPC."""
+    with rasterio.open(source) as file:
+        pixels, rpcs = change(file.read(1), seed), file.rpcs
+    height, width = (n // coarser for n in pixels.shape)
+    pixels = pixels[: height * coarser, : width * coarser].astype(np.float32)
+    pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    for axis in ("line", "samp"):
+        setattr(rpcs, f"{axis}_off", (getattr(rpcs, f"{axis}_off") + 0.5) / coarser - 0.5)
+        setattr(rpcs, f"{axis}_scale", getattr(rpcs, f"{axis}_scale") / coarser)
+    layout = {"driver": "GTiff", "count": 1, "dtype": "uint16", "width": width, "height": height}
+    with rasterio.open(target, "w", **layout) as file:
+        file.write(np.rint(pixels).astype(np.uint16), 1)
+        file.rpcs = rpcs
+
+
+def rms(a: Path, b: Path, ties: Path, coarser: int, judge: str | None, folder: Path) -> float:
+    """RMS distance of check points from the epipolar lines [px of the second image as it was]."""
+    table = np.genfromtxt(ties, delimiter=",", names=True)
+    xy = [np.stack([table[f"col_{k}"], table[f"row_{k}"]], axis=1) for k in "ab"]
+    xy[1] = (xy[1] + 0.5) / coarser - 0.5
+    if judge is None:
+        rpcs = read_rpc(a), read_rpc(b)
+        offset, _ = epipolar_offset(*rpcs, *xy, np.full(len(xy[0]), rpcs[0].ground_offset[2]))
+        return coarser * float(np.sqrt((offset**2).mean()))
+    scaled = folder / "ties.csv"
+    np.savetxt(scaled, np.hstack(xy), "%.4f", ",", header="col_a,row_a,col_b,row_b", comments="")
+    done = subprocess.run([sys.executable, judge, a, b, scaled], capture_output=True, text=True, check=True)
+    return coarser * float(json.loads(done.stdout)["rms"])
+
+
+def adjusted(images: list[Path], out: Path, ties: Path, coarser: int, judge: str | None) -> tuple[float, str]:
+    """RMS after the adjustment, and what tied the pair in how many CPU seconds."""
+    start = time.process_time()
+    try:
+        result = adjust(images, out, RunOptions(overwrite=True))
+    except BarpcError as error:
+        return float("nan"), " ".join(str(error).split())[:70]
+    seconds = time.process_time() - start
+    after = [Path(out) / f"{path.stem}.vrt" for path in images]
+    pair = result.summary["pairs"][0]
+    kind, report = pair["matching"]["matcher"], pair["matching"]
+    kind += ", loosened" * report["loosened"]
+    words = f"{kind}: {pair['num_matches']} tracks, decoys {report['control_share']:.3f}, {seconds:.1f} s"
+    return rms(after[0], after[1], ties, coarser, judge, out), words
+
+
+def table(data: Path, seeds: int, only: str, judge: str | None) -> None:
+    """All cases over all pairs and seeds."""
+    print("| case | pair | seed | delivered | floor | after | tied by |\n|---|---|---|---|---|---|---|")
+    folder = data / "optical/phr_triplet_north"
+    with tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        for first, second in TRIPLET:
+            ties = data / f"truth/ties/phr_triplet_north__{first}__{second}__ncc_check.csv"
+            paths = [folder / f"{first}.tif", folder / f"{second}.tif"]
+            delivered = rms(*paths, ties, 1, judge, work)
+            floor, _ = adjusted(paths, work / "clean", ties, 1, judge)
+            for case, (change, coarser) in CASES.items():
+                if only not in case:
+                    continue
+                for seed in range(seeds):
+                    other = work / f"{second}_x.tif"
+                    write(paths[1], other, change, seed, coarser)
+                    after, words = adjusted([paths[0], other], work / "out", ties, coarser, judge)
+                    figures = f"{delivered:.3f} | {floor:.3f} | {after:.3f}"
+                    print(f"| {case} | {first[-1]}-{second[-1]} | {seed} | {figures} | {words} |", flush=True)
+
+
+def sentinel2(data: Path) -> None:
+    """Two dates on one grid, through one camera: matches of a regular grid about their common affine."""
+    rpc = read_rpc(data / "optical/phr_triplet_north/img_01.tif")
+    views = [
+        View(path.stem, str(path), (1200, 1200), rpc, altitude_range(rpc))
+        for path in sorted((data / "optical/s2_two_dates").glob("*.tif"))
+    ]
+    options = TieOptions(matcher="structure")
+    found, report = match(views, [join([])] * 2, select_pairs(views, options), options)[0]
+    at, shift = found.xy[:, 0], found.xy[:, 1] - found.xy[:, 0]
+    common = [robust_affine(at, shift[:, k]) for k in (0, 1)]
+    grid = np.stack(np.meshgrid(*[np.arange(40.0, 1160.0, 40.0)] * 2), axis=-1).reshape(-1, 2)
+    start = grid + np.stack([fit(grid) for fit in common], axis=1)
+    files = [(view.path, view.size) for view in views]
+    xy, ok, _ = register_places(files, 1, grid, start, np.broadcast_to(np.eye(2), (len(grid), 2, 2)))
+    fine = [robust_affine(grid[ok], (xy - grid)[ok, k]) for k in (0, 1)]
+    rest = np.hypot(*((xy - grid)[:, k] - fit(grid) for k, fit in enumerate(fine)))
+    print(
+        f"Sentinel-2, shift {np.median(shift, axis=0).round(2)} px: {report.status}, {len(found)} matches; of a grid of "
+        f"{len(grid)} places {ok.mean():.1%} are found, {(rest[ok] < 1).mean():.1%} of these within 1 px of their "
+        f"common affine, median {np.median(rest[ok]):.2f} px\n"
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path, metavar="DATA")
+    parser.add_argument("--judge", metavar="TOOL", help="program that prints JSON with rms")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--only", default="", help="cases with this in their name")
+    given = parser.parse_args()
+    sentinel2(given.data)
+    table(given.data, given.seeds, given.only, given.judge)
+
+
+if __name__ == "__main__":
+    main()
