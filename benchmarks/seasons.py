@@ -164,10 +164,10 @@ def sentinel2(data: Path) -> None:
     xy, ok, _ = register_places(files, 1, grid, start, np.broadcast_to(np.eye(2), (len(grid), 2, 2)))
     fine = [robust_affine(grid[ok], (xy - grid)[ok, k]) for k in (0, 1)]
     rest = np.hypot(*((xy - grid)[:, k] - fit(grid) for k, fit in enumerate(fine)))
+    print(f"Sentinel-2: {report.status}, {len(found)} matches, shift {np.median(shift, axis=0).round(2)} px;")
     print(
-        f"Sentinel-2, shift {np.median(shift, axis=0).round(2)} px: {report.status}, {len(found)} matches; of a grid of "
-        f"{len(grid)} places {ok.mean():.1%} are found, {(rest[ok] < 1).mean():.1%} of these within 1 px of their "
-        f"common affine, median {np.median(rest[ok]):.2f} px\n"
+        f"of a grid of {len(grid)} places {ok.mean():.1%} are found, {(rest[ok] < 1).mean():.1%} of these within 1 px "
+        f"of their common affine, median {np.median(rest[ok]):.2f} px\n"
     )
 
 

@@ -276,11 +276,11 @@ class PairEntry(Record):
         "before": Column("before [px]", lambda pair: _offset_cell(pair.epipolar_before), ".3f"),
         "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
     }
-    PAGE: ClassVar = "pair num_matches convergence_deg base_to_height height_m_per_px before after"
+    PAGE: ClassVar = "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px before after"
     TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
     CSV: ClassVar = (
         "a b num_matches convergence_deg base_to_height height_m_per_px epipolar_before.median epipolar_before.spread "
-        "epipolar_before.rms epipolar_after.median epipolar_after.spread epipolar_after.rms"
+        "epipolar_before.rms epipolar_after.median epipolar_after.spread epipolar_after.rms tied_by decoy_share noise_px"
     )
 
     a: str = said("First view")
@@ -295,6 +295,24 @@ class PairEntry(Record):
     epipolar_after: OffsetEntry | None = said("Through the new cameras")
     matching: Mapping[str, Any] | None = said(
         "What became of it in matching; null for tie points from a file"
+    )
+    tied_by: str | None = said(
+        "Matcher that tied it, and whether with loosened thresholds; null as there",
+        head="tied by",
+        default=None,
+    )
+    decoy_share: Number = said(
+        "Share of its matches that bands which hold no true one say is false",
+        head="decoys",
+        form=".3f",
+        default=None,
+    )
+    noise_px: Number = said(
+        "Robust spread of its matches across the epipolar lines, before registration",
+        "px",
+        "noise",
+        ".2f",
+        default=None,
     )
 
     @property
@@ -701,8 +719,12 @@ def _pairs(run: Run) -> tuple[PairEntry, ...]:
     for ties, (angle, base, height), first, last in zip(run.pairs, geometry, before, after, strict=True):
         names = (run.views[ties.views[0]].name, run.views[ties.views[1]].name)
         report = reports.get(names)
-        matching = None if report is None else plain(report)
-        entries.append(PairEntry(*names, len(ties.a), angle, base, height, first, last, matching))
+        entry = PairEntry(*names, len(ties.a), angle, base, height, first, last, None)
+        if report is not None:
+            tied = report.matcher + ", loosened" * report.loosened
+            share, noise = report.control_share, report.spread
+            entry = replace(entry, matching=plain(report), tied_by=tied, decoy_share=share, noise_px=noise)
+        entries.append(entry)
     return tuple(entries)
 
 

@@ -160,7 +160,7 @@ def test_the_band_that_is_asked_for_is_matched(scene: Rendered, tmp_path) -> Non
 
 
 def test_names_are_those_of_the_tables() -> None:
-    with pytest.raises(InputError, match="matcher 'other' is not one of guided"):
+    with pytest.raises(InputError, match="matcher 'other' is not one of guided, structure"):
         TieOptions(matcher="other")
 
 

@@ -1,0 +1,121 @@
+"""Matching of structure: seasons that keypoints refuse, wrong places refused, decoys that say so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.errors import TiePointError
+from barpc.scene import View
+from barpc.tie import TieOptions, common_tracks, find_tracks
+from barpc.tie.features import join
+from barpc.tie.matching import STRUCTURE, _altitudes, _better, _within, match_pair
+from barpc.tie.pairs import select_pairs
+from barpc.tie.raster import read_pixels
+from barpc.tie.structure import register_places
+from tests.scenes.season import SEASONS, disguised
+from tests.tie.conftest import write_image
+
+
+@pytest.fixture(scope="module")
+def winter(render, tmp_path_factory) -> tuple[View, View]:
+    """Two views of a scene, the second under half a metre of snow for 40 %, a quarter of its classes turned over."""
+    first, second = render(views=2).views
+    pixels, _ = read_pixels(second.path, (0, 0, *second.size))
+    path = tmp_path_factory.mktemp("winter") / "winter.tif"
+    write_image(path, disguised(pixels, 1, *SEASONS["winter"]))
+    return first, replace(second, path=str(path))
+
+
+@pytest.fixture(scope="module")
+def tied(winter):
+    return find_tracks(winter)
+
+
+def test_what_keypoints_find_too_little_of_is_tied_by_structure(render, winter, tied) -> None:
+    report = tied.pairs[0]
+    assert report.matcher == STRUCTURE
+    assert 0.0 <= report.control_share <= 0.05
+    first, second = common_tracks(tied.tracks, 0, 1)
+    errors = render(views=2).errors(0, 1, first, second)
+    assert 60 < len(errors) < 600
+    spread = 1.4826 * np.median(np.abs(errors - np.median(errors, axis=0)), axis=0)
+    assert (spread > 0.005).all()
+    assert (spread < 0.5).all()
+    assert (np.abs(np.median(errors, axis=0)) < 0.1).all()
+    assert (np.abs(errors).max(axis=1) > 2.0).mean() <= 0.05
+    assert 0.1 < tied.tracks.sigma.mean() < 0.5  # half of the variance at either end
+
+
+def test_the_same_images_give_the_same_bytes(winter, tied) -> None:
+    again = find_tracks(winter).tracks
+    assert again.xy.tobytes() == tied.tracks.xy.tobytes()
+
+
+def test_another_place_is_refused(render, winter) -> None:
+    other = render(views=2, seed=5).views[1]
+    with pytest.raises(TiePointError, match="no common offset|too few matches"):
+        find_tracks(
+            [winter[0], replace(winter[1], path=other.path)], TieOptions(matcher=STRUCTURE, search=90.0)
+        )
+
+
+def test_as_delivered_it_is_a_fifth_of_a_pixel_off(render) -> None:
+    scene = render(views=2)
+    found = find_tracks(scene.views, TieOptions(matcher=STRUCTURE))
+    errors = scene.errors(0, 1, *common_tracks(found.tracks, 0, 1))
+    spread = 1.4826 * np.median(np.abs(errors), axis=0)
+    assert len(errors) > 200
+    assert 0.01 < spread.min() < 0.2  # across the epipolar lines
+    assert 0.01 < spread.max() < 0.45  # along them: a patch sees more than its middle's altitude
+    assert found.keypoints == (0, 0)
+
+
+def test_a_patch_is_registered_where_the_truth_says(render) -> None:
+    scene = render(views=2)
+    a, b = scene.views
+    at = np.stack(np.meshgrid(np.arange(100.0, 500.0, 40.0), np.arange(100.0, 500.0, 40.0)), -1).reshape(
+        -1, 2
+    )
+    truth = scene.errors(0, 1, at, np.zeros_like(at))
+    if len(truth) != len(at):
+        pytest.skip("a place stands beside a step")
+    linear = np.broadcast_to(np.eye(2), (len(at), 2, 2))
+    xy, ok, score = register_places([(v.path, v.size) for v in (a, b)], 1, at, truth + [1.0, -1.0], linear)
+    assert ok.mean() > 0.8
+    assert (np.abs(np.median((xy - truth)[ok], axis=0)) < 0.1).all()
+    assert (score[ok] > 0.3).all()
+
+
+def test_terrain_or_other_ties_narrow_the_altitudes(render) -> None:
+    views = tuple(render(views=2).views)
+    low, high = views[0].alt_range
+    middle = 0.5 * (low + high)
+    flat = _within(views, lambda lon, lat: np.full(len(lon), middle), (low, low))
+    assert flat[0].alt_range == flat[1].alt_range == (max(low, middle - 150), min(high, middle + 150))
+    assert _within(views, None, None) == views
+    assert _within(views, None, (high + 1e4, high + 2e4)) == views
+    assert _within(views, lambda lon, lat: np.full(len(lon), np.nan), (low, low))[0].alt_range[1] == min(
+        high, low + 150
+    )
+    pair = select_pairs(views, TieOptions())[0]
+    found, report = match_pair(views, (join([]), join([])), pair, TieOptions(matcher=STRUCTURE))
+    known = _altitudes([(views, found)])
+    seen = render(views=2).altitude[0]
+    assert known is not None
+    assert abs(known[0] - np.nanpercentile(seen, 2)) < 15
+    assert abs(known[1] - np.nanpercentile(seen, 98)) < 15
+    assert _altitudes([]) is None
+    assert report.matcher == STRUCTURE
+
+
+def test_the_attempt_with_more_verified_matches_counts_and_a_refused_one_never(render) -> None:
+    views = tuple(render(views=2).views)
+    pair = select_pairs(views, TieOptions())[0]
+    found, report = match_pair(views, (join([]), join([])), pair, TieOptions(matcher=STRUCTURE))
+    few, refused = replace(report, verified=20), replace(report, verified=900, status="too few matches")
+    assert _better((found, few), (found, report), (found, refused))[1] is report
+    assert _better((found, refused), (found, few))[1] is few
+    assert _better((found, few), (found, replace(few, loosened=True)))[1] is few
