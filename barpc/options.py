@@ -201,8 +201,8 @@ class TieOptions(Options):
     band: int = option(1, "Band of multi-band images, from 1.", least=1)
     matcher: str = option(
         "guided",
-        """What matches a pair: `guided`, keypoints, and structure where they find few; `structure`, gradients whatever the
-        grey values. `module:name`: a function of yours, in a module that Python finds; it is run.""",
+        """What matches a pair: `guided`, keypoints, and structure where they find few; `structure`, gradients
+        whatever the grey values. `module:name`: a function of yours, in a module that Python finds; it is run.""",
         rows="barpc.tie.matching.MATCHERS",
         hook=True,
     )

@@ -280,7 +280,8 @@ class PairEntry(Record):
     TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
     CSV: ClassVar = (
         "a b num_matches convergence_deg base_to_height height_m_per_px epipolar_before.median epipolar_before.spread "
-        "epipolar_before.rms epipolar_after.median epipolar_after.spread epipolar_after.rms tied_by decoy_share noise_px"
+        "epipolar_before.rms epipolar_after.median epipolar_after.spread epipolar_after.rms "
+        "tied_by decoy_share noise_px"
     )
 
     a: str = said("First view")
