@@ -276,7 +276,10 @@ class PairEntry(Record):
         "before": Column("before [px]", lambda pair: _offset_cell(pair.epipolar_before), ".3f"),
         "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
     }
-    PAGE: ClassVar = "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px before after"
+    PAGE: ClassVar = (
+        "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px "
+        "before after"
+    )
     TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
     CSV: ClassVar = (
         "a b num_matches convergence_deg base_to_height height_m_per_px epipolar_before.median epipolar_before.spread "

@@ -144,12 +144,12 @@ def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
 
 
 def register_part(
-    structural: bool,
     files: tuple[tuple[str, tuple[int, int]], tuple[str, tuple[int, int]]],
     band: int,
     reference: Array,
     start: Array,
     linear: Array,
+    structural: bool,
 ) -> Registration:
     """Patches registered on their grey values, or on channels of oriented gradients; `ok` where they are alike."""
     if structural:

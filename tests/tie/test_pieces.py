@@ -567,9 +567,9 @@ def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
     monkeypatch.setattr("barpc.tie.register._sparse", lambda *_: False)
     found = links.register(TieOptions(tile=256), None, None)
     assert len(found.xy) == 160
-    for _, band, origin, start, linear, patch in seen:
+    for _, band, origin, start, linear, structural in seen:
         assert (np.ptp(np.floor(origin / 256), axis=0) == 0).all()
-        assert (band, patch) == (1, 21)
+        assert (band, structural) == (1, False)
         assert len(origin) == len(start) == len(linear)
     assert sum(len(task[2]) for task in seen) == 160
     assert len(seen) > 20
