@@ -383,7 +383,7 @@ class _Links:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
             tasks.append(
-                (self._is_structural(part), images, options.band, origin[part], start[part], linear[part])
+                (images, options.band, origin[part], start[part], linear[part], self._is_structural(part))
             )
         done: list[Registration] = ordered(executor, register_part, tasks, "refine", progress)
         found = Registration.none(start)
