@@ -203,8 +203,13 @@ def register_places(
     On the channels, at the coarser of the two resolutions; a parabola through the correlations is as exact as least
     squares on the channels and takes a quarter of the time.
     """
-    turned = np.median(linear, axis=0)
-    return _found(files, band, _resolution(turned), reference, start, turned, PATCH)
+    place, ok, score = start.copy(), np.zeros(len(start), dtype=bool), np.zeros(len(start))
+    step = _resolution(np.median(linear, axis=0))
+    for rows in grouped(*np.floor(reference[:, ::-1] / (step * _TILE)).T):
+        place[rows], ok[rows], score[rows] = _found(
+            files, band, step, reference[rows], start[rows], np.median(linear[rows], axis=0), PATCH
+        )
+    return place, ok, score
 
 
 @dataclass(frozen=True, eq=False)
