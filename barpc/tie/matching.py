@@ -184,7 +184,7 @@ def match(
     tasks = [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
     found: list[tuple[Matches, PairReport]] = ordered(executor, match_pair, tasks, "match", progress)
     thin = [k for k, (_, report) in enumerate(found) if not _enough(report)]
-    if options.matcher == STRUCTURE or options.matcher not in MATCHERS or not thin:
+    if options.matcher != _DEFAULTS.matcher or not thin:  # who names a matcher wants that one
         return found
     known = _altitudes(
         [(tasks[k][0], matches) for k, (matches, report) in enumerate(found) if _enough(report)]
