@@ -532,7 +532,7 @@ def run(scene: Scene, **options: Any) -> tuple[tuple[SensorModel, ...], Any]:
             write_rpc(view.sensor, folder / f"{view.name}_RPC.TXT")
             paths.append(path)
         write_matches(folder / "ties.npz", scene.tracks, [view.name for view in scene.views])
-        given = {"images": "none", "matches": str(folder / "ties.npz"), **options}
+        given = {"images": "none", "matches": str(folder / "ties.npz"), "matches_only": True, **options}
         if scene.gcps is not None:
             (folder / "points.gcp").write_text(_gcp_text(scene))
             given["gcp"] = [str(folder / "points.gcp")]

@@ -60,11 +60,10 @@ def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
 
 def with_located(options: RunOptions) -> RunOptions:
     """The options with the rasters that may lie on other hosts found there; others are refused (ImageError)."""
-    if not options.allow_remote:
-        return options
 
     def at(path: str) -> str:
-        return os.fspath(versioned(located(path, options.allow_remote), IMAGE))
+        found = located(path, options.allow_remote)
+        return os.fspath(versioned(found, IMAGE)) if isinstance(found, Remote) else path
 
     dem, geoid = (path if path is None else at(path) for path in (options.dem, options.geoid))
     return replace(options, dem=dem, geoid=geoid, reference=tuple(map(at, options.reference)))

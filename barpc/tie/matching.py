@@ -55,6 +55,7 @@ _CLEAR = 0.4  # share of the matches that makes wider passes needless
 _FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
 _LOOSE = 0.95, 0.05  # ratio and false share of the second attempt
+_LEAST = 8  # matches of it
 _LEAST_REACH = 5.0  # px of half a segment, below which matches say nothing of altitudes
 _MARGIN = 150.0  # m beyond known altitudes: how wrong cameras make them
 _PROBES = 12  # pixels along a side at which the terrain is asked
@@ -93,11 +94,13 @@ def match_pair(
     first = _attempt(views, keypoints, pair, options)
     if _enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
         return first
+    if options.matcher == STRUCTURE and first[1].matches < _LEAST:  # thresholds do not say where it looks
+        return first
     loose = replace(
         options,
         ratio=max(options.ratio, _LOOSE[0]),
         false_share=max(options.false_share, _LOOSE[1]),
-        min_matches=min(options.min_matches, 8),
+        min_matches=min(options.min_matches, _LEAST),
     )
     found, report = _attempt(views, keypoints, pair, loose)
     return _better(first, (found, replace(report, loosened=True)))

@@ -142,17 +142,19 @@ class _Search:
     def _tile(self, where: Frame, rows: IntArray) -> tuple[Array, Array, Array]:
         """Points of A, their best places in B and how unlike these look, of some rows."""
         at, asked = self._points[rows], self._prediction
-        before, after, slope = where.before[rows], where.after[rows], where.slope[rows]
+        reach_along, slope = 0.5 * (where.after - where.before)[rows], where.slope[rows]
         middle = 0.5 * (where.before + where.after)
         linear = linear_map(*self._views, at.mean(axis=0))
         axes = np.stack([where.axis, [-where.axis[1], where.axis[0]]])
         half = max(asked.half_width, 0.75 * self._step)
         wide = half if asked.probes else 2.0 * asked.half_width + 6.0 + half
+        wide = min(wide, float(np.abs(axes[1]) @ self._files[1][1]))  # B is no wider
+        shift, longest = self._part_in_b(where, middle, rows, wide)
         turned = np.abs(np.linalg.inv(self._step * linear) @ axes.T)
-        reach = np.ceil(turned @ [0.5 * float((after - before).max()), wide]).astype(np.int64) + 1
-        tile = Tile.of(
-            self._files, self._band, self._step, at, where.place(middle)[rows], linear, reach, _HALF
-        )
+        whole = np.abs(np.linalg.inv(self._step * linear)) @ self._files[1][1]
+        reach = np.ceil(np.minimum(turned @ [longest, wide], whole)).astype(np.int64) + 1
+        centers = where.place(middle + shift)[rows]
+        tile = Tile.of(self._files, self._band, self._step, at, centers, linear, reach, _HALF)
         surface = tile.surfaces()
         if asked.probes:  # neighbours are moved alike
             apart = np.abs(at[:, None] - at[None]).max(axis=2)
@@ -162,12 +164,27 @@ class _Search:
         part = (tile.left @ tile.matrix.T @ axes.T)[:, None, None]
         along, across = off[..., 0] - part[..., 0], off[..., 1] - part[..., 1]
         across = across - slope[:, None, None] * along
-        inside = (np.abs(along) <= 0.5 * (after - before)[:, None, None]) & (np.abs(across) <= wide)
+        inside = (np.abs(along + shift) <= reach_along[:, None, None]) & (np.abs(across) <= wide)
         place, score = tile.peaks(np.where(inside, surface, np.float32(-1.0)))
         ok = (score > 0.0) & tile.shown()
         if not asked.probes:
             ok &= tile.returns(place)
         return at[ok], tile.in_b(place)[ok], 1.0 - score[ok]
+
+    def _part_in_b(self, where: Frame, middle: Array, rows: IntArray, wide: float) -> tuple[float, float]:
+        """Middle and half the length [px] of what a tile's segments have in B, from their middles: one for all."""
+        start = where.place(middle)[rows]
+        step = where.place(middle + 1.0)[rows] - start
+        size = np.array(self._files[1][1], dtype=np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.stack([(-wide - start) / step, (size + wide - start) / step])
+        ends = np.where(np.isfinite(ends), ends, np.array([-np.inf, np.inf])[:, None, None])
+        most = 0.5 * (where.after - where.before)[rows]
+        low = np.maximum(ends.min(axis=0).max(axis=1), -most)
+        high = np.minimum(ends.max(axis=0).min(axis=1), most)
+        cut = low <= high
+        first, last = float(low[cut].min(initial=np.inf)), float(high[cut].max(initial=-np.inf))
+        return (0.5 * (first + last), 0.5 * (last - first)) if first <= last else (0.0, 0.0)
 
 
 def _resolution(linear: Array) -> int:

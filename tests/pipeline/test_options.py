@@ -13,7 +13,7 @@ import pytest
 from rasterio import Affine
 
 from barpc.ba import AdjustOptions
-from barpc.errors import BarpcWarning, FitError, InputError, OutputError
+from barpc.errors import BarpcError, BarpcWarning, FitError, InputError, OutputError
 from barpc.fit import FitOptions
 from barpc.geodesy import ground_from_ecef
 from barpc.pipeline import AdjustResult, RunOptions, adjust
@@ -242,12 +242,33 @@ def fit(run: Run, out: Path, scene: Path) -> None:
     assert {fitted.num_cnp for fitted in found.run.fits} == {120}
 
 
+def allow_remote(run: Run, out: Path, scene: Path) -> None:  # what is read so: tests/remote
+    url = "https://127.0.0.1:9/dem.tif"  # nobody answers there
+    said = []
+    for name, hosts in (("a", ()), ("b", ("127.0.0.1:9",))):
+        with pytest.raises(BarpcError) as refused:
+            run(name, dem=url, allow_remote=hosts)
+        said.append(str(refused.value))
+    assert "--allow-remote" in said[0]
+    assert "--allow-remote" not in said[1]
+    assert url in said[1]
+    with pytest.raises(InputError, match="allow_remote 'a b' is no HOST"):
+        RunOptions(allow_remote=("a b",))
+
+
+def store(run: Run, out: Path, scene: Path) -> None:  # what goes there: tests/remote/test_stores.py
+    assert RunOptions(store="s3://bucket/folder").store == "s3://bucket/folder"
+    with pytest.raises(InputError, match="store 'folder' is no s3://BUCKET/FOLDER"):
+        RunOptions(store="folder")
+
+
 ROWS = {
     "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
-    "reference": reference, "reference_sigma": reference_sigma, "tie": tie, "adjust": adjust_, "fit": fit,
+    "reference": reference, "reference_sigma": reference_sigma,
+    "allow_remote": allow_remote, "store": store, "tie": tie, "adjust": adjust_, "fit": fit,
 }  # fmt: skip
 
 
