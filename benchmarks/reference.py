@@ -102,7 +102,6 @@ def row(
         dem=str(kind / "dem.tif"),
         matches=str(kind / "ties/matches.npz"),
         matches_only=True,
-        matches_only=True,
         overwrite=True,
     )
     result = adjust(images, out, options)

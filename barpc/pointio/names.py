@@ -29,6 +29,7 @@ def unique_names(files: Sequence[Place]) -> list[str]:
 
     Examples
     --------
+    >>> from pathlib import Path
     >>> unique_names([Path("a/img.tif"), Path("b/img.tif"), Path("b/other.tif")])
     ['a_img', 'b_img', 'other']
     >>> unique_names([Path("a/img.tif"), Path("a/img.jp2")])
