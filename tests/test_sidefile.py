@@ -172,7 +172,9 @@ def sniff_and_read(name: str, text: str) -> None:
 def test_sniffers_and_readers_take_time_in_proportion_to_the_text(fill, prefix):
     small, large = (prefix + FILLS[fill] * n for n in (10_000, 40_000))
     for name in FORMATS:
-        first, last = (min(cpu(partial(sniff_and_read, name, text)) for _ in range(3)) for text in (small, large))
+        first, last = (
+            min(cpu(partial(sniff_and_read, name, text)) for _ in range(3)) for text in (small, large)
+        )
         # a square takes 16 times as long, a cube 64; below some milliseconds it is the clock that is measured
         assert last < max(8 * first, 0.1), name
 
