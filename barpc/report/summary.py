@@ -298,7 +298,7 @@ class PairEntry(Record):
     epipolar_before: OffsetEntry | None = said("Through the delivered cameras")
     epipolar_after: OffsetEntry | None = said("Through the new cameras")
     matching: Mapping[str, Any] | None = said(
-        "What became of it in matching; null for tie points from a file"
+        "What became of it in matching; null for tie points taken as given (matches_only)"
     )
     tied_by: str | None = said(
         "Matcher that tied it, and whether with loosened thresholds; null as there",
