@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -58,18 +59,22 @@ def report_html(summary: Summary, folder: Path | str) -> str:
     InputError
         A table is missing or damaged.
     """
+    files = read_tables(summary, Path(folder))
+    shown = [section for make in SECTIONS if (section := make(files)) is not None]
+    return visible(
+        _template().render(summary=summary, sections=shown, words=STATUS_WORDS, most_lines=_MOST_LINES)
+    )
+
+
+@cache
+def _template() -> Any:
     import jinja2
 
-    files = read_tables(summary, Path(folder))
     loader, undefined = jinja2.PackageLoader("barpc.report", ""), jinja2.StrictUndefined
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=undefined, trim_blocks=True, lstrip_blocks=True
     )
-    shown = [section for make in SECTIONS if (section := make(files)) is not None]
-    template = environment.get_template("template.html.j2")
-    return visible(
-        template.render(summary=summary, sections=shown, words=STATUS_WORDS, most_lines=_MOST_LINES)
-    )
+    return environment.get_template("template.html.j2")
 
 
 def remake_report(folder: Path | str) -> Path:

@@ -90,7 +90,7 @@ def test_the_order_of_the_images_changes_no_byte(scene, tmp_path, way):
 
 @pytest.mark.slow
 def test_ten_images_in_ten_orders_give_the_same_bytes(tmp_path):
-    images = write_scene(tmp_path / "scene", ImageOptions(views=10, size=(400, 400), seed=3))
+    images = write_scene(tmp_path / "scene", ImageOptions(views=10, size=(256, 256), seed=3))
     adjust(images, tmp_path / "sorted")
     truth = outputs(tmp_path / "sorted")
     for seed in range(10):
