@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +19,7 @@ import numpy.typing as npt
 from barpc.errors import RpcFormatError
 from barpc.geodesy import Array
 from barpc.sensor.curve import MARGIN
+from barpc.sensor.document import Fields
 from barpc.sidefile import parse_xml
 
 TimeArray = npt.NDArray[np.datetime64]
@@ -27,7 +27,6 @@ TimeArray = npt.NDArray[np.datetime64]
 MISSIONS = {"S1A": "Sentinel-1A", "S1B": "Sentinel-1B", "S1C": "Sentinel-1C", "S1D": "Sentinel-1D"}
 """Mission of an annotation -> mission of an orbit file."""
 
-_LARGEST = 1e9  # no number of an annotation that is read here comes near
 _TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?)Z?")
 
 
@@ -228,38 +227,11 @@ def parse_time(text: str, name: str) -> np.datetime64:
         raise RpcFormatError(f"{name}: {text[:40]!r} is not a UTC time") from error
 
 
-class _Fields:
-    """Fields of an XML element; what is missing or malformed is refused by name."""
-
-    def __init__(self, element: Element, name: str) -> None:
-        self.element, self.name = element, name
-
-    def text(self, path: str) -> str:
-        text = self.element.findtext(path)
-        if text is None or not text.strip():
-            raise RpcFormatError(f"{self.name}: no {path} below <{self.element.tag}>; is the file complete?")
-        return text.strip()
-
-    def all(self, path: str) -> list[_Fields]:
-        return [_Fields(element, self.name) for element in self.element.findall(path)]
+class _Fields(Fields):
+    """Fields of an annotation or an orbit file, whose times are UTC."""
 
     def time(self, path: str) -> np.datetime64:
         return parse_time(self.text(path), self.name)
-
-    def numbers(self, path: str) -> Array:
-        try:
-            numbers = np.array(self.text(path).split(), dtype=np.float64)
-        except ValueError as error:
-            raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
-        if not (np.abs(numbers) <= _LARGEST).all():
-            raise RpcFormatError(f"{self.name}: {path} holds a number that is not finite or absurdly large")
-        return numbers
-
-    def positive(self, path: str, most: float = _LARGEST) -> float:
-        value = float(self.numbers(path)[0])
-        if not 0 < value <= most:
-            raise RpcFormatError(f"{self.name}: {path} is {value:g}, expected above 0 and at most {most:g}")
-        return value
 
 
 def _times(rows: Sequence[_Fields], tag: str) -> TimeArray:
