@@ -192,6 +192,24 @@ def _open_sentinel1(path: Place, pol: str | None = None, **choices: Any) -> Came
     return Camera(model, path, "sentinel-1", model.size, model.alt_range)
 
 
+def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
+    """The XML of a SICD image, or a NITF that holds it."""
+    if b"<SICD" in head or not head.startswith(b"NITF02.10") or not isinstance(path, Path):
+        return b"<SICD" in head
+    from barpc.sensor.sicd import find_sicd
+
+    return find_sicd(path) is not None
+
+
+def _open_sicd(path: Place) -> Camera:
+    from barpc.sensor.sicd import open_sicd
+
+    if not isinstance(path, Path):
+        raise ImageError(f"{path}: a radar image's metadata are read from disk only")
+    model = open_sicd(path)
+    return Camera(model, path, "sicd", model.size, model.alt_range)
+
+
 def _is_grid(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
     return driver_of(head) == "GTiff" and ("altitudes" in choices or correspondence_kind(path) == "grid")
 
@@ -213,6 +231,7 @@ OPENERS: dict[str, Opener] = {
         _open_rpc,
         {"first_pixel": {"auto": None, "0": 0.0, "0.5": 0.5, "1": 1.0}.__getitem__, "band": int},
     ),
+    "sicd": Opener(_is_sicd, _open_sicd),
     "grid": Opener(_is_grid, _open_grid, {"altitudes": _numbers}),
     "sentinel-1": Opener(
         _is_sentinel1,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -23,11 +23,20 @@ from barpc.sensor.rpc import RPC
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
-CenterMethod = Literal["line", "nominal"]
+CenterMethod = Literal["line", "nominal", "stated"]
 _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
+
+
+@runtime_checkable
+class Radar(Protocol):
+    """A model that knows where its beam comes from: not from where the ground points of one pixel lie over altitude."""
+
+    def to_radar(self, ground: Array) -> Array:
+        """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the radar that sees them."""
+        ...
 
 
 def altitude_range(rpc: RPC) -> tuple[float, float]:
@@ -106,15 +115,24 @@ def sight_enu(sensor: SensorModel, ground: Array) -> Array:
 
 
 def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """Incidence and azimuth of the line of sight at ground points (..., 3).
+    """Incidence and azimuth of the line of sight, or of a radar's beam, at ground points (..., 3).
 
     Returns
     -------
     incidence : (...), angle between the local vertical and the direction to the sensor [deg]
     azimuth : (...), direction to the sensor, clockwise from north [deg, 0 to 360]
     """
-    east, north, up = np.moveaxis(sight_enu(sensor, ground), -1, 0)
+    east, north, up = np.moveaxis(_to_sensor(sensor, np.asarray(ground, dtype=np.float64)), -1, 0)
     return np.degrees(np.arctan2(np.hypot(east, north), up)), np.degrees(np.arctan2(east, north)) % 360.0
+
+
+def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
+    """East, north, up (..., 3) of the direction to the sensor, of any length."""
+    if isinstance(sensor, Several):
+        return sensor.each(_to_sensor, ground)
+    if isinstance(sensor, Radar):
+        return np.asarray((enu_basis(ground) @ sensor.to_radar(ground)[..., None])[..., 0])
+    return sight_enu(sensor, ground)
 
 
 def ground_sample_distance(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
@@ -163,6 +181,13 @@ class Several:
         starts = np.flatnonzero(np.diff(of_row[order], prepend=-1))
         self._parts = [(sensors[of_row[rows[0]]], rows) for rows in np.split(order, starts)[1:]]
 
+    def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
+        """What a function of a camera and ground points gives, (N, 3), for ground points (N, 3)."""
+        found = np.empty((len(ground), 3))
+        for sensor, rows in self._parts:
+            found[rows] = function(sensor, ground[rows])
+        return found
+
     def project(self, ground: Array) -> Array:
         """Image points (N, 2) [px] of ground points (N, 3) [deg, deg, m]."""
         image = np.empty((len(ground), 2))
@@ -191,7 +216,7 @@ class CameraCenter:
 
     ecef: Array  # (3,) [m]
     altitude: float
-    method: CenterMethod  # how it was found: "nominal" where "line" was not plausible
+    method: CenterMethod  # how it was found: "nominal" where "line" was not plausible, "stated" by a radar
 
 
 def camera_center(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
@@ -200,7 +225,7 @@ def camera_center(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[f
     One image line of a pushbroom camera IS a perspective camera, so its rays meet in one point, found by least
     squares. (A projective camera regressed over the whole image, as in the paper, stands at about twice the distance:
     the image is perspective across the track and affine along it.) A point outside `PLAUSIBLE_ALTITUDE` is replaced
-    by one at `NOMINAL_ALTITUDE` on the central ray, and says so in its ``method``.
+    by one at `NOMINAL_ALTITUDE` on the central ray, and says so in its ``method``. A radar states where it is.
 
     Parameters
     ----------
@@ -212,6 +237,12 @@ def camera_center(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[f
     RpcError
         The model cannot be localised over its own image.
     """
+    if isinstance(sensor, Radar):
+        point = sensor.localize((np.array(size) - 1) / 2.0, np.array(np.mean(alt_range)))
+        ecef = ecef_from_ground(point) + sensor.to_radar(point)
+        if not np.isfinite(ecef).all():
+            raise RpcError("camera centre: the model has no ground point at its image's centre")
+        return CameraCenter(ecef, float(ground_from_ecef(ecef)[2]), "stated")
     ecef = _center_of_line(sensor, size, alt_range)
     altitude = float(ground_from_ecef(ecef)[2])
     if PLAUSIBLE_ALTITUDE[0] <= altitude <= PLAUSIBLE_ALTITUDE[1]:

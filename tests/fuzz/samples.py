@@ -38,11 +38,13 @@ from barpc.rpcio.text import decode
 from barpc.scene import View
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.sentinel1 import open_product
+from barpc.sensor.sicd import open_sicd
 from barpc.tie.pairs import read_area
 from barpc.workspace import Workspace
 from tests.pointio.test_foreign import binary, colmap
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
+from tests.sensor.radar_documents import document, nitf
 from tests.sensor.s1_product import Product
 
 from .mutate import (
@@ -339,6 +341,17 @@ def _beside_orbit(folder: Path) -> None:
     (folder / _BURSTS.name).write_bytes(_annotation(_BURSTS))
 
 
+def _use_sicd(path: Path) -> object:
+    radar = open_sicd(path)
+    return radar.project(radar.localize(np.array([[100.0, 20.0]]), np.array([100.0])))
+
+
+@cache
+def _sicd_nitf() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        return nitf(document("PFA"), Path(folder) / "image.ntf").read_bytes()
+
+
 # --- lists and tables -------------------------------------------------------------------------------------
 
 
@@ -481,6 +494,8 @@ SAMPLES: dict[str, Sample] = {
     "annotation grd": Sample(
         _GROUND.name, _use_product, lambda: _annotation(_GROUND), (mutate_xml,), share=0.2
     ),
+    "sicd": Sample("image.xml", _use_sicd, lambda: document("INCA").encode(), (mutate_xml,), share=0.2),
+    "sicd nitf": Sample("image.ntf", _use_sicd, _sicd_nitf, (), share=0.2),
     "product zip": Sample("S1A.zip", _use_product, _safe, (), share=0.2),
     "orbit": Sample("S1A.EOF", _use_orbit, _BURSTS.eof, (mutate_xml,), _beside_orbit, share=0.2),
 }

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorr
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sicd import open_sicd
 from barpc.simulate.orbit import Look, fly
+from tests.sensor.radar_documents import document
 from tests.sensor.s1_product import Product
 
 
@@ -55,6 +59,14 @@ def _corrected_range_doppler() -> Case:
     case = _range_doppler(5.4)
     correction = Correction([2e-6, -3e-6, 1e-6], [4.0, -3.0, 2.0], ecef_from_ground([10.0, 42.0, 7e5]))
     return Case(Corrected(case.model, correction), case.size, case.alt_range)
+
+
+def _sicd(kind: str, lon: float = 5.4, **said: object) -> Case:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "image.xml"
+        path.write_text(document(kind, ground=(lon, 43.3, 120.0), **said))
+        model = open_sicd(path)
+    return Case(model, model.size, model.alt_range)
 
 
 def _grid(lon: float) -> DirectGrid:
@@ -98,6 +110,9 @@ MODELS: dict[str, Callable[[], Case]] = {
     "range-doppler": lambda: _range_doppler(5.4),
     "range-doppler across the antimeridian": lambda: _range_doppler(180.0),
     "corrected range-doppler": _corrected_range_doppler,
+    "sicd, polar format": lambda: _sicd("PFA"),
+    "sicd, zero doppler, to the left": lambda: _sicd("INCA", side="L"),
+    "sicd, ground plane across the antimeridian": lambda: _sicd("PLANE", lon=180.0),
 }
 
 

@@ -21,12 +21,11 @@ from barpc.geodesy import (
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
-    ground_from_ecef,
     pointwise,
-    up,
     wrap_longitude,
 )
-from barpc.sensor.curve import Curve, Orbit, cross, fit_orbit
+from barpc.sensor.circle import aside, dot, on_circle
+from barpc.sensor.curve import Curve, Orbit, fit_orbit
 from barpc.sensor.sentinel1.annotation import (
     Annotation,
     burst_rows,
@@ -53,8 +52,6 @@ _GRID_TOLERANCE = 5.0  # px and lines: a grid farther off does not belong to the
 _STEPS = 12  # at most; three are enough near the image
 _SLACK = 10.0  # s: how far beyond the orbit the search for zero Doppler may wander
 _SETTLED = 1e-5  # s: quadratic convergence leaves less than 1e-12 s after a step so small
-_ANGLE_STEPS = 12
-_ANGLE_SETTLED = 1e-9  # rad, about a millimetre: what is left after such a step is below rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,13 +142,9 @@ class RangeDoppler(Frozen):
         )
         return azimuth_time, range_time
 
-    def incidence(self, ground: Array) -> Array:
-        """Angles (...) [deg] between the ellipsoid's normal and the beam at ground points (..., 3).
-
-        Not those of `barpc.sensor.geometry.view_angles`, which follows the ground points of one pixel over altitude:
-        for a radar they lie on a circle about the track, at a right angle to the beam. NaN where `azimuth_range` is.
-        """
-        return pointwise(self._incidence, CHUNK, [()], ground)[0]
+    def to_radar(self, ground: Array) -> Array:
+        """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the satellite; NaN where `azimuth_range` is."""
+        return pointwise(self._to_radar, CHUNK, [(3,)], ground)[0]
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN where `azimuth_range` is."""
@@ -186,30 +179,24 @@ class RangeDoppler(Frozen):
         for _ in range(_STEPS):
             position, velocity, acceleration = self.orbit.states(time)
             sight = position - point
-            rate = -_dot(acceleration, sight) - _dot(velocity, velocity)
-            moved = np.clip(time + _dot(velocity, sight) / rate, low - _SLACK, high + _SLACK)
+            rate = -dot(acceleration, sight) - dot(velocity, velocity)
+            moved = np.clip(time + dot(velocity, sight) / rate, low - _SLACK, high + _SLACK)
             step, time = np.abs(moved - time), moved
             if not (step.max(initial=0.0, where=np.isfinite(step)) > _SETTLED):
                 break
         position, velocity, acceleration = self.orbit.states(time)
         sight = position - point
-        distance = np.sqrt(_dot(sight, sight))
+        distance = np.sqrt(dot(sight, sight))
         sight /= distance
-        rate = -distance * _dot(acceleration, sight) - _dot(velocity, velocity)
-        side = _dot(self._aside(position, velocity), sight)
+        rate = -distance * dot(acceleration, sight) - dot(velocity, velocity)
+        side = dot(aside(position, velocity, self.look == "right"), sight)
         time[~((time >= low) & (time <= high) & (side < 0) & (step <= _SETTLED))] = np.nan
         times = np.stack([time, distance * (2.0 / SPEED_OF_LIGHT)])
         return _Seen(times, sight, distance, velocity, -velocity / rate)
 
-    def _aside(self, position: Array, velocity: Array) -> Array:
-        """Vectors (3, N) across the track, to the side that is looked at."""
-        right = cross(velocity, position)
-        return right if self.look == "right" else -right
-
-    def _incidence(self, ground: Array) -> list[Array]:
+    def _to_radar(self, ground: Array) -> list[Array]:
         seen = self._geometry(ecef_from_ground(ground))
-        cosine = _dot(up(ground), seen.sight)
-        return [np.where(np.isnan(seen.times[0]), np.nan, np.rad2deg(np.arccos(cosine)))]
+        return [np.where(np.isnan(seen.times[0]), np.nan, seen.distance * seen.sight).T]
 
     def _project(self, ground: Array) -> list[Array]:
         seen = self._geometry(ecef_from_ground(ground))
@@ -250,30 +237,7 @@ class RangeDoppler(Frozen):
         time = np.where((times[0] >= low) & (times[0] <= high), times[0], np.nan)
         position, velocity, _ = self.orbit.states(time)
         distance = 0.5 * SPEED_OF_LIGHT * times[1]
-        across = self._aside(position, velocity)
-        across /= np.sqrt(_dot(across, across))
-        above = position * _dot(velocity, velocity) - velocity * _dot(velocity, position)
-        above /= np.sqrt(_dot(above, above))
-        height = ground_from_ecef(position.T)[:, 2]
-        radius = np.sqrt(_dot(position, position)) - height + alt
-        cosine = _dot(position, position) + distance**2 - radius**2
-        angle = np.arccos(cosine / (2 * distance * _dot(position, above)))
-
-        def at(angle: Array) -> tuple[Array, Array]:
-            away = across * np.sin(angle) - above * np.cos(angle)
-            return away, ground_from_ecef((position + distance * away).T)
-
-        for _ in range(_ANGLE_STEPS):
-            _, ground = at(angle)
-            turned = across * np.cos(angle) + above * np.sin(angle)
-            step = (alt - ground[:, 2]) / (distance * _dot(up(ground), turned))
-            angle = angle + step
-            if not (np.abs(step).max(initial=0.0, where=np.isfinite(step)) > _ANGLE_SETTLED):
-                break
-        away, ground = at(angle)
-        ground[~(np.abs(ground[:, 2] - alt) <= 1e-6)] = np.nan
-        ground[:, 2] = alt
-        return ground, -away
+        return on_circle(position, velocity, distance, alt, self.look == "right")
 
 
 @dataclass(frozen=True)
@@ -291,10 +255,6 @@ class _Seen:
         moved = np.einsum("in,jn->nij", self.velocity, self.time_by_ecef) - np.eye(3)
         moved += np.einsum("in,jn->nij", self.sight, self.sight)  # velocity has no part along the sight
         return np.asarray(moved / self.distance[:, None, None])
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def extent(annotation: Annotation, burst: int | None = None) -> tuple[np.datetime64, int]:

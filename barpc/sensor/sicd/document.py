@@ -1,0 +1,176 @@
+"""The metadata of a SICD image: XML, as a file of its own or in a data extension of a NITF 2.1."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import numpy as np
+
+from barpc.errors import InputError, RpcFormatError
+from barpc.geodesy import Array, ground_from_ecef
+from barpc.sensor.curve import Curve
+from barpc.sensor.document import Fields
+from barpc.sensor.sicd.formation import Formation, ImagePlane, PolarFormat, RangeAzimuth, ZeroDoppler
+from barpc.sensor.sicd.monostatic import Monostatic
+from barpc.sidefile import MAX_XML, PRODUCT, opened, parse_xml
+
+RELIEF = 1000.0  # m above and below the scene centre that the image is used for, where nothing else is said
+_GROUND = (-1000.0, 10000.0)  # m: where a scene's centre can be
+_ORDER = 30  # no polynomial of a document has so high a power
+_SCP_TOLERANCE = 1.0  # px: where the stated centre point must project
+_NITF = b"NITF02.10"
+_COUNTS = 360  # where a NITF's header counts its segments
+_SEGMENTS = ((6, 10), (4, 6), (0, 0), (4, 5), (4, 9))
+"""Digits of the lengths of subheader and data: images, graphics, reserved, texts, data extensions."""
+
+
+def find_sicd(path: Path) -> bytes | None:
+    """The SICD document that a file is or, in a NITF, holds; None where there is none.
+
+    RpcFormatError for a NITF whose header is damaged, InputError for a document that is too large.
+    """
+    with opened(path, PRODUCT) as file:
+        head = file.read(4096)
+        if not head.startswith(_NITF):
+            return head + file.read(MAX_XML + 1 - len(head)) if b"<SICD" in head else None
+        try:
+            return next((text for text in _extensions(file) if b"<SICD" in text[:4096]), None)
+        except ValueError as error:
+            raise RpcFormatError(f"{path}: a NITF with a damaged header ({error})") from error
+
+
+def _extensions(file: BinaryIO) -> list[bytes]:
+    """The data of all data extensions of a NITF."""
+    file.seek(_COUNTS - 6)
+    place = _digits(file, 6)
+    found = []
+    for kind, (header, data) in enumerate(_SEGMENTS):
+        lengths = [
+            (_digits(file, header), _digits(file, data)) for _ in range(_digits(file, 3) if data else 0)
+        ]
+        if not data:
+            file.seek(3, 1)  # the number of reserved segments, always 0
+        here = file.tell()
+        for subheader, length in lengths:
+            if kind == len(_SEGMENTS) - 1 and length <= MAX_XML:
+                file.seek(place + subheader)
+                found.append(file.read(length))
+            place += subheader + length
+        file.seek(here)
+    return found
+
+
+def _digits(file: BinaryIO, count: int) -> int:
+    text = file.read(count)
+    if len(text) != count or not text.isdigit():
+        raise ValueError(f"{text[:10]!r} where {count} digits belong")
+    return int(text)
+
+
+def open_sicd(path: Path) -> Monostatic:
+    """The model of a SICD image, an XML or a NITF file.
+
+    Row and column 0 are the image's own first, also where it is a part of a larger one.
+
+    Raises
+    ------
+    RpcFormatError
+        Not a SICD, or a damaged one: a field missing, no number, or a centre that is not seen where it is said to be.
+    InputError
+        A bistatic image, or a way of forming images that the standard does not project.
+    """
+    data = find_sicd(path)
+    if data is None:
+        raise RpcFormatError(f"{path}: no SICD metadata in it")
+    root = Fields(parse_xml(data, name=str(path), strip_namespaces=True), str(path))
+    if root.element.findtext("CollectionInfo/CollectType", "MONOSTATIC").strip() != "MONOSTATIC":
+        raise InputError(f"{path}: a bistatic image; only monostatic ones are read")
+    scp = _vector(root, "GeoData/SCP/ECF")
+    altitude = float(ground_from_ecef(scp)[2])
+    if not _GROUND[0] <= altitude <= _GROUND[1]:
+        raise RpcFormatError(
+            f"{path}: GeoData/SCP/ECF is {altitude:.0f} m above the ellipsoid, not on the ground"
+        )
+    first = [_whole(root, f"ImageData/First{axis}") for axis in ("Row", "Col")]
+    center = [_whole(root, f"ImageData/SCPPixel/{axis}") for axis in ("Row", "Col")]
+    model = Monostatic(
+        orbit=_orbit(root),
+        formation=_formation(root, scp),
+        spacing=(root.positive("Grid/Row/SS"), root.positive("Grid/Col/SS")),
+        origin=(center[0] - first[0], center[1] - first[1]),
+        size=(int(root.positive("ImageData/NumCols")), int(root.positive("ImageData/NumRows"))),
+        alt_range=(altitude - RELIEF, altitude + RELIEF),
+        look=_look(root),
+    )
+    seen = model.project(ground_from_ecef(scp))
+    miss = float(np.abs(seen - model.origin[::-1]).max())
+    if not miss <= _SCP_TOLERANCE:
+        raise RpcFormatError(
+            f"{path}: its scene centre point is not seen where it says (off by {miss:.3g} px); is the file damaged?"
+        )
+    return model
+
+
+def _whole(root: Fields, path: str) -> int:
+    return int(root.numbers(path)[0])
+
+
+def _vector(root: Fields, path: str) -> Array:
+    return np.array([root.numbers(f"{path}/{axis}")[0] for axis in "XYZ"])
+
+
+def _look(root: Fields) -> Literal["right", "left"]:
+    side = root.text("SCPCOA/SideOfTrack")
+    if side not in ("R", "L"):
+        raise RpcFormatError(f"{root.name}: SCPCOA/SideOfTrack is {side[:20]!r}, expected R or L")
+    return "right" if side == "R" else "left"
+
+
+def _orbit(root: Fields) -> Curve:
+    """ARPPoly over the time of the collection."""
+    axes = [_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ"]
+    coeffs = np.zeros((1, max(map(len, axes)), 3))
+    for k, axis in enumerate(axes):
+        coeffs[0, : len(axis), k] = axis
+    return Curve(np.array([0.0, root.positive("Timeline/CollectDuration")]), coeffs)
+
+
+def _polynomial(root: Fields, path: str, variables: int) -> Array:
+    """Coefficients by their powers, (K,) or (K, L)."""
+    terms = root.all(f"{path}/Coef")
+    if not terms:
+        raise RpcFormatError(f"{root.name}: no {path}; is the file complete?")
+    powers = [[term.element.get(f"exponent{k + 1}", "") for k in range(variables)] for term in terms]
+    if not all(p.isdecimal() and p.isascii() and int(p) <= _ORDER for power in powers for p in power):
+        raise RpcFormatError(f"{root.name}: {path} has a coefficient of no power from 0 to {_ORDER}")
+    table = np.array(powers, dtype=np.int64)
+    coeffs = np.zeros(table.max(axis=0) + 1)
+    for power, term in zip(table, terms, strict=True):
+        coeffs[tuple(power)] = term.numbers(".")[0]
+    return coeffs
+
+
+def _formation(root: Fields, scp: Array) -> Formation:
+    """By Grid/Type and, for RGAZIM, ImageFormation/ImageFormAlgo."""
+    time, kind = _polynomial(root, "Grid/TimeCOAPoly", 2), root.text("Grid/Type")
+    if kind == "RGAZIM":
+        algorithm = root.text("ImageFormation/ImageFormAlgo")
+        if algorithm == "PFA":
+            angle, scale = (_polynomial(root, f"PFA/{p}", 1) for p in ("PolarAngPoly", "SpatialFreqSFPoly"))
+            return PolarFormat(time, scp, angle, scale)
+        if algorithm == "RGAZCOMP":
+            return RangeAzimuth(time, scp, float(root.numbers("RgAzComp/AzSF")[0]))
+        kind = f"RGAZIM by {algorithm}"
+    if kind == "RGZERO":
+        return ZeroDoppler(
+            time,
+            _polynomial(root, "RMA/INCA/TimeCAPoly", 1),
+            root.positive("RMA/INCA/R_CA_SCP"),
+            _polynomial(root, "RMA/INCA/DRateSFPoly", 2),
+        )
+    if kind in ("XRGYCR", "XCTYAT", "PLANE"):
+        return ImagePlane(time, scp, _vector(root, "Grid/Row/UVectECF"), _vector(root, "Grid/Col/UVectECF"))
+    raise InputError(
+        f"{root.name}: an image of the kind {kind[:40]}, which the SICD standard does not project"
+    )

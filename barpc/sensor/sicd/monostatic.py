@@ -1,0 +1,171 @@
+"""A monostatic radar image as a camera: a ground point is seen where range and range rate are those of the pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from barpc.errors import RpcError
+from barpc.frozen import Frozen
+from barpc.geodesy import (
+    Array,
+    ecef_from_ground,
+    ecef_from_ground_jacobian,
+    pointwise,
+    wrap_longitude,
+)
+from barpc.sensor.circle import aside, dot, on_circle
+from barpc.sensor.curve import Curve
+from barpc.sensor.sicd.formation import Aperture, Formation
+
+CHUNK = 4096  # points worked on at a time
+_STEPS = 12  # at most; four are enough
+_SETTLED = 1e-4  # m: what is left after a step so small is below rounding
+_STEP = 1.0  # m: central differences over so much are exact to 1e-9
+_BEYOND = 1.0  # sides of the image around it that its polynomials are believed for
+
+
+@dataclass(frozen=True, eq=False)
+class Monostatic(Frozen):
+    """A SICD image: itself a `SensorModel`.
+
+    Rows of the image go on in range (x), columns along the flight (y), so that `image` is (column, row) as ever.
+
+    Parameters
+    ----------
+    orbit : Curve, position of the antenna (ARPPoly) [m], ECEF; time counts from the start of the collection
+    formation : Formation, (x, y) to range and range rate
+    spacing : (float, float), x and y of a pixel [m]
+    origin : (float, float), row and column [px] of the scene centre point
+    size : (width, height) [px]
+    alt_range : (low, high), altitudes that the image is used for [m above the ellipsoid]
+    look : "right" or "left", side of the track; a point on the other side projects to NaN
+    """
+
+    orbit: Curve
+    formation: Formation
+    spacing: tuple[float, float]
+    origin: tuple[float, float]
+    size: tuple[int, int]
+    alt_range: tuple[float, float]
+    look: Literal["right", "left"] = "right"
+
+    advice: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.size) < 1 or not self.alt_range[0] <= self.alt_range[1] or not min(self.spacing) > 0:
+            raise RpcError(f"SICD: size {self.size}, spacing {self.spacing} m, altitudes {self.alt_range}")
+        if self.look not in ("right", "left"):
+            raise RpcError(f"SICD: look {self.look!r}, expected 'right' or 'left'")
+
+    def project(self, ground: Array) -> Array:
+        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN far off, or on the other side."""
+        return pointwise(
+            lambda part: [self._image(self._solve(ecef_from_ground(part).T)[0])], CHUNK, [(2,)], ground
+        )[0]
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        return image, jacobian
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m].
+
+        Longitudes run on across the antimeridian; NaN far off the image or where the range does not reach.
+        """
+        ground = pointwise(self._localize, CHUNK, [(3,)], image, alt)[0]
+        with np.errstate(all="ignore"):
+            ground[..., 0] = wrap_longitude(ground[..., 0], self._middle)
+        return ground
+
+    def to_radar(self, ground: Array) -> Array:
+        """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the antenna that sees them; NaN as `project`."""
+        return pointwise(lambda part: [self._to_radar(part)], CHUNK, [(3,)], ground)[0]
+
+    @cached_property
+    def _middle(self) -> float:
+        image = 0.5 * np.array(self.size, dtype=np.float64)[None, :]
+        with np.errstate(all="ignore"):
+            lon = float(self._localize(image, np.array([np.mean(self.alt_range)]))[0][0, 0])
+        return lon if np.isfinite(lon) else 0.0
+
+    @cached_property
+    def _bounds(self) -> tuple[Array, Array]:
+        """The lowest and highest (x, y) (2, 1) [m] that are believed."""
+        sides = np.array([self.size[1], self.size[0]], dtype=np.float64)
+        spacing, origin = np.array(self.spacing), np.array(self.origin)
+        low, high = (-_BEYOND * sides - origin) * spacing, ((1 + _BEYOND) * sides - origin) * spacing
+        return low[:, None], high[:, None]
+
+    def _image(self, plane: Array) -> Array:
+        """(col, row) (N, 2) of (x, y) (2, N)."""
+        row, col = plane / np.array(self.spacing)[:, None] + np.array(self.origin)[:, None]
+        return np.column_stack([col, row])
+
+    def _miss(self, plane: Array, point: Array) -> tuple[Array, Aperture, Array, Array]:
+        """Pixel - point in range and rate (2, N), the aperture, and the point's sight (3, N) and distance (N,)."""
+        seen = self.formation.at(plane[0], plane[1], self.orbit)
+        sight = seen.position - point
+        distance = np.sqrt(dot(sight, sight))
+        sight = sight / distance
+        miss = np.stack([seen.distance - distance, seen.rate - dot(seen.velocity, sight)])
+        return miss, seen, sight, distance
+
+    def _by_plane(self, plane: Array, point: Array) -> Array:
+        """Derivative (2, 2, N) of `_miss` by (x, y)."""
+        steps = _STEP * np.eye(2)[:, :, None]
+        columns = [self._miss(plane + s, point)[0] - self._miss(plane - s, point)[0] for s in steps]
+        return np.stack(columns, axis=1) / (2 * _STEP)
+
+    def _solve(self, point: Array) -> tuple[Array, Array]:
+        """(x, y) (2, N) of points (3, N), ECEF, by Newton from the scene centre; and the last derivative (2, 2, N)."""
+        low, high = self._bounds
+        plane = np.where(np.isfinite(point[:2]), 0.0, np.nan)
+        for _ in range(_STEPS):
+            slope = self._by_plane(plane, point)
+            moved = np.clip(plane - _solve(slope, self._miss(plane, point)[0]), low, high)
+            step, plane = np.abs(moved - plane).max(axis=0), moved
+            if not (step.max(initial=0.0, where=np.isfinite(step)) > _SETTLED):
+                break
+        _, seen, sight, _ = self._miss(plane, point)
+        side = dot(aside(seen.position, seen.velocity, self.look == "right"), sight)
+        inside = ((plane > low) & (plane < high)).all(axis=0)
+        plane[:, ~(inside & (side < 0) & (step <= _SETTLED))] = np.nan
+        return plane, slope
+
+    def _to_radar(self, ground: Array) -> Array:
+        point = ecef_from_ground(ground).T
+        _, _, sight, distance = self._miss(self._solve(point)[0], point)
+        return (sight * distance).T
+
+    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
+        point = ecef_from_ground(ground).T
+        plane, slope = self._solve(point)
+        _, seen, sight, distance = self._miss(plane, point)
+        toward = dot(seen.velocity, sight)
+        by_point = np.stack([sight, (seen.velocity - toward * sight) / distance])  # (2, 3, N)
+        moved = -np.stack([_solve(slope, by_point[:, k]) for k in range(3)], axis=1)  # d(x, y)/dX
+        by_ground = np.einsum("ikn,nkj->nij", moved, ecef_from_ground_jacobian(ground))
+        jacobian = by_ground / np.array(self.spacing)[:, None]
+        return self._image(plane), jacobian[:, ::-1]
+
+    def _localize(self, image: Array, alt: Array) -> list[Array]:
+        low, high = self._bounds
+        plane = ((image[:, ::-1] - np.array(self.origin)) * np.array(self.spacing)).T
+        plane[:, ~((plane > low) & (plane < high)).all(axis=0)] = np.nan
+        seen = self.formation.at(plane[0], plane[1], self.orbit)
+        ahead = -seen.rate / np.sqrt(dot(seen.velocity, seen.velocity))
+        ground, _ = on_circle(seen.position, seen.velocity, seen.distance, alt, self.look == "right", ahead)
+        return [ground]
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    """Solutions (2, N) of 2 x 2 systems (2, 2, N)."""
+    (a, b), (c, d) = matrix
+    solved: Array = np.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c)
+    return solved
