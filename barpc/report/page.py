@@ -5,6 +5,7 @@ A section is a question that a user has, the answer in words, and the charts and
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -17,8 +18,10 @@ import numpy as np
 from barpc.errors import BarpcError, visible
 from barpc.geodesy import Array
 from barpc.report import charts
-from barpc.report.charts import MAX_ROWS, ground_map, numbered, residual_panels
+from barpc.report.charts import MAX_ROWS, numbered
 from barpc.report.compare import flat_options
+from barpc.report.maps import ground_map, residual_panels
+from barpc.report.matrix import facts, pair_matrix
 from barpc.report.records import Cell, Table, cell_of, table
 from barpc.report.summary import (
     DATUM,
@@ -61,8 +64,15 @@ def report_html(summary: Summary, folder: Path | str) -> str:
     """
     files = read_tables(summary, Path(folder))
     shown = [section for make in SECTIONS if (section := make(files)) is not None]
+    known = facts(files) if len(summary.views) <= charts.MAX_DRAWN else {"views": [], "pairs": []}
     return visible(
-        _template().render(summary=summary, sections=shown, words=STATUS_WORDS, most_lines=_MOST_LINES)
+        _template().render(
+            summary=summary,
+            sections=shown,
+            words=STATUS_WORDS,
+            most_lines=_MOST_LINES,
+            facts=json.dumps(known, separators=(",", ":")).replace("<", "\\u003c"),
+        )
     )
 
 
@@ -145,12 +155,20 @@ def _map(files: RunFiles) -> Section | None:
             caption += " Triangles are GCPs, those on their tip check points."
         shown.append((ground_map(files), caption))
     if shown and len(views) > charts.MAX_DRAWN:
-        more = f"At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, evenly taken, and no graph of the pairs"
+        more = f"At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, evenly taken, and no matrix"
         shown[0] = (shown[0][0], f"{shown[0][1]} {more}; all are in footprints.geojson and pairs.csv.")
     if pairs and 2 < len(views) <= charts.MAX_DRAWN:
-        caption = "Numbers as in the table of images; a thicker line is a pair with more matches."
-        shown.append((charts.connections(files), caption))
-    return Section("map", "Where are the images, and which hold together?", _bonds(files), shown)
+        caption = "Every two images with tie points in common, numbered as in their table."
+        shown.append((pair_matrix(files), caption))
+    question = "Where are the images, and which hold together?"
+    return Section("map", question, _bonds(files), shown, bars=_lengths(files))
+
+
+def _lengths(files: RunFiles) -> list[tuple[str, str, float]]:
+    """How many images see a tie point, as bars."""
+    found = {length: num for length, num in files.summary.tracks.by_length.items() if num}
+    most = max(found.values(), default=1)
+    return [(f"Tie points in {length} images", f"{num}", 100 * num / most) for length, num in found.items()]
 
 
 def _bonds(files: RunFiles) -> str:

@@ -12,6 +12,7 @@ frame.addEventListener("load", () => {
   for (const svg of page.querySelectorAll("svg")) {
     const view = svg.viewBox.baseVal, boxes = [];
     for (const text of svg.querySelectorAll("text")) {
+      if (!text.getClientRects().length) continue;  // of a measure that is not chosen
       const box = text.getBBox(), words = svg.getAttribute("aria-labelledby") + ": " + text.textContent;
       if (box.x < -2 || box.y < -2 || box.x + box.width > view.width + 2 || box.y + box.height > view.height + 2) found.outside.push(words);
       for (const [other, name] of boxes) {

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from barpc.cli.main import cli
 from barpc.errors import BarpcError, InputError
 from barpc.pipeline import outputs
-from barpc.report import Run, charts, page, records, summarize
+from barpc.report import Run, charts, maps, page, records, summarize
 from barpc.report.summary import metres
 from barpc.report.tables import TABLES, Observations, RunFiles
 from barpc.scene import Tracks
@@ -111,7 +111,7 @@ def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_pat
 
 
 def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatch):
-    monkeypatch.setattr(charts, "_MOST", 4)
+    monkeypatch.setattr(maps, "_MOST", 4)
     monkeypatch.setattr(records, "MAX_TABLE_ROWS", 5)
     monkeypatch.setattr(charts, "MAX_ROWS", 3)
     monkeypatch.setattr(page, "MAX_ROWS", 3)
@@ -167,7 +167,7 @@ def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_ru
     assert f"And {views - 200} more; all are in summary.json." in html
     assert html.count('class="outline doubtful"') == (views if num == 300 else views // 3)
     assert ("At most 400 of 1008 outlines are drawn, evenly taken" in html) == (num == 1000)
-    assert ('id="graph-chart-t"' in html) == (num == 300)
+    assert ('id="matrix-chart-t"' in html) == (num == 300)
     pairs = len(files.summary.pairs)
     shown = -(-pairs // -(-pairs // 1500))
     assert html.count('class="dot after see"') == shown

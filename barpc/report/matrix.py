@@ -1,0 +1,129 @@
+"""The matrix of the pairs: a cell for each two images, shaded by matches, epipolar offset or angle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from barpc.report.charts import WIDTH, label, number, sheet, tag
+from barpc.report.summary import PairEntry
+from barpc.report.tables import RunFiles
+
+_LEFT = 30.0
+_TOP = 18.0
+_TEXTS = 12  # images: of no more the figures stand in the cells
+
+
+@dataclass(frozen=True)
+class Measure:
+    """What a shade stands for: a key, words, its value in a pair, how it is written, and the limits of the shades."""
+
+    key: str
+    words: str
+    value: Callable[[PairEntry], float | None]
+    form: str
+    limits: tuple[float, ...]
+
+    def shade(self, value: float) -> int:
+        """The number of the shade of a value."""
+        return sum(value >= limit for limit in self.limits)
+
+    @property
+    def legend(self) -> list[str]:
+        """What each shade says."""
+        low, high = self.limits[0], self.limits[-1]
+        between = [f"{a:g} to {b:g}" for a, b in pairwise(self.limits)]
+        return [f"below {low:g}", *between, f"{high:g} and more"]
+
+
+MEASURES = (
+    Measure("matches", "matches", lambda p: p.num_matches, ".0f", (10, 30, 100, 300, 1000)),
+    Measure(
+        "offset", "epipolar offset, RMS [px]", lambda p: p.offset_rms[-1], ".2f", (0.05, 0.1, 0.2, 0.5, 1)
+    ),
+    Measure("angle", "angle of convergence [deg]", lambda p: p.convergence_deg, ".1f", (1, 5, 15, 35, 60)),
+)
+
+
+def pair_matrix(files: RunFiles) -> str:
+    """Rows and columns are the images as numbered in their table; above the diagonal the pairs, below it the shades."""
+    views, pairs, index = files.summary.views, files.summary.pairs, files.number
+    side = (WIDTH - _LEFT - 4) / len(views)
+    cells = [(min(ends), max(ends), p) for p in pairs for ends in [(index[p.a], index[p.b])]]
+    parts = [
+        tag("rect", x=_LEFT, y=_TOP, width=side * len(views), height=side * len(views), class_="empty"),
+        *_numbers(len(views), side),
+    ]
+    for place, measure in enumerate(MEASURES):
+        parts.append(
+            tag(
+                "g",
+                *_layer(measure, cells, side, len(views)),
+                class_=f"layer l{place}",
+                data_words=measure.words,
+            )
+        )
+    parts.append(tag("rect", x=0, y=0, width=side, height=side, class_="cursor"))
+    return sheet(
+        "matrix-chart",
+        "Matrix of the pairs",
+        f"{len(views)} images, {len(pairs)} pairs; the figures are in the table of pairs.",
+        _TOP + side * len(views) + 4,
+        parts,
+        class_="matrix",
+        data_side=side,
+        data_left=_LEFT,
+        data_top=_TOP,
+    )
+
+
+def facts(files: RunFiles) -> dict[str, list[list[object]]]:
+    """What the page's script says of an image or a pair that is pointed at: names, and pairs with their figures."""
+    index = files.number
+    names: list[list[object]] = [[view.name, view.num_observations] for view in files.summary.views]
+    pairs: list[list[object]] = []
+    for pair in files.summary.pairs:
+        a, b = sorted((index[pair.a], index[pair.b]))
+        values = [(m.value(pair), m.form) for m in MEASURES]
+        pairs.append([a, b, *("" if value is None else format(value, form) for value, form in values)])
+    return {"views": names, "pairs": pairs}
+
+
+def _numbers(num: int, side: float) -> list[str]:
+    step = next(s for s in (1, 2, 5, 10, 20, 50, 100) if s * side >= 15 or s == 100)
+    parts = []
+    for k in sorted({0, *range(step - 1, num, step)} if step > 2 else range(step - 1, num, step)):
+        middle = side * (k + 0.5)
+        parts.append(label(_LEFT + middle, _TOP - 5, str(k + 1), "middle"))
+        parts.append(label(_LEFT - 4, _TOP + middle + 4, str(k + 1), "end"))
+    return parts
+
+
+def _layer(measure: Measure, cells: Sequence[tuple[int, int, PairEntry]], side: float, num: int) -> list[str]:
+    shades: dict[int, list[str]] = {}
+    texts = []
+    box = f"h{number(side)}v{number(side)}h-{number(side)}z"
+    for a, b, pair in cells:
+        value = measure.value(pair)
+        if value is None:
+            continue
+        x, y = _LEFT + b * side, _TOP + a * side
+        shades.setdefault(measure.shade(value), []).append(f"M{number(x)} {number(y)}{box}")
+        if num <= _TEXTS:
+            texts.append(
+                label(x + side / 2, y + side / 2 + 4, format(value, measure.form), "middle", "value")
+            )
+    parts = [tag("path", d="".join(d), class_=f"cell s{k}") for k, d in sorted(shades.items())]
+    return [*parts, *texts, *_legend(measure, side * num)]
+
+
+def _legend(measure: Measure, whole: float) -> list[str]:
+    """In the lower left, where no pair stands."""
+    top = _TOP + whole - 18 * len(measure.legend) - 6
+    parts = [label(_LEFT + 8, top - 6, measure.words, class_="axis")]
+    for k, words in enumerate(measure.legend):
+        y = top + 18 * k
+        parts.append(tag("rect", x=_LEFT + 8, y=y, width=14, height=14, class_=f"cell s{k}"))
+        parts.append(label(_LEFT + 28, y + 11, words))
+    return parts

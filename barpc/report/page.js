@@ -1,0 +1,124 @@
+"use strict";
+// The page is whole without this: tables that sort and filter, one selection in map, matrix, tables and panels,
+// and residual maps in large.
+const make = (name, set, ...children) => { const e = Object.assign(document.createElement(name), set); e.append(...children); return e; };
+const facts = JSON.parse(document.getElementById("facts").textContent);
+const pairs = new Map(facts.pairs.map(([a, b, ...rest]) => [a + "-" + b, rest]));
+const bar = document.querySelector(".chosen"), matrix = document.querySelector(".matrix");
+let chosen = [];
+
+const image = k => `${k + 1} ${facts.views[k][0]}`;
+const say = ([a, b]) => {
+  if (b === undefined) return `${image(a)}: ${facts.views[a][1]} tie points`;
+  const found = pairs.get(a + "-" + b);
+  return `${image(a)} and ${image(b)}: ` + (found ? `${found[0]} matches, epipolar offset ${found[1] || "?"} px, ${found[2] || "?"} degrees` : "no matches");
+};
+const same = views => views.length === chosen.length && views.every((v, i) => v === chosen[i]);
+
+function choose(views, from) {
+  chosen = same(views) ? [] : views;
+  for (const e of document.querySelectorAll(".on")) e.classList.remove("on");
+  for (const e of document.querySelectorAll("[data-v]"))
+    if (chosen.includes(+e.dataset.v)) (e.closest("figure .panel") ? e.closest("figure") : e).classList.add("on");
+  for (const row of document.querySelectorAll("tr[data-views]")) {
+    const own = row.dataset.views.split("-").map(Number);
+    if (!chosen.length || !(own.length === 1 ? chosen.includes(own[0]) : chosen.every(v => own.includes(v)))) continue;
+    row.classList.add("on");
+    const box = row.closest(".scroll");
+    if (box && !box.contains(from) && !box.querySelector(".on ~ .on")) box.scrollTop = row.offsetTop - box.clientHeight / 2;
+  }
+  cursor(chosen.length === 2 ? chosen : null);
+  bar.hidden = !chosen.length;
+  bar.replaceChildren(...(chosen.length ? [say(chosen), make("button", { type: "button", textContent: "clear", onclick: () => choose([]) })] : []));
+}
+
+function cursor(views) {
+  const mark = matrix && matrix.querySelector(".cursor");
+  if (!mark) return;
+  mark.classList.toggle("seen", !!views);
+  if (!views) return;
+  const { side, left, top } = matrix.dataset;
+  mark.setAttribute("x", +left + Math.max(...views) * side);
+  mark.setAttribute("y", +top + Math.min(...views) * side);
+}
+
+for (const e of document.querySelectorAll("svg [data-v]")) e.addEventListener("click", event => choose([+e.dataset.v], event.target));
+
+if (matrix) {
+  const note = make("span", { className: "note", ariaLive: "polite" });
+  const tools = make("div", { className: "tools" });
+  [...matrix.querySelectorAll(".layer")].forEach((layer, k) => {
+    const radio = make("input", { type: "radio", name: "measure", checked: !k, onchange: () => { matrix.classList.remove("m1", "m2"); if (k) matrix.classList.add("m" + k); } });
+    tools.append(make("label", {}, radio, " " + layer.dataset.words));
+  });
+  matrix.before(tools);
+  matrix.after(note);
+  const at = event => {
+    const box = matrix.getBoundingClientRect(), unit = matrix.viewBox.baseVal.width / box.width;
+    const { side, left, top } = matrix.dataset;
+    const [b, a] = [((event.clientX - box.left) * unit - left) / side, ((event.clientY - box.top) * unit - top) / side].map(Math.floor);
+    const views = [Math.min(a, b), Math.max(a, b)];
+    return a !== b && views[0] >= 0 && views[1] < facts.views.length ? views : null;
+  };
+  matrix.addEventListener("pointermove", event => { const views = at(event); note.textContent = views ? say(views) : ""; cursor(views); });
+  matrix.addEventListener("pointerleave", () => { note.textContent = ""; cursor(chosen.length === 2 ? chosen : null); });
+  matrix.addEventListener("click", event => { const views = at(event); if (views) choose(views, matrix); });
+}
+
+for (const table of document.querySelectorAll("table")) {
+  const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0], rows = [...body.rows];
+  heads.forEach((head, column) => head.firstElementChild.addEventListener("click", () => {
+    const down = head.getAttribute("aria-sort") === "ascending";
+    heads.forEach(other => other.setAttribute("aria-sort", "none"));
+    head.setAttribute("aria-sort", down ? "descending" : "ascending");
+    const key = row => row.cells[column].dataset.key ?? row.cells[column].textContent;
+    const compare = (a, b) => a !== "" && b !== "" && !isNaN(a) && !isNaN(b) ? a - b : a.localeCompare(b, undefined, { numeric: true });
+    body.append(...[...body.rows].sort((a, b) => compare(key(a), key(b)) * (down ? -1 : 1)));
+  }));
+  if (heads[0].textContent.trim() === "#" && facts.views.length) {
+    table.classList.add("live");
+    rows.forEach((row, k) => {
+      const views = row.cells[0].textContent.trim().split("-").map(n => n - 1).sort((a, b) => a - b);
+      row.dataset.views = views.join("-");
+      row.tabIndex = k ? -1 : 0;
+      row.addEventListener("click", () => choose(views, row));
+      row.addEventListener("keydown", event => {
+        const step = { ArrowDown: "nextElementSibling", ArrowUp: "previousElementSibling" }[event.key];
+        if (event.key === "Enter" || event.key === " ") choose(views, row);
+        else if (!step) return;
+        let other = step && row[step];
+        while (other && other.hidden) other = other[step];
+        if (other) { row.tabIndex = -1; other.tabIndex = 0; other.focus(); }
+        event.preventDefault();
+      });
+    });
+  }
+  if (rows.length > 8) {
+    const count = make("span", { className: "note", ariaLive: "polite" });
+    const field = make("input", { type: "search", oninput: () => {
+      const words = field.value.toLowerCase().split(/\s+/);
+      let shown = 0;
+      for (const row of rows) shown += !(row.hidden = !words.every(word => row.textContent.toLowerCase().includes(word)));
+      count.textContent = field.value ? `${shown} of ${rows.length} rows` : "";
+    } });
+    table.closest(".scroll").before(make("div", { className: "tools" }, make("label", {}, "Filter rows ", field), count));
+  }
+}
+
+const dialog = document.body.appendChild(make("dialog"));
+dialog.addEventListener("click", () => dialog.close());
+for (const panel of document.querySelectorAll(".panels figure")) {
+  const open = () => {
+    const copy = panel.querySelector("svg").cloneNode(true);
+    copy.removeAttribute("aria-labelledby");
+    copy.setAttribute("aria-label", panel.querySelector("title").textContent);
+    for (const e of copy.querySelectorAll("[id]")) e.removeAttribute("id");
+    const close = make("button", { type: "button", textContent: "close" });
+    dialog.replaceChildren(copy, make("p", { className: "tools" }, panel.querySelector("figcaption").textContent, close));
+    dialog.showModal();
+  };
+  panel.tabIndex = 0;
+  panel.setAttribute("role", "button");
+  panel.addEventListener("click", open);
+  panel.addEventListener("keydown", event => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); open(); } });
+}

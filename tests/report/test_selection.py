@@ -1,0 +1,89 @@
+"""What the report's script does, in a real browser: one selection everywhere, filters, residual maps in large."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from html import escape, unescape
+from pathlib import Path
+
+import pytest
+
+from .test_chromium import CHROMIUM, FLAGS
+
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no chromium on this machine (apt-get install chromium)"
+)
+pytest.importorskip("jinja2")
+
+DRIVER = Path(__file__).with_name("selection.js").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def found(block_run, tmp_path_factory) -> dict:
+    folder = tmp_path_factory.mktemp("driver")
+    html = (block_run.folder / "report.html").read_text(encoding="utf-8")
+    page = folder / "driver.html"
+    page.write_text(
+        f'<!doctype html><meta charset="utf-8"><body><iframe style="width:1200px;height:900px" '
+        f'srcdoc="{escape(html)}"></iframe><script>{DRIVER}</script></body>'
+    )
+    command = [CHROMIUM, *FLAGS, f"--user-data-dir={folder / 'profile'}", page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    body = done.stdout[done.stdout.index("<body>") + 6 : done.stdout.rindex("</body>")]
+    return json.loads(unescape(body))
+
+
+@pytest.fixture(scope="module")
+def pair(block_run) -> dict:
+    """The pair of the first two images."""
+    return next(p for p in block_run.summary["pairs"] if {p["a"], p["b"]} == {"view_0000", "view_0001"})
+
+
+def test_nothing_goes_wrong(found):
+    assert found["errors"] == []
+
+
+def test_an_outline_that_is_clicked_is_chosen_in_the_tables_and_not_when_clicked_again(found, block_run):
+    lit, rows, said = found["map"]
+    partners = [p for p in block_run.summary["pairs"] if "view_0002" in (p["a"], p["b"])]
+    assert lit == ["2"]
+    assert [row for row in rows if row.startswith("t-images")] == ["t-images 3"]
+    assert len([row for row in rows if row.startswith("t-pairs")]) == len(partners)
+    assert said == f"3 view_0002: {block_run.summary['views'][2]['num_observations']} tie points"
+    assert found["again"] == [[], [], ""]
+
+
+def test_a_cell_of_the_matrix_says_its_pair_under_the_pointer_and_chooses_it(found, pair):
+    assert found["hover"].startswith(
+        f"1 view_0000 and 2 view_0001: {pair['num_matches']} matches, epipolar offset 0."
+    )
+    assert found["hover"].endswith(f"{pair['convergence_deg']:.1f} degrees")
+    assert found["diagonal"] == ""
+    lit, rows, said = found["matrix"]
+    assert sorted(lit) == ["0", "1"]
+    assert [row for row in rows if row.startswith("t-images")] == ["t-images 1", "t-images 2"]
+    assert [row for row in rows if row.startswith("t-pairs")] == ["t-pairs 1-2"]
+    assert said == found["hover"]
+    assert found["cursor"] == [True, 1, 0]
+    assert found["cleared"] == [[], [], ""]
+
+
+def test_keys_walk_and_choose(found):
+    assert found["focus"] == "2"
+    assert found["keyed"][0] == ["1"]
+    assert found["keyed"][1].startswith("2 view_0001")
+
+
+def test_one_measure_is_shown_at_a_time(found):
+    assert found["layers"] == [[True, False, False], [False, True, False], [False, False, True]]
+
+
+def test_a_filter_keeps_the_rows_that_have_its_words(found):
+    assert found["filtered"] == ["view_0003"]
+    assert found["count"] == "1 of 9 rows"
+
+
+def test_a_residual_map_opens_in_large(found):
+    assert found["dialog"] == [True, True, True]
+    assert found["closed"] is False
