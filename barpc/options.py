@@ -403,6 +403,11 @@ class RunOptions(Options):
         connected group is not tied to, write an RPC that misses the fit's tolerance. Such a run ends with exit code
         3.""",
     )
+    pictures: bool = option(
+        True,
+        """Show a quick-look of each image and patches about tie points in the report: pixels, which go where the report
+        goes.""",
+    )
     overwrite: bool = option(False, "Replace the results of an earlier run in the same folder.")
     allow_remote: tuple[str, ...] = option(
         (),

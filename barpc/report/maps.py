@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -106,9 +106,7 @@ def ground_map(files: RunFiles) -> str:
     stacks = _stacks(plane, files.outlines)
     parts += _pair_lines(stacks, files)
     if len(stacks) <= 100:
-        parts += [
-            label(stack.place[0], stack.place[1] + 4, stack.text, "middle", "stack") for stack in stacks
-        ]
+        parts += _stack_names(stacks)
     for kind, places in known.items():
         up = 1 if kind == "gcps" else -1
         for point, (x, y) in evenly(list(zip(points_of[kind], plane(places), strict=True)), MAX_DRAWN):
@@ -152,6 +150,18 @@ def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
         else:
             stacks[near].views.append(k)
     return stacks
+
+
+def _stack_names(stacks: Sequence[Stack]) -> list[str]:
+    """The numbers of stacks, without those that would stand on others."""
+    taken: list[tuple[float, float, float]] = []
+    names = []
+    for stack in stacks:
+        (x, y), half = stack.place.tolist(), 3.6 * len(stack.text)
+        if all(abs(x - u) > half + other or abs(y - v) > 14 for u, v, other in taken):
+            taken.append((x, y, half))
+            names.append(label(x, y + 4, stack.text, "middle", "stack"))
+    return names
 
 
 def _pair_lines(stacks: Sequence[Stack], files: RunFiles) -> list[str]:
@@ -228,7 +238,7 @@ def cells_of(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
 
 
 def residual_panels(
-    views: Sequence[ViewEntry], observations: Observations, when: str
+    views: Sequence[ViewEntry], observations: Observations, when: str, looks: Mapping[str, str]
 ) -> tuple[list[tuple[str, str]], list[float], str]:
     """Small maps of the residuals "before" or "after", with captions, of the images with the largest systematic part.
 
@@ -253,12 +263,28 @@ def residual_panels(
     for k in sorted(sorted(range(len(views)), key=lambda k: -shares[k])[:_MOST]):
         rows = rows_of[k][:: max(1, -(-len(rows_of[k]) // most))]
         svg = _panel(when, k, views[k], grids[k], observations.xy[rows], residuals[rows], longest)
+        svg = _over(looks.get(views[k].name), svg)
         charts.append((svg, f"{k + 1} {views[k].name}: {_note(grids[k])}"))
     words = f"A thin line of a {_PANEL / _REACH:.0f}th of a panel's width is {longest:.2g} px"
     key = f"{words}; bold arrows are drawn twice as long."
     if len(charts) < len(views):
         key += f" The {len(charts)} of {len(views)} images with the largest systematic part are shown."
     return charts, shares, key
+
+
+def _over(look: str | None, svg: str) -> str:
+    """A panel over the quick-look of its image, which the page shows where the panel is large."""
+    if look is None:
+        return svg
+    image = tag(
+        "image",
+        href=f"data:image/jpeg;base64,{look}",
+        width="100%",
+        height="100%",
+        preserveAspectRatio="none",
+    )
+    head, end, rest = svg.partition("</desc>")
+    return f"{head}{end}{image}{rest}"
 
 
 def _note(cells: Cells) -> str:

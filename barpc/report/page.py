@@ -39,7 +39,7 @@ from barpc.report.summary import (
     listed,
     metres,
 )
-from barpc.report.tables import RunFiles, read_summary, read_tables
+from barpc.report.tables import RunFiles, TiePatches, read_summary, read_tables
 from barpc.report.verdict import GOOD
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
@@ -117,7 +117,8 @@ class Section:
     """A question and its answer, with what shows it.
 
     `panels`: small maps; `folds`: words and more of them that open on demand; `bars`: words, a value as text and a
-    length in percent; `half`: half the width of a desk's screen is enough.
+    length in percent; `ties`: patches of tie points; `half`: half the width of
+    a desk's screen is enough.
     """
 
     key: str
@@ -128,6 +129,7 @@ class Section:
     folds: Sequence[tuple[str, Pictures]] = ()
     bars: Sequence[tuple[str, str, float]] = ()
     tables: Sequence[Table] = ()
+    ties: Sequence[TiePatches] = ()
     half: bool = False
 
 
@@ -215,7 +217,9 @@ def _randomness(files: RunFiles) -> Section | None:
     if not len(files.observations.view):
         return None
     views, adjusted, folds = files.summary.views, files.summary.adjusted, []
-    panels, shares, key = residual_panels(views, files.observations, "after" if adjusted else "before")
+    panels, shares, key = residual_panels(
+        views, files.observations, "after" if adjusted else "before", files.pictures.quicklooks
+    )
     marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
     answer = "Mostly: in no image do residuals point the same way in more than half of the cells."
     if marked:
@@ -227,9 +231,22 @@ def _randomness(files: RunFiles) -> Section | None:
         f" cell that is larger than chance allows. {key}"
     )
     if adjusted:
-        before, _, key = residual_panels(views, files.observations, "before")
+        before, _, key = residual_panels(views, files.observations, "before", {})
         folds.append((f"Before the adjustment. {key}", before))
     return Section("random", "Are the residuals random?", answer, panels=panels, folds=folds)
+
+
+def _ties(files: RunFiles) -> Section | None:
+    ties = files.pictures.ties
+    if not ties:
+        return None
+    worst = sum(tie.kind == "worst" for tie in ties)
+    answer = (
+        f"The {worst} with the largest residuals, then {len(ties) - worst} at random. Point at a patch or go to it with"
+        " the Tab key: it blinks between the two images, the second brought over by the cameras. What jumps is their"
+        " error; what looks like two places is a wrong match."
+    )
+    return Section("ties", "What do tie points look like?", answer, ties=ties)
 
 
 def _pairs(files: RunFiles) -> Section | None:
@@ -393,6 +410,6 @@ def _run(files: RunFiles) -> Section:
 
 
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
-    _images, _map, _errors, _randomness, _pairs, _corrections, _gauge, _check_points, _files, _run,
+    _images, _map, _errors, _randomness, _ties, _pairs, _corrections, _gauge, _check_points, _files, _run,
 )  # fmt: skip
 """In the order of the page; a section that has nothing to show is None."""

@@ -9,7 +9,9 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterable, Sequence
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -174,6 +176,8 @@ TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
     "points.ply": _points_ply,
 }
 """File name -> its bytes, of a run and its summary."""
+PICTURES = "pictures.json"
+"""Pixels for the report, of a run that wrote them."""
 
 
 # --- read back --------------------------------------------------------------------------------------------
@@ -193,6 +197,28 @@ class Observations:
     used: BoolArray
 
 
+@dataclass(frozen=True)
+class TiePatches:
+    """A tie point in pixels: a JPEG (base64) of the image `a`, and of `b` brought over by the cameras before and after.
+
+    `kind`: "worst" or "random"; `offset_px`: distances from the epipolar line with these cameras.
+    """
+
+    kind: str
+    a: str
+    b: str
+    offset_px: Sequence[float]
+    patches: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What a run shows of its pixels: name of an image -> quick-look, a JPEG in base64; tie points."""
+
+    quicklooks: Mapping[str, str]
+    ties: Sequence[TiePatches]
+
+
 @dataclass(frozen=True, eq=False)
 class RunFiles:
     """What lies in the folder of a run.
@@ -205,6 +231,7 @@ class RunFiles:
     observations: Observations
     points: Array
     outlines: Sequence[Sequence[Array]]
+    pictures: Pictures
 
     @property
     def number(self) -> dict[str, int]:
@@ -263,7 +290,37 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     if len(outlines) != len(names):
         raise InputError(f"{folder / 'footprints.geojson'}: {len(outlines)} outlines of {len(names)} images")
     observations = _read(folder / "observations.csv", TABLE, lambda text: _observations(text, names))
-    return RunFiles(summary, observations, _read(folder / "residuals.csv", TABLE, _points), outlines)
+    points = _read(folder / "residuals.csv", TABLE, _points)
+    there = os.path.lexists(folder / PICTURES)
+    pictures = _read(folder / PICTURES, SUMMARY, _pictures) if there else Pictures({}, ())
+    return RunFiles(summary, observations, points, outlines, pictures)
+
+
+_BASE64 = re.compile(r"[A-Za-z0-9+/]{4,400000}={0,2}")
+
+
+def _pictures(text: str) -> Pictures:
+    found = parse_json(text)
+    looks = {str(name): _jpeg(data) for name, data in found["quicklooks"].items()}
+    ties = [
+        TiePatches(
+            {"worst": "worst", "random": "random"}[tie["kind"]],
+            str(tie["a"]),
+            str(tie["b"]),
+            [float(value) for value in tie["offset_px"]],
+            [_jpeg(data) for data in tie["patches"]],
+        )
+        for tie in found["ties"]
+    ]
+    if any(len(tie.patches) != len(tie.offset_px) + 1 or not tie.offset_px for tie in ties):
+        raise ValueError("a tie point without its patches")
+    return Pictures(looks, ties)
+
+
+def _jpeg(data: str) -> str:
+    if not _BASE64.fullmatch(data):
+        raise ValueError("a picture that is none")
+    return data
 
 
 def _read(path: Path, kind: Kind, parse: Any) -> Any:

@@ -154,7 +154,7 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
         *(np.concatenate([column] * copies) for column in columns),
     )
     told = replace(summary, views=tuple(views), pairs=tuple(pairs), verdict=tuple(lines))
-    return RunFiles(told, observations, np.concatenate(points), outlines)
+    return RunFiles(told, observations, np.concatenate(points), outlines, found.pictures)
 
 
 @pytest.mark.parametrize("num", [300, 1000])
