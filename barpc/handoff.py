@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,12 +26,18 @@ import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import RPCTransformer
+from scipy.interpolate import RegularGridInterpolator
 
+from barpc.cameras import open_camera
 from barpc.errors import OutputError
+from barpc.fit.certificate import Sample
 from barpc.geodesy import Array, wrap_longitude
 from barpc.raster import GDAL_OPTIONS
 from barpc.rpcio import Carrier, hidden_by, read_rpc, row_of, sidecars
+from barpc.rpcio.grids import CORRECTION, GRID, read_correction
 from barpc.sensor import SensorModel
+from barpc.sensor.correction_grid import CorrectionGrid
+from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import image_grid
 from barpc.vrt import Vrt, read_vrt
 from barpc.workspace import own_files
@@ -127,6 +133,34 @@ def verify(
     ]
 
 
+def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = None) -> list[Reading]:
+    """Open a file of more than an RPC as its consumers do and look for its largest error.
+
+    Parameters
+    ----------
+    path : Path
+        A localisation or correction grid, by the end of its name; else the image, resampled by `correction`.
+    sample : Sample
+        Of the model that it should hold.
+    """
+    return [
+        _attempt(path, name, partial(_sought, sample, consumer, correction))
+        for name, consumer in _grid_consumers(path).items()
+        if consumer.installed
+    ]
+
+
+def _sought(sample: Sample, consumer: Consumer, correction: CorrectionGrid | None, path: Path) -> float:
+    """The largest distance [px] of what a consumer reads to the model, all over the image and its altitudes."""
+    read, model = consumer.open(path), sample.model
+
+    def off(ground: Array, at: Array) -> Array:
+        image = model.project(read(at)) if consumer.locates else read(ground)
+        return (image if correction is None else correction.apply(image)) - at[:, :2]
+
+    return float(np.linalg.norm(sample.sought(off)[1]))
+
+
 def unverified(paths: Sequence[Path | str]) -> list[str]:
     """A sentence for each kind of these files that no installed tool but barpc reads."""
     kinds = {path.suffix: path for path in map(Path, paths) if not any(_readers(path).values())}
@@ -139,6 +173,8 @@ def unverified(paths: Sequence[Path | str]) -> list[str]:
 
 def _readers(path: Path) -> dict[str, bool]:
     """The tools besides barpc that read a file, and whether they are installed."""
+    if path.name.endswith((GRID, CORRECTION)):
+        return {name: one.installed for name, one in _grid_consumers(path).items() if one.package != "barpc"}
     row = row_of(path)
     return {} if row is None else {name: CONSUMERS[name].installed for name in row.consumers}
 
@@ -146,10 +182,15 @@ def _readers(path: Path) -> dict[str, bool]:
 def _reading(
     path: Path, name: str, opener: Callable[[Path], Projection], ground: Array, image: Array
 ) -> Reading:
+    return _attempt(path, name, lambda lent: _largest(opener(lent), ground, image))
+
+
+def _attempt(path: Path, name: str, measure: Callable[[Path], float]) -> Reading:
+    """What a consumer makes of a file, or why it does not."""
     try:
         with warnings.catch_warnings(), nullcontext(path) if name == "barpc" else _lent(path) as lent:
             warnings.simplefilter("ignore")
-            error = _largest(opener(lent), ground, image)
+            error = measure(lent)
     except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
         return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
     return Reading(path, name, error, "" if np.isfinite(error) else "it projects to no finite point")
@@ -193,6 +234,8 @@ class Consumer:
 
     package: str
     open: Callable[[Path], Projection]
+    locates: bool = False
+    """Whether it gives ground points (N, 3) of col, row, altitude (N, 3) instead."""
 
     @property
     def installed(self) -> bool:
@@ -275,6 +318,39 @@ def _keywords(path: Path) -> Projection:
     return _transformer(rasterio.rpc.RPC(**values))
 
 
+def _shareloc_grid(path: Path) -> Projection:
+    model = import_module("shareloc.geomodels").GeoModel(str(path), "GRID")
+    return lambda at: np.asarray(model.direct_loc_h(at[:, 1] + 0.5, at[:, 0] + 0.5, at[:, 2]))
+
+
+def _linear_grid(path: Path) -> Projection:
+    grid = open_camera(path).model
+    assert isinstance(grid, DirectGrid)
+    lonlat = RegularGridInterpolator((grid.alts, grid.rows, grid.cols), grid.lonlat, bounds_error=False)
+    return lambda at: np.column_stack([lonlat(at[:, ::-1]), at[:, 2]])
+
+
+def _gdal_correction(path: Path) -> Projection:
+    """As whoever resamples reads it: values at the places that GDAL gives for the centres of its pixels."""
+    rpc = _gdal_raster(path)
+    with rasterio.open(path) as dataset:
+        cols = np.array(dataset.xy(np.zeros(dataset.width), np.arange(dataset.width))[0]) - 0.5
+        rows = np.array(dataset.xy(np.arange(dataset.height), np.zeros(dataset.height))[1]) - 0.5
+        shift = RegularGridInterpolator((rows, cols), np.moveaxis(dataset.read(), 0, -1))
+    ends = np.array([(rows[0], cols[0]), (rows[-1], cols[-1])])
+
+    def project(ground: Array) -> Array:
+        image = rpc(ground)
+        return np.asarray(image + shift(np.clip(image[:, ::-1], *ends)))
+
+    return project
+
+
+def _own_correction(path: Path) -> Projection:
+    rpc, grid = read_correction(path)
+    return lambda ground: grid.apply(rpc.project(ground))
+
+
 CONSUMERS: dict[str, Consumer] = {
     "gdal": Consumer("rasterio", _gdal_raster),
     "gdal, beside an image": Consumer("rasterio", _gdal_text),
@@ -285,3 +361,20 @@ CONSUMERS: dict[str, Consumer] = {
     "barpc": Consumer("barpc", lambda path: read_rpc(path).project),
 }
 """Consumer -> how it reads. Which formats it reads stands in their rows; those not installed are passed over."""
+
+_GRIDS: dict[str, dict[str, Consumer]] = {
+    GRID: {
+        "shareloc": Consumer("shareloc", _shareloc_grid, locates=True),
+        "linear": Consumer("barpc", _linear_grid, locates=True),
+        "barpc": Consumer("barpc", lambda path: open_camera(path).model.project),
+    },
+    CORRECTION: {
+        "gdal": Consumer("rasterio", _gdal_correction),
+        "barpc": Consumer("barpc", _own_correction),
+    },
+    "": {"gdal": Consumer("rasterio", _gdal_raster), "barpc": CONSUMERS["barpc"]},
+}
+
+
+def _grid_consumers(path: Path) -> dict[str, Consumer]:
+    return next(consumers for end, consumers in _GRIDS.items() if path.name.endswith(end))

@@ -40,7 +40,7 @@ GROUND = (
 )
 ADJUSTMENT = (*CAMERA, *GROUND)
 MATCH = ("overwrite", "keep_going", "store")
-RUN = (*MATCH, "images", "rpc_formats")
+RUN = (*MATCH, "images", "rpc_formats", "grids", "tiles", "resample")
 """Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
 _NAMES = {"tie.keypoints_per_image": "--ip-per-image", "rpc_formats": "--rpc-format"}
 

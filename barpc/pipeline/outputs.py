@@ -17,6 +17,7 @@ from barpc.fit import RpcFit
 from barpc.handoff import verify
 from barpc.options import RunOptions
 from barpc.pipeline.executor import CachingExecutor
+from barpc.pipeline.grids import grid_names
 from barpc.pipeline.inputs import PRIOR
 from barpc.pipeline.pictures import pictures
 from barpc.report import Run, Summary
@@ -127,6 +128,7 @@ def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> li
         return [*names, *MATCHES, *(f"asp/{name}" for name in pairs)]
     if options.stop_after == "all":
         names += [name for view in views for name in file_names(view, options.images, options.rpc_formats)]
+        names += [name for view in views for name in grid_names(view, options)]
     return [*names, PRIOR]
 
 

@@ -27,6 +27,7 @@ from barpc.pipeline.cluster import watched
 from barpc.pipeline.control import load_gcps
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.given import given_matches, given_tracks
+from barpc.pipeline.grids import write_grids
 from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs, with_located
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.views import Image, image_path, load_views
@@ -398,7 +399,7 @@ def _fitted(run: Run, options: RunOptions, executor: Executor, progress: Progres
         (model, view.size, view.alt_range)
         for view, model in zip(run.views, run.adjustment.sensors, strict=True)
     ]
-    strict, num = not options.keep_going, len(cameras)
+    strict, num = not (options.keep_going or options.grids), len(cameras)
     tasks = [(tuple(cameras[at : at + _GROUP]), options.fit, strict) for at in range(0, num, _GROUP)]
     told = progress and (lambda stage, done, _: progress(stage, min(done * _GROUP, num), num))
     found = [one for group in ordered(executor, fit_group, tasks, "fit", told) for one in group]
@@ -441,4 +442,5 @@ def _written(
     written = write_views(workspace, fitted, options.images, options.rpc_formats, executor, progress)
     for sentence in unverified([workspace.folder / name for name in written[0]]):
         logger.warning(sentence)
-    return replace(run, written=tuple(written))
+    beyond = write_grids(workspace, fitted, options, executor, progress)
+    return replace(run, written=tuple({**one, **more} for one, more in zip(written, beyond, strict=True)))

@@ -52,7 +52,8 @@ def _failure(view: ViewEntry, run: Run) -> str:
     tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
     if run.adjustment is not None and view.name in run.adjustment.left_out:
         return "not tied to the other images: its camera was left as it was"
-    if view.fit is not None and not max(map(_known, view.fit.max_px)) <= tolerance:
+    grids = getattr(run.options, "grids", False)  # they hold what the RPC does not
+    if view.fit is not None and not grids and not max(map(_known, view.fit.max_px)) <= tolerance:
         return f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range"
     return ""
 

@@ -30,7 +30,7 @@ from barpc.sensor.rpc import RPC
 from barpc.sidefile import IMAGE, opened, plain_path
 from barpc.vrt import GDAL_TYPES
 
-_TIFF = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
+TIFF = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
 _COPIED = 4 << 20  # bytes at a time
 _FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk
 
@@ -72,7 +72,7 @@ def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative:
         lines.append(rpc_domain(rpc))
         for index in dataset.indexes:
             lines += _vrt_band(dataset, index, _vrt_source(dataset, name, relative, str(index)))
-        if _has_mask(dataset):
+        if has_mask(dataset):
             mask = (f"  {line}" for line in _vrt_source(dataset, name, relative, "mask,1"))
             band = ['    <VRTRasterBand dataType="Byte">', *mask, "    </VRTRasterBand>"]
             lines += ["  <MaskBand>", *band, "  </MaskBand>"]
@@ -121,7 +121,7 @@ def plain_source(image_path: Path | str) -> Path:
     return found.resolve()
 
 
-def _has_mask(dataset: Any) -> bool:
+def has_mask(dataset: Any) -> bool:
     """Whether a raster has a mask of its own, apart from an alpha band."""
     return (
         MaskFlags.per_dataset in dataset.mask_flag_enums[0] and ColorInterp.alpha not in dataset.colorinterp
@@ -148,11 +148,11 @@ def write_rpc_copy(
     ImageError, OutputError
         The image cannot be read; the copy exists, is the image itself, or cannot be written.
     """
-    with _copying(image_path, copy_path, overwrite) as (dataset, partial):
+    with copying(image_path, copy_path, overwrite) as (dataset, partial):
         if not isinstance(dataset, Mosaic) and dataset.driver == "GTiff":
             _copy_bytes(image_path, partial)
         else:
-            _convert(dataset, partial, Path(copy_path), **_TIFF)
+            _convert(dataset, partial, Path(copy_path), **TIFF)
         put_tag(partial, printable(rpc), placed=dataset.crs is not None)
 
 
@@ -169,7 +169,7 @@ def write_rpc_nitf(
 ) -> None:
     """Write a NITF copy of an image with an RPC in its RPC00B extension (`nitf_record` says what it holds)."""
     record = nitf_record(rpc)
-    with _copying(image_path, nitf_path, overwrite) as (dataset, partial):
+    with copying(image_path, nitf_path, overwrite) as (dataset, partial):
         _convert(dataset, partial, Path(nitf_path), driver="NITF", TRE=f"RPC00B={record}")
 
 
@@ -201,20 +201,20 @@ def write_crop(
     """
     col, row, width, height = window
     cropped = printable(rpc.crop(col, row))
-    with _copying(image_path, crop_path, overwrite) as (dataset, partial):
+    with copying(image_path, crop_path, overwrite) as (dataset, partial):
         if not (0 <= col < col + width <= dataset.width and 0 <= row < row + height <= dataset.height):
             raise ImageError(
                 f"{image_path}: window {window} is not inside the image of {dataset.width} x {dataset.height}"
             )
         place = Window(col, row, width, height)
-        _copy_window(dataset, partial, place, **_TIFF)
+        _copy_window(dataset, partial, place, **TIFF)
         _require_same(dataset, place, partial, Path(crop_path))
         put_tag(partial, cropped, placed=dataset.crs is not None)
     return cropped
 
 
 @contextmanager
-def _copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iterator[tuple[Any, Path]]:
+def copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iterator[tuple[Any, Path]]:
     """An image and the temporary file of its copy; what GDAL says when it cannot write is told as one error."""
     source, _ = identify(image_path)
     target = Path(target).absolute()
@@ -223,7 +223,7 @@ def _copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Ite
         try:
             yield dataset, partial
         except (RasterioError, CPLE_BaseError) as error:
-            raise _unwritten(target, str(error.__cause__ or error)) from error
+            raise unwritten(target, str(error.__cause__ or error)) from error
 
 
 def _convert(dataset: Any, partial: Path, target: Path, **options: str) -> None:
@@ -250,7 +250,7 @@ def _copy_window(dataset: Any, target: Path, window: Window, **options: str) -> 
             crop.colorinterp = dataset.colorinterp
             for block, part in _blocks(crop, window):
                 crop.write(dataset.read(window=part), window=block)
-                if _has_mask(dataset) and options["driver"] == "GTiff":
+                if has_mask(dataset) and options["driver"] == "GTiff":
                     crop.write_mask(dataset.read_masks(1, window=part), window=block)
 
 
@@ -266,12 +266,13 @@ def _require_same(dataset: Any, window: Window, partial: Path, target: Path) -> 
         with open_raster(partial) as copy:
             for block, part in _blocks(copy, window):
                 if dataset.read(window=part).tobytes() != copy.read(window=block).tobytes():
-                    raise _unwritten(target, "it holds other pixels than were written")
+                    raise unwritten(target, "it holds other pixels than were written")
     except ImageError as error:
-        raise _unwritten(target, "it cannot be read back") from error
+        raise unwritten(target, "it cannot be read back") from error
 
 
-def _unwritten(target: Path, reason: str) -> OutputError:
+def unwritten(target: Path, reason: str) -> OutputError:
+    """The error of a file that does not hold what was written; GDAL does not say that a disk is full."""
     full = shutil.disk_usage(target.parent).free < _FULL
     return OutputError(f"{target}: cannot be written ({os.strerror(errno.ENOSPC) if full else reason})")
 

@@ -1,11 +1,13 @@
 """A direct localisation grid as a camera: ground points of a regular grid of image points, layer by layer.
 
 Vendors deliver their physical model as a table G(col, row, alt) = (lon, lat) on a grid. Between the nodes it is
-a tensor-product cubic spline; `project` inverts it by Newton's method with the spline's own derivatives.
+a tensor-product cubic spline; `project` inverts it by Newton's method with the spline's own derivatives. Of any other
+camera `DirectGrid.of` makes one, dense enough for those who interpolate linearly.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,14 +17,21 @@ from scipy.interpolate import NdBSpline, make_interp_spline
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
+from barpc.sensor import SensorModel
 from barpc.sensor.rational import DERIVATIVE, monomials
 
 CHUNK = 2048  # points worked on at a time: what belongs to them stays in cache
+LINEAR = 0.005  # px: what linear interpolation in a grid made here may miss by
 
 _FAR = 1e9  # px and m: beyond it no node lies
 _STEPS = 8
 _SETTLED = 1e-5  # px: what is left after a step of this size is below rounding
 _SHRINK = 1e-4  # of a step to the next: more asks for new derivatives
+
+_LONGEST = 1024.0, 1024.0, 1000.0  # px, px, m: from node to node of a grid made here
+_CELLS = 1024  # along an axis, at most
+_NODES = 4_000_000  # of a grid made here, at most
+_TRIED = 1000  # cells
 
 _VALUE, _BY_COL, _BY_ROW, _BY_ALT = (0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)
 
@@ -91,6 +100,35 @@ class DirectGrid(Frozen):
         lonlat = np.full((*shape, 2), np.nan)
         lonlat[places] = ground[:, :2]
         return cls(axes[2], axes[1], axes[0], lonlat)
+
+    @classmethod
+    def of(
+        cls,
+        model: SensorModel,
+        size: tuple[int, int],
+        alt_range: tuple[float, float],
+        tolerance: float = LINEAR,
+    ) -> DirectGrid:
+        """The grid of a camera from corner to corner of an image of `size` (width, height) and over its altitudes.
+
+        Linear interpolation between its nodes misses by no more than `tolerance` [px], unless that asks for
+        millions of nodes. RpcError where the camera sees no ground.
+        """
+        low = np.array([-0.5, -0.5, alt_range[0]])
+        high = np.array([size[0] - 0.5, size[1] - 0.5, alt_range[1]])
+        middle = (low + high) / 2
+        center = model.localize(middle[:2], middle[2])
+        to_px = np.linalg.inv(_slopes(model, middle)).T
+
+        def seen(points: Array) -> Array:
+            """Ground points (..., 2) of points (..., 3) col, row, altitude, about in pixels."""
+            lonlat = model.localize(points[..., :2], points[..., 2])[..., :2]
+            return np.asarray((wrap_longitude(lonlat, center[:2]) - center[:2]) @ to_px)
+
+        cols, rows, alts = linear_axes(seen, low, high, np.array(_LONGEST), tolerance)
+        nodes = np.stack(np.meshgrid(cols, rows), axis=-1)
+        ground = [model.localize(nodes, np.full(nodes.shape[:2], alt))[..., :2] for alt in alts]
+        return cls(cols, rows, alts, np.stack(ground))
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN off the grid."""
@@ -175,3 +213,41 @@ def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
     basis = monomials(((ground - offset) / scale).T).T
     image = np.column_stack([col.ravel(), row.ravel(), np.zeros(col.size)])
     return np.vstack([offset, scale, np.linalg.lstsq(basis, image, rcond=None)[0]])
+
+
+def _slopes(model: SensorModel, at: Array) -> Array:
+    """Derivative (2, 2) [deg/px] of lon, lat by col, row at a point (3,) col, row, altitude."""
+    steps = np.concatenate([np.eye(2), -np.eye(2)])
+    ground = model.localize(at[:2] + steps, np.full(4, at[2]))[:, :2]
+    return np.asarray((wrap_longitude(ground[:2] - ground[2:]) / 2).T)
+
+
+def linear_axes(
+    value: Callable[[Array], Array], low: Array, high: Array, longest: Array, tolerance: float
+) -> list[Array]:
+    """Nodes along each axis of a box `low`, `high` (d,), between which values are linear to a tolerance.
+
+    The error along each axis is measured at random places of random cells, whose phase no wave can hide in.
+
+    Parameters
+    ----------
+    value : callable, points (N, d) -> values (N, k), in the unit of `tolerance`
+    longest : (d,), cells at the beginning; they are made smaller until the errors of all axes add up to `tolerance`
+    """
+    counts = np.maximum(1, np.ceil((high - low) / longest)).astype(np.int64)
+    for axis in range(len(low)):
+        rng, along = np.random.default_rng(axis), np.eye(len(low))[axis]
+        while True:
+            step = (high - low) / counts * along
+            first, t = low + (high - low - step) * rng.random((_TRIED, len(low))), rng.random((_TRIED, 1))
+            miss = (1 - t) * value(first) + t * value(first + step) - value(first + t * step)
+            worst = float(np.linalg.norm(miss, axis=1).max())
+            if not np.isfinite(worst):
+                raise RpcError("localisation grid: the camera has no ground point in part of the image")
+            if worst <= tolerance / len(low) or counts[axis] >= _CELLS:
+                break
+            more = min(4.0, max(1.25, 1.1 * (worst * len(low) / tolerance) ** 0.5))
+            counts[axis] = min(_CELLS, int(np.ceil(counts[axis] * more)))
+    if np.prod(counts + 1.0) > _NODES:
+        return linear_axes(value, low, high, longest, 2 * tolerance)
+    return [np.linspace(a, b, n + 1) for a, b, n in zip(low, high, counts, strict=True)]

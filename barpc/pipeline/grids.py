@@ -1,0 +1,263 @@
+"""Cameras that one RPC does not hold: grids, RPCs of tiles and resampled images, reopened like every output."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import warnings
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from barpc.errors import BarpcWarning, FitError, OutputError, RpcError
+from barpc.fit import RpcFit, fit_rpc
+from barpc.fit.certificate import Sample
+from barpc.fit.points import widened
+from barpc.geodesy import Array
+from barpc.handoff import verify_grid
+from barpc.options import FitOptions, RunOptions
+from barpc.pipeline.executor import CachingExecutor
+from barpc.rpcio import read_rpc, write_rpc
+from barpc.rpcio.grids import CORRECTION, GRID, read_correction, write_correction, write_grid
+from barpc.rpcio.resample import write_resampled
+from barpc.scene import View
+from barpc.sensor import SensorModel
+from barpc.sensor.corrected import ImageAffine, ImageCorrected
+from barpc.sensor.correction_grid import CorrectionGrid
+from barpc.sensor.direct_grid import LINEAR, DirectGrid
+from barpc.sensor.rpc import RPC
+from barpc.tie.tasks import Progress, ordered
+from barpc.workspace import Workspace
+
+logger = logging.getLogger(__name__)
+
+MISFIT = 0.02
+"""A camera that its RPC misses by more [px] gets grids, too."""
+RESAMPLED, TILES = "_resampled.tif", "_tiles.json"
+REOPENED = 1e-5  # px: what a reopened file may differ by from what was written
+
+_GROUP = 8  # tiles that are fitted in one task, whose result is kept
+_BOX = "col", "row", "width", "height"
+
+Written = dict[str, dict[str, float | str]]
+Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Files:
+    """Which files are written of a view beside its RPC."""
+
+    grids: bool
+    resampled: bool
+
+    def names(self, view: View) -> list[str]:
+        """Their names."""
+        ends = [GRID] * self.grids + [CORRECTION] * (self.grids or self.resampled)
+        return [view.name + end for end in (*ends, *[RESAMPLED] * self.resampled)]
+
+
+def grid_names(view: View, options: RunOptions) -> list[str]:
+    """The files that `write_grids` may write for a view, before it is known whether its RPC holds it."""
+    boxes = [] if options.tiles is None else tile_boxes(view.size, options.tiles)
+    tiles = [*(tile_name(view, box) for box in boxes), *[view.name + TILES] * bool(boxes)]
+    return [*Files(grids=True, resampled=options.resample).names(view), *tiles]
+
+
+def write_grids(
+    run: Workspace,
+    fitted: Sequence[tuple[View, RpcFit, SensorModel]],
+    options: RunOptions,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> list[Written]:
+    """Write what is asked for of every view, grids also where its RPC misses it, and open every file again.
+
+    OutputError where a file cannot be written, or does not hold what was written.
+    """
+    files = [
+        Files(options.grids or not np.linalg.norm(fit.max_ckp) <= MISFIT, options.resample)
+        for _, fit, _ in fitted
+    ]
+    written: list[Written] = [{} for _ in fitted]
+    some = [i for i, one in enumerate(files) if one.names(fitted[i][0])]
+    if some:
+        with run.stage("grids"):
+            tasks = [(fitted[i][0], fitted[i][1].rpc, fitted[i][2], files[i]) for i in some]
+            for i, found in zip(some, _write(run, tasks, executor, progress), strict=True):
+                written[i] |= found
+    if options.tiles is not None:
+        with run.stage("tiles"):
+            for found, one in zip(written, fitted, strict=True):
+                found |= _write_tiles(run, *one, options, executor)
+    return written
+
+
+Task = tuple[View, RPC, SensorModel, Files]
+
+
+def _write(
+    run: Workspace, tasks: Sequence[Task], executor: Executor | None, progress: Progress | None
+) -> list[Written]:
+    """Workers make the files in a room of the run folder, here they get their place, and workers open them again."""
+    room = run.partial / "grids"
+    with CachingExecutor(run, {}, executor, keep=False) as fresh:
+        try:
+            made = ordered(fresh, make_grids, [(*task, str(room)) for task in tasks], "grids", progress)
+            for (view, *_), errors in zip(tasks, made, strict=True):
+                for name in errors:
+                    with run.output(name) as partial:
+                        (room / view.name / name).replace(partial)
+        finally:
+            shutil.rmtree(room, ignore_errors=True)
+        again = [
+            (view, model, errors, str(run.folder))
+            for (view, _, model, _), errors in zip(tasks, made, strict=True)
+        ]
+        return ordered(fresh, verify_grids, again, "verify grids", progress)
+
+
+def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str) -> dict[str, float]:
+    """Write the grids of a view, and its resampled image, into a room; what each misses the model by [px]."""
+    place, alts = Path(room) / view.name, widened(view.alt_range)
+    place.mkdir(parents=True, exist_ok=True)
+    sample, errors = Sample.of(model, view.size, alts), dict[str, float]()
+    try:
+        if files.grids:
+            grid = DirectGrid.of(model, view.size, alts)
+            errors[view.name + GRID] = _off(sample, grid)
+            write_grid(grid, place / (view.name + GRID), overwrite=True)
+        rpc, lacking, error = correction_of(rpc, sample)
+        write_correction(lacking, rpc, place / (view.name + CORRECTION), overwrite=True)
+    except (RpcError, FitError) as failure:
+        raise OutputError(f"{view.name}: no grid can be made of its camera: {failure}") from failure
+    errors[view.name + CORRECTION] = error
+    if files.resampled:
+        errors[view.name + RESAMPLED] = error
+        write_resampled(rpc, lacking, view.path, place / (view.name + RESAMPLED), overwrite=True)
+    return errors
+
+
+def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, float]:
+    """An RPC and what it lacks, and by how much both together miss the camera of a sample [px].
+
+    What `rpc` lacks may depend on the altitude: the best RPC of all trades denominators, which see altitudes, for what
+    changes with the rows. Then another one serves better here, though it misses by more.
+    """
+    model, size, alts = sample.model, sample.size, sample.alt_range
+    best: tuple[RPC, CorrectionGrid, float] | None = None
+    failed: RpcError | FitError | None = None
+    methods: tuple[Literal["vendor-denominators", "ridge"] | None, ...] = None, "vendor-denominators", "ridge"
+    for method in methods:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", BarpcWarning)  # the fit of the RPC has said it
+                how = FitOptions(method=method or "auto")
+                one = rpc if method is None else fit_rpc(model, size, alts, options=how, strict=False).rpc
+            one = replace(one, err_bias=rpc.err_bias, err_rand=rpc.err_rand)
+            lacking = CorrectionGrid.between(one, model, size, float(np.mean(alts)))
+        except (RpcError, FitError) as error:
+            failed = error
+            continue
+        found = one, lacking, _off(sample, one, lacking)
+        best = found if best is None or found[2] < best[2] else best
+        if best[2] <= LINEAR:
+            break
+    if best is None:
+        assert failed is not None
+        raise failed
+    return best
+
+
+def _off(sample: Sample, camera: RPC | DirectGrid, lacking: CorrectionGrid | None = None) -> float:
+    """The largest distance [px] of a camera, and what it lacks, to the model of a sample."""
+
+    def off(ground: Array, at: Array) -> Array:
+        image = camera.project(ground)
+        return (image if lacking is None else lacking.apply(image)) - at[:, :2]
+
+    return float(np.linalg.norm(sample.sought(off)[1]))
+
+
+def verify_grids(view: View, model: SensorModel, errors: Mapping[str, float], folder: str) -> Written:
+    """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads more than their errors."""
+    sample, written = Sample.of(model, view.size, widened(view.alt_range)), Written()
+    for name, error in errors.items():
+        path, lacking = Path(folder) / name, None
+        if name.endswith(RESAMPLED):
+            lacking = read_correction(Path(folder) / (view.name + CORRECTION))[1]
+        readings = verify_grid(path, sample, lacking)
+        for reading in readings:
+            if reading.consumer in ("barpc", "gdal") and not reading.max_error <= 2 * error + REOPENED:
+                raise OutputError(
+                    f"{path}: {reading.consumer} reads it {reading.max_error:.3g} px off ({reading.note}); "
+                    "is the disk full, or another RPC file beside it?"
+                )
+        written[name] = {one.consumer: one.note or one.max_error for one in readings}
+        if not error <= MISFIT:
+            logger.warning("%s: misses the camera by up to %.3g px", path, error)
+    return written
+
+
+# --- tiles ------------------------------------------------------------------------------------------------
+
+
+def tile_boxes(size: tuple[int, int], side: int) -> list[Box]:
+    """Tiles (col, row, width, height) from multiples of `side` on; a rest narrower than half joins its neighbour."""
+    edges = [[*range(0, max(1, length - side // 2), side), length] for length in size]
+    return [(c, r, right - c, low - r) for r, low in pairwise(edges[1]) for c, right in pairwise(edges[0])]
+
+
+def tile_name(view: View, box: Box) -> str:
+    """The file with the RPC of a tile: its first row and column."""
+    return f"{view.name}_tiles/{box[1]:05d}_{box[0]:05d}_RPC.TXT"
+
+
+def _write_tiles(
+    run: Workspace,
+    view: View,
+    fit: RpcFit,
+    model: SensorModel,
+    options: RunOptions,
+    executor: Executor | None,
+) -> Written:
+    """An RPC for each tile, in the tile's own pixels, and a list of them."""
+    assert options.tiles is not None
+    boxes, rows = tile_boxes(view.size, options.tiles), list[dict[str, Any]]()
+    alts = widened(view.alt_range)
+    tasks = [
+        (model, tuple(boxes[at : at + _GROUP]), alts, options.fit) for at in range(0, len(boxes), _GROUP)
+    ]
+    with CachingExecutor(run, {}, executor) as caching:
+        fits = [one for group in ordered(caching, fit_tiles, tasks, "tiles") for one in group]
+    for box, tile in zip(boxes, fits, strict=True):
+        known = replace(tile.rpc, err_bias=fit.rpc.err_bias, err_rand=fit.rpc.err_rand)
+        with run.output(tile_name(view, box)) as partial:
+            write_rpc(known, partial, format="txt", overwrite=True)
+            error = float(np.linalg.norm(tile.as_written(read_rpc(partial)).max_ckp))
+        rows.append({"file": tile_name(view, box), **dict(zip(_BOX, box, strict=True)), "max_px": error})
+    worst = max(row["max_px"] for row in rows)
+    if not worst <= LINEAR:
+        logger.warning("%s: tiles of %d px miss the camera by up to %.3g px", view.name, options.tiles, worst)
+    text = ",\n".join(map(json.dumps, rows))
+    head = json.dumps({"image": view.path, "size": view.size, "alt_range_m": alts})[1:-1]
+    run.write_text(view.name + TILES, f'{{{head}, "tiles": [\n{text}\n]}}\n')
+    return {view.name + TILES: {"barpc": worst}}
+
+
+def fit_tiles(
+    model: SensorModel, boxes: Sequence[Box], alt_range: tuple[float, float], options: FitOptions
+) -> list[RpcFit]:
+    """The RPCs of some tiles of a camera, whose images begin at their first pixels."""
+    fits = []
+    for col, row, *size in boxes:
+        tile = ImageCorrected(model, ImageAffine(-np.array([col, row], dtype=np.float64), np.zeros((2, 2))))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", BarpcWarning)  # the fit of the RPC has said it
+            fits.append(fit_rpc(tile, (size[0], size[1]), alt_range, options=options, strict=False))
+    return fits

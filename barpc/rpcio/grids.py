@@ -1,0 +1,108 @@
+"""Cameras that no RPC holds, as small GeoTIFFs: localisation grids with altitude layers, and what an RPC lacks.
+
+A localisation grid is laid out as CARS (shareloc) reads it: bands lon, lat of each layer, their altitudes in the tags
+``ALTITUDE_Bn``, nodes where the geotransform puts the corners of the pixels. A correction grid holds dcol and drow;
+its nodes are the centres of its pixels, as GDAL sees them, and its RPC tag is the RPC that they are added to.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from barpc.atomic import replacing
+from barpc.errors import RpcError, RpcFormatError
+from barpc.geodesy import Array
+from barpc.raster import open_raster
+from barpc.remote import Place
+from barpc.rpcio.tiff import printable, put_tag, read_tag
+from barpc.sensor.correction_grid import CorrectionGrid
+from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.rpc import RPC
+from barpc.sidefile import Kind
+
+GRID, CORRECTION = "_grid.tif", "_correction.tif"
+"""Ends of the names of localisation and correction grids."""
+
+SIGN = "image point = that of the RPC in this file + (dcol, drow)"
+_TIFF: dict[str, Any] = {"driver": "GTiff", "COMPRESS": "DEFLATE", "PREDICTOR": 3}
+_EVEN = 1e-6  # of a step: how far nodes may be off
+_TABLE = Kind("a correction grid", 1 << 30, RpcFormatError)
+
+
+def write_grid(grid: DirectGrid, path: Path | str, *, overwrite: bool = False) -> None:
+    """Write a localisation grid, which `barpc.cameras.open_camera`, CARS and shareloc read.
+
+    RpcError where its nodes are not evenly spaced.
+    """
+    origin, steps = _even(grid.cols, grid.rows)
+    layers = np.moveaxis(grid.lonlat, -1, 1).reshape(-1, *grid.lonlat.shape[1:3])
+    tags = {f"ALTITUDE_B{i}": repr(float(grid.alts[i // 2])) for i in range(len(layers))}
+    with replacing(path, overwrite=overwrite) as partial:
+        _write(partial, layers, origin, steps, {"REF": "EPSG:4326", **tags})
+
+
+def write_correction(grid: CorrectionGrid, rpc: RPC, path: Path | str, *, overwrite: bool = False) -> None:
+    """Write what is added to the image points of `rpc`; RpcError where its nodes are not evenly spaced."""
+    origin, steps = _even(grid.cols, grid.rows)
+    layers = np.moveaxis(grid.shift, -1, 0).astype(np.float32)
+    with replacing(path, overwrite=overwrite) as partial:
+        _write(partial, layers, origin - steps / 2, steps, {"CORRECTION": SIGN}, ("dcol", "drow"))
+        put_tag(partial, printable(rpc))
+
+
+def read_correction(path: Place) -> tuple[RPC, CorrectionGrid]:
+    """The RPC and the displacements of a correction grid; RpcFormatError where the file is none."""
+    with open_raster(path) as dataset:
+        _TABLE.check(f"{path}, read", 4 * dataset.count * dataset.width * dataset.height)
+        if dataset.count != 2 or dataset.tags().get("CORRECTION") != SIGN:
+            raise RpcFormatError(f"{path}: no correction grid: it lacks the tag CORRECTION or its two bands")
+        shift = np.moveaxis(dataset.read(), 0, -1).astype(np.float64)
+        a, b, c, d, e, f = dataset.transform[:6]
+        shape = dataset.shape
+    rpc = read_tag(path)
+    if rpc is None or b or d:
+        raise RpcFormatError(f"{path}: a correction grid without its RPC, or one that is turned")
+    cols, rows = (
+        x + step * (np.arange(n) + 0.5) - 0.5 for x, step, n in ((c, a, shape[1]), (f, e, shape[0]))
+    )
+    try:
+        return rpc, CorrectionGrid(cols, rows, shift)
+    except RpcError as error:
+        raise RpcFormatError(f"{path}: {error}") from error
+
+
+def _even(cols: Array, rows: Array) -> tuple[Array, Array]:
+    """First node (2,), from the corner of the first pixel, and steps (2,) [px]."""
+    steps = np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (cols, rows)])
+    for axis, step in zip((cols, rows), steps, strict=True):
+        if np.abs(np.diff(axis) - step).max() > _EVEN * step:
+            raise RpcError("a grid whose nodes are not evenly spaced is not written")
+    return np.array([cols[0], rows[0]]) + 0.5, steps
+
+
+def _write(
+    path: Path,
+    layers: npt.NDArray[Any],
+    origin: Array,
+    steps: Array,
+    tags: Mapping[str, str],
+    names: Sequence[str] = (),
+) -> None:
+    profile = {**_TIFF, "count": len(layers), "dtype": layers.dtype.name}
+    profile |= {"height": layers.shape[1], "width": layers.shape[2]}
+    profile["transform"] = rasterio.Affine(steps[0], 0.0, origin[0], 0.0, steps[1], origin[1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", **profile) as dataset:
+            dataset.write(layers)
+            dataset.update_tags(**tags)
+            for band, name in enumerate(names, start=1):
+                dataset.set_band_description(band, name)
