@@ -18,7 +18,9 @@ from barpc.pointio.ground import Correspondences, correspondence_kind, read_corr
 from barpc.raster import driver_of, open_raster
 from barpc.remote import Place, located, place
 from barpc.rpcio import read_rpc_source
+from barpc.rpcio.grids import SIGN, read_correction
 from barpc.sensor import SensorModel
+from barpc.sensor.correction_grid import GridCorrected
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
@@ -221,6 +223,15 @@ def _open_grid(path: Place, altitudes: list[float] | None = None) -> Camera:
     return Camera(grid, path, "grid", size, (float(grid.alts[0]), float(grid.alts[-1])))
 
 
+def _open_correction(path: Place) -> Camera:
+    rpc, lacking = read_correction(path)
+    size = (
+        int(lacking.cols[-1]) + 1,
+        int(lacking.rows[-1]) + 1,
+    )  # its nodes go from corner to corner of the image
+    return Camera(GridCorrected(rpc, lacking), path, "correction", size, altitude_range(rpc))
+
+
 def _numbers(text: str) -> list[float]:
     return [float(part) for part in text.split(":")]
 
@@ -233,6 +244,9 @@ OPENERS: dict[str, Opener] = {
     ),
     "sicd": Opener(_is_sicd, _open_sicd),
     "grid": Opener(_is_grid, _open_grid, {"altitudes": _numbers}),
+    "correction": Opener(
+        lambda _path, head, _choices: driver_of(head) == "GTiff" and SIGN.encode() in head, _open_correction
+    ),
     "sentinel-1": Opener(
         _is_sentinel1,
         _open_sentinel1,

@@ -6,6 +6,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -13,8 +14,11 @@ import numpy as np
 
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.terminal import as_json, echo, say, tell_gate
-from barpc.errors import InputError, OutputError
-from barpc.handoff import TOLERANCE, Reading, refuse_hiding, unverified, verify
+from barpc.errors import FitError, InputError, OutputError
+from barpc.fit import FitOptions, fit_rpc
+from barpc.fit.certificate import Sample
+from barpc.fit.points import widened
+from barpc.handoff import TOLERANCE, Reading, refuse_hiding, unverified, verify, verify_grid
 from barpc.raster import open_raster
 from barpc.rpcio import (
     CARRIERS,
@@ -29,6 +33,8 @@ from barpc.rpcio import (
     write_crop,
     write_rpc,
 )
+from barpc.rpcio.grids import GRID, write_grid
+from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
@@ -73,7 +79,8 @@ def convert(
 ) -> int:
     r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.
 
-    TARGET ends as --rpc-format says (xml is Maxar's, json rpcm's); .vrt, .tif and .ntf carry the image, too. With
+    TARGET ends as --rpc-format says (xml is Maxar's, json rpcm's); .vrt, .tif and .ntf carry the image, too;
+    _grid.tif is a localisation grid. A SOURCE that is a grid goes into an RPC where one holds it. With
     --window or --bbox the GeoTIFF TARGET is a part of the image, with the RPC of exactly that part. With -o images get
     their RPCs, or those of --rpc, in a new folder; every file is then opened as GDAL, rpcm and others do, and what
     lies beside an image and would hide an RPC put into it is named. Images stay as they are.
@@ -94,6 +101,16 @@ def convert(
         raise click.UsageError("give SOURCE and TARGET, or images and -o DIR (with it: --rpc, --images)")
     source, target = files
     camera, image, cut = open_camera(source), Path(split_spec(source)[0]), bool(window or bbox)
+    if target.endswith(GRID) and not cut:
+        check_target(target, [image, camera.path], overwrite)
+        return _as_grid(camera, target, overwrite, as_json)
+    if camera.format in ("grid", "correction"):
+        options = FitOptions()
+        fit = fit_rpc(camera.model, camera.extent, camera.alt_range, options=options, strict=False)
+        if wrong := fit.verdict(options.tolerance):
+            raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
+        say(f"{camera.path}: {camera.format}, fitted to {float(fit.max_ckp.max()):.1g} px")
+        camera = replace(camera, model=fit.rpc)
     check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
     if cut:
         window = _window(camera, window, bbox, alt)
@@ -128,6 +145,16 @@ def _copy(
         "another RPC file beside it",
         [],
     )
+
+
+def _as_grid(camera: Camera, target: str, overwrite: bool, as_json: bool) -> int:
+    """Write a camera as a localisation grid, and say what linear interpolation in it is off by."""
+    alts = widened(camera.alt_range)
+    write_grid(DirectGrid.of(camera.model, camera.extent, alts), target, overwrite=overwrite)
+    readings = verify_grid(Path(target), Sample.of(camera.model, camera.extent, alts))
+    _tell(readings, as_json)
+    off = [f"{one.consumer}: {one.note or one.max_error}" for one in readings if not one.max_error <= LINEAR]
+    return tell_gate(f"{target} does not hold the camera to {LINEAR:g} px", off) if off else 0
 
 
 def check_target(

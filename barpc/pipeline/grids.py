@@ -245,7 +245,7 @@ def _write_tiles(
     if not worst <= LINEAR:
         logger.warning("%s: tiles of %d px miss the camera by up to %.3g px", view.name, options.tiles, worst)
     text = ",\n".join(map(json.dumps, rows))
-    head = json.dumps({"image": view.path, "size": view.size, "alt_range_m": alts})[1:-1]
+    head = json.dumps({"image": view.name, "size": view.size, "alt_range_m": alts})[1:-1]
     run.write_text(view.name + TILES, f'{{{head}, "tiles": [\n{text}\n]}}\n')
     return {view.name + TILES: {"barpc": worst}}
 

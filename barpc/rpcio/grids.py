@@ -102,7 +102,7 @@ def _write(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(path, "w", **profile) as dataset:
-            dataset.write(layers)
-            dataset.update_tags(**tags)
+            dataset.update_tags(**tags)  # before the values: in front of them
             for band, name in enumerate(names, start=1):
                 dataset.set_band_description(band, name)
+            dataset.write(layers)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -14,6 +14,8 @@ from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import LINEAR, linear_axes
 
 _LONGEST = 1024.0  # px, from node to node
+_STEPS = 12  # displacements change by thousandths of a pixel a pixel: each step gains two digits
+_SETTLED = 1e-9  # px
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +31,15 @@ class CorrectionGrid(Frozen):
     cols: Array
     rows: Array
     shift: Array
+    _linear: RegularGridInterpolator = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("cols", "rows"):
             axis = self._array(name, (None,), RpcError)
             if len(axis) < 2 or not (np.diff(axis) > 0).all():
                 raise RpcError(f"correction grid: {name} must ascend")
-        self._array("shift", (len(self.rows), len(self.cols), 2), RpcError)
+        shift = self._array("shift", (len(self.rows), len(self.cols), 2), RpcError)
+        self._keep("_linear", RegularGridInterpolator((self.rows, self.cols), shift))
 
     @classmethod
     def between(
@@ -61,10 +65,46 @@ class CorrectionGrid(Frozen):
 
     def at(self, image: Array) -> Array:
         """Displacements (..., 2) [px] at image points (..., 2) [px] of the RPC; NaN at NaN."""
-        ends = np.array([(axis[0], axis[-1]) for axis in (self.cols, self.rows)]).T
-        inside = np.clip(image, *ends)[..., ::-1]
-        return np.asarray(RegularGridInterpolator((self.rows, self.cols), self.shift)(inside))
+        low, high = np.array([(axis[0], axis[-1]) for axis in (self.cols, self.rows)]).T
+        inside = np.clip(image, low, high)[..., ::-1]
+        return np.asarray(self._linear(inside)).reshape(inside.shape)
+
+    def slope(self, image: Array) -> Array:
+        """Derivative (..., 2, 2) of the displacements by col, row, over a tenth of a cell around image points."""
+        reach = 0.05 * np.array([self.cols[1] - self.cols[0], self.rows[1] - self.rows[0]])
+        by_axis = [
+            (self.at(image + step) - self.at(image - step)) / step.sum() for step in 2 * np.diag(reach)
+        ]
+        return np.stack(by_axis, axis=-1) / 2
 
     def apply(self, image: Array) -> Array:
         """True image points (..., 2) [px] of those of the RPC (..., 2) [px]."""
         return np.asarray(image + self.at(image))
+
+
+@dataclass(frozen=True)
+class GridCorrected:
+    """`sensor`, an RPC, and what it lacks; itself a `SensorModel`."""
+
+    sensor: SensorModel
+    correction: CorrectionGrid  # what is added to its image points
+
+    def project(self, ground: Array) -> Array:
+        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        return self.correction.apply(self.sensor.project(ground))
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        image, jacobian = self.sensor.project_jacobian(ground)
+        return self.correction.apply(image), (np.eye(2) + self.correction.slope(image)) @ jacobian
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]."""
+        image = np.asarray(image, dtype=np.float64)
+        of_rpc = image
+        for _ in range(_STEPS):
+            before, of_rpc = of_rpc, image - self.correction.at(of_rpc)
+            change = np.abs(of_rpc - before)
+            if not (change.max(initial=0.0, where=np.isfinite(change)) > _SETTLED):
+                break
+        return self.sensor.localize(of_rpc, alt)
