@@ -336,7 +336,7 @@ def _gdal_correction(path: Path) -> Projection:
     with rasterio.open(path) as dataset:
         cols = np.array(dataset.xy(np.zeros(dataset.width), np.arange(dataset.width))[0]) - 0.5
         rows = np.array(dataset.xy(np.arange(dataset.height), np.zeros(dataset.height))[1]) - 0.5
-        shift = RegularGridInterpolator((rows, cols), np.moveaxis(dataset.read(), 0, -1))
+        shift = RegularGridInterpolator((rows, cols), np.moveaxis(dataset.read(), 0, -1), bounds_error=False)
     ends = np.array([(rows[0], cols[0]), (rows[-1], cols[-1])])
 
     def project(ground: Array) -> Array:

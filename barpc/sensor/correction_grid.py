@@ -39,7 +39,7 @@ class CorrectionGrid(Frozen):
             if len(axis) < 2 or not (np.diff(axis) > 0).all():
                 raise RpcError(f"correction grid: {name} must ascend")
         shift = self._array("shift", (len(self.rows), len(self.cols), 2), RpcError)
-        self._keep("_linear", RegularGridInterpolator((self.rows, self.cols), shift))
+        self._keep("_linear", RegularGridInterpolator((self.rows, self.cols), shift, bounds_error=False))
 
     @classmethod
     def between(

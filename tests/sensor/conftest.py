@@ -13,6 +13,7 @@ import pytest
 from barpc.geodesy import ecef_from_ground
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
+from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
@@ -79,6 +80,14 @@ def _grid(lon: float) -> DirectGrid:
     return DirectGrid(cols, rows, alts, _pushbroom(lon).localize(nodes, alts[:, None, None])[..., :2])
 
 
+def _lacking() -> CorrectionGrid:
+    """Displacements that grow evenly, so that they have one slope all over the image."""
+    cols, rows = np.linspace(-2000.0, 22000.0, 9), np.linspace(-2000.0, 21000.0, 5)
+    col, row = np.meshgrid(cols, rows)
+    shift = np.stack([2.0 + 1e-4 * col - 2e-4 * row, -3.0 + 3e-4 * col + 1e-4 * row], axis=-1)
+    return CorrectionGrid(cols, rows, shift)
+
+
 MODELS: dict[str, Callable[[], Case]] = {
     "rpc": lambda: Case(make_rpc(), (20000, 19000), (0.0, 1000.0)),
     "rpc across the antimeridian": lambda: Case(make_rpc(lon=179.98), (20000, 19000), (0.0, 1000.0)),
@@ -99,6 +108,9 @@ MODELS: dict[str, Callable[[], Case]] = {
         ImageCorrected(make_rpc(), ImageAffine([3.0, -4.0], [[1e-4, 2e-4], [-1e-4, 3e-4]])),
         (20000, 19000),
         (0.0, 1000.0),
+    ),
+    "rpc and what it lacks": lambda: Case(
+        GridCorrected(make_rpc(), _lacking()), (20000, 19000), (0.0, 1000.0)
     ),
     "pushbroom": lambda: Case(_pushbroom(5.4), (20000, 19000), (0.0, 1000.0)),
     "pushbroom across the antimeridian": lambda: Case(_pushbroom(180.0), (20000, 19000), (0.0, 1000.0)),
