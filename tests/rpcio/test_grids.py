@@ -74,9 +74,8 @@ def test_shareloc_localises_with_the_grid(folder, camera):
     linear = RegularGridInterpolator((grid.alts, grid.rows, grid.cols), grid.lonlat)
     lonlat = linear(np.column_stack([ground[:, 2], image[:, ::-1]]))
     assert np.abs((found[:, :2] - lonlat) * metres_per_unit(ground)[:, :2]).max() < 1e-3
-    row, col, _ = model.inverse_loc(
-        *np.ascontiguousarray(ground[:20].T)
-    )  # needs the predictor to have been made
+    model.estimate_inverse_loc_predictor()
+    row, col, _ = model.inverse_loc(*np.ascontiguousarray(ground[:20].T))
     back = np.column_stack([col, row]) - 0.5
     assert np.linalg.norm(back - image[:20], axis=1).max() < 0.01
 
