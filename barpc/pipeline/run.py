@@ -440,7 +440,8 @@ def _written(
     assert run.adjustment is not None
     fitted = list(zip(run.views, run.fits, run.adjustment.sensors, strict=True))
     written = write_views(workspace, fitted, options.images, options.rpc_formats, executor, progress)
-    for sentence in unverified([workspace.folder / name for name in written[0]]):
-        logger.warning(sentence)
     beyond = write_grids(workspace, fitted, options, executor, progress)
+    names = [*written[0], *(name for one in beyond for name in one)]
+    for sentence in unverified([workspace.folder / name for name in names]):
+        logger.warning(sentence)
     return replace(run, written=tuple({**one, **more} for one, more in zip(written, beyond, strict=True)))
