@@ -15,11 +15,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.errors import BarpcWarning, FitError, OutputError, RpcError
+from barpc.errors import BarpcError, BarpcWarning, FitError, OutputError, RpcError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
-from barpc.geodesy import Array
 from barpc.handoff import verify_grid
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.executor import CachingExecutor
@@ -29,7 +28,7 @@ from barpc.rpcio.resample import write_resampled
 from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import ImageAffine, ImageCorrected
-from barpc.sensor.correction_grid import CorrectionGrid
+from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
@@ -130,7 +129,7 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str
     try:
         if files.grids:
             grid = DirectGrid.of(model, view.size, alts)
-            errors[view.name + GRID] = _off(sample, grid)
+            errors[view.name + GRID] = _off(sample, grid)[1]
             write_grid(grid, place / (view.name + GRID), overwrite=True)
         rpc, lacking, error = correction_of(rpc, sample)
         write_correction(lacking, rpc, place / (view.name + CORRECTION), overwrite=True)
@@ -150,8 +149,8 @@ def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, float]
     changes with the rows. Then another one serves better here, though it misses by more.
     """
     model, size, alts = sample.model, sample.size, sample.alt_range
-    best: tuple[RPC, CorrectionGrid, float] | None = None
-    failed: RpcError | FitError | None = None
+    found: list[tuple[float, float, RPC, CorrectionGrid]] = []
+    failed: BarpcError | None = None
     methods: tuple[Literal["vendor-denominators", "ridge"] | None, ...] = None, "vendor-denominators", "ridge"
     for method in methods:
         try:
@@ -159,29 +158,26 @@ def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, float]
                 warnings.simplefilter("ignore", BarpcWarning)  # the fit of the RPC has said it
                 how = FitOptions(method=method or "auto")
                 one = rpc if method is None else fit_rpc(model, size, alts, options=how, strict=False).rpc
-            one = replace(one, err_bias=rpc.err_bias, err_rand=rpc.err_rand)
             lacking = CorrectionGrid.between(one, model, size, float(np.mean(alts)))
         except (RpcError, FitError) as error:
             failed = error
             continue
-        found = one, lacking, _off(sample, one, lacking)
-        best = found if best is None or found[2] < best[2] else best
-        if best[2] <= LINEAR:
+        found.append((*_off(sample, GridCorrected(one, lacking)), one, lacking))
+        if found[-1][1] <= LINEAR:
             break
-    if best is None:
+    if not found:
         assert failed is not None
         raise failed
-    return best
+    _, largest, best, lacking = min(
+        found, key=lambda row: row[0]
+    )  # the largest may be one of a step, in all of them
+    return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, largest
 
 
-def _off(sample: Sample, camera: RPC | DirectGrid, lacking: CorrectionGrid | None = None) -> float:
-    """The largest distance [px] of a camera, and what it lacks, to the model of a sample."""
-
-    def off(ground: Array, at: Array) -> Array:
-        image = camera.project(ground)
-        return (image if lacking is None else lacking.apply(image)) - at[:, :2]
-
-    return float(np.linalg.norm(sample.sought(off)[1]))
+def _off(sample: Sample, camera: SensorModel) -> tuple[float, float]:
+    """RMS and largest distance [px] of a camera to the model of a sample."""
+    errors, largest = sample.sought(lambda ground, at: camera.project(ground) - at[:, :2])
+    return float(np.linalg.norm(errors.rmse)), float(np.linalg.norm(largest))
 
 
 def verify_grids(view: View, model: SensorModel, errors: Mapping[str, float], folder: str) -> Written:

@@ -33,6 +33,7 @@ GRID, CORRECTION = "_grid.tif", "_correction.tif"
 
 SIGN = "image point = that of the RPC in this file + (dcol, drow)"
 _TIFF: dict[str, Any] = {"driver": "GTiff", "COMPRESS": "DEFLATE", "PREDICTOR": 3}
+_FAR = 1e9  # px
 _EVEN = 1e-6  # of a step: how far nodes may be off
 _TABLE = Kind("a correction grid", 1 << 30, RpcFormatError)
 
@@ -64,15 +65,17 @@ def read_correction(path: Place) -> tuple[RPC, CorrectionGrid]:
         _TABLE.check(f"{path}, read", 4 * dataset.count * dataset.width * dataset.height)
         if dataset.count != 2 or dataset.tags().get("CORRECTION") != SIGN:
             raise RpcFormatError(f"{path}: no correction grid: it lacks the tag CORRECTION or its two bands")
-        shift = np.moveaxis(dataset.read(), 0, -1).astype(np.float64)
+        shift = np.moveaxis(np.real(dataset.read()), 0, -1).astype(np.float64)
         a, b, c, d, e, f = dataset.transform[:6]
         shape = dataset.shape
     rpc = read_tag(path)
     if rpc is None or b or d:
         raise RpcFormatError(f"{path}: a correction grid without its RPC, or one that is turned")
-    cols, rows = (
-        x + step * (np.arange(n) + 0.5) - 0.5 for x, step, n in ((c, a, shape[1]), (f, e, shape[0]))
-    )
+    with np.errstate(all="ignore"):
+        cols = c + a * (np.arange(shape[1]) + 0.5) - 0.5
+        rows = f + e * (np.arange(shape[0]) + 0.5) - 0.5
+    if not all((np.abs(axis) <= _FAR).all() for axis in (cols, rows, shift)):
+        raise RpcFormatError(f"{path}: a node of it is no image point, or has no displacement")
     try:
         return rpc, CorrectionGrid(cols, rows, shift)
     except RpcError as error:

@@ -19,6 +19,7 @@ import rasterio
 from barpc.ba import BlockPrior
 from barpc.ba.incremental import apply_prior
 from barpc.ba.priors import CameraPrior
+from barpc.cameras import open_camera
 from barpc.cli.options import image_paths
 from barpc.cli.points import read_points
 from barpc.cli.terminal import print_comparison
@@ -34,7 +35,9 @@ from barpc.report.page import report_html
 from barpc.report.tables import read_summary
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.fields import ReadOptions
+from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.text import decode
+from barpc.rpcio.tiff import put_tag
 from barpc.scene import View
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.sentinel1 import open_product
@@ -218,6 +221,26 @@ def _use_grid(path: Path) -> object:
         return DirectGrid.from_points(points.ground, points.image).project(points.ground[:5])
     except RpcError:  # points that are no full grid are a table still
         return None
+
+
+def _correction(transform: rasterio.Affine | None = None, rng: np.random.Generator | None = None) -> bytes:
+    shift = np.zeros((2, 3, 4), np.float32 if rng is None else rng.choice(["float32", "complex64", "int16"]))
+    tags = {"CORRECTION": SIGN}
+    if rng is not None:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            shift.flat[int(rng.integers(shift.size))] = np.nan_to_num(rng.choice(BENT)).astype(shift.dtype)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.tif"
+        path.write_bytes(_raster(shift, transform or rasterio.Affine(100, 0, -50, 0, 90, -45), tags))
+        put_tag(path, make_rpc())
+        return path.read_bytes()
+
+
+def _use_correction(path: Path) -> object:
+    read_correction(path)
+    camera = open_camera(path)
+    return camera.model.localize(np.array([[1.0, 2.0]]), np.array([camera.altitude])) if camera.size else None
 
 
 def _gtx() -> bytes:
@@ -468,6 +491,13 @@ SAMPLES: dict[str, Sample] = {
     "geoid gtx": Sample("geoid.gtx", _use_dem, _gtx, (mutate_header,)),
     "grid": Sample(
         "nodes.tif", _use_grid, _localisation, (_mutate_transform(_localisation), mutate_header), share=0.2
+    ),
+    "correction": Sample(
+        "a_correction.tif",
+        _use_correction,
+        _correction,
+        (_mutate_transform(_correction), mutate_header),
+        share=0.2,
     ),
     "prior": Sample("block.npz", _use_prior, _prior, (mutate_npz,)),
     "record": Sample(

@@ -150,7 +150,9 @@ def test_a_file_that_cannot_be_read_is_named_with_its_reason(sample, tmp_path):
 def test_only_tools_that_are_not_installed_are_missed(folder, monkeypatch):
     monkeypatch.setattr("barpc.handoff._is_installed", lambda package: package != "shareloc")
     (sentence,) = unverified([folder / f"a{GRID}"])
-    assert sentence.endswith("a_grid.tif: only barpc itself has read it (.tif: shareloc would, and is not installed)")
+    assert sentence.endswith(
+        "a_grid.tif: only barpc itself has read it (.tif: shareloc would, and is not installed)"
+    )
     assert unverified([folder / f"a{CORRECTION}"]) == []  # GDAL has
 
 
