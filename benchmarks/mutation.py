@@ -40,10 +40,10 @@ import shapely  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[1]
 TOML = Path(__file__).with_suffix(".toml")
-GATE = ("barpc/pipeline/outputs.py", "barpc/handoff.py")
+GATE = ("barpc/pipeline/outputs.py", "barpc/pipeline/grids.py", "barpc/handoff.py")
 TESTS = {
     **{name: f"tests/{name}/test_*.py" for name in ("ba", "fit", "tie", "sensor", "rpcio")},
-    "gate": "tests/*/test_outputs.py tests/test_handoff.py",
+    "gate": "tests/*/test_outputs.py tests/pipeline/test_grids.py tests/test_handoff.py",
 }
 """Part of the core -> its tests."""
 SLOW = ("test_real_images.py", "test_simulated.py", "test_sentinel1_example.py")

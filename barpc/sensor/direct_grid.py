@@ -29,7 +29,7 @@ _SETTLED = 1e-5  # px: what is left after a step of this size is below rounding
 _SHRINK = 1e-4  # of a step to the next: more asks for new derivatives
 
 _LONGEST = 1024.0, 1024.0, 1000.0  # px, px, m: from node to node of a grid made here
-_CELLS = 1024  # along an axis, at most
+_FEWEST, _CELLS = 3, 1024  # cells along an axis; splines are cubic from three on
 _NODES = 4_000_000  # of a grid made here, at most
 _TRIED = 1000  # cells
 
@@ -234,7 +234,7 @@ def linear_axes(
     value : callable, points (N, d) -> values (N, k), in the unit of `tolerance`
     longest : (d,), cells at the beginning; they are made smaller until the errors of all axes add up to `tolerance`
     """
-    counts = np.maximum(1, np.ceil((high - low) / longest)).astype(np.int64)
+    counts = np.maximum(_FEWEST, np.ceil((high - low) / longest)).astype(np.int64)
     for axis in range(len(low)):
         rng, along = np.random.default_rng(axis), np.eye(len(low))[axis]
         while True:

@@ -163,6 +163,15 @@ def test_nodata_stays_nodata_where_it_is_and_comes_nowhere_else(tmp_path, dtype,
     assert np.abs(inside / top - truth[60:98, 5:-5])[:-3].max() < 0.02
 
 
+@pytest.mark.parametrize(("shift", "lost"), [(0.4, 0), (0.6, 1)])
+def test_an_image_ends_half_a_pixel_beyond_its_last_centre(tmp_path, shift, lost):
+    image = raster(tmp_path / "a.tif", np.full((1, *SIZE[::-1]), 7, np.uint8), nodata=0)
+    write_resampled(make_rpc(), grid(lambda c, r: shift, lambda c, r: -shift), image, tmp_path / "b.tif")
+    known = pixels(tmp_path / "b.tif")[0] == 7
+    assert known[lost:, : SIZE[0] - lost].all()
+    assert known.sum() == (SIZE[0] - lost) * (SIZE[1] - lost)
+
+
 def test_a_mask_and_an_alpha_band_go_along(tmp_path):
     data = seen(200.0, "uint8")
     mask = np.full(SIZE[::-1], 255, np.uint8)

@@ -98,6 +98,15 @@ def test_a_localisation_grid_is_the_camera_for_those_who_interpolate_linearly(pe
     assert grid.lonlat.nbytes < 8e6
 
 
+def test_a_grid_of_a_narrow_image_is_inverted_everywhere():
+    """One cell would do for linear interpolation, but splines through two nodes do not find every point again."""
+    camera, size, alts = scene(400.0, 0.5, (240, 1200), (180.0, 280.0)), (240, 1200), (180.0, 280.0)
+    rng = np.random.default_rng(1)
+    image = rng.uniform(-0.5, np.array(size) - 0.5, (3000, 2))
+    ground = camera.localize(image, rng.uniform(*alts, 3000))
+    assert np.abs(DirectGrid.of(camera, size, alts).project(ground) - image).max() < 1e-3
+
+
 def test_a_looser_promise_takes_fewer_nodes(camera):
     fine, coarse = (DirectGrid.of(camera, SIZE, ALTS, tolerance).lonlat.size for tolerance in (0.005, 0.05))
     assert 10 * coarse < fine

@@ -1,0 +1,164 @@
+"""Stripes in surface models by jitter, and which file of a camera takes them away.
+
+Two strips of a scene with relief and houses are rendered through pushbroom cameras that swing while they scan, +-12
+degrees along the flight. Both images are orthorectified onto the true ground with each kind of camera file, and
+what is left between them is measured window by window in the pixels: along the flight it is a height (a stripe), across
+what stereo matchers call vertical parallax. The cameras are the true ones: what an adjustment knows of them is not the
+question here, only what files hold.
+
+    python benchmarks/stripes.py [--rows 4000] [--period 1200] [--pixels 0.5]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+from scipy import ndimage
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests, where barpc is installed as a package
+
+from barpc.cameras import open_camera
+from barpc.fit import fit_rpc
+from barpc.options import RunOptions
+from barpc.pipeline.grids import tile_boxes, write_grids
+from barpc.rpcio import read_rpc
+from barpc.scene import View
+from barpc.simulate.orbit import Look, fly
+from barpc.workspace import Workspace
+from tests.jitter import Delivered, jittered
+from tests.scenes.render import render
+from tests.scenes.terrain import Plane, make_terrain
+from tests.scenes.texture import Date, make_surfaces
+
+COLS, GSD, ANGLE, WINDOW, EDGE = 240, 0.5, 12.0, 40, 30
+TARGET = np.array([5.4, 43.3, 230.0])
+ALTS = (180.0, 280.0)
+TILE = 200
+
+
+class Tiled:
+    """The RPC of its tile for every point, found by another camera."""
+
+    def __init__(self, folder: Path, name: str, size, guide) -> None:
+        self.guide = guide
+        self.tiles = [
+            (box, read_rpc(folder / f"{name}_tiles/{box[1]:05d}_{box[0]:05d}_RPC.TXT"))
+            for box in tile_boxes(size, TILE)
+        ]
+
+    def project(self, ground):
+        """Image points (..., 2) [px]."""
+        at, out = self.guide.project(ground), np.full((*ground.shape[:-1], 2), np.nan)
+        for (col, row, width, height), rpc in self.tiles:
+            inside = ((at >= [col, row]) & (at < [col + width, row + height])).all(axis=-1)
+            out[inside] = rpc.project(ground[inside]) + np.array([col, row])
+        return out
+
+
+def scene(rows: int, period: float, pixels: float):
+    """Views with their RPCs as delivered, true cameras, images, and the ground (H, W, 3) in the middle."""
+    size = (COLS, rows)
+    nadir = fly(TARGET, Look(0.0, 12.0), size, GSD)
+    reach = np.abs(
+        np.array([nadir.localize(np.array([c, r]), np.array(230.0)) for c in (0, COLS) for r in (0, rows)])
+    )
+    plane = Plane(5.4, 43.3)
+    edge = float(np.abs(plane.xy(reach)).max()) + 60.0
+    rng = np.random.default_rng(5)
+    terrain = make_terrain(rng, plane, (-edge, -edge, edge, edge), 230.0, 30.0, 3.0)
+    surface = make_surfaces(rng, terrain, 0.5, [Date()])[0]
+    middle = render(nadir, size, surface, samples=1).altitude
+    at = np.stack(np.meshgrid(np.arange(COLS), np.arange(rows)), axis=-1).astype(float)
+    ground = nadir.localize(at, np.nan_to_num(middle.astype(float), nan=230.0))
+    shots = []
+    for number, (name, azimuth) in enumerate((("aft", 12.0), ("fore", 192.0))):
+        nominal = fly(TARGET, Look(ANGLE, azimuth), size, GSD)
+        true = jittered(nominal, period * (1.0 + 0.3 * number), pixels)
+        image = ndimage.gaussian_filter(render(true, size, surface).brightness, 0.7)
+        shots.append((name, Delivered(fit_rpc(nominal, size, ALTS).rpc, true), image))
+    return shots, np.where(np.isnan(middle)[..., None], np.nan, ground)
+
+
+def left(images, cameras, ground):
+    """What is left between two orthoimages (N, 2), across and along the flight [px], window by window."""
+    ortho = [
+        ndimage.map_coordinates(image, np.moveaxis(camera.project(ground), -1, 0)[::-1], order=3, cval=np.nan)
+        for image, camera in zip(images, cameras, strict=True)
+    ]
+    drow, dcol = np.gradient((ortho[0] + ortho[1]) / 2)
+    rows = []
+    for top in range(0, len(ground) - WINDOW + 1, WINDOW):
+        part = slice(top, top + WINDOW), slice(EDGE, COLS - EDGE)
+        a, b, c = (v[part].ravel() for v in (dcol, drow, ortho[1] - ortho[0]))
+        known = np.isfinite(a) & np.isfinite(b) & np.isfinite(c)
+        if known.mean() > 0.8:
+            keep = known & (np.abs(c) < 0.1)  # walls that only one of them sees
+            rows.append(np.linalg.lstsq(np.column_stack([a, b])[keep], c[keep], rcond=None)[0])
+    return np.array(rows)
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--rows", type=int, default=4000)
+    parser.add_argument("--period", type=float, default=1200.0, help="of the swing [rows]")
+    parser.add_argument("--pixels", type=float, default=0.5, help="of the swing")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    shots, ground = scene(arguments.rows, arguments.period, arguments.pixels)
+    size, height = (COLS, arguments.rows), GSD / (2 * np.tan(np.radians(ANGLE)))
+    with tempfile.TemporaryDirectory() as folder:
+        place, fitted = Path(folder), []
+        for name, camera, image in shots:
+            path = place / f"{name}.tif"
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                with rasterio.open(path, "w", "GTiff", *size, 1, dtype="float32") as out:
+                    out.write(image.astype(np.float32), 1)
+            view = View(name, str(path), size, camera.sensor, ALTS)
+            fitted.append((view, fit_rpc(camera, size, ALTS, strict=False), camera))
+        with Workspace(place / "out") as run:
+            write_grids(run, fitted, RunOptions(grids=True, tiles=TILE, resample=True))
+        out, images = place / "out", [image for *_, image in shots]
+        resampled = []
+        for name, *_ in shots:
+            with rasterio.open(out / f"{name}_resampled.tif") as dataset:
+                resampled.append(dataset.read(1))
+
+        def files(end):
+            return [open_camera(out / f"{name}{end}").model for name, *_ in shots]
+
+        kinds = {
+            "as delivered": (images, [camera.sensor for _, camera, _ in shots]),
+            "one RPC": (images, [fit.rpc for _, fit, _ in fitted]),
+            "_grid.tif": (images, files("_grid.tif")),
+            "_correction.tif": (images, files("_correction.tif")),
+            "tiles": (images, [Tiled(out, name, size, camera) for name, camera, _ in shots]),
+            "_resampled.tif": (resampled, files("_resampled.tif")),
+            "truth": (images, [camera for _, camera, _ in shots]),
+        }
+        print(
+            f"{'cameras':18}{'across RMS [px]':>17}{'stripes RMS [m]':>17}{'largest [m]':>13}{'at the swing [m]':>18}"
+        )
+        for kind, (pictures, cameras) in kinds.items():
+            found = left(pictures, cameras, ground)
+            heights = (found[:, 1] - found[:, 1].mean()) * height
+            line = np.arange(len(heights)) * WINDOW
+            waves = np.concatenate([[np.sin(2 * np.pi * line / p), np.cos(2 * np.pi * line / p)]
+                                    for p in (arguments.period, 1.3 * arguments.period)])  # fmt: skip
+            wave = waves.T @ np.linalg.lstsq(waves.T, heights, rcond=None)[0]
+            across = float(np.sqrt((found[:, 0] ** 2).mean()))
+            print(
+                f"{kind:18}{across:17.3f}{heights.std():17.3f}{np.abs(heights).max():13.3f}{wave.std():18.3f}"
+            )
+
+
+if __name__ == "__main__":
+    main()
