@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from barpc.cameras import open_camera
 from barpc.cli.main import cli
@@ -228,12 +231,10 @@ def block(tmp_path_factory):
 
 
 def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, tmp_path):
-    from concurrent.futures import ProcessPoolExecutor
-
     images, matches = block
     options = RunOptions(matches=matches, matches_only=True, grids=True, tiles=128, resample=True)
     result = adjust(images, tmp_path / "a", options)
-    with ProcessPoolExecutor(2) as executor:
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
         adjust(images, tmp_path / "b", options, executor=executor)
     for view in result.record.views:
         ends = [".vrt", "_RPC.TXT", *ENDS]
@@ -276,8 +277,6 @@ def test_with_grids_a_camera_that_no_rpc_holds_is_no_failure(block, tmp_path):
 
 
 def test_verbs_understand_grids(block, tmp_path):
-    from click.testing import CliRunner
-
     images, matches = block
     adjust(images, tmp_path / "a", RunOptions(matches=matches, matches_only=True, grids=True))
     name = images[0].stem
@@ -302,8 +301,6 @@ def test_verbs_understand_grids(block, tmp_path):
 
 
 def test_a_grid_that_no_rpc_holds_is_not_converted(tmp_path, view, camera, fit):
-    from click.testing import CliRunner
-
     run_of(tmp_path / "out", (view, fit, camera))
     path = tmp_path / "out" / f"a{GRID}"
     found = CliRunner().invoke(
