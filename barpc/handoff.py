@@ -34,7 +34,7 @@ from barpc.fit.certificate import Sample
 from barpc.geodesy import Array, wrap_longitude
 from barpc.raster import GDAL_OPTIONS
 from barpc.rpcio import Carrier, hidden_by, read_rpc, row_of, sidecars
-from barpc.rpcio.grids import CORRECTION, GRID, read_correction
+from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.sensor import SensorModel
 from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.direct_grid import DirectGrid
@@ -144,21 +144,28 @@ def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = 
         Of the model that it should hold.
     """
     return [
-        _attempt(path, name, partial(_sought, sample, consumer, correction))
+        _grid_reading(path, name, consumer, sample, correction)
         for name, consumer in _grid_consumers(path).items()
         if consumer.installed
     ]
 
 
-def _sought(sample: Sample, consumer: Consumer, correction: CorrectionGrid | None, path: Path) -> float:
-    """The largest distance [px] of what a consumer reads to the model, all over the image and its altitudes."""
-    read, model = consumer.open(path), sample.model
+def _grid_reading(
+    path: Path, name: str, consumer: Consumer, sample: Sample, correction: CorrectionGrid | None
+) -> Reading:
+    model = sample.model
 
-    def off(ground: Array, at: Array) -> Array:
+    def off(read: Projection, ground: Array, at: Array) -> Array:
         image = model.project(read(at)) if consumer.locates else read(ground)
         return (image if correction is None else correction.apply(image)) - at[:, :2]
 
-    return float(np.linalg.norm(sample.sought(off)[1]))
+    try:
+        with warnings.catch_warnings(), _lent(path) as lent:
+            warnings.simplefilter("ignore")
+            error = float(np.linalg.norm(sample.sought(partial(off, consumer.open(lent)))[1]))
+    except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
+        return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
+    return Reading(path, name, error, "" if np.isfinite(error) else "it has no finite point")
 
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
@@ -182,15 +189,10 @@ def _readers(path: Path) -> dict[str, bool]:
 def _reading(
     path: Path, name: str, opener: Callable[[Path], Projection], ground: Array, image: Array
 ) -> Reading:
-    return _attempt(path, name, lambda lent: _largest(opener(lent), ground, image))
-
-
-def _attempt(path: Path, name: str, measure: Callable[[Path], float]) -> Reading:
-    """What a consumer makes of a file, or why it does not."""
     try:
         with warnings.catch_warnings(), nullcontext(path) if name == "barpc" else _lent(path) as lent:
             warnings.simplefilter("ignore")
-            error = measure(lent)
+            error = _largest(opener(lent), ground, image)
     except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
         return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
     return Reading(path, name, error, "" if np.isfinite(error) else "it projects to no finite point")
@@ -323,6 +325,10 @@ def _shareloc_grid(path: Path) -> Projection:
     return lambda at: np.asarray(model.direct_loc_h(at[:, 1] + 0.5, at[:, 0] + 0.5, at[:, 2]))
 
 
+def _own_grid(path: Path) -> Projection:
+    return open_camera(path).model.project
+
+
 def _linear_grid(path: Path) -> Projection:
     grid = open_camera(path).model
     assert isinstance(grid, DirectGrid)
@@ -333,7 +339,7 @@ def _linear_grid(path: Path) -> Projection:
 def _gdal_correction(path: Path) -> Projection:
     """As whoever resamples reads it: values at the places that GDAL gives for the centres of its pixels."""
     rpc = _gdal_raster(path)
-    with rasterio.open(path) as dataset:
+    with rasterio.Env(**GDAL_OPTIONS), rasterio.open(path) as dataset:
         cols = np.array(dataset.xy(np.zeros(dataset.width), np.arange(dataset.width))[0]) - 0.5
         rows = np.array(dataset.xy(np.arange(dataset.height), np.zeros(dataset.height))[1]) - 0.5
         shift = RegularGridInterpolator((rows, cols), np.moveaxis(dataset.read(), 0, -1), bounds_error=False)
@@ -344,11 +350,6 @@ def _gdal_correction(path: Path) -> Projection:
         return np.asarray(image + shift(np.clip(image[:, ::-1], *ends)))
 
     return project
-
-
-def _own_correction(path: Path) -> Projection:
-    rpc, grid = read_correction(path)
-    return lambda ground: grid.apply(rpc.project(ground))
 
 
 CONSUMERS: dict[str, Consumer] = {
@@ -366,11 +367,11 @@ _GRIDS: dict[str, dict[str, Consumer]] = {
     GRID: {
         "shareloc": Consumer("shareloc", _shareloc_grid, locates=True),
         "linear": Consumer("barpc", _linear_grid, locates=True),
-        "barpc": Consumer("barpc", lambda path: open_camera(path).model.project),
+        "barpc": Consumer("barpc", _own_grid),
     },
     CORRECTION: {
         "gdal": Consumer("rasterio", _gdal_correction),
-        "barpc": Consumer("barpc", _own_correction),
+        "barpc": Consumer("barpc", _own_grid),
     },
     "": {"gdal": Consumer("rasterio", _gdal_raster), "barpc": CONSUMERS["barpc"]},
 }

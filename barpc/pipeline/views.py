@@ -177,6 +177,8 @@ def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str])
     else:
         path, choices = split_spec(image, hosts)
         camera = open_split(file if isinstance(file, Remote) else path, choices, size=size)
+        if camera.format in ("grid", "correction") and "camera" not in choices:
+            raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
     view = View(name, file if isinstance(file, Remote) else str(file), size, camera.model, _altitudes(camera))
     ring = footprint(view.sensor, size, view.altitude)
     if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too

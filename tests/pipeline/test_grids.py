@@ -15,10 +15,10 @@ from click.testing import CliRunner
 
 from barpc.cameras import open_camera
 from barpc.cli.main import cli
-from barpc.errors import OutputError
+from barpc.errors import ImageError, OutputError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.options import RunOptions
-from barpc.pipeline import adjust, grids
+from barpc.pipeline import adjust, check, grids
 from barpc.pipeline.grids import CORRECTION, GRID, RESAMPLED, TILES, grid_names, tile_boxes, write_grids
 from barpc.rpcio import read_rpc
 from barpc.rpcio.grids import read_correction
@@ -298,6 +298,17 @@ def test_verbs_understand_grids(block, tmp_path):
     code, text = said("check", "--json", rpc, "--against", grid)
     assert json.loads(text)[0]["max_px"] < 1e-3
     assert said("fit", grid)[0] == 0
+
+
+def test_a_grid_is_the_camera_of_an_image_and_no_image(block, tmp_path):
+    images, matches = block
+    adjust(images, tmp_path / "a", RunOptions(matches=matches, matches_only=True, grids=True))
+    for end in (GRID, CORRECTION):
+        given = [f"{path},camera={tmp_path / 'a' / (path.stem + end)}" for path in images]
+        found = check(given, RunOptions(matches=matches, matches_only=True))
+        assert found.record.views[0].rmse_before < 0.5
+        with pytest.raises(ImageError, match="a grid and no image"):
+            check([str(tmp_path / "a" / (images[0].stem + end)), images[1]])
 
 
 def test_a_grid_that_no_rpc_holds_is_not_converted(tmp_path, view, camera, fit):
