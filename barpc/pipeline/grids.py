@@ -6,12 +6,12 @@ import json
 import logging
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -45,6 +45,7 @@ _GROUP = 8  # tiles that are fitted in one task, whose result is kept
 _BOX = "col", "row", "width", "height"
 
 Written = dict[str, dict[str, float | str]]
+Misses = dict[str, tuple[float, float]]  # file -> RMS and largest distance to the camera that it holds [px]
 Box = tuple[int, int, int, int]
 
 
@@ -109,9 +110,11 @@ def _write(
         try:
             made = ordered(fresh, make_grids, [(*task, str(room)) for task in tasks], "grids", progress)
             for (view, *_), errors in zip(tasks, made, strict=True):
-                for name in errors:
+                for name, (rms, largest) in errors.items():
                     with run.output(name) as partial:
                         (room / view.name / name).replace(partial)
+                    if not largest <= MISFIT:
+                        logger.warning("%s: %.3g px RMS off, up to %.3g px (at steps?)", name, rms, largest)
         finally:
             shutil.rmtree(room, ignore_errors=True)
         again = [
@@ -121,15 +124,15 @@ def _write(
         return ordered(fresh, verify_grids, again, "verify grids", progress)
 
 
-def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str) -> dict[str, float]:
+def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str) -> Misses:
     """Write the grids of a view, and its resampled image, into a room; what each misses the model by [px]."""
     place, alts = Path(room) / view.name, widened(view.alt_range)
     place.mkdir(parents=True, exist_ok=True)
-    sample, errors = Sample.of(model, view.size, alts), dict[str, float]()
+    sample, errors = Sample.of(model, view.size, alts), Misses()
     try:
         if files.grids:
             grid = DirectGrid.of(model, view.size, alts)
-            errors[view.name + GRID] = _off(sample, grid)[1]
+            errors[view.name + GRID] = _off(sample, grid)
             write_grid(grid, place / (view.name + GRID), overwrite=True)
         rpc, lacking, error = correction_of(rpc, sample)
         write_correction(lacking, rpc, place / (view.name + CORRECTION), overwrite=True)
@@ -142,8 +145,8 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str
     return errors
 
 
-def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, float]:
-    """An RPC and what it lacks, and by how much both together miss the camera of a sample [px].
+def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, tuple[float, float]]:
+    """An RPC and what it lacks, and RMS and largest distance of both together to the camera of a sample [px].
 
     What `rpc` lacks may depend on the altitude: the best RPC of all trades denominators, which see altitudes, for what
     changes with the rows. Then another one serves better here, though it misses by more.
@@ -168,10 +171,10 @@ def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, float]
     if not found:
         assert failed is not None
         raise failed
-    _, largest, best, lacking = min(
+    rms, largest, best, lacking = min(
         found, key=lambda row: row[0]
-    )  # the largest may be one of a step, in all of them
-    return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, largest
+    )  # the largest is a step's, if there is one
+    return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, (rms, largest)
 
 
 def _off(sample: Sample, camera: SensorModel) -> tuple[float, float]:
@@ -180,10 +183,10 @@ def _off(sample: Sample, camera: SensorModel) -> tuple[float, float]:
     return float(np.linalg.norm(errors.rmse)), float(np.linalg.norm(largest))
 
 
-def verify_grids(view: View, model: SensorModel, errors: Mapping[str, float], folder: str) -> Written:
+def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) -> Written:
     """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads more than their errors."""
     sample, written = Sample.of(model, view.size, widened(view.alt_range)), Written()
-    for name, error in errors.items():
+    for name, (_, error) in errors.items():
         path, lacking = Path(folder) / name, None
         if name.endswith(RESAMPLED):
             lacking = read_correction(Path(folder) / (view.name + CORRECTION))[1]
@@ -195,8 +198,6 @@ def verify_grids(view: View, model: SensorModel, errors: Mapping[str, float], fo
                     "is the disk full, or another RPC file beside it?"
                 )
         written[name] = {one.consumer: one.note or one.max_error for one in readings}
-        if not error <= MISFIT:
-            logger.warning("%s: misses the camera by up to %.3g px", path, error)
     return written
 
 
@@ -204,7 +205,7 @@ def verify_grids(view: View, model: SensorModel, errors: Mapping[str, float], fo
 
 
 def tile_boxes(size: tuple[int, int], side: int) -> list[Box]:
-    """Tiles (col, row, width, height) from multiples of `side` on; a rest narrower than half joins its neighbour."""
+    """Tiles (col, row, width, height) from multiples of `side` on; a rest of up to half a side joins its neighbour."""
     edges = [[*range(0, max(1, length - side // 2), side), length] for length in size]
     return [(c, r, right - c, low - r) for r, low in pairwise(edges[1]) for c, right in pairwise(edges[0])]
 
@@ -224,25 +225,32 @@ def _write_tiles(
 ) -> Written:
     """An RPC for each tile, in the tile's own pixels, and a list of them."""
     assert options.tiles is not None
-    boxes, rows = tile_boxes(view.size, options.tiles), list[dict[str, Any]]()
-    alts = widened(view.alt_range)
+    boxes, alts = tile_boxes(view.size, options.tiles), widened(view.alt_range)
     tasks = [
         (model, tuple(boxes[at : at + _GROUP]), alts, options.fit) for at in range(0, len(boxes), _GROUP)
     ]
-    with CachingExecutor(run, {}, executor) as caching:
-        fits = [one for group in ordered(caching, fit_tiles, tasks, "tiles") for one in group]
+    try:
+        with CachingExecutor(run, {}, executor) as caching:
+            fits = [one for group in ordered(caching, fit_tiles, tasks, "tiles") for one in group]
+    except FitError as error:
+        raise FitError(f"{view.name}, {error}") from error
+    errors, rows = [], []
     for box, tile in zip(boxes, fits, strict=True):
-        known = replace(tile.rpc, err_bias=fit.rpc.err_bias, err_rand=fit.rpc.err_rand)
-        with run.output(tile_name(view, box)) as partial:
+        name, known = (
+            tile_name(view, box),
+            replace(tile.rpc, err_bias=fit.rpc.err_bias, err_rand=fit.rpc.err_rand),
+        )
+        with run.output(name) as partial:
             write_rpc(known, partial, format="txt", overwrite=True)
-            error = float(np.linalg.norm(tile.as_written(read_rpc(partial)).max_ckp))
-        rows.append({"file": tile_name(view, box), **dict(zip(_BOX, box, strict=True)), "max_px": error})
-    worst = max(row["max_px"] for row in rows)
+            errors.append(float(np.linalg.norm(tile.as_written(read_rpc(partial)).max_ckp)))
+        told = errors[-1] if np.isfinite(errors[-1]) else None
+        rows.append(json.dumps({"file": name, **dict(zip(_BOX, box, strict=True)), "max_px": told}))
+    worst = float(np.max(errors))
     if not worst <= LINEAR:
         logger.warning("%s: tiles of %d px miss the camera by up to %.3g px", view.name, options.tiles, worst)
-    text = ",\n".join(map(json.dumps, rows))
     head = json.dumps({"image": view.name, "size": view.size, "alt_range_m": alts})[1:-1]
-    run.write_text(view.name + TILES, f'{{{head}, "tiles": [\n{text}\n]}}\n')
+    listed = ",\n".join(rows)
+    run.write_text(view.name + TILES, f'{{{head}, "tiles": [\n{listed}\n]}}\n')
     return {view.name + TILES: {"barpc": worst}}
 
 
@@ -255,5 +263,8 @@ def fit_tiles(
         tile = ImageCorrected(model, ImageAffine(-np.array([col, row], dtype=np.float64), np.zeros((2, 2))))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", BarpcWarning)  # the fit of the RPC has said it
-            fits.append(fit_rpc(tile, (size[0], size[1]), alt_range, options=options, strict=False))
+            try:
+                fits.append(fit_rpc(tile, (size[0], size[1]), alt_range, options=options, strict=False))
+            except FitError as error:
+                raise FitError(f"tile from column {col}, row {row} on: {error}") from error
     return fits

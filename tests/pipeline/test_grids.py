@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from barpc.cameras import open_camera
 from barpc.cli.main import cli
-from barpc.errors import ImageError, OutputError
+from barpc.errors import FitError, ImageError, OutputError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.options import RunOptions
 from barpc.pipeline import adjust, check, grids
@@ -199,6 +199,7 @@ def test_tiles_that_were_fitted_are_not_fitted_again(tmp_path, view, camera, fit
 
 
 def test_a_camera_without_ground_in_a_part_of_its_image_is_one_line(tmp_path, view, camera, fit):
+    @dataclass(frozen=True)
     class Blind:
         def __getattr__(self, name):
             return getattr(camera, name)
@@ -206,9 +207,31 @@ def test_a_camera_without_ground_in_a_part_of_its_image_is_one_line(tmp_path, vi
         def localize(self, image, alt):
             return np.where(np.asarray(image)[..., :1] > 1400, np.nan, camera.localize(image, alt))
 
+    with pytest.raises(FitError, match=r"^a, tile from column 1000, row 0 on: .*no ground point"):
+        run_of(tmp_path / "tiles", (view, replace(fit, max_ckp=np.zeros(2)), Blind()), tiles=500)
     with pytest.raises(OutputError, match=r"^a: no grid can be made of its camera") as caught:
         run_of(tmp_path / "out", (view, fit, Blind()), grids=True)
     assert "\n" not in str(caught.value)
+
+
+def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
+    """A grid does not hold a step between detectors in the cell that it runs through: said, with how much it is."""
+
+    class Stepped:
+        sensor = camera.sensor
+
+        def localize(self, image, alt):
+            image = np.asarray(image)
+            return camera.localize(image - 0.1 * (image[..., :1] > 700.3), alt)
+
+        def project(self, ground):
+            image = camera.project(ground)
+            return image + 0.1 * (image[..., :1] > 700.25)
+
+    with caplog.at_level(logging.WARNING):
+        (written,) = run_of(tmp_path, (view, fit, Stepped()), grids=True)
+    assert 0.02 < written["a" + CORRECTION]["barpc"] < 0.3
+    assert "px RMS off, up to 0." in caplog.text
 
 
 def test_all_names_are_known_before_the_run(view):
