@@ -188,7 +188,7 @@ def test_a_damaged_correction_grid_is_one_line(tmp_path, what):
     if what == "three bands":
         data, profile["count"] = np.concatenate([data, data[:1]]), 3
     if what == "turned":
-        profile["transform"] = profile["transform"] @ rasterio.Affine.rotation(10.0)
+        profile["transform"] = rasterio.Affine(50.0, 1.0, -25.0, 1.0, 50.0, -25.0)
     path.unlink()
     with rasterio.open(path, "w", **profile, **({} if what == "no RPC" else {"rpcs": rpcs})) as out:
         out.write(data)
