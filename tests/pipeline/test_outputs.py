@@ -258,7 +258,7 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
         stop: output_names([view, other], RunOptions(stop_after=stop, rpc_formats=("rpb",)), tmp_path)
         for stop in ("matching", "adjustment", "all")
     }
-    common = [*TABLES, "summary.json"] + (["report.html"] if can_render() else [])
+    common = [*TABLES, "summary.json"] + (["report.html", "pictures.json"] if can_render() else [])
     pairs = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"]
     assert sorted(names["matching"]) == sorted([*common, "matches.csv", "matches.npz", *pairs])
     assert sorted(names["adjustment"]) == sorted([*common, PRIOR])
@@ -286,7 +286,7 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
         watched = lambda self, name, *given, real=real: (written.append(name), real(self, name, *given))[1]  # noqa: E731
         monkeypatch.setattr(Workspace, method, watched)
     with Workspace(tmp_path / "out") as run:
-        plain = SimpleNamespace(reference=None)
+        plain = SimpleNamespace(reference=None, options=RunOptions(pictures=False))
         told = outputs.write_tables(run, plain, Said("what was found"))  # type: ignore[arg-type]
     names = ["a.csv", "b.csv", *(["report.html"] if page else []), "summary.json"]
     assert list(dict.fromkeys(written)) == names
