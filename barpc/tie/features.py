@@ -73,13 +73,23 @@ class Sift:
         if not found:  # OpenCV fails where there is nothing to describe
             return join([])
         kept = keep(*_table(found))
-        described, raw = self._sift.compute(picture, [found[i] for i in kept])
+        described, raw = self._sift.compute(picture, [_an_octave_up(found[i]) for i in kept])
         if raw is None:
             return join([])
         xy, scale, response = _table(described)
         root = np.sqrt(raw / np.maximum(np.abs(raw).sum(axis=1, keepdims=True), 1e-9))
         angle = np.radians([k.angle for k in described])
         return Keypoints(xy, scale, angle, response, np.rint(255 * root).astype(np.uint8))
+
+
+def _an_octave_up(keypoint: Any) -> Any:
+    """The keypoint, to be described in the picture of half the size: a quarter of the samples, and as distinct.
+
+    OpenCV packs the octave (signed) and the picture of it, from 1 to 3, into a byte each; picture 3 is the next one's 0.
+    """
+    octave = keypoint.octave
+    keypoint.octave = octave & ~0xFFFF | (octave + 1) & 0xFF | max(((octave >> 8) & 0xFF) - 3, 0) << 8
+    return keypoint
 
 
 def _table(found: Sequence[Any]) -> tuple[Array, Array, Array]:
