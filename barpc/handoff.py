@@ -16,11 +16,11 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache, partial
+from html import escape
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 import rasterio
@@ -220,7 +220,7 @@ def _lent(path: Path) -> Iterator[Path]:
 
 def _camera_only(vrt: Vrt) -> str:
     items = vrt.metadata.get("RPC", {}).items()
-    rows = "".join(f"<MDI key={quoteattr(key)}>{escape(value)}</MDI>" for key, value in items)
+    rows = "".join(f'<MDI key="{escape(key)}">{escape(value)}</MDI>' for key, value in items)
     return (
         f'<VRTDataset rasterXSize="{vrt.size[0]}" rasterYSize="{vrt.size[1]}">'
         f'<Metadata domain="RPC">{rows}</Metadata><VRTRasterBand dataType="Byte" band="1"/></VRTDataset>\n'

@@ -10,7 +10,6 @@ import math
 import os
 import re
 import reprlib
-import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
@@ -532,6 +531,8 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
 
     InputError where it does not exist or parse, or holds an unknown option or a value that it cannot have.
     """
+    import tomllib  # most runs read none
+
     text = read_text(path, OPTIONS)
     try:
         data = tomllib.loads(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import gc
 import logging
 import os
 import signal
@@ -21,6 +22,8 @@ from barpc import __version__
 from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
 from barpc.cli.terminal import THREADS, Formatter, echo, say
 from barpc.errors import BarpcError, BarpcWarning
+
+_OBJECTS = 50_000  # made between two looks for cycles
 
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
@@ -179,6 +182,8 @@ cli.help = _kept_lines(cli.help)
 def main(args: list[str] | None = None) -> None:
     """Run a verb, and turn errors into one line and an exit code."""
     argv = sys.argv[1:] if args is None else args
+    if args is None:  # the process is ours: no looking for cycles every 700 objects while modules are loaded
+        gc.set_threshold(_OBJECTS)
     for name in THREADS:  # sums keep their order whatever the machine; -j spreads the work
         os.environ.setdefault(name, "1")
     with _interruptible(), warnings.catch_warnings():
@@ -198,6 +203,8 @@ def main(args: list[str] | None = None) -> None:
             if "--debug" in argv:
                 echo(traceback.format_exc(), err=True)
             say(message)
+    if args is None:
+        gc.freeze()  # nor at the end in what the system takes back
     sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -8,9 +8,9 @@ import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
 import rasterio
 from rasterio._err import CPLE_BaseError
@@ -67,7 +67,7 @@ def rpc_vrt(rpc: RPC, image_path: Path | str, vrt_path: Path | str, *, relative:
         lines = [f'<VRTDataset rasterXSize="{dataset.width}" rasterYSize="{dataset.height}">']
         if dataset.crs is not None:
             numbers = ", ".join(repr(v) for v in dataset.transform.to_gdal())
-            lines.append(f"  <SRS>{escape(dataset.crs.to_wkt())}</SRS>")
+            lines.append(f"  <SRS>{escape(dataset.crs.to_wkt(), quote=False)}</SRS>")
             lines.append(f"  <GeoTransform>{numbers}</GeoTransform>")
         lines.append(rpc_domain(rpc))
         for index in dataset.indexes:
@@ -94,7 +94,7 @@ def _vrt_source(dataset: Any, name: str, relative: bool, band: str) -> list[str]
     frame = f'xOff="0" yOff="0" xSize="{dataset.width}" ySize="{dataset.height}"'
     return [
         "    <SimpleSource>",
-        f'      <SourceFilename relativeToVRT="{int(relative)}">{escape(name)}</SourceFilename>',
+        f'      <SourceFilename relativeToVRT="{int(relative)}">{escape(name, quote=False)}</SourceFilename>',
         f"      <SourceBand>{band}</SourceBand>",
         f"      <SrcRect {frame} />",
         f"      <DstRect {frame} />",

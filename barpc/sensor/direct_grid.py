@@ -9,16 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import NdBSpline, make_interp_spline
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, pointwise, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rational import DERIVATIVE, monomials
+
+if TYPE_CHECKING:
+    from scipy.interpolate import NdBSpline
 
 CHUNK = 2048  # points worked on at a time: what belongs to them stays in cache
 LINEAR = 0.005  # px: what linear interpolation in a grid made here may miss by
@@ -64,6 +67,8 @@ class DirectGrid(Frozen):
     _lon: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        from scipy.interpolate import NdBSpline, make_interp_spline  # a fifth of a second, which RPCs do not need
+
         for name in ("cols", "rows", "alts", "lonlat"):
             self._keep(name, np.array(getattr(self, name), dtype=np.float64))
         axes = (self.alts, self.rows, self.cols)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy import fft
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
@@ -53,6 +52,8 @@ def channels(pixels: FloatImage, valid: BoolArray) -> FloatImage:
 def correlation(template: FloatImage, search: FloatImage) -> FloatImage:
     """Correlation coefficients (B, H - h + 1, W - w + 1) of templates (B, C, h, w) within areas (B, C, H, W)."""
     (h, w), (height, width) = template.shape[2:], search.shape[2:]
+    from scipy import fft  # of structure alone
+
     size = fft.next_fast_len(height, real=True), fft.next_fast_len(width, real=True)
     spectrum = (fft.rfft2(search, size) * fft.rfft2(template, size).conj()).sum(axis=1)
     product = fft.irfft2(spectrum, size)[:, : height - h + 1, : width - w + 1]
