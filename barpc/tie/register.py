@@ -34,6 +34,7 @@ _BAND = 512  # rows that are swept by columns where points are few: strips and b
 _TOGETHER = 512  # such points of a task
 _STEPS = 12
 _SETTLED = 0.003  # px; a step below it is the last
+_ROUGHLY = 0.05  # px; the same where a place is only compared
 _SMALLER = 0.7  # side of the patch of the second try and of the check
 _TORN = 0.5  # px that the smaller patch may lie apart
 _FINE = 4  # samples a pixel and axis
@@ -181,16 +182,17 @@ def register(
     with a smaller patch; what succeeds must be confirmed by it.
     """
     fine, best = _upsampled(images[1]), Registration.none(start)
+    pictures = _with_derivatives(images[0])
     smaller = int(_SMALLER * patch) | 1
     for side in (patch, smaller):
-        template = _Template(images[0], side)
+        template = _Template(pictures, images[0].shape[1], side)
         usable = [_usable(mask, side) for mask in valid]
         possible = np.flatnonzero(~best.ok & _at(usable[0], reference) & _at(usable[1], start))
         for rows in _chunks(possible):
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
-        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows])
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], _ROUGHLY)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
         best.ok[rows] = apart <= np.maximum(_TORN, 5.0 * inner.sigma)
     return best
@@ -232,15 +234,20 @@ def _kernels() -> list[FloatImage]:
     return kernels
 
 
+def _with_derivatives(image: FloatImage) -> list[FloatImage]:
+    """The pixels (H W,) of an image and their derivatives by column and row."""
+    derivative = np.array([1, -8, 0, 8, -1], np.float32) / 12
+    smooth = np.array([1, 2, 1], np.float32) / 4
+    by_col = cv2.sepFilter2D(image, -1, derivative, smooth)
+    by_row = cv2.sepFilter2D(image, -1, smooth, derivative)
+    return [np.asarray(one, np.float32).ravel() for one in (image, by_col, by_row)]
+
+
 class _Template:
     """Reference patches of an image, ready to be found in another one."""
 
-    def __init__(self, image: FloatImage, patch: int) -> None:
-        self._image = image
-        derivative = np.array([1, -8, 0, 8, -1], np.float32) / 12
-        smooth = np.array([1, 2, 1], np.float32) / 4
-        self._by_col = cv2.sepFilter2D(image, -1, derivative, smooth)
-        self._by_row = cv2.sepFilter2D(image, -1, smooth, derivative)
+    def __init__(self, pictures: Sequence[FloatImage], width: int, patch: int) -> None:
+        self._pictures, self._width = pictures, width
         half = patch // 2
         row, col = np.mgrid[-half : half + 1, -half : half + 1]
         self._half = half
@@ -248,6 +255,7 @@ class _Template:
         weight = np.exp(-0.5 * (self._col**2 + self._row**2) / (_WEIGHT * half) ** 2)
         self._effective = float(weight.sum() ** 2 / (weight**2).sum())  # pixels that count
         self._weight = (weight / weight.sum()).astype(np.float32)
+        self._root = np.sqrt(self._weight)
 
     def _normalized(self, patches: FloatImage) -> tuple[FloatImage, FloatImage]:
         """Patches of weighted mean 0 and variance 1, and their standard deviations (N, 1)."""
@@ -258,38 +266,53 @@ class _Template:
         deviation = np.where(flat, np.float32(np.inf), deviation)
         return centred / deviation, deviation
 
-    def find(self, fine: FloatImage, reference: IntArray, start: Array, linear: Array) -> Registration:
+    def find(
+        self,
+        fine: FloatImage,
+        reference: IntArray,
+        start: Array,
+        linear: Array,
+        settled: float = _SETTLED,
+    ) -> Registration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
-        cols, rows = reference[:, :1] + self._col, reference[:, 1:] + self._row
-        values, deviation = self._normalized(self._image[rows, cols])
-        by_col, by_row = self._by_col[rows, cols] / deviation, self._by_row[rows, cols] / deviation
+        corner, offset = reference[:, 1:] * self._width + reference[:, :1], self._row * self._width + self._col
+        image, by_col, by_row = (picture.take(corner + offset) for picture in self._pictures)
+        values, deviation = self._normalized(image)
         x, y = (self._col / self._half).astype(np.float32), (self._row / self._half).astype(np.float32)
-        affine = [by_col, by_row, by_col * x, by_col * y, by_row * x, by_row * y]
-        jacobian = np.stack([*affine, values, np.ones_like(values)], axis=1)
-        weighted = jacobian * self._weight
-        normal = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
+        jacobian = np.empty((len(reference), 8, len(offset)), np.float32)  # times the roots of the weights
+        jacobian[:, 0], jacobian[:, 1] = (by * (self._root / deviation) for by in (by_col, by_row))
+        for row, (by, lever) in enumerate(((0, x), (0, y), (1, x), (1, y)), start=2):
+            np.multiply(jacobian[:, by], lever, out=jacobian[:, row])
+        jacobian[:, 6], jacobian[:, 7] = values * self._root, self._root
+        normal = (jacobian @ jacobian.transpose(0, 2, 1)).astype(np.float64)
         normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.linalg.inv(normal)
-        solver = inverse.astype(np.float32) @ weighted
-        xy, step = self._iterate(fine, solver, start.copy(), linear.copy())
+        xy, step = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
         sampled = self._normalized(self._sample(fine, *xy))[0]
         correlation = ((sampled * values) @ self._weight).astype(np.float64)
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_LEAST_SIGMA)
         moved = np.hypot(*(xy[0] - start).T)
-        ok = (step <= 10 * _SETTLED) & (moved <= _REACH) & np.isfinite(sigma)
+        ok = (step <= 10 * settled) & (moved <= _REACH) & np.isfinite(sigma)
         return Registration(xy[0], correlation, sigma, ok)
 
     def _iterate(
-        self, fine: FloatImage, solver: FloatImage, centre: Array, linear: Array
+        self,
+        fine: FloatImage,
+        solver: tuple[FloatImage, Array],
+        centre: Array,
+        linear: Array,
+        settled: float,
     ) -> tuple[tuple[Array, Array], Array]:
         """Centres and distortions after the iterations, and the length of each one's last step [px]."""
         length = np.full(len(centre), np.inf)
         active = np.arange(len(centre))
+        jacobian, inverse = solver
         for _ in range(_STEPS):
             sampled = np.rint(centre[active] / _GRID) * _GRID  # else the sampler would round, and we not know
             patches = self._normalized(self._sample(fine, sampled, linear[active]))[0]
-            solution = (solver[active] @ patches[:, :, None])[:, :, 0].astype(np.float64)
+            right = (jacobian @ (self._root * patches)[:, :, None]).astype(np.float64)
+            solution = (inverse @ right)[:, :, 0]
             change = solution[:, :6] / np.maximum(solution[:, 6:7], 0.2)  # gain: how like the patches are
             shift = np.clip(change[:, :2], -1.0, 1.0)
             distortion = np.clip(change[:, 2:].reshape(-1, 2, 2) / self._half, -0.2, 0.2)
@@ -297,9 +320,11 @@ class _Template:
             moved = sampled - (linear[active] @ shift[:, :, None])[:, :, 0]
             length[active] = np.hypot(*(moved - centre[active]).T)
             centre[active] = moved
-            active = active[length[active] > _SETTLED]
-            if not len(active):
+            going = length[active] > settled
+            if not going.any():
                 break
+            if not going.all():
+                active, jacobian, inverse = active[going], jacobian[going], inverse[going]
         return (centre, linear), length
 
     def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatImage:
