@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.tie.register import _Template, _upsampled, register, register_places
+from barpc.tie.register import _Template, _upsampled, _with_derivatives, register, register_places
 from tests.tie.conftest import write_image
 
 SIZE = 400
@@ -196,9 +196,11 @@ def test_sigma_grows_with_the_noise_and_shrinks_with_the_patch(texture, referenc
 
 def test_the_derivative_of_a_ramp_is_its_slope() -> None:
     row, col = np.mgrid[:60, :80].astype(np.float32)
-    template = _Template(3.0 * col - 5.0 * row, 21)
-    np.testing.assert_allclose(template._by_col[5:-5, 5:-5], 3.0, rtol=1e-5)
-    np.testing.assert_allclose(template._by_row[5:-5, 5:-5], -5.0, rtol=1e-5)
+    pictures = _with_derivatives(3.0 * col - 5.0 * row)
+    by_col, by_row = (picture.reshape(60, 80)[5:-5, 5:-5] for picture in pictures[1:])
+    np.testing.assert_allclose(by_col, 3.0, rtol=1e-5)
+    np.testing.assert_allclose(by_row, -5.0, rtol=1e-5)
+    template = _Template(pictures, 80, 21)
     assert template._weight.sum() == pytest.approx(1.0, rel=1e-5)
     middle, edge = template._weight[220], template._weight[210]
     assert edge / middle == pytest.approx(np.exp(-0.5 / 0.7**2), rel=1e-5)
@@ -213,7 +215,7 @@ def test_the_derivative_of_a_ramp_is_its_slope() -> None:
 @pytest.mark.parametrize(("detail", "flat"), [(0.0005, True), (0.003, False)])
 def test_a_patch_is_flat_below_a_millionth_of_its_level(detail: float, flat: bool) -> None:
     """Of level 1000 a millionth is 0.001, some steps of float32."""
-    template = _Template(np.zeros((60, 60), np.float32), 21)
+    template = _Template(_with_derivatives(np.zeros((60, 60), np.float32)), 60, 21)
     noise = np.random.default_rng(9).normal(0, detail, (1, 21 * 21))
     patch, deviation = template._normalized((1000.0 + noise).astype(np.float32))
     assert (patch == 0).all() == flat
@@ -243,8 +245,8 @@ def test_a_patch_whose_inner_part_goes_elsewhere_is_not_ok(
     """By more than half a pixel, and more than five standard deviations: it lies across a step of the ground."""
     find = _Template.find
 
-    def found_apart(self, fine, reference, start, linear):
-        found = find(self, fine, reference, start, linear)
+    def found_apart(self, fine, reference, start, linear, *settled):
+        found = find(self, fine, reference, start, linear, *settled)
         if self._half == 10:
             return found
         return replace(found, xy=found.xy + apart * np.array([0.6, -0.8]), sigma=np.full(len(start), sigma))
