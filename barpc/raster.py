@@ -55,7 +55,7 @@ GDAL_OPTIONS: dict[str, Any] = {
     "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{noext}",
     "GDAL_HTTP_MAX_RETRY": 0,
     "GDAL_VRT_ENABLE_PYTHON": "NO",
-    "GDAL_CACHEMAX": 64,  # MB
+    "GDAL_CACHEMAX": 64 << 20,  # bytes, as rasterio sets it
 }
 """Settings under which every raster is read."""
 _ALONE: dict[str, Any] = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}

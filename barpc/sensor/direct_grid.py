@@ -67,7 +67,8 @@ class DirectGrid(Frozen):
     _lon: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        from scipy.interpolate import NdBSpline, make_interp_spline  # a fifth of a second, which RPCs do not need
+        # a fifth of a second, which RPCs do not need
+        from scipy.interpolate import NdBSpline, make_interp_spline
 
         for name in ("cols", "rows", "alts", "lonlat"):
             self._keep(name, np.array(getattr(self, name), dtype=np.float64))

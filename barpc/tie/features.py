@@ -85,7 +85,7 @@ class Sift:
 def _an_octave_up(keypoint: Any) -> Any:
     """The keypoint, to be described in the picture of half the size: a quarter of the samples, and as distinct.
 
-    OpenCV packs the octave (signed) and the picture of it, from 1 to 3, into a byte each; picture 3 is the next one's 0.
+    OpenCV packs the octave (signed) and its picture, 1 to 3, into a byte each; picture 3 is the next octave's 0.
     """
     octave = keypoint.octave
     keypoint.octave = octave & ~0xFFFF | (octave + 1) & 0xFF | max(((octave >> 8) & 0xFF) - 3, 0) << 8

@@ -127,7 +127,7 @@ class _Best:
 class _Strips:
     """Points of B sorted into strips across the epipolar direction, and along it within a strip."""
 
-    height = 16.0
+    height = 8.0
 
     def __init__(self, turned: Array) -> None:
         self._turned = turned

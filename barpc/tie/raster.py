@@ -29,9 +29,9 @@ Box = tuple[int, int, int, int]
 CELL = 64
 """Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""
 _ROWS = 512  # px read at a time, at least one row of blocks
-_WIDE = 4096  # px, and two tiles: strips of wider images are read whole
 _SAMPLES = 5  # blocks a side whose pixels make the stretch
 _SAMPLE_SIDE = 128  # px
+_LEVEL = 4  # px a side of a pixel of the samples, where decoding is dear
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
 _LEVELS = 1000.0  # grey values that most of a window is spread over
 _OUTLIER = 1e6  # grey values beyond which a pixel is cut: it would drown its surroundings
@@ -152,10 +152,11 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | Non
     with open_raster(path) as dataset:
         _check_band(dataset, path, band)
         kind = np.dtype(dataset.dtypes[band - 1])
-        side_x, side_y = (min(_SAMPLE_SIDE, n) for n in (dataset.width, dataset.height))
+        zoom = _LEVEL if _levels(dataset, band) else 1
+        side_x, side_y = (min(zoom * _SAMPLE_SIDE, n) for n in (dataset.width, dataset.height))
         for row in np.linspace(0, dataset.height - side_y, _SAMPLES).astype(int):
             for col in np.linspace(0, dataset.width - side_x, _SAMPLES).astype(int):
-                pixels, valid = _read(dataset, (int(col), int(row), side_x, side_y), band)
+                pixels, valid = _read(dataset, (int(col), int(row), side_x, side_y), band, zoom)
                 found.append(pixels[valid][::7].astype(np.float64))
     values = np.concatenate(found)
     low, high = np.percentile(values, [0.5, 99.5]) if len(values) else (0.0, 0.0)
@@ -179,8 +180,12 @@ def survey(path: str | os.PathLike[str], band: int = 1) -> Survey | None:
     stretch = sample_stretch(path, band)
     with open_raster(path) as dataset:
         height, width = dataset.block_shapes[band - 1]
-        levels = getattr(dataset, "driver", "") == "JP2OpenJPEG" and {2, 4} <= set(dataset.overviews(band))
+        levels = _levels(dataset, band)
     return None if stretch is None else Survey(stretch, (width, height), levels)
+
+
+def _levels(dataset: Any, band: int) -> bool:
+    return getattr(dataset, "driver", "") == "JP2OpenJPEG" and {2, _LEVEL} <= set(dataset.overviews(band))
 
 
 def read_picture(
@@ -231,12 +236,12 @@ def tiles(
 ) -> list[Box]:
     """Boxes that cover an image of `size` (width, height) without overlap, cut at whole cells.
 
-    A side is `options.tile` times `zoom` px; strips of a wide image are taken whole, and so are blocks that are dear to
+    A side is `options.tile` times `zoom` px; strips are taken whole, and so are blocks that are dear to
     decode.
     """
     sides = [zoom * options.tile] * 2
-    if found is not None and found.block[0] >= size[0] > max(_WIDE, 2 * sides[0]):
-        sides[0] = size[0]
+    if found is not None and found.block[0] >= size[0]:
+        sides[0] = max(sides[0], size[0])
     if found is not None and found.levels:
         sides = [
             max(2, side // (zoom * block)) * zoom * block

@@ -31,7 +31,8 @@ PATCH = 21
 """Side of the patches that are registered [px], odd."""
 _CHUNK = 256  # patches worked on at a time: they stay in cache
 _BAND = 512  # rows that are swept by columns where points are few: strips and blocks are decoded once
-_TOGETHER = 512  # such points of a task
+_TOGETHER = 512  # such points of a task, at most
+_ALL_OF_A_PAIR = 8192  # points of a task where they are many: its tiles share what is decoded
 _STEPS = 12
 _SETTLED = 0.003  # px; a step below it is the last
 _ROUGHLY = 0.05  # px; the same where a place is only compared
@@ -83,17 +84,21 @@ def register_places(
     start: Array,
     linear: Array,
     patch: int,
+    tile: int = 1024,
 ) -> Registration:
-    """Read what is needed of two images, each a path and its size, and register as `register` does."""
+    """Read what is needed of two images, each a path and its size, and register as `register` does, tile by tile."""
     cv2.setNumThreads(1)
     margin = patch + _TAPS + int(_REACH)
-    read = _mosaics if _sparse(reference, margin) else _window
-    reads = zip(files, (reference, start), strict=True)
-    (first, valid_a, shift_a), (second, valid_b, shift_b) = (
-        read(file, band, xy, margin) for file, xy in reads
-    )
-    found = register((first, second), (valid_a, valid_b), reference - shift_a, start - shift_b, linear, patch)
-    return replace(found, xy=found.xy + shift_b)
+    sparse, every = _sparse(reference, margin), Registration.none(start)
+    read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, tile))
+    with PixelReader(files[0][0], band) as first, PixelReader(files[1][0], band) as second:
+        for rows in groups:
+            a, valid_a, shift_a = read(first, files[0][1], reference[rows], margin)
+            b, valid_b, shift_b = read(second, files[1][1], start[rows], margin)
+            places = reference[rows] - shift_a, start[rows] - shift_b
+            found = register((a, b), (valid_a, valid_b), *places, linear[rows], patch)
+            every.put(rows, replace(found, xy=found.xy + shift_b))
+    return every
 
 
 Read = tuple[
@@ -106,42 +111,60 @@ def _sparse(xy: Array, margin: int) -> bool:
     return len(xy) * (2 * margin + 1) ** 2 < 0.5 * float(np.prod(np.ptp(xy, axis=0) + 2 * margin + 1))
 
 
-def _window(file: tuple[str, tuple[int, int]], band: int, xy: Array, margin: int) -> Read:
+def _window(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> Read:
     """The pixels about all points."""
     low, high = np.floor(xy.min(axis=0)).astype(int), np.ceil(xy.max(axis=0)).astype(int)
-    box = grow((low[0], low[1], *(high - low + 1)), margin, file[1])
-    with PixelReader(file[0], band) as reader:
-        pixels, usable = reader.read(box)
+    box = grow((low[0], low[1], *(high - low + 1)), margin, size)
+    pixels, usable = reader.read(box)
     return levelled(pixels, usable), usable, np.array(box[:2], dtype=np.float64)
 
 
-def _mosaics(file: tuple[str, tuple[int, int]], band: int, xy: Array, margin: int) -> Read:
+def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> Read:
     """The pixels about every point, side by side in one picture: what lies between points is not worked on."""
     side = 2 * margin + 1
     columns = int(np.ceil(np.sqrt(len(xy))))
     shape = -(-len(xy) // columns) * side, columns * side
     picture, usable = np.zeros(shape, np.float32), np.zeros(shape, dtype=bool)
     shift = np.empty((len(xy), 2))
-    with PixelReader(file[0], band) as reader:
-        for number, corner in enumerate(np.rint(xy).astype(np.int64) - margin):
-            col, row = number % columns * side, number // columns * side
-            shift[number] = corner - (col, row)
-            low, high = corner.clip(0), np.minimum(corner + side, file[1])
-            if (high > low).all():
-                pixels, known = reader.read((int(low[0]), int(low[1]), *(high - low).tolist()))
-                (left, top), (right, below) = low - corner, corner + side - high
-                place, border = np.s_[row : row + side, col : col + side], (top, below, left, right)
-                picture[place] = cv2.copyMakeBorder(levelled(pixels, known), *border, cv2.BORDER_REFLECT_101)
-                usable[place] = np.pad(known, ((top, below), (left, right)))
+    for number, corner in enumerate(np.rint(xy).astype(np.int64) - margin):
+        col, row = number % columns * side, number // columns * side
+        shift[number] = corner - (col, row)
+        low, high = corner.clip(0), np.minimum(corner + side, size)
+        if (high > low).all():
+            pixels, known = reader.read((int(low[0]), int(low[1]), *(high - low).tolist()))
+            (left, top), (right, below) = low - corner, corner + side - high
+            place, border = np.s_[row : row + side, col : col + side], (top, below, left, right)
+            picture[place] = cv2.copyMakeBorder(levelled(pixels, known), *border, cv2.BORDER_REFLECT_101)
+            usable[place] = np.pad(known, ((top, below), (left, right)))
     return picture, usable, shift
 
 
 def _parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
-    """Links that are registered together: those of a tile, or, where they are few, of a band of rows."""
+    """Links that are registered in one task: of whole tiles, or, where they are few, of whole bands of rows."""
     if not _sparse(origin, PATCH + _TAPS + int(_REACH)):
-        return [links[rows] for rows in grouped(*np.floor(origin[:, ::-1] / tile).astype(np.int64).T)]
+        return [links[rows] for rows in _joined(_by_tile(origin, tile), _ALL_OF_A_PAIR)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // _BAND))
-    return [links[order[first : first + _TOGETHER]] for first in range(0, len(order), _TOGETHER)]
+    bands = np.split(order, np.flatnonzero(np.diff(origin[order, 1] // _BAND)) + 1)
+    pieces = [band[at : at + _TOGETHER] for band in bands for at in range(0, len(band), _TOGETHER)]
+    return [links[rows] for rows in _joined(pieces, _TOGETHER)]
+
+
+def _by_tile(xy: Array, tile: int) -> list[IntArray]:
+    """Rows of the points (N, 2) in every tile, row by row of tiles."""
+    return grouped(*np.floor(xy[:, ::-1] / tile).astype(np.int64).T)
+
+
+def _joined(groups: Sequence[IntArray], most: int) -> list[IntArray]:
+    """Groups that follow each other as one, as far as they hold so many together."""
+    parts: list[list[IntArray]] = []
+    count = most
+    for group in groups:
+        count += len(group)
+        if count > most:
+            parts.append([])
+            count = len(group)
+        parts[-1].append(group)
+    return [np.concatenate(part) for part in parts]
 
 
 def register_part(
@@ -151,12 +174,13 @@ def register_part(
     start: Array,
     linear: Array,
     structural: bool,
+    tile: int,
 ) -> Registration:
     """Patches registered on their grey values, or on channels of oriented gradients; `ok` where they are alike."""
     if structural:
         xy, ok, correlation = structure.register_places(files, band, reference, start, linear)
         return Registration(xy, correlation, np.full(len(xy), structure.SIGMA), ok)
-    found = register_places(files, band, reference, start, linear, PATCH)
+    found = register_places(files, band, reference, start, linear, PATCH, tile)
     return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
 
 
@@ -275,8 +299,9 @@ class _Template:
         settled: float = _SETTLED,
     ) -> Registration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
-        corner, offset = reference[:, 1:] * self._width + reference[:, :1], self._row * self._width + self._col
-        image, by_col, by_row = (picture.take(corner + offset) for picture in self._pictures)
+        offset = self._row * self._width + self._col
+        place = reference[:, 1:] * self._width + reference[:, :1] + offset
+        image, by_col, by_row = (picture.take(place) for picture in self._pictures)
         values, deviation = self._normalized(image)
         x, y = (self._col / self._half).astype(np.float32), (self._row / self._half).astype(np.float32)
         jacobian = np.empty((len(reference), 8, len(offset)), np.float32)  # times the roots of the weights
@@ -286,7 +311,7 @@ class _Template:
         jacobian[:, 6], jacobian[:, 7] = values * self._root, self._root
         normal = (jacobian @ jacobian.transpose(0, 2, 1)).astype(np.float64)
         normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
-        inverse = np.linalg.inv(normal)
+        inverse = np.asarray(np.linalg.inv(normal), np.float64)
         xy, step = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
         sampled = self._normalized(self._sample(fine, *xy))[0]
         correlation = ((sampled * values) @ self._weight).astype(np.float64)
@@ -407,9 +432,8 @@ class _Links:
         for part in parts:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
-            tasks.append(
-                (images, options.band, origin[part], start[part], linear[part], self._is_structural(part))
-            )
+            places = origin[part], start[part], linear[part]
+            tasks.append((images, options.band, *places, self._is_structural(part), options.tile))
         done: list[Registration] = ordered(executor, register_part, tasks, "refine", progress)
         found = Registration.none(start)
         for part, one in zip(parts, done, strict=True):

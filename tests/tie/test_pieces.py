@@ -34,6 +34,7 @@ from barpc.tie.raster import survey, tiles
 from barpc.tie.register import (
     Registration,
     _at,
+    _joined,
     _Links,
     _parts,
     _shared,
@@ -521,12 +522,26 @@ def test_what_is_verified_is_on_its_line_at_its_altitude_and_no_less_certain_tha
     assert np.flatnonzero(~left).tolist() == [20, 50, 51, 80]
 
 
-def test_few_points_are_registered_in_bands_of_rows_swept_by_columns() -> None:
-    places = np.random.default_rng(0).uniform(0, 40_000, (1300, 2))
-    links = np.arange(1300) + 7
+def test_tiles_that_follow_each_other_share_a_task_as_far_as_it_holds_their_points() -> None:
+    groups = [np.arange(first, last) for first, last in ((0, 3), (3, 5), (5, 6), (6, 12), (12, 14))]
+    for most, lengths in ((1, [3, 2, 1, 6, 2]), (5, [5, 1, 6, 2]), (6, [6, 6, 2]), (14, [14])):
+        joined = _joined(groups, most)
+        assert [len(part) for part in joined] == lengths
+        np.testing.assert_array_equal(np.concatenate(joined), np.arange(14))
+    assert _joined([], 5) == []
+
+
+@pytest.mark.parametrize("count", [1300, 60_000])
+def test_few_points_are_registered_in_bands_of_rows_swept_by_columns(count: int) -> None:
+    places = np.random.default_rng(0).uniform(0, 40_000, (count, 2))
+    links = np.arange(count) + 7
     parts = _parts(places, links, 1024)
-    assert [len(part) for part in parts] == [512, 512, 276]
+    assert max(len(part) for part in parts) <= 512
+    assert len(parts) <= 1.1 * count / 512 + count / 400  # nearly full
     assert sorted(np.concatenate(parts)) == links.tolist()
+    if count < 10_000:  # a band is in one task: strips are decoded once
+        bands = [set(places[part - 7, 1] // 512) for part in parts]
+        assert sum(map(len, bands)) == len(set.union(*bands))
     swept = places[np.concatenate(parts) - 7]
     assert (np.diff(swept[:, 1] // 512) >= 0).all()
     same = np.diff(swept[:, 1] // 512) == 0
@@ -565,11 +580,12 @@ def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
 
     monkeypatch.setattr("barpc.tie.register.ordered", ordered)
     monkeypatch.setattr("barpc.tie.register._sparse", lambda *_: False)
+    monkeypatch.setattr("barpc.tie.register._ALL_OF_A_PAIR", 1)
     found = links.register(TieOptions(tile=256), None, None)
     assert len(found.xy) == 160
-    for _, band, origin, start, linear, structural in seen:
+    for _, band, origin, start, linear, structural, tile in seen:
         assert (np.ptp(np.floor(origin / 256), axis=0) == 0).all()
-        assert (band, structural) == (1, False)
+        assert (band, structural, tile) == (1, False, 256)
         assert len(origin) == len(start) == len(linear)
     assert sum(len(task[2]) for task in seen) == 160
     assert len(seen) > 20

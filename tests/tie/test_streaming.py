@@ -7,6 +7,7 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 from barpc.errors import InputError
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
-from barpc.tie import TieOptions, features, find_tracks
+from barpc.tie import TieOptions, features, find_tracks, raster
 from barpc.tie.features import KeypointFiles, Share, detect_tile, keep_tile, locate
 from barpc.tie.raster import Survey, read_picture, survey, tiles
 from barpc.tie.register import _usual
@@ -221,17 +222,82 @@ def test_the_levels_of_a_jpeg_2000_show_the_same_places(tmp_path, zoom: int) -> 
     assert np.abs(offset).max() < 0.1 * zoom
 
 
+def decoded(log: list[tuple[int, str, tuple[int, int], tuple[int, int, int, int], int]]) -> dict[str, float]:
+    """Blocks decoded for the windows of a log over those of the file: GDAL keeps them while it is open."""
+    blocks = {
+        (number, path, zoom, c, r)
+        for number, path, (height, width), (col, row, wide, high), zoom in log
+        for c in range(col // width, (col + wide - 1) // width + 1)
+        for r in range(row // height, (row + high - 1) // height + 1)
+    }
+    shapes = {path: shape for _, path, shape, _, _ in log}
+    whole = {path: -(-SIDE // shape[0]) * -(-SIDE // shape[1]) for path, shape in shapes.items()}
+    return {
+        path: sum(1 / zoom**2 for _, p, zoom, _, _ in blocks if p == path) / n for path, n in whole.items()
+    }
+
+
+def stored(view: View, folder: Path, layout: dict[str, Any]) -> View:
+    """The view with its pixels in a file of another layout."""
+    rasterio = pytest.importorskip("rasterio")
+    path, size = folder / f"{view.name}.img", {"width": SIDE, "height": SIDE, "count": 1, "dtype": "uint16"}
+    with (
+        rasterio.open(view.path) as of,
+        rasterio.open(path, "w", **{"driver": "GTiff", **size, **layout}) as out,
+    ):
+        out.write(of.read())
+    return replace(view, path=str(path))
+
+
+@pytest.mark.parametrize(
+    ("layout", "surveyed", "found"),
+    [
+        ({"blockysize": 8, "compress": "deflate"}, 0.75, 1.15),
+        ({"tiled": True, "blockxsize": 64, "blockysize": 64}, 0.8, 1.6),
+        ({"driver": "JP2OpenJPEG", "BLOCKXSIZE": 256, "BLOCKYSIZE": 256, "RESOLUTIONS": 4}, 0.07, 1.0),
+    ],
+)
+def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, surveyed, found) -> None:
+    """But for those in the margins; of JPEG 2000 the survey looks at every fourth pixel."""
+    warnings.simplefilter("ignore")
+    views, options = [stored(view, tmp_path, layout) for view in pair], TieOptions(tile=512)
+    log: list[Any] = []
+    opened: list[str] = []
+    read, start = raster._read, raster.open_raster
+    monkeypatch.setattr(raster, "open_raster", lambda path: opened.append(str(path)) or start(path))
+
+    def noted(dataset, box, band, zoom=1):
+        log.append((len(opened), dataset.name, dataset.block_shapes[0], box, zoom))
+        return read(dataset, box, band, zoom)
+
+    monkeypatch.setattr(raster, "_read", noted)
+    known = survey(views[0].path)
+    assert known is not None
+    assert 0.0 < decoded(log)[views[0].path] <= surveyed
+    log.clear()
+    for box in tiles((SIDE, SIDE), options, 1, known):
+        detect_tile(views[0].path, (SIDE, SIDE), box, known, Share(0.004), options)
+    assert 0.99 <= decoded(log)[views[0].path] <= found
+    assert find_tracks(views, options).tracks.num_points > 500
+    registered = [
+        entry for entry in log if entry[0] == len(opened)
+    ]  # both files were opened before any was read
+    assert len(registered) == 8  # windows: four tiles of either
+    assert all(0.9 <= share <= 1.0 for share in decoded(registered).values())
+
+
 @pytest.mark.parametrize(
     ("size", "zoom", "found", "widths", "heights"),
     [
         ((9000, 3000), 1, Survey(None, (9000, 8), False), {9000}, {1024, 952}),  # type: ignore[arg-type]
+        ((900, 3000), 1, Survey(None, (900, 8), False), {900}, {1024, 952}),  # type: ignore[arg-type]
         ((9000, 3000), 1, Survey(None, (512, 512), False), {1024, 808}, {1024, 952}),  # type: ignore[arg-type]
-        ((4000, 3000), 1, Survey(None, (4000, 8), False), {1024, 928}, {1024, 952}),  # type: ignore[arg-type]
+        ((4000, 3000), 1, Survey(None, (4000, 8), False), {4000}, {1024, 952}),  # type: ignore[arg-type]
         ((9000, 9000), 2, Survey(None, (1024, 1024), True), {4096, 808}, {4096, 808}),  # type: ignore[arg-type]
         ((9000, 9000), 1, Survey(None, (640, 640), True), {1280, 40}, {1280, 40}),  # type: ignore[arg-type]
     ],
 )  # fmt: skip
-def test_tiles_are_whole_strips_of_wide_images_and_whole_blocks_where_decoding_is_dear(
+def test_tiles_are_whole_strips_and_whole_blocks_where_decoding_is_dear(
     size, zoom, found, widths, heights
 ) -> None:
     boxes = tiles(size, TieOptions(), zoom, found)
