@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from barpc.errors import InputError
+from barpc.errors import ImageError, InputError
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, features, find_tracks, raster
@@ -323,3 +323,15 @@ def test_the_store_goes_with_the_run_folder(tmp_path) -> None:
     with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as executor:
         assert Path(executor.store.folder) == workspace.cache
         assert Path(executor.store.room) == workspace.partial
+
+
+def test_a_block_that_two_windows_share_is_decoded_once(tmp_path) -> None:
+    """The pixels are gone from the file when the second window asks for them."""
+    path = write_image(tmp_path / "a.tif", quiet(10.0), **BLOCKS)
+    with raster.PixelReader(path) as reader:
+        before = reader.read((10, 10, 600, 600))[0]
+        with path.open("r+b") as file:
+            file.write(bytes(path.stat().st_size))
+        np.testing.assert_array_equal(reader.read((100, 200, 300, 400))[0], before[190:590, 90:390])
+    with pytest.raises(ImageError):
+        raster.read_pixels(path, (100, 200, 300, 400))
