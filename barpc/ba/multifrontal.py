@@ -22,7 +22,7 @@ from barpc.ba.dissection import Dissection, Front
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-IN_MEMORY = 3e9  # bytes of a factor; the rest goes to a temporary file
+IN_MEMORY = 2e9  # bytes of a factor; the rest goes to a temporary file
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +97,8 @@ class Cholesky:
 
     blocks: Blocks
     order: Dissection
-    # of every front L of its pivots (p q, p q), above whose diagonal nothing is meant, and of its border (b q, p q)
-    upper: _Store = field(default_factory=_Store)
-    lower: _Store = field(default_factory=_Store)
+    # of every front L of its pivots (p q, p q), above whose diagonal nothing is meant, then of its border (b q, p q)
+    parts: _Store = field(default_factory=_Store)
 
     @property
     def _size(self) -> int:
@@ -145,8 +144,8 @@ class Cholesky:
             if failed:
                 raise np.linalg.LinAlgError(f"{failed}-th leading minor not positive definite")
             lower = dtrsm(1.0, upper, matrix[split:, :split], side=1, lower=1, trans_a=1)
-            self.upper.append(upper)
-            self.lower.append(lower)
+            self.parts.append(upper)
+            self.parts.append(lower)
             if front.parent >= 0:
                 rest = dsyrk(-1.0, lower, beta=1.0, c=matrix[split:, split:], lower=1)
                 left.setdefault(front.parent, []).append((front.border, rest))
@@ -173,16 +172,21 @@ class Cholesky:
         y = np.ascontiguousarray(b.reshape(len(b), -1)[chosen])
         for number, front in enumerate(self.order.fronts):
             own, border = self._rows(front)
-            lower = self.lower[number]
-            y[own] = dtrsm(1.0, self.upper[number], y[own].T, side=1, lower=1, trans_a=1).T
+            upper, lower = self._of(number)
+            y[own] = dtrsm(1.0, upper, y[own].T, side=1, lower=1, trans_a=1).T
             y[border] -= lower @ y[own]
         for number in range(len(self.order.fronts) - 1, -1, -1):
             own, border = self._rows(self.order.fronts[number])
-            rest = y[own] - self.lower[number].T @ y[border]
-            y[own] = dtrsm(1.0, self.upper[number], rest.T, side=1, lower=1).T
+            upper, lower = self._of(number)
+            rest = y[own] - lower.T @ y[border]
+            y[own] = dtrsm(1.0, upper, rest.T, side=1, lower=1).T
         out = np.empty_like(y)
         out[chosen] = y
         return out.reshape(b.shape)
+
+    def _of(self, number: int) -> tuple[Array, Array]:
+        """L of a front: of its pivots and of its border."""
+        return self.parts[2 * number], self.parts[2 * number + 1]
 
     def _rows(self, front: Front) -> tuple[slice, IntArray]:
         """Unknowns of a front's pivots and its border, in the order of elimination."""
@@ -212,7 +216,7 @@ class Cholesky:
 
     def _inverse_of(self, number: int, front: Front, known: dict[int, Array]) -> Array:
         """The inverse's part (m q, m q) of a front, by that of its parent."""
-        upper, split = self.upper[number], len(front.pivots) * self._size
+        (upper, lower), split = self._of(number), len(front.pivots) * self._size
         found, failed = dpotri(upper, lower=1)
         if failed:
             raise np.linalg.LinAlgError(f"{failed}-th pivot is zero")
@@ -223,7 +227,7 @@ class Cholesky:
         whole = np.empty((split + len(front.border) * self._size,) * 2)
         place = _spread(self._local(self.order.fronts[front.parent], front.border), self._size)
         beyond = known[front.parent][np.ix_(place, place)]
-        weights = dtrsm(1.0, upper, self.lower[number], side=1, lower=1)
+        weights = dtrsm(1.0, upper, lower, side=1, lower=1)
         across = beyond @ weights
         whole[split:, split:], whole[split:, :split], whole[:split, split:] = beyond, -across, -across.T
         whole[:split, :split] = own + weights.T @ across
