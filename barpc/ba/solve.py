@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg as la
@@ -57,9 +57,15 @@ class Minimum:
     reduced: Reduced  # the last linearisation: at the minimum (scipy), or one small step before it
     factor: Factor | None = None  # of its matrix, free unknowns only, where it was factorised
     status: str = ""  # which solver ran, and why it stopped
+    _known: list[Covariance] = field(default_factory=list, repr=False)
 
     def covariance(self, free: BoolArray) -> Covariance:
-        """The posterior covariance, by the last linearisation."""
+        """The posterior covariance, by the last linearisation; what it works out is kept."""
+        if not self._known:
+            self._known.append(self._covariance(free))
+        return self._known[0]
+
+    def _covariance(self, free: BoolArray) -> Covariance:
         factor = self.factor
         if factor is None:
             try:

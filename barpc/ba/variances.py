@@ -41,8 +41,7 @@ _UNEXPECTED = (
 _LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
 _ITERATIONS = 10
 _STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
-_SMALL = 400  # unknowns up to which every view is tried and the covariance's diagonal is exact
-_PROBES = 32
+_SMALL = 400  # unknowns up to which every view is tried
 _LEAST = 0.5  # degrees of freedom below which nothing is said
 
 
@@ -115,17 +114,22 @@ class Variances:
         """Priors while outliers are looked for: a drift that was not expected must not look like them."""
         return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, _SEARCH))
 
-    def learnt(self, problem: Problem, minimum: Minimum) -> tuple[CameraPrior, PriorTest]:
-        """The priors that the block supports, in its linearisation at a minimum."""
+    def learnt(
+        self, problem: Problem, minimum: Minimum, exact: bool = False
+    ) -> tuple[CameraPrior, PriorTest]:
+        """The priors that the block supports, in its linearisation at a minimum.
+
+        A large block's variances are probed unless they are to be `exact`.
+        """
         try:
-            return self._learnt(problem, minimum)
+            return self._learnt(problem, minimum, exact)
         except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
             _LOG.warning("the priors of the cameras are left as they are: %s", error)
             n = len(minimum.state.params)
             nothing = PriorTest(float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), ())
             return problem.camera_prior, nothing
 
-    def _learnt(self, problem: Problem, minimum: Minimum) -> tuple[CameraPrior, PriorTest]:
+    def _learnt(self, problem: Problem, minimum: Minimum, exact: bool) -> tuple[CameraPrior, PriorTest]:
         around = _Around(problem, minimum)
         now, params = problem.camera_prior, minimum.state.params
         covariance = minimum.covariance(problem.free)
@@ -133,7 +137,7 @@ class Variances:
         prior = self._prior(scale, wide)
         if around.small and (now.sigma != prior.sigma).any():
             _, params, covariance = around.under(prior)
-        known = self._known(covariance, prior if around.small else now)
+        known = self._known(covariance, prior if around.small else now, exact)
         total, freedom = (float(part.sum()) for part in self._squares(params, known))
         ratio = total / freedom if freedom > _LEAST else float("nan")
         for _ in range(_ITERATIONS):
@@ -169,11 +173,13 @@ class Variances:
                 sigma[:, part] = np.hypot(sigma[:, part], _MOVING * sigma[:, :3])
         return CameraPrior(self.given.mean, sigma)
 
-    def _known(self, covariance: Covariance, prior: CameraPrior) -> Array:
+    def _known(self, covariance: Covariance, prior: CameraPrior, exact: bool = True) -> Array:
         """How far the observations determine each unknown (N, q): 0 not at all, 1 wholly."""
         shape = prior.sigma.shape
         use = covariance.free.reshape(shape) & np.isfinite(prior.sigma)
-        known = 1.0 - _posterior_variance(covariance, shape) / prior.sigma**2
+        probed = covariance.is_sparse and not exact
+        variance = covariance.probed_variances() if probed else covariance.variances()
+        known = 1.0 - variance / prior.sigma**2
         return np.where(use, known.clip(0.0, 1.0), 0.0)
 
     def _squares(
@@ -266,12 +272,3 @@ def same_prior(a: CameraPrior, b: CameraPrior, share: float) -> bool:
     """Whether the standard deviations of two priors differ by less than a share; infinite ones are infinite in both."""
     finite = np.isfinite(a.sigma) & np.isfinite(b.sigma)
     return bool((np.abs(np.log(a.sigma[finite] / b.sigma[finite])) < share).all())
-
-
-def _posterior_variance(covariance: Covariance, shape: tuple[int, ...]) -> Array:
-    """Posterior variances (N, q) of all unknowns: exact for small blocks, else by random probes (Hutchinson)."""
-    n = len(covariance.free)
-    if n <= _SMALL:
-        return np.diag(covariance.full).reshape(shape)
-    probes = np.where(np.random.default_rng(n).integers(0, 2, (n, _PROBES)) > 0, 1.0, -1.0)
-    return np.asarray((probes * covariance.solve(probes)).mean(axis=1).reshape(shape))
