@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from html import escape
@@ -125,12 +125,7 @@ def verify(
     ground, image = control_grid(model, size, alt_range)
     if not len(ground):
         raise OutputError("hand-off: the model sees no ground point inside its own image")
-    return [
-        _reading(path, name, CONSUMERS[name].open, ground, image)
-        for path in map(Path, paths)
-        for name, installed in (*_readers(path).items(), ("barpc", True))
-        if installed
-    ]
+    return [reading for path in map(Path, paths) for reading in _readings(path, ground, image)]
 
 
 def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = None) -> list[Reading]:
@@ -186,16 +181,29 @@ def _readers(path: Path) -> dict[str, bool]:
     return {} if row is None else {name: CONSUMERS[name].installed for name in row.consumers}
 
 
-def _reading(
-    path: Path, name: str, opener: Callable[[Path], Projection], ground: Array, image: Array
-) -> Reading:
+def _readings(path: Path, ground: Array, image: Array) -> list[Reading]:
+    """What all consumers make of a file, which is lent to those that are not barpc."""
+    names = [name for name, installed in _readers(path).items() if installed]
     try:
-        with warnings.catch_warnings(), nullcontext(path) if name == "barpc" else _lent(path) as lent:
+        with _lent(path) as lent:
+            found = [_reading(path, lent, name, ground, image) for name in names]
+    except Exception as failure:  # noqa: BLE001 - what cannot be lent is read by none
+        found = [_unread(path, name, failure) for name in names]
+    return [*found, _reading(path, path, "barpc", ground, image)]
+
+
+def _reading(path: Path, lent: Path, name: str, ground: Array, image: Array) -> Reading:
+    try:
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            error = _largest(opener(lent), ground, image)
+            error = _largest(CONSUMERS[name].open(lent), ground, image)
     except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
-        return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
+        return _unread(path, name, failure)
     return Reading(path, name, error, "" if np.isfinite(error) else "it projects to no finite point")
+
+
+def _unread(path: Path, name: str, failure: Exception) -> Reading:
+    return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
 
 
 @contextmanager
@@ -272,13 +280,20 @@ def _gdal_raster(path: Path) -> Projection:
 def _gdal_text(path: Path) -> Projection:
     """GDAL reads text only beside an image: one of a single pixel is lent to it."""
     stem = path.name[: -len("_rpc.txt")] if path.name.lower().endswith("_rpc.txt") else path.stem
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+    with tempfile.TemporaryDirectory() as folder:
         image = Path(folder) / f"{stem}.tif"
-        with rasterio.open(image, "w", driver="GTiff", width=1, height=1, count=1, dtype="uint8") as made:
-            made.write(np.zeros((1, 1, 1), dtype=np.uint8))
+        image.write_bytes(_pixel())
         shutil.copy(path, folder)
         return _gdal_raster(image)
+
+
+@cache
+def _pixel() -> bytes:
+    with warnings.catch_warnings(), rasterio.MemoryFile() as file:
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with file.open(driver="GTiff", width=1, height=1, count=1, dtype="uint8") as made:
+            made.write(np.zeros((1, 1, 1), dtype=np.uint8))
+        return bytes(file.read())
 
 
 def _rpcm(path: Path) -> Projection:

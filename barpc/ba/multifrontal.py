@@ -22,7 +22,7 @@ from barpc.ba.dissection import Dissection, Front
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-IN_MEMORY = 2e9  # bytes of a factor; the rest goes to a temporary file
+IN_MEMORY = 1.5e9  # bytes of a factor; the rest goes to a temporary file
 
 
 @dataclass(frozen=True, eq=False)

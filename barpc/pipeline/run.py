@@ -167,9 +167,8 @@ def adjust(
             with _told(workspace, "block", progress), workspace.output(PRIOR) as partial:
                 block_prior(run.adjustment).save(partial)
         with _told(workspace, "summary", progress):
-            run = replace(run, out_dir=str(out_dir))
+            run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
             summary = summarize(run)
-        run = replace(run, stages=list(workspace.stages))
         summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
         _tell(progress, REPORT, 0)
         summary = write_tables(workspace, run, summary)

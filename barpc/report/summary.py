@@ -24,7 +24,7 @@ from barpc.report.records import Cell, Column, Number, Record, plain, said, valu
 from barpc.report.run import Run
 from barpc.scene import IntArray
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.corrected import Corrected, Correction, ImageCorrected
 from barpc.sensor.geometry import (
     Several,
     base_to_height,
@@ -798,7 +798,8 @@ def medians(values: Array, group: IntArray, num: int) -> Array:
 def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
     """The correction of a view, at the ground point (3,) in the middle of its image."""
     sensor, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
-    correction, covariance = adjustment.corrections[i], adjustment.covariance.view(i)
+    assert isinstance(sensor, Corrected | ImageCorrected)
+    correction, covariance = sensor.correction, adjustment.covariance.view(i)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     common = (model, adjustment.params[i].tolist(), sigma)
     if not isinstance(correction, Correction):
