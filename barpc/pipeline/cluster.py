@@ -1,4 +1,4 @@
-"""A cluster's workers come and go: whether any is left is said while a run waits."""
+"""A cluster's workers come and go: whether any is left is said while a run waits, and each must be this barpc's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
+from importlib import metadata
 from typing import Any
+
+from barpc.errors import InputError
 
 logger = logging.getLogger(__name__)
 
@@ -18,17 +21,40 @@ POLL, REMIND = 5.0, 60.0
 
 @contextmanager
 def watched(executor: Executor | None) -> Iterator[None]:
-    """Say when a dask cluster has no worker, once a minute that one is waited for, and when work goes on."""
+    """Say when a dask cluster has no worker, once a minute that one is waited for, and when work goes on.
+
+    InputError where a worker has another version of barpc.
+    """
     client = getattr(executor, "_client", None)
     if client is None:
         yield
         return
+    _require_own_version(client)
     end = threading.Event()
     threading.Thread(target=_watch, args=(client, end), daemon=True).start()
     try:
         yield
     finally:
         end.set()
+
+
+def other_version(theirs: str, own: str, where: str = "a worker") -> InputError:
+    """What is wrong with a worker that would give other bytes."""
+    return InputError(
+        f"{where} has barpc {theirs}, this process {own}: results would differ; install the same version everywhere"
+    )
+
+
+def _require_own_version(client: Any) -> None:
+    try:
+        own = metadata.version("barpc")
+    except metadata.PackageNotFoundError:  # from a folder: nothing to compare with
+        return
+    found = client.run(metadata.version, "barpc", on_error="return")
+    for worker, theirs in sorted(found.items()):
+        if theirs != own:
+            none = isinstance(theirs, Exception)
+            raise other_version("of no version" if none else theirs, own, f"the worker {worker}")
 
 
 def _watch(client: Any, end: threading.Event) -> None:

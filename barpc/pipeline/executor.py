@@ -25,8 +25,10 @@ from typing import Any
 
 import numpy as np
 
+from barpc import __version__
 from barpc.errors import AdjustError, BarpcError
 from barpc.frozen import Arrays, from_arrays, to_arrays
+from barpc.pipeline.cluster import other_version
 from barpc.tie.store import Store
 from barpc.workspace import Workspace, key_of
 
@@ -129,7 +131,7 @@ class CachingExecutor(Executor):
             try:
                 tasks = [self._spill(task.args) for task in batch]
                 assert self.executor is not None
-                future = self.executor.submit(run_batch, batch[0].fn, tasks)
+                future = self.executor.submit(run_batch, batch[0].fn, tasks, __version__)
             except (RuntimeError, OSError) as error:  # the pool is broken or shut down; the disk is full
                 self._resolve(batch, [(0.0, None, _explained(error))] * len(batch))
             else:
@@ -273,8 +275,15 @@ class Spilled:
         return arguments
 
 
-def run_batch(fn: Function, tasks: Sequence[tuple[Any, ...] | Spilled]) -> tuple[list[Outcome], float]:
-    """Work on a batch, in a worker: one task's error leaves the others their results; CPU seconds that it took."""
+def run_batch(
+    fn: Function, tasks: Sequence[tuple[Any, ...] | Spilled], version: str
+) -> tuple[list[Outcome], float]:
+    """Work on a batch, in a worker: one task's error leaves the others their results; CPU seconds that it took.
+
+    One that came to a cluster with another `version` works on nothing.
+    """
+    if version != __version__:
+        return [(0.0, None, other_version(__version__, version))] * len(tasks), 0.0
     outcomes: list[Outcome] = []
     cpu = time.thread_time()
     for task in tasks:

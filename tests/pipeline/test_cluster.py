@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import time
+from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
 import barpc
+from barpc.errors import InputError
 from barpc.options import RunOptions, TieOptions
 from barpc.pipeline import cluster
+from barpc.pipeline.executor import run_batch
 
 distributed = pytest.importorskip("distributed")
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
@@ -28,6 +33,10 @@ class Counted:
         if number is None:
             raise OSError("Timed out")
         return {f"tcp://127.0.0.1:{i}": 1 for i in range(number)}
+
+    def run(self, function: Callable[[str], str], package: str, on_error: str) -> dict[str, str]:
+        assert on_error == "return"
+        return {"tcp://127.0.0.1:0": function(package)}
 
 
 class Works:
@@ -60,6 +69,56 @@ def test_a_cluster_with_workers_and_an_executor_that_is_none_are_not_spoken_of(
     assert told(caplog, Counted(1), 0.2) == []
     with cluster.watched(None):
         assert not [t for t in threading.enumerate() if t.name == cluster.__name__]
+
+
+class Mixed(Counted):
+    """A client with one worker of this version and another one."""
+
+    def __init__(self, other: str | Exception) -> None:
+        super().__init__(2)
+        self.other = other
+
+    def run(self, function: Callable[[str], str], package: str, on_error: str) -> dict[str, object]:
+        return {"tcp://b:1": self.other, **super().run(function, package, on_error)}
+
+
+@pytest.mark.parametrize(
+    ("other", "said"), [("0.0.9", "0.0.9"), (metadata.PackageNotFoundError("barpc"), "of no version")]
+)
+def test_a_worker_of_another_version_is_named_before_any_work(other: str | Exception, said: str) -> None:
+    line = f"the worker tcp://b:1 has barpc {said}, this process {metadata.version('barpc')}: results would differ"
+    with pytest.raises(InputError, match=re.escape(line)), cluster.watched(Works(Mixed(other))):  # type: ignore[arg-type]
+        pytest.fail("the run began")
+
+
+def test_a_worker_that_comes_later_with_another_version_works_on_nothing() -> None:
+    done: list[int] = []
+    outcomes, seconds = run_batch(done.append, [(1,), (2,)], "0.0.9")
+    assert not done
+    assert seconds == 0.0
+    assert [str(error).split(":")[0] for _, _, error in outcomes] == [
+        f"a worker has barpc {barpc.__version__}, this process 0.0.9"
+    ] * 2
+    assert run_batch(done.append, [(1,), (2,)], barpc.__version__)[0][0][2] is None
+    assert done == [1, 2]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_the_version_of_real_workers_is_asked_for(tmp_path: Path) -> None:
+    folder = tmp_path / "barpc-9.9.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: barpc\nVersion: 9.9\n")
+    local = {"n_workers": 1, "threads_per_worker": 1, "local_directory": str(tmp_path / "dask")}
+    with (
+        distributed.LocalCluster(dashboard_address=None, **local) as dask,
+        distributed.Client(dask) as client,
+    ):
+        client.wait_for_workers(1)
+        with cluster.watched(client.get_executor()):
+            client.run(exec, f"import sys; sys.path.insert(0, {str(tmp_path)!r})")
+        with pytest.raises(InputError, match=r"has barpc 9\.9"), cluster.watched(client.get_executor()):
+            pytest.fail("the run began")
 
 
 def test_the_last_worker_is_said_within_ten_seconds_and_then_once_a_minute() -> None:
