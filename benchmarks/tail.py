@@ -1,10 +1,13 @@
-"""Everything but the matching, by the number of images: CPU seconds and memory of every stage of `barpc adjust`.
+"""Whole runs by the number of images: CPU seconds and memory of every stage of `barpc adjust`.
 
-Simulated blocks as files: small images with simulated RPCs, and matches.npz given with --matches. Prints, for each
-size, pairs, CPU seconds (whole process tree) and peak memory; then the CPU seconds of every stage and the share of
-the run's time that stages account for; then the exponent of CPU seconds over images between the sizes.
+Simulated blocks as files: small images with simulated RPCs, and matches.npz given with --matches, so that everything
+but the matching is measured; or small images of one ground, which are matched. Prints, for each size, pairs, CPU
+seconds (whole process tree) and peak memory; then the CPU seconds of every stage and the share of the run's time that
+stages account for; then the exponent of CPU seconds over images between the sizes. Of matched images it says, too,
+what the exact tie points of the simulation are left with.
 
     python benchmarks/tail.py --views 100 300 1000 --folder /somewhere
+    python benchmarks/tail.py --matching 192 --views 100 300 1000
 """
 
 from __future__ import annotations
@@ -21,17 +24,22 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
+from scipy.interpolate import RectBivariateSpline
 
+from barpc.geodesy import metres_per_unit
 from barpc.pointio.matches import write_matches
 from barpc.rpcio.tiff import put_tag
 from barpc.scene import View
+from barpc.sensor.corrected import Corrected
 from barpc.simulate import simulate_block
 
 SIDE, GSD = 512, 20.0  # px, m: images of ten kilometres
 LAYOUT = {"size": (SIDE, SIDE), "gsd": GSD, "attitude": 5e-5, "overlap": 0.1}
+PICTURES = {"gsd": 2.0, "overlap": 0.5, "alt_range": (0.0, 60.0)}  # to be matched
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -53,19 +61,62 @@ def write_block(folder: Path, num_views: int, tracks: int) -> Path:
         return listed
     folder.mkdir(parents=True)
     block = simulate_block(num_views, tracks * num_views, seed=1, num_checks=0, **LAYOUT)
-    paths = [_write_image(folder, n, view) for n, view in enumerate(block.views)]
+    ramp = np.add.outer(np.arange(SIDE), np.arange(SIDE)).astype(np.uint16)
+    paths = [_write_image(folder, view, ramp + n) for n, view in enumerate(block.views)]
     write_matches(folder / "matches.npz", block.tracks, [view.name for view in block.views])
     listed.write_text("".join(f"{path}\n" for path in paths))
     return listed
 
 
-def _write_image(folder: Path, number: int, view: View) -> Path:
-    path = folder / f"{view.name}.tif"
-    ramp = np.add.outer(np.arange(SIDE), np.arange(SIDE)) + number
+def write_pictures(folder: Path, num_views: int, side: int) -> Path:
+    """Images of one ground as the exact cameras of a block see it; the list of them."""
+    listed = folder / "images.txt"
+    if listed.exists():
+        return listed
+    folder.mkdir(parents=True)
+    block = simulate_block(num_views, 20 * num_views, seed=1, num_checks=0, size=(side, side), **PICTURES)
+    write_matches(folder / "exact.npz", block.tracks, [view.name for view in block.views])
+    exact = [Corrected(view.sensor, c) for view, c in zip(block.views, block.truth.corrections, strict=True)]
+    origin = block.truth.ground.min(axis=0) - (0.01, 0.01, 0.0)
+    size = np.ceil((np.ptp(block.truth.ground, axis=0) + 0.02)[:2] * metres_per_unit(origin)[:2]).astype(int)
+    ground = _texture(*size)
+    paths = []
+    for view, camera in zip(block.views, exact, strict=True):
+        east, north = _seen(camera, side, origin).astype(np.float32)
+        pixels = cv2.remap(ground, east, north, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        paths.append(_write_image(folder, view, pixels.astype(np.uint16)))
+    listed.write_text("".join(f"{path}\n" for path in paths))
+    return listed
+
+
+def _texture(width: int, height: int) -> np.ndarray:
+    """Brightness of every square metre: noise of several scales."""
+    rng, out = np.random.default_rng(0), np.full((height, width), 500.0, dtype=np.float32)
+    for step in (2, 4, 8, 16):
+        coarse = rng.normal(0.0, 60.0, (height // step + 2, width // step + 2)).astype(np.float32)
+        out += cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_CUBIC)[:height, :width]
+    return out.clip(1.0, 2000.0)
+
+
+def _seen(camera: Corrected, side: int, origin: np.ndarray) -> np.ndarray:
+    """Metres east and north (2, side, side) of an origin that every pixel shows, on waves of 20 m."""
+    nodes = np.linspace(0, side - 1, 33)
+    row, col = (axis.ravel() for axis in np.meshgrid(nodes, nodes, indexing="ij"))
+    alt = np.zeros(len(row))
+    for _ in range(3):  # lines of sight are steeper than the waves
+        at = (camera.localize(np.column_stack([col, row]), alt) - origin)[:, :2] * metres_per_unit(origin)[:2]
+        alt = 30.0 + 20.0 * np.sin(at[:, 0] / 150.0) * np.cos(at[:, 1] / 200.0)
+    every = np.arange(side)
+    splines = (RectBivariateSpline(nodes, nodes, axis.reshape(33, 33)) for axis in at.T)
+    return np.stack([spline(every, every) for spline in splines])
+
+
+def _write_image(folder: Path, view: View, pixels: np.ndarray) -> Path:
+    path, (height, width) = folder / f"{view.name}.tif", pixels.shape
     warnings.simplefilter("ignore", NotGeoreferencedWarning)
-    profile = {"driver": "GTiff", "width": SIDE, "height": SIDE, "count": 1, "dtype": "uint16"}
+    profile = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": "uint16"}
     with rasterio.open(path, "w", compress="deflate", predictor=2, **profile) as image:
-        image.write(ramp.astype(np.uint16), 1)
+        image.write(pixels, 1)
     put_tag(path, view.sensor)
     return path
 
@@ -73,9 +124,10 @@ def _write_image(folder: Path, number: int, view: View) -> Path:
 def run(listed: Path, out: Path, jobs: int) -> Trial:
     """`barpc adjust` in a process of its own."""
     matches = listed.parent / "matches.npz"
-    command = [sys.executable, "-m", "barpc", "-q", "adjust", "--image-list", listed, "--matches", matches]
+    command = [sys.executable, "-m", "barpc", "-q", "adjust", "--image-list", listed]
+    command += ["--matches", matches, "--matches-only"] * matches.exists()
     start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    words = [str(word) for word in (*command, "--matches-only", "-o", out, "--overwrite", "-j", jobs)]
+    words = [str(word) for word in (*command, "-o", out, "--overwrite", "-j", jobs)]
     done = subprocess.run(words, capture_output=True, text=True, env=os.environ | THREADS, check=False)
     wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode not in (0, 3):
@@ -93,6 +145,7 @@ def main() -> None:
     )
     parser.add_argument("--views", type=int, nargs="+", default=[100, 300, 1000], help="images, ascending")
     parser.add_argument("--tracks", type=int, default=95, help="tracks an image")
+    parser.add_argument("--matching", type=int, metavar="SIDE", help="match images of so many pixels a side")
     parser.add_argument("--jobs", type=int, default=1, help="worker processes")
     parser.add_argument("--folder", type=Path, help="where the files go and stay; default: a temporary one")
     options = parser.parse_args()
@@ -101,8 +154,11 @@ def main() -> None:
         print(" images   tracks    pairs  CPU [s]  clock [s]  memory [MB]  report.html [MB]", flush=True)
         trials = {}
         for num in options.views:
-            listed = write_block(folder / f"block_{num}", num, options.tracks)
-            trials[num] = found = run(listed, folder / f"run_{num}", options.jobs)
+            if options.matching is None:
+                listed = write_block(folder / f"block_{num}", num, options.tracks)
+            else:
+                listed = write_pictures(folder / f"pictures_{num}", num, options.matching)
+            trials[num] = found = run(listed, folder / f"run_{listed.parent.name}", options.jobs)
             counts = f"{num:7d}  {found.summary['tracks']['num_tracks']:7d}  {len(found.summary['pairs']):7d}"
             print(
                 f"{counts}  {found.cpu:7.1f}  {found.wall:9.1f}  {found.memory:11.0f}  {found.page:16.2f}",

@@ -42,7 +42,9 @@ def matcher_named(name: str) -> type[Matcher] | Hook:
 
 
 THIN = 100
-"""Verified matches of a pair below which it is tried again."""
+"""Verified matches of a pair below which it is tried again,"""
+SHARE, FEW = 0.3, 30
+"""unless they are this share of the keypoints in its common area, and so many: small images have no more to give."""
 TOLERANCE = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
 _DEFAULTS = TieOptions()
@@ -107,7 +109,9 @@ def match_pair(
 
 
 def _enough(report: PairReport) -> bool:
-    return report.status == "ok" and report.verified >= THIN
+    common = report.overlap * min(report.keypoints)
+    least = min(THIN, max(FEW, SHARE * common)) if common > 0 else THIN
+    return report.status == "ok" and report.verified >= least
 
 
 def _better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:

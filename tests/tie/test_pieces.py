@@ -28,7 +28,7 @@ from barpc.tie.epipolar import (
 )
 from barpc.tie.features import Share, detect_tile, join
 from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matching import MATCHERS, PairReport, _latest, _Search
+from barpc.tie.matching import MATCHERS, PairReport, _enough, _latest, _Search
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import survey, tiles
 from barpc.tie.register import (
@@ -612,6 +612,27 @@ def test_tracks_must_tie_every_pair_after_registration() -> None:
 
 
 # --- matching ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("keypoints", "overlap", "verified", "enough"),
+    [
+        ((5000, 4000), 1.0, 100, True),
+        ((5000, 4000), 1.0, 99, False),
+        ((360, 400), 0.5, 54, True),  # a third of what a small image has in the common area
+        ((360, 400), 0.5, 53, False),
+        ((360, 400), 0.1, 30, True),
+        ((360, 400), 0.1, 29, False),
+        ((0, 0), 1.0, 99, False),  # of a matcher that wants no keypoints
+        ((360, 400), float("nan"), 99, False),
+    ],
+)
+def test_a_pair_is_tried_again_where_it_has_fewer_matches_than_it_should(
+    keypoints, overlap, verified, enough
+) -> None:
+    report = PairReport(("v0", "v1"), "ok", keypoints, verified, verified, overlap=overlap)
+    assert _enough(report) == enough
+    assert not _enough(replace(report, status="too few matches"))
 
 
 class Scripted:
