@@ -105,9 +105,11 @@ def test_an_interrupted_run_leaves_its_work_and_says_how_to_go_on(wide, tmp_path
     assert not [path for path in (tmp_path / "out").iterdir() if path.name != ".barpc"]  # it did not finish
     for worker in workers:
         wait_until_gone(worker)
-    kept = len(list(tmp_path.glob("out/.barpc/cache/*/*.npz")))
-    assert kept >= 1
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("out/.barpc/cache/*/*.npz")}
+    assert kept
     assert barpc(*command).code == 0
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept  # nothing finished was made again
+    assert len(list(tmp_path.glob("out/.barpc/cache/*/*.npz"))) > len(kept)
 
 
 def wait_until_gone(pid: int) -> None:
