@@ -16,7 +16,7 @@ from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 _COLUMNS = 240  # unit vectors solved for at a time
-_PROBES = 32
+_LARGE, _PROBES = 900, 32
 _SMALL = 2000  # unknowns up to which the whole matrix is kept
 
 
@@ -40,15 +40,14 @@ class Covariance:
         return out
 
     @property
-    def is_sparse(self) -> bool:
-        """Whether the matrix is one of blocks, whose inverse costs as much as two factorisations."""
-        return self.factor.inverse is not None
+    def is_large(self) -> bool:
+        """Whether there are so many unknowns that exact variances take seconds: as much as two factorisations."""
+        return len(self.free) > _LARGE
 
     def variances(self) -> Array:
         """Variances (N, q) of all unknowns; zero for fixed ones."""
-        q = self.num_unknowns
-        if not self.is_sparse:
-            return self.full.diagonal().reshape(-1, q)
+        if self.factor.inverse is None:
+            return self.full.diagonal().reshape(-1, self.num_unknowns)
         return np.asarray(self._near.diagonal.diagonal(axis1=1, axis2=2))
 
     def probed_variances(self) -> Array:
@@ -57,10 +56,9 @@ class Covariance:
         Unknowns count in units of their standard deviation where all other views stood still: a variance would
         drown in those of others that are a hundred times as large.
         """
-        matrix, q = self.reduced.matrix, self.num_unknowns
-        assert isinstance(matrix, Blocks)
-        views, unit = self.free.reshape(-1, q).any(axis=1), np.ones((len(matrix.diagonal), q))
-        unit[views] = np.sqrt(np.linalg.inv(matrix.diagonal[views]).diagonal(axis1=1, axis2=2))
+        q = self.num_unknowns
+        views, unit = np.flatnonzero(self.free[::q]), np.ones((len(self.free) // q, q))
+        unit[views] = np.sqrt(np.linalg.inv(self.reduced.of_views()[views]).diagonal(axis1=1, axis2=2))
         random = np.random.default_rng(unit.size).integers(0, 2, (unit.size, _PROBES))
         probes = np.where(random > 0, 1.0, -1.0)
         found = (probes * self.solve(probes / unit.reshape(-1, 1))).mean(axis=1)
@@ -73,14 +71,14 @@ class Covariance:
     def joint(self, views: IntArray) -> Array:
         """Covariance (m q, m q) of the unknowns of some views."""
         of_full = len(self.free) <= _SMALL or "full" in self.__dict__
-        if of_full or not self.is_sparse:
+        if of_full or self.factor.inverse is None:
             place = self._places(views)
             return self._columns(place, of_full)[place]
         return np.block([[self._of_pair(int(i), int(j), False) for j in views] for i in views])
 
     def _of_pair(self, i: int, j: int, of_full: bool) -> Array:
         """Covariance (q, q) of view i with view j: where they share points, all such are known at once."""
-        if self.is_sparse and not of_full:
+        if self.factor.inverse is not None and not of_full:
             if i == j:
                 return np.asarray(self._near.diagonal[i])
             if (at := self._near.pair(min(i, j), max(i, j))) is not None:

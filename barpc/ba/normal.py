@@ -64,6 +64,16 @@ class Reduced:
             dense -= self.common.by_camera.T @ self.common.by_camera
         return dense if free.all() else dense[np.ix_(free, free)]
 
+    def of_views(self) -> Array:
+        """The blocks (N, q, q) on S's diagonal."""
+        if not isinstance(self.matrix, np.ndarray):
+            if self.common is None:
+                return self.matrix.diagonal
+            less = self.common.by_camera.reshape(-1, *self.matrix.diagonal.shape[:2])
+            return np.asarray(self.matrix.diagonal - np.einsum("mni,mnj->nij", less, less))
+        n, q, every = self.structure.num_views, self.cross.shape[2], np.arange(self.structure.num_views)
+        return np.asarray(self.matrix.reshape(n, q, n, q)[every, :, every, :])
+
     def factor(self, free: BoolArray, damping: float = 0.0) -> Factor:
         """The factorised S, of the unknowns that are free (N q,): those of whole views."""
         if isinstance(self.matrix, np.ndarray):

@@ -133,7 +133,7 @@ class Rounds:
         settled &= same_prior(prior, self.problem.camera_prior, _SAME_PRIOR)
         if self.passes > MAX_PASSES or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
-            if found.covariance(self.problem.free).is_sparse:
+            if found.covariance(self.problem.free).is_large:
                 tested = self.variances.learnt(self.problem, found, exact=True)[1]
             return Outcome(
                 self.problem,

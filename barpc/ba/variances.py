@@ -177,7 +177,7 @@ class Variances:
         """How far the observations determine each unknown (N, q): 0 not at all, 1 wholly."""
         shape = prior.sigma.shape
         use = covariance.free.reshape(shape) & np.isfinite(prior.sigma)
-        probed = covariance.is_sparse and not exact
+        probed = covariance.is_large and not exact
         variance = covariance.probed_variances() if probed else covariance.variances()
         known = 1.0 - variance / prior.sigma**2
         return np.where(use, known.clip(0.0, 1.0), 0.0)

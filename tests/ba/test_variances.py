@@ -238,7 +238,7 @@ def test_what_is_determined_is_what_the_prior_alone_does_not_say() -> None:
     full = np.diag([4.0, 2.0, 1.0, 0.0, 5.0, 4.0])
     free = np.array([1, 1, 1, 0, 1, 1], dtype=bool)
     covariance: Any = SimpleNamespace(
-        free=free, is_sparse=False, variances=lambda: full.diagonal().reshape(2, 3)
+        free=free, is_large=False, variances=lambda: full.diagonal().reshape(2, 3)
     )
     np.testing.assert_allclose(v._known(covariance, v.given), [[0.0, 0.5, 0.75], [0.0, 0.0, 0.0]])
     loose = CameraPrior(v.given.mean, np.where(np.arange(3) == 1, np.inf, v.given.sigma))
@@ -256,7 +256,7 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
     ):  # which share an error, taken off the sparse matrix
         found = adjust_tracks(block.views, block.tracks, AdjustOptions(), centers=centers_of(block))
     covariance = found.covariance
-    assert covariance.is_sparse
+    assert covariance.is_large
     by_camera = covariance.reduced.common.by_camera
     matrix = covariance.reduced.matrix.plain() - by_camera.T @ by_camera
     true = np.linalg.inv(matrix).diagonal().reshape(300, 9)
