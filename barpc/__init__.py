@@ -17,6 +17,7 @@ _MODULES = {
     "barpc.sensor.sentinel1": "RangeDoppler",
     "barpc.sensor": "SensorModel",
     "barpc.sensor.corrected": "Correction Corrected",
+    "barpc.sensor.splined": "RowSpline Splined",
     "barpc.scene": "View Tracks GroundPoints",
     "barpc.rpcio": "read_rpc write_rpc",
     "barpc.fit": "fit_rpc fit_rpc_points",
@@ -51,6 +52,8 @@ if TYPE_CHECKING:
     from barpc.sensor.pushbroom import Pushbroom as Pushbroom
     from barpc.sensor.rpc import RPC as RPC
     from barpc.sensor.sentinel1 import RangeDoppler as RangeDoppler
+    from barpc.sensor.splined import RowSpline as RowSpline
+    from barpc.sensor.splined import Splined as Splined
 
 __all__ = ["__version__", *sorted(_PUBLIC)]
 

@@ -17,6 +17,7 @@ from barpc.ba.structure import Structure
 from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
+from barpc.sensor.splined import bsplines
 
 Fit = dict[int, tuple[slice, Array]]
 """View -> where its observations are, coefficients (2, TERMS) of their smooth part."""
@@ -70,7 +71,7 @@ class Smooth:
 
     def _terms(self, rows: slice) -> Array:
         col, row = self._col[rows], self._row[rows]
-        return np.vstack([_bsplines(row), col, col**2, col**3, row * col])
+        return np.vstack([bsplines(row, SPLINES), col, col**2, col**3, row * col])
 
     def part(self, residual: Array, weight: Array, fit: Fit | None = None) -> Array:
         """The smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
@@ -144,15 +145,3 @@ class Smooth:
         with np.errstate(invalid="ignore"):
             target = np.where(weight[rows] > 0, residual[:, rows], 0.0)
         return np.asarray(np.linalg.solve(matrix, weighted @ target.T).T, dtype=np.float64)
-
-
-def _bsplines(u: Array) -> Array:
-    """Uniform cubic B-splines (SPLINES, n) at u (n,) in -1 .. 1."""
-    at = (u + 1.0) * (0.5 * (SPLINES - 3))
-    first = np.minimum(at.astype(np.int64), SPLINES - 4)
-    t = at - first
-    basis = np.zeros((SPLINES, len(u)))
-    pieces = (1.0 - t) ** 3, (3.0 * t - 6.0) * t**2 + 4.0, ((3.0 - 3.0 * t) * t + 3.0) * t + 1.0, t**3
-    for n, piece in enumerate(pieces):
-        basis[first + n, np.arange(len(u))] = piece / 6.0
-    return basis

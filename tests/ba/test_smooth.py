@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from barpc.ba.smooth import SPLINES, Smooth, SmoothTest, _bsplines
+from barpc.ba.smooth import SPLINES, Smooth, SmoothTest
 from barpc.ba.structure import make_structure
 from barpc.ba.unknowns import Unknowns
+from barpc.sensor.splined import bsplines
 
 SIZE = (10000, 20000)
 
@@ -36,7 +37,7 @@ def noise(smooth: Smooth, sigma: float, seed: int = 1) -> np.ndarray:
 
 def test_splines_reproduce_cubics_and_wiggle_a_dozen_times() -> None:
     u = np.linspace(-1, 1, 500)
-    basis = _bsplines(u)
+    basis = bsplines(u, SPLINES)
     assert basis.shape == (SPLINES, 500)
     np.testing.assert_allclose(basis.sum(axis=0), 1.0)
     assert (basis >= 0).all()

@@ -18,6 +18,7 @@ from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sicd import open_sicd
+from barpc.sensor.splined import RowSpline, Splined
 from barpc.simulate.orbit import Look, fly
 from tests.sensor.radar_documents import document
 from tests.sensor.s1_product import Product
@@ -45,6 +46,11 @@ def make_rpc(lon: float = 5.4, lat: float = 43.2, seed: int = 3) -> RPC:
 
 def _correction(lon: float = 5.4, lat: float = 43.2) -> Correction:
     return Correction([2e-5, -3e-5, 1e-5], [4.0, -3.0, 2.0], ecef_from_ground([lon + 2.0, lat - 1.0, 7e5]))
+
+
+def _row_spline() -> RowSpline:
+    coeffs = np.random.default_rng(5).normal(0, 0.5, (13, 2))
+    return RowSpline(coeffs, 9499.5, 9500.0)
 
 
 def _pushbroom(lon: float) -> Pushbroom:
@@ -103,6 +109,9 @@ MODELS: dict[str, Callable[[], Case]] = {
         ),
         (20000, 19000),
         (0.0, 1000.0),
+    ),
+    "corrected rpc behind a row spline": lambda: Case(
+        Splined(Corrected(make_rpc(), _correction()), _row_spline()), (20000, 19000), (0.0, 1000.0)
     ),
     "rpc corrected in the image": lambda: Case(
         ImageCorrected(make_rpc(), ImageAffine([3.0, -4.0], [[1e-4, 2e-4], [-1e-4, 3e-4]])),

@@ -1,0 +1,143 @@
+"""What no rotation and no RPC holds: a correction in the image, a spline over its rows and steps between detectors.
+
+Attitude jitter moves image rows against each other, a focal plane that is put together of detectors moves its columns.
+Both are functions of where a point is *seen*, so that x = P(X) + s(x): localisation is explicit, projection iterates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from barpc.errors import RpcError
+from barpc.frozen import Frozen
+from barpc.geodesy import Array
+from barpc.sensor import SensorModel
+
+IntArray = npt.NDArray[np.int64]
+
+_STEPS = 8  # a spline changes by thousandths of a pixel a row: each step gains three digits
+_SETTLED = 1e-7  # px
+
+
+def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, Array]:
+    """Uniform cubic B-splines at u (n,) in -1 .. 1: the first (n,) of the four that are not zero, and these (4, n).
+
+    The first and the last value hold beyond; `rate`: their derivatives by u instead.
+    """
+    at = (np.clip(np.nan_to_num(u), -1.0, 1.0) + 1.0) * (0.5 * (count - 3))
+    first = np.minimum(at.astype(np.int64), count - 4)
+    t = at - first
+    if not rate:
+        pieces = (1.0 - t) ** 3, (3.0 * t - 6.0) * t**2 + 4.0, ((3.0 - 3.0 * t) * t + 3.0) * t + 1.0, t**3
+        return first, np.stack(pieces) / 6.0
+    pieces = -((1.0 - t) ** 2), (3.0 * t - 4.0) * t, (2.0 - 3.0 * t) * t + 1.0, t**2
+    return first, np.stack(pieces) * np.where(np.abs(u) <= 1.0, 0.25 * (count - 3), 0.0)
+
+
+def bsplines(u: Array, count: int) -> Array:
+    """All uniform cubic B-splines (count, n) at u (n,) in -1 .. 1."""
+    first, pieces = bspline_pieces(u, count)
+    basis = np.zeros((count, len(u)))
+    for n, piece in enumerate(pieces):
+        basis[first + n, np.arange(len(u))] = piece
+    return basis
+
+
+@dataclass(frozen=True, eq=False)
+class RowSpline(Frozen):
+    """A displacement of image points: where a point is seen, less where a model without it projects it.
+
+    Parameters
+    ----------
+    coeffs : (M, 2)
+        Of uniform cubic B-splines over the rows, (col, row) [px]; M = 0: none, else at least 4.
+    row_offset, row_scale : float
+        Middle row, and rows from there to the ends of the knots [px].
+    edges : (C,)
+        Columns at which another detector begins [px], ascending.
+    steps : (C + 1, 2)
+        Displacement of each detector, (col, row) [px]; without any detector (0, 2).
+    """
+
+    coeffs: Array
+    row_offset: float = 0.0
+    row_scale: float = 1.0
+    edges: Array = field(default_factory=lambda: np.zeros(0))
+    steps: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __post_init__(self) -> None:
+        for name, shape in (("coeffs", (None, 2)), ("edges", (None,)), ("steps", (None, 2))):
+            self._array(name, shape, RpcError)
+        if 0 < len(self.coeffs) < 4:
+            raise RpcError(f"a cubic spline has at least 4 coefficients, found {len(self.coeffs)}")
+        if (
+            len(self.steps) != (len(self.edges) + 1) * bool(len(self.edges))
+            or (np.diff(self.edges) <= 0).any()
+        ):
+            raise RpcError("detectors: their edges ascend, and there is one detector more than edges")
+        if not (np.isfinite(self.row_offset) and np.isfinite(self.row_scale) and self.row_scale > 0):
+            raise RpcError(f"spline rows: offset {self.row_offset}, scale {self.row_scale}")
+
+    @property
+    def spacing(self) -> float:
+        """Rows between knots [px]; NaN without a spline."""
+        return 2.0 * self.row_scale / (len(self.coeffs) - 3) if len(self.coeffs) else np.nan
+
+    def at(self, image: Array) -> Array:
+        """The displacement (..., 2) [px] of points seen at image points (..., 2) [px]."""
+        out = self._along(image[..., 1], rate=False)
+        if len(self.steps):
+            out += self.steps[
+                np.searchsorted(self.edges, image[..., 0], side="right").clip(0, len(self.edges))
+            ]
+        return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
+
+    def rate(self, row: Array) -> Array:
+        """Its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
+        return self._along(row, rate=True) / self.row_scale
+
+    def _along(self, row: Array, rate: bool) -> Array:
+        u = (np.asarray(row, dtype=np.float64) - self.row_offset) / self.row_scale
+        if not len(self.coeffs):
+            return np.zeros((*u.shape, 2))
+        first, pieces = bspline_pieces(u.ravel(), len(self.coeffs), rate)
+        out = sum(piece[:, None] * self.coeffs[first + n] for n, piece in enumerate(pieces))
+        return np.asarray(out).reshape(*u.shape, 2)
+
+
+@dataclass(frozen=True)
+class Splined:
+    """`sensor` with its image points displaced by `correction`; itself a `SensorModel`."""
+
+    sensor: SensorModel  # usually P_BA
+    correction: RowSpline  # what is added to its image points
+
+    def project(self, ground: Array) -> Array:
+        """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
+        return self._displaced(self.sensor.project(ground))
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
+        image, jacobian = self.sensor.project_jacobian(ground)
+        image = self._displaced(image)
+        rate = self.correction.rate(image[..., 1])  # the row moves the spline, and the spline the row
+        by_row = jacobian[..., 1, :] / (1.0 - rate[..., 1, None])
+        return image, jacobian + rate[..., None] * by_row[..., None, :]
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        """Ground points (..., 3) seen at image points (..., 2) [px] at altitudes (...) [m]."""
+        image = np.asarray(image, dtype=np.float64)
+        return self.sensor.localize(image - self.correction.at(image), alt)
+
+    def _displaced(self, projected: Array) -> Array:
+        """Where points are seen that are projected to image points (..., 2) [px]."""
+        image = projected
+        for _ in range(_STEPS):
+            before, image = image, projected + self.correction.at(image)
+            change = np.abs(image - before)
+            if not (change.max(initial=0.0, where=np.isfinite(change)) > _SETTLED):
+                break
+        return image
