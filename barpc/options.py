@@ -27,7 +27,7 @@ T = TypeVar("T")
 Record = TypeVar("Record", bound="Options")
 
 Nodes = Literal["uniform", "chebyshev"]
-AUTO, GEOMETRIC = "auto", "rotation+translation"
+AUTO, OFF, GEOMETRIC = "auto", "off", "rotation+translation"
 Model = Literal["auto", "rotation+translation", "rotation", "translation", "shift", "shift-drift", "affine"]
 
 HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
@@ -253,6 +253,19 @@ class AdjustOptions(Options):
         least=0,
         most=2,
     )
+    jitter: str = option(
+        "auto",
+        """What rotations leave along the rows: a spline in every image. `auto`: where the residuals ask for it and tie
+        points that took no part are met better; `off`; or the rows between its knots.""",
+        unit="auto|off|rows",
+    )
+    detectors: tuple[float, ...] = option(
+        (),
+        """Column of every image at which another detector begins. Without: found, with `jitter`, where residuals
+        step.""",
+        unit="px",
+        above=0,
+    )
     sigma_attitude: float | None = option(
         None,
         """Prior standard deviation of the rotation, on the ground (angle x distance). Without: the accuracy that
@@ -319,9 +332,24 @@ class AdjustOptions(Options):
     )
 
     def __post_init__(self) -> None:
+        if isinstance(self.jitter, (int, float)) and not isinstance(self.jitter, bool):
+            object.__setattr__(self, "jitter", f"{self.jitter:g}")
         super().__post_init__()
+        if not (self.jitter in (AUTO, OFF) or self.spacing > 0):
+            raise InputError(f"jitter {self.jitter!r} is not auto, off or a number of rows above 0")
+        if (columns := list(self.detectors)) != sorted(set(columns)):
+            raise InputError(f"detectors: columns ascend, found {columns}")
         if self.drift and "rotation" not in self.first_model:
             raise InputError(f"drift {self.drift} needs a model with a rotation, not {self.model!r}")
+
+    @property
+    def spacing(self) -> float:
+        """Rows between the knots of splines that were asked for; 0 for none."""
+        try:
+            rows = float(self.jitter)
+        except ValueError:
+            return 0.0
+        return rows if math.isfinite(rows) else 0.0
 
     @property
     def first_model(self) -> str:

@@ -13,9 +13,10 @@ from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import agreeing, two_groups
 from barpc.ba.covariance import Covariance
 from barpc.ba.datum import datum_shares
+from barpc.ba.detectors import find_edges
 from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control, reference_control
-from barpc.ba.heldout import HeldOut, enu_offsets, keep_out, measure
+from barpc.ba.heldout import HeldOut, enu_offsets, is_better, keep_out, measure
 from barpc.ba.incremental import BlockPrior, apply_prior
 from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
@@ -25,8 +26,9 @@ from barpc.ba.snooping import ControlTest, control_test
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
+from barpc.ba.waves import Waves
 from barpc.geodesy import Array
-from barpc.options import AUTO, AdjustOptions
+from barpc.options import AUTO, OFF, AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Reference, Tracks, View
 
 SMOOTH_LEAST = 0.06  # smooth residuals below this [px] are left alone: two views share what one is wrong by
@@ -39,6 +41,12 @@ _BETTER = 0.8  # of the noise
 _WORTH = 0.004  # px that an affine must take away: it leaves the tilts of the scene open
 _CLEARLY_BETTER = 0.9  # the same, where the drift that was learnt is no drift
 _MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
+WAVE_DEGREE = 2  # polynomials of the row that are the drift's
+_SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
+_PER_SPLINE = 30  # observations of a view
+_FEWEST = 7  # splines
+_MISSES = 2  # one after the other
+_MOST_SPLINES = 2600  # of all views: what a block of 200 takes is three times as long
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
 
 
@@ -141,6 +149,12 @@ class _Solution:
         return left or self.after.error > _MUCH_NOISE * self.outcome.noise
 
     @property
+    def has_waves(self) -> bool:
+        """Whether neighbours share something that splines over the rows or steps between detectors may follow."""
+        tested = self.outcome.smooth
+        return bool((tested.found(_TREND) | (tested.shared > _TREND)).any())
+
+    @property
     def is_skew(self) -> bool:
         """Whether the drift that was learnt shears images more than a platform does: one of them was turned."""
         learnt = self.outcome.prior.drift_sigma
@@ -161,16 +175,78 @@ def _choose_model(
     prior: BlockPrior | None,
 ) -> tuple[_Solution, float | None]:
     """The block solved; by an affine in the image where the data choose it, and what the model in space left [px]."""
-    found = _solve(block, outer, options, dem, centers, prior)
-    if options.model != AUTO or options.drift is not None or prior is not None:
+    found, in_space = _solve(block, outer, options, dem, centers, prior), None
+    given = options.model != AUTO or options.drift is not None or prior is not None
+    skew, chosen = found.is_skew, found
+    trend = skew or found.has_trend or found.has_waves
+    if trend and not given and _bent_by_control(found, block, outer, options, dem, centers):
         return found, None
-    skew = found.is_skew
-    if (skew or found.has_trend) and not _bent_by_control(found, block, outer, options, dem, centers):
+    if (skew or found.has_trend) and not given:
         in_image = _solve(block, outer, replace(options, model="affine"), dem, None, None)
         better = in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error
         if better and in_image.after.whole_rms < found.after.whole_rms - _WORTH:
-            return in_image, found.after.whole_rms
-    return found, None
+            chosen, in_space = in_image, found.after.whole_rms
+    if prior is None and found.problem.cameras.unknowns.geometric:
+        followed = _followed(found, block, outer, options)
+        if chosen is found or followed.after.error < _MUCH_BETTER * chosen.after.error:
+            return followed, None
+    return chosen, in_space
+
+
+def _followed(found: _Solution, block: Block, outer: Block, options: AdjustOptions) -> _Solution:
+    """The block with splines over the rows and steps between detectors, where asked for or where they tell.
+
+    Knots are set twice as dense until nothing is left that neighbours share, the observations are too few, or the
+    tracks that took no part are met no better.
+    """
+    given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
+    best, misses = found, 0
+    for count in _spline_counts(block, options):
+        if misses == _MISSES or not (asked or best.has_waves):
+            break
+        tried = _with_waves(
+            found, block, outer, options, Waves(count, WAVE_DEGREE, _given_edges(block, options))
+        )
+        if not options.detectors and tried.has_waves:
+            outcome = tried.outcome
+            sigma = block.sigma * outcome.noise
+            edges = find_edges(outcome.problem, tried.final, outcome.residual, outcome.inlier, sigma)
+            if edges.size:
+                tried = _with_waves(tried, block, outer, options, Waves(count, WAVE_DEGREE, edges))
+        better = given or (asked and best is found) or is_better(tried.after, best.after, outer)
+        best, misses = (tried, 0) if better else (best, misses + 1)
+    return best
+
+
+def _given_edges(block: Block, options: AdjustOptions) -> Array:
+    return np.tile(np.array(options.detectors, dtype=np.float64) - 0.5, (len(block.views), 1))
+
+
+def _spline_counts(block: Block, options: AdjustOptions) -> list[int]:
+    """Numbers of splines to try, the fewest first, as many as the observations hold: those of the poorest view."""
+    rows = max(view.size[1] for view in block.views)
+    if options.jitter == OFF:
+        return [0] if options.detectors else []
+    if options.spacing:
+        return [max(int(np.ceil(rows / options.spacing)) + 3, _FEWEST)]
+    count = np.bincount(block.view[block.use], minlength=len(block.views))
+    most = min(float(np.median(count)) / _PER_SPLINE, _MOST_SPLINES / len(block.views))
+    wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
+    return [n for n in np.unique(np.maximum(wanted, _FEWEST)).tolist() if n <= most]
+
+
+def _with_waves(
+    found: _Solution, block: Block, outer: Block, options: AdjustOptions, waves: Waves
+) -> _Solution:
+    """A block solved again with splines and steps, from where it ended; every observation may come back."""
+    problem, ended = found.problem, found.outcome.minimum.state
+    unknowns = problem.cameras.unknowns
+    bent = make_problem(block, options, unknowns.center, None, unknowns.drift, waves)
+    there, _ = revived(problem, ended, found.outcome.residual, found.outcome.inlier, block.use / block.sigma)
+    space = there.params[:, : unknowns.in_waves.start]
+    there = replace(there, params=np.hstack([space, np.zeros((len(space), waves.size))]))
+    outcome = Rounds(bent, block, there, options, found.heights, block.use).run()
+    return _ended(found, bent, block, outer, options, outcome)
 
 
 def _bent_by_control(
@@ -218,11 +294,19 @@ def _solve(
         there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
         problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
-    tested = None
+    first = _Solution(problem, state, before, heights, outcome, start, start, None)
+    return _ended(first, problem, block, outer, options, outcome)
+
+
+def _ended(
+    found: _Solution, problem: Problem, block: Block, outer: Block, options: AdjustOptions, outcome: Outcome
+) -> _Solution:
+    """What the rounds of a problem ended with, its control tested and measured; where it started is `found`'s."""
+    heights, tested = found.heights, None
     if block.gcps.names:
-        outcome, heights, tested = _tested(problem, block, options, outcome, heights, state)
+        outcome, heights, tested = _tested(problem, block, options, outcome, heights, found.state)
     after = measure(problem, outcome.minimum.state.params, outer)
-    return _Solution(problem, state, before, heights, outcome, start, after, tested)
+    return replace(found, problem=problem, heights=heights, outcome=outcome, after=after, tested=tested)
 
 
 def _tested(
@@ -343,21 +427,22 @@ def make_problem(
     centers: Array | None,
     prior: BlockPrior | None,
     drift: int | None = None,
+    waves: Waves | None = None,
 ) -> Problem:
     """Observations, cameras and priors, before anything is known about points; `drift` instead of the options'."""
     views = block.views
     drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
         centers = _known_centers(block, options, centers, prior)
-    unknowns = make_unknowns(views, options.first_model, drift, centers)
+    unknowns = make_unknowns(views, options.first_model, drift, centers, waves)
     off = None if block.reference is None else np.linalg.norm(block.reference.offset, axis=1)
-    sigma = prior_sigmas(views, options, drift, off)
+    sigma = prior_sigmas(views, options, drift, off, 0 if waves is None else waves.size)
     on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma), None
     if prior is not None:
         on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras)
     joined = None if jointly is None else np.unique(jointly.index // unknowns.size)
     return Problem(
-        Cameras(views, unknowns, block.xy[1]),
+        Cameras(views, unknowns, block.xy),
         make_structure(block.view, block.point, len(views), block.num_points, unknowns.place, joined),
         block.xy,
         on_cameras,

@@ -40,20 +40,20 @@ class Projected:
 class Cameras:
     """The views of a block behind their corrections.
 
-    A drift asks when each point was seen: `row` (K,), as observed [px], sorted by view.
+    A drift asks when each point was seen, and splines where: `seen` (2, K), as observed [px], sorted by view.
     """
 
-    def __init__(self, views: Sequence[View], unknowns: Unknowns, row: Array | None = None) -> None:
-        self.row = row
+    def __init__(self, views: Sequence[View], unknowns: Unknowns, seen: Array | None = None) -> None:
+        self.seen = seen
         self.sensors = tuple(view.sensor for view in views)
         self.unknowns = unknowns
         self.is_rpc = np.array([isinstance(sensor, RPC) for sensor in self.sensors])
         self._stack = _RpcStack(self.sensors)
 
-    def seeing(self, row: Array) -> Cameras:
-        """The same views for other observations, of rows (K,) [px]."""
+    def seeing(self, seen: Array) -> Cameras:
+        """The same views for other observations, seen at (2, K) [px]."""
         cameras = copy(self)
-        cameras.row = row
+        cameras.seen = seen
         return cameras
 
     def project(
@@ -75,8 +75,8 @@ class Cameras:
         for views in self._chunks(bounds):
             for part in parts(bounds[views.stop], CHUNK, bounds[views.start]):
                 of_view = np.clip(bounds[views.start : views.stop + 1], part.start, part.stop) - part.start
-                row = None if self.row is None else self.row[part]
-                piece = self._project(params, ecef[:, part], views, of_view, wanted, row)
+                seen = None if self.seen is None else self.seen[:, part]
+                piece = self._project(params, ecef[:, part], views, of_view, wanted, seen)
                 image[:, part] = piece.image
                 by_point[..., part] = piece.by_point[:, : by_point.shape[1]]
                 by_unknown[..., part] = piece.by_unknown[:, : by_unknown.shape[1]]
@@ -103,29 +103,37 @@ class Cameras:
             yield run
 
     def _project(
-        self, params: Array, ecef: Array, views: slice, bounds: IntArray, wanted: Wanted, row: Array | None
+        self, params: Array, ecef: Array, views: slice, bounds: IntArray, wanted: Wanted, seen: Array | None
     ) -> Projected:
         index = np.repeat(np.arange(views.start, views.stop), np.diff(bounds))
         unknowns = self.unknowns
         if not unknowns.geometric:
             image, by_point = self._by_ecef(ecef, views, bounds)
             return Projected(*unknowns.in_image(params, index, image, by_point))
-        drift = None
+        drift = row = None
         if unknowns.drift:
-            assert row is not None
-            row = (row - unknowns.middle[1, index]) / unknowns.half[1, index]
+            assert seen is not None
+            row = (seen[1] - unknowns.middle[1, index]) / unknowns.half[1, index]
             drift = unknowns.drift_rotation(params, index, row)
         of_views = params[views]
         rotation, translation = unknowns.rotation(of_views, views), unknowns.translation(of_views)
         motion = Motion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
+        waves, added = [], np.zeros((2, 1))
+        if unknowns.waves is not None:
+            assert seen is not None
+            added, waves = unknowns.waves_at(params, index, seen)
         if wanted == "image":
             none = np.empty((2, 0, len(index)))
-            return Projected(self._image(motion.ecef, views, bounds), none, none)
+            return Projected(self._image(motion.ecef, views, bounds) + added, none, none)
         image, by_moved = self._by_ecef(motion.ecef, views, bounds)
+        image = image + added
         by_point, by_rotation, by_drift = motion.derivatives(by_moved)
         if wanted == "points":
             return Projected(image, by_point, by_point[:, :0])
-        return Projected(image, by_point, unknowns.stack(by_rotation, by_drift, by_point, index, row))
+        stacked = unknowns.stack(by_rotation, by_drift, by_point, index, row)
+        if unknowns.waves is not None:
+            unknowns.waves.stack(stacked[:, unknowns.in_waves], waves)
+        return Projected(image, by_point, stacked)
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
         """Uncorrected image points (2, n) without a derivative."""

@@ -29,6 +29,8 @@ _ODD = np.uint64(0x9E3779B97F4A7C15)
 _LEAST = 100  # observations of a view, or its tracks are all needed
 _ROBUST_STEPS = 3
 _WIDE = 4.0  # sigmas
+_LESS = 0.99  # of the error, at most
+_SURELY = 3.0  # standard deviations
 _FEW = 20  # observations of a view that tell nothing by themselves
 
 
@@ -87,7 +89,7 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     index, point = np.unique(block.point, return_inverse=True)
     part = replace(
         problem,
-        cameras=problem.cameras.seeing(block.xy[1]),
+        cameras=problem.cameras.seeing(block.xy),
         structure=make_structure(block.view, point, views, len(index)),
         xy=block.xy,
         point_prior=None,
@@ -111,6 +113,19 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
         noise[v] = np.sqrt(np.median(squared[rows]) / MEDIAN)
         rms[v] = noise[v] * np.sqrt(expected[rows].mean())
     return HeldOut(residual, index, points, noise, rms)
+
+
+def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
+    """Whether cameras with more unknowns meet the tracks of a block that took no part better than others do.
+
+    Track by track, as the same noise is in both; where one is wrong, by no more than so much.
+    """
+    if not len(block.point) or not one.error < _LESS * other.error:
+        return False
+    index, point = np.unique(block.point, return_inverse=True)
+    cost = [(h.residual**2).sum(axis=0) / (other.error * block.sigma) ** 2 for h in (one, other)]
+    less = np.bincount(point, (cost[1] / (1.0 + cost[1] / _WIDE**2)) - (cost[0] / (1.0 + cost[0] / _WIDE**2)))
+    return bool(less.mean() > _SURELY * less.std() / np.sqrt(len(index)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from barpc.ba.waves import FIRST_SIGMA
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
@@ -108,7 +109,7 @@ def stated_accuracy(view: View) -> float:
 
 
 def prior_sigmas(
-    views: tuple[View, ...], options: AdjustOptions, drift: int, off: Array | None = None
+    views: tuple[View, ...], options: AdjustOptions, drift: int, off: Array | None = None, waves: int = 0
 ) -> Array:
     """Prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px).
 
@@ -126,4 +127,5 @@ def prior_sigmas(
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
         parts.append(np.full((len(views), size), IMAGE_SIGMA))
+    parts.append(np.full((len(views), waves), FIRST_SIGMA))
     return np.hstack(parts)

@@ -20,6 +20,7 @@ from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
+from barpc.sensor.splined import RowSpline, Splined
 
 _SAMPLE = 200  # of a pair's tie points
 
@@ -128,10 +129,20 @@ class Adjustment:
     options: AdjustOptions = field(repr=False)
 
     @property
+    def splines(self) -> tuple[RowSpline | None, ...]:
+        """What every view's correction is followed by in the image; None: nothing."""
+        return tuple(sensor.correction if isinstance(sensor, Splined) else None for sensor in self.sensors)
+
+    @property
+    def bases(self) -> tuple[SensorModel, ...]:
+        """The sensors without what is in the image alone: the delivered ones behind their corrections."""
+        return tuple(sensor.sensor if isinstance(sensor, Splined) else sensor for sensor in self.sensors)
+
+    @property
     def corrections(self) -> tuple[Correction | ImageAffine, ...]:
         """The correction of every view."""
         found = []
-        for sensor in self.sensors:
+        for sensor in self.bases:
             assert isinstance(sensor, Corrected | ImageCorrected)
             found.append(sensor.correction)
         return tuple(found)

@@ -11,11 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from barpc.ba.waves import Waves
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.geometry import camera_center
+from barpc.sensor.splined import Splined
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
 """Image models: which of the terms 1, col, row each coordinate's correction has."""
@@ -33,6 +35,7 @@ class Unknowns:
     half: Array  # (2, N) its half width and height [px]
     # (N, 2) where its scene stands, east and north of the middle of all [m]
     place: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    waves: Waves | None = None  # what is left in the image
 
     @property
     def geometric(self) -> bool:
@@ -44,7 +47,17 @@ class Unknowns:
         """Number of unknowns q of a view."""
         if not self.geometric:
             return 2 * len(_IMAGE_TERMS[self.model])
+        return self._in_space + (0 if self.waves is None else self.waves.size)
+
+    @property
+    def _in_space(self) -> int:
+        """Unknowns of a view that move the camera; those in the image follow."""
         return 3 * (self.rotates + self.translates + self.drift)
+
+    @property
+    def in_waves(self) -> slice:
+        """Where a view's unknowns in the image are."""
+        return slice(self._in_space, self.size)
 
     @property
     def rotates(self) -> bool:
@@ -72,7 +85,10 @@ class Unknowns:
     def drift_vectors(self, params: Array) -> Array:
         """Rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
         start = 3 * (self.rotates + self.translates)
-        return params[:, start:].reshape(len(params), self.drift, 3) / self.distance[:, None, None]
+        return (
+            params[:, start : self._in_space].reshape(len(params), self.drift, 3)
+            / self.distance[:, None, None]
+        )
 
     def normalized(self, image: Array, index: IntArray) -> Array:
         """col, row (2, n) [px] -> -1 at the left and the top, 1 at the right and the bottom of their images."""
@@ -107,6 +123,13 @@ class Unknowns:
             at += 3
         return out
 
+    def waves_at(self, params: Array, index: IntArray, seen: Array) -> tuple[Array, list[Array]]:
+        """Displacement (2, n) [px] of points seen at (2, n) [px] that splines and steps add, and its basis."""
+        assert self.waves is not None
+        row = (seen[1] - self.middle[1, index]) / self.half[1, index]
+        basis = self.waves.basis(row, seen[0], index)
+        return self.waves.displaced(params[:, self.in_waves], index, basis), basis
+
     def in_image(
         self, params: Array, index: IntArray, image: Array, by_point: Array
     ) -> tuple[Array, Array, Array]:
@@ -135,7 +158,12 @@ class Unknowns:
             Correction(*of_view, *(row if self.drift else ()))
             for *of_view, row in zip(*vectors, rows, strict=True)
         ]
-        return tuple(Corrected(view.sensor, found) for view, found in zip(views, corrections, strict=True))
+        found: list[SensorModel] = [Corrected(v.sensor, c) for v, c in zip(views, corrections, strict=True)]
+        if self.waves is not None:
+            for i, one in enumerate(params[:, self.in_waves]):
+                of_rows = float(self.middle[1, i]), float(self.half[1, i])
+                found[i] = Splined(found[i], self.waves.correction(one, i, *of_rows))
+        return tuple(found)
 
     def _affine(self, params: Array, i: int) -> ImageAffine:
         normalized = np.zeros((2, 3))
@@ -146,7 +174,11 @@ class Unknowns:
 
 
 def make_unknowns(
-    views: Sequence[View], model: str, drift: int = 0, centers: Array | None = None
+    views: Sequence[View],
+    model: str,
+    drift: int = 0,
+    centers: Array | None = None,
+    waves: Waves | None = None,
 ) -> Unknowns:
     """The layout for N views; `centers` (N, 3), ECEF [m], are regressed from the sensors where None."""
     size = np.array([view.size for view in views], dtype=np.float64).reshape(-1, 2)
@@ -159,7 +191,7 @@ def make_unknowns(
     distance = np.linalg.norm(centers - scene, axis=1)
     middle = scene.mean(axis=0)
     place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
-    return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0, place)
+    return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0, place, waves)
 
 
 def _middle_of_scene(view: View) -> Array:

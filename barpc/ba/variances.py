@@ -42,6 +42,8 @@ _LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior
 _ITERATIONS = 10
 _STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
 _SMALL = 400  # unknowns up to which every view is tried
+LEAST_WAVES = 0.01  # px: of splines and steps, counting as one observation
+_OWN = 2.0  # as many degrees of freedom has the size of all views beside that of one
 _LEAST = 0.5  # degrees of freedom below which nothing is said
 
 
@@ -130,6 +132,8 @@ class Variances:
             return problem.camera_prior, nothing
 
     def _learnt(self, problem: Problem, minimum: Minimum, exact: bool) -> tuple[CameraPrior, PriorTest]:
+        if self.learn_waves:
+            self = self._going_on(problem.camera_prior.sigma)
         around = _Around(problem, minimum)
         now, params = problem.camera_prior, minimum.state.params
         covariance = minimum.covariance(problem.free)
@@ -144,6 +148,8 @@ class Variances:
             if self.learn_constant and self._too_large(params, known, scale):
                 scale, odd = self._widened(around, params, known, wide)
             before = prior
+            if self.learn_waves:
+                self = self._going_on(self._waves(params, known, prior.sigma))
             wide = self._drift(params, known) if self.learn_drift else wide
             prior = self._prior(scale, wide)
             if not around.small or same_prior(prior, before, _STANDS):
@@ -154,6 +160,29 @@ class Variances:
             float(np.median(prior.sigma[:, self._drift_part(d).start])) for d in range(self._degrees)
         )
         return prior, PriorTest(ratio, freedom, scale, odd, drift)
+
+    @property
+    def learn_waves(self) -> bool:
+        """Whether there are splines or steps, whose sizes are always learnt."""
+        return self.unknowns.waves is not None
+
+    def _going_on(self, sigma: Array) -> Variances:
+        """With splines and steps as large as in the standard deviations (N, q)."""
+        part, given = self.unknowns.in_waves, self.given.sigma.copy()
+        given[:, part] = sigma[:, part]
+        return replace(self, given=CameraPrior(self.given.mean, given))
+
+    def _waves(self, params: Array, known: Array, sigma: Array) -> Array:
+        """The standard deviations (N, q), splines and steps as large as each view's show."""
+        assert self.unknowns.waves is not None
+        part, bands = self.unknowns.in_waves, self.unknowns.waves.bands
+        out = sigma.copy()
+        for band in range(int(bands.max()) + 1):
+            rows = part.start + np.flatnonzero(bands == band)
+            squares, freedom = (params[:, rows] ** 2).sum(axis=1), known[:, rows].sum(axis=1)
+            common = (LEAST_WAVES**2 + squares.sum()) / (1.0 + freedom.sum())
+            out[:, rows] = np.sqrt((_OWN * common + squares) / (_OWN + freedom))[:, None]
+        return out
 
     @property
     def _degrees(self) -> int:

@@ -77,6 +77,9 @@ class Observations:
     ) -> None:
         self.structure, self.sigma, self.noise_floor = problem.structure, sigma, noise_floor
         self.is_tie = is_tie
+        waves = problem.cameras.unknowns.waves
+        # errors that neighbours share are others in every stretch of a spline
+        self.stretches = 1 if waves is None else sum(waves.parts)
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True
@@ -124,7 +127,7 @@ class Observations:
         """
         weight: Array = use / (self.sigma * noise)
         information = self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0]
-        floor = self.noise_floor**2 + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
+        floor = self.noise_floor**2 / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
         alike = np.sqrt(np.minimum(ALIKE / np.maximum(count, 1.0), 1.0))

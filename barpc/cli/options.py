@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import click
 
@@ -26,7 +26,15 @@ TIE = (
     "tie.keypoints_per_image",
     "tie.search",
 )
-CAMERA = ("adjust.model", "adjust.drift", "adjust.sigma_attitude", "adjust.sigma_position", "adjust.fixed")
+CAMERA = (
+    "adjust.model",
+    "adjust.drift",
+    "adjust.jitter",
+    "adjust.detectors",
+    "adjust.sigma_attitude",
+    "adjust.sigma_position",
+    "adjust.fixed",
+)
 GROUND = (
     "gcp",
     "check_points",
@@ -73,6 +81,9 @@ def flag(target: str) -> Callable[[Function], Function]:
         elif kind in (int, float):
             with suppress(ValueError):  # a text is refused by what follows
                 value = kind(value)
+        elif get_args(kind)[:1] == (float,):
+            with suppress(ValueError):
+                value = [float(word) for words in value for word in words.split(",")]
         try:
             return checked(target.rpartition(".")[2], kind, rule, value)
         except InputError as error:
