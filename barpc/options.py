@@ -332,8 +332,9 @@ class AdjustOptions(Options):
     )
 
     def __post_init__(self) -> None:
-        if isinstance(self.jitter, (int, float)) and not isinstance(self.jitter, bool):
-            object.__setattr__(self, "jitter", f"{self.jitter:g}")
+        rows: Any = self.jitter
+        if isinstance(rows, Real) and not isinstance(rows, bool):
+            object.__setattr__(self, "jitter", f"{float(rows):g}")
         super().__post_init__()
         if not (self.jitter in (AUTO, OFF) or self.spacing > 0):
             raise InputError(f"jitter {self.jitter!r} is not auto, off or a number of rows above 0")

@@ -41,7 +41,6 @@ _BETTER = 0.8  # of the noise
 _WORTH = 0.004  # px that an affine must take away: it leaves the tilts of the scene open
 _CLEARLY_BETTER = 0.9  # the same, where the drift that was learnt is no drift
 _MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
-WAVE_DEGREE = 2  # polynomials of the row that are the drift's
 _SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
 _PER_SPLINE = 30  # observations of a view
 _FEWEST = 7  # splines
@@ -204,15 +203,13 @@ def _followed(found: _Solution, block: Block, outer: Block, options: AdjustOptio
     for count in _spline_counts(block, options):
         if misses == _MISSES or not (asked or best.has_waves):
             break
-        tried = _with_waves(
-            found, block, outer, options, Waves(count, WAVE_DEGREE, _given_edges(block, options))
-        )
+        tried = _with_waves(found, block, outer, options, Waves(count, _given_edges(block, options)))
         if not options.detectors and tried.has_waves:
             outcome = tried.outcome
             sigma = block.sigma * outcome.noise
             edges = find_edges(outcome.problem, tried.final, outcome.residual, outcome.inlier, sigma)
             if edges.size:
-                tried = _with_waves(tried, block, outer, options, Waves(count, WAVE_DEGREE, edges))
+                tried = _with_waves(tried, block, outer, options, Waves(count, edges))
         better = given or (asked and best is found) or is_better(tried.after, best.after, outer)
         best, misses = (tried, 0) if better else (best, misses + 1)
     return best
@@ -433,6 +430,7 @@ def make_problem(
     views = block.views
     drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
+        waves = prior.waves(block.names)
         centers = _known_centers(block, options, centers, prior)
     unknowns = make_unknowns(views, options.first_model, drift, centers, waves)
     off = None if block.reference is None else np.linalg.norm(block.reference.offset, axis=1)

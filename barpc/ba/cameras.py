@@ -118,22 +118,19 @@ class Cameras:
         of_views = params[views]
         rotation, translation = unknowns.rotation(of_views, views), unknowns.translation(of_views)
         motion = Motion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
-        waves, added = [], np.zeros((2, 1))
-        if unknowns.waves is not None:
-            assert seen is not None
-            added, waves = unknowns.waves_at(params, index, seen)
         if wanted == "image":
             none = np.empty((2, 0, len(index)))
-            return Projected(self._image(motion.ecef, views, bounds) + added, none, none)
-        image, by_moved = self._by_ecef(motion.ecef, views, bounds)
-        image = image + added
-        by_point, by_rotation, by_drift = motion.derivatives(by_moved)
-        if wanted == "points":
-            return Projected(image, by_point, by_point[:, :0])
-        stacked = unknowns.stack(by_rotation, by_drift, by_point, index, row)
-        if unknowns.waves is not None:
-            unknowns.waves.stack(stacked[:, unknowns.in_waves], waves)
-        return Projected(image, by_point, stacked)
+            found = Projected(self._image(motion.ecef, views, bounds), none, none)
+        else:
+            image, by_moved = self._by_ecef(motion.ecef, views, bounds)
+            by_point, by_rotation, by_drift = motion.derivatives(by_moved)
+            by_unknown = by_point[:, :0]
+            if wanted == "unknowns":
+                by_unknown = unknowns.stack(by_rotation, by_drift, by_point, index, row)
+            found = Projected(image, by_point, by_unknown)
+        if unknowns.waves is not None and seen is not None:
+            unknowns.add_waves(found.image, found.by_unknown, params, index, seen)
+        return found
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
         """Uncorrected image points (2, n) without a derivative."""

@@ -16,6 +16,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from barpc.ba.priors import CameraPrior, JointPrior
+from barpc.ba.waves import Waves
 from barpc.errors import InputError
 from barpc.frozen import load_npz
 from barpc.geodesy import Array
@@ -47,6 +48,8 @@ class BlockPrior:
         Camera centres [m], ECEF.
     less : (m, n q)
         Rows B of B^T B that is still to be taken off a sparse matrix: what heights have in common.
+    splines, edges : int, (n, C)
+        Layout of the unknowns in the image (see `barpc.ba.waves`).
     """
 
     names: tuple[str, ...]
@@ -56,6 +59,18 @@ class BlockPrior:
     information: Array | sp.csr_array
     center: Array
     less: Array | None = None
+    splines: int = 0
+    edges: Array | None = None
+
+    def waves(self, names: tuple[str, ...]) -> Waves | None:
+        """The unknowns in the image of views that go on from the block; a new one has no detectors."""
+        if self.edges is None or not (self.splines or self.edges.size):
+            return None
+        edges = np.full((len(names), self.edges.shape[1]), np.inf)
+        known = dict(zip(self.names, self.edges, strict=True))
+        for i, name in enumerate(names):
+            edges[i] = known.get(name, np.inf)
+        return Waves(self.splines, edges)
 
     def save(self, path: Path) -> None:
         """Write the prior to an .npz file."""
@@ -67,7 +82,13 @@ class BlockPrior:
             arrays["less"] = np.zeros((0, self.params.size)) if self.less is None else self.less
         with Path(path).open("wb") as file:
             np.savez_compressed(
-                file, names=np.array(self.names), model=self.model, drift=self.drift, **arrays
+                file,
+                names=np.array(self.names),
+                model=self.model,
+                drift=self.drift,
+                splines=self.splines,
+                edges=np.zeros((len(self.names), 0)) if self.edges is None else self.edges,
+                **arrays,
             )
 
     @classmethod
@@ -85,7 +106,9 @@ class BlockPrior:
             params, sparse = file["params"], "indptr" in file
             matrix = file["information"] if not sparse else _csr(file, params.size)
             less = file["less"] if sparse else None
-            prior = cls(names, str(file["model"]), int(file["drift"]), params, matrix, file["center"], less)
+            splines, edges = int(file.get("splines", 0)), file.get("edges", np.zeros((len(names), 0)))
+            known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
+            prior = cls(names, *known, splines, edges)
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
         if not prior._is_whole():
@@ -104,6 +127,8 @@ class BlockPrior:
             and all(array.dtype == np.float64 for array in arrays)
             and all(np.isfinite(getattr(a, "data" if sp.issparse(a) else "real")).all() for a in arrays)
             and bool((self.information.diagonal() > 0).all())
+            and (self.edges is None or (self.edges.ndim == 2 and len(self.edges) == n))
+            and (self.splines == 0 or 4 <= self.splines <= q)
             and (
                 self.less is None or (self.less.shape[1:] == (n * q,) and bool(np.isfinite(self.less).all()))
             )
@@ -141,6 +166,7 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
     BlockPrior
     """
     reduced, free, n = adjustment.covariance.reduced, adjustment.covariance.free, len(adjustment.names)
+    waves = adjustment.cameras.unknowns.waves
     views, matrix = np.flatnonzero(free.reshape(n, -1)[:, 0]), reduced.matrix
     return BlockPrior(
         tuple(adjustment.names[v] for v in views),
@@ -152,6 +178,8 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
         None
         if isinstance(matrix, np.ndarray) or reduced.common is None
         else reduced.common.by_camera[:, free],
+        waves.count if waves else 0,
+        waves.edges[views] if waves else None,
     )
 
 

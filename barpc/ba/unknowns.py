@@ -123,12 +123,14 @@ class Unknowns:
             at += 3
         return out
 
-    def waves_at(self, params: Array, index: IntArray, seen: Array) -> tuple[Array, list[Array]]:
-        """Displacement (2, n) [px] of points seen at (2, n) [px] that splines and steps add, and its basis."""
+    def add_waves(self, image: Array, by_unknown: Array, params: Array, index: IntArray, seen: Array) -> None:
+        """Add what splines and steps do to points seen at (2, n) [px]: to image points (2, n) and derivatives."""
         assert self.waves is not None
         row = (seen[1] - self.middle[1, index]) / self.half[1, index]
         basis = self.waves.basis(row, seen[0], index)
-        return self.waves.displaced(params[:, self.in_waves], index, basis), basis
+        image += self.waves.displaced(params[:, self.in_waves], index, basis)
+        if by_unknown.shape[1]:
+            self.waves.stack(by_unknown[:, self.in_waves], basis)
 
     def in_image(
         self, params: Array, index: IntArray, image: Array, by_point: Array

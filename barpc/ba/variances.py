@@ -175,13 +175,15 @@ class Variances:
     def _waves(self, params: Array, known: Array, sigma: Array) -> Array:
         """The standard deviations (N, q), splines and steps as large as each view's show."""
         assert self.unknowns.waves is not None
-        part, bands = self.unknowns.in_waves, self.unknowns.waves.bands
+        first, bands = self.unknowns.in_waves.start, self.unknowns.waves.bands
         out = sigma.copy()
         for band in range(int(bands.max()) + 1):
-            rows = part.start + np.flatnonzero(bands == band)
-            squares, freedom = (params[:, rows] ** 2).sum(axis=1), known[:, rows].sum(axis=1)
+            rows = first + np.flatnonzero(bands == band)
+            learnt = np.isfinite(sigma[:, rows[0]])  # those of an earlier block are in its matrix
+            squares, freedom = (learnt * part.sum(axis=1) for part in (params[:, rows] ** 2, known[:, rows]))
             common = (LEAST_WAVES**2 + squares.sum()) / (1.0 + freedom.sum())
-            out[:, rows] = np.sqrt((_OWN * common + squares) / (_OWN + freedom))[:, None]
+            size = np.sqrt((_OWN * common + squares) / (_OWN + freedom))
+            out[:, rows] = np.where(learnt, size, np.inf)[:, None]
         return out
 
     @property

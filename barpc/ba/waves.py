@@ -18,6 +18,7 @@ from barpc.scene import IntArray
 from barpc.sensor.splined import RowSpline, bsplines
 
 FIRST_SIGMA = 0.3  # px: a prior's standard deviation before anything is known
+_DEGREE = 2  # of the polynomials of the row that are the drift's
 _SAMPLES = 40  # a spline, to integrate over
 
 
@@ -26,7 +27,6 @@ class Waves:
     """Layout of a view's unknowns in the image [px]: (col, row) of the splines, then of the steps."""
 
     count: int  # B-splines over the rows of an image; 0: none
-    degree: int  # of the polynomials of the row that are the drift's
     # (N, C) columns where another detector begins [px], ascending; infinite where a view has fewer
     edges: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -35,8 +35,8 @@ class Waves:
         """(M, m) orthonormal coefficients of what is orthogonal to the polynomials, the slowest first."""
         if not self.count:
             return np.zeros((0, 0))
-        u = (np.arange(self.count * _SAMPLES) + 0.5) / (0.5 * self.count * _SAMPLES) - 1.0
-        free = _complement(bsplines(u, self.count) @ np.vander(u, self.degree + 1))
+        u = np.linspace(-1.0, 1.0, self.count * _SAMPLES, dtype=np.float64)
+        free = _complement(bsplines(u, self.count) @ np.vander(u, _DEGREE + 1))
         rough = np.diff(free, axis=0)
         vectors: Array = free @ la.eigh(rough.T @ rough)[1]
         return vectors * np.where(vectors[-1] < 0, -1.0, 1.0)
@@ -73,9 +73,8 @@ class Waves:
     def bands(self) -> Array:
         """Which unknowns (size,) are about as large: half an octave of waves, or steps."""
         m, s = self.parts
-        octave = 2.0 * np.log2(np.arange(m) + self.degree + 1.0)
-        octave = np.floor(octave).astype(np.int64) - int(np.log2(self.degree + 1.0) * 2.0)
-        rank = np.unique(octave, return_inverse=True)[1]
+        octave = 2.0 * np.log2(np.arange(m) + _DEGREE + 1.0)
+        rank = np.unique(np.floor(octave), return_inverse=True)[1]
         return np.concatenate([rank, rank, np.full(2 * s, rank.max(initial=-1) + 1)])
 
     def basis(self, row: Array, col: Array, index: IntArray) -> list[Array]:
@@ -116,5 +115,5 @@ class Waves:
 
 def _complement(vectors: Array) -> Array:
     """An orthonormal basis (n, n - k) of what is orthogonal to vectors (n, k)."""
-    q: Array = la.qr(vectors)[0]
+    q: Array = np.asarray(la.qr(vectors)[0], dtype=np.float64)
     return q[:, vectors.shape[1] :]

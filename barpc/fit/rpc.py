@@ -20,9 +20,11 @@ from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
+from barpc.sensor.splined import Splined
 
 _CHUNK = 8192
 _LOOPS = 4096  # round trips that a table of points is tried on, about
+_ABOUT = 1.1  # times the error
 _MISSING = 0.1  # part of the image without a ground point, at most
 _CELLS = 72  # of ``gauss-newton``, along each side of the image
 _HOPE = 3.0  # times the tolerance: what ``minimax`` may bring below it
@@ -136,7 +138,8 @@ def fit_rpc(
     alt_range : (low, high), altitudes [m above the ellipsoid]; at least 100 m are taken around a flat scene
     options : FitOptions, optional, grid, solver, tolerance
     strict : bool
-        Raise where the tolerance is missed; otherwise give the best fit found, to be judged by `RpcFit.verdict`.
+        Raise where the tolerance is missed; otherwise give the best fit found, to be judged by `RpcFit.verdict`. A
+        camera behind a spline (`barpc.sensor.splined`) is expected to miss it.
 
     Raises
     ------
@@ -162,17 +165,28 @@ def fit_rpc(
 
     given = partial(_given, model, size, alt_range, options)
 
-    def attempt(method: str) -> RpcFit:
-        solution = solve(*given(method), options, method, vendor=vendor)
+    def attempt(method: str, source: SensorModel = model) -> RpcFit:
+        solution = solve(*_given(source, size, alt_range, options, method), options, method, vendor=vendor)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
         return _certified(solution, *sample.errors(solution.rpc), loop, size, beyond)
 
     try:
-        fit = _best(attempt, options, vendor, strict, exact=True)
+        fit = _best(attempt, options, vendor, strict and not isinstance(model, Splined), exact=True)
+        if isinstance(model, Splined):
+            fit = _plainer(fit, attempt("ridge", model.sensor))
         return _localised(fit, given, partial(_missed, sample), options, strict)
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
+
+
+def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
+    """Of two RPCs for a camera behind a spline, which no RPC holds, the one made without it where it is about as good.
+
+    Its denominators are calmer; jitter that is faster than cubics of the row only makes the other one wave.
+    """
+    error, other = (float(np.linalg.norm(one.rmse_ckp)) for one in (fit, plain))
+    return plain if other <= _ABOUT * error or not fit.min_denominator > 0 else fit
 
 
 def _given(

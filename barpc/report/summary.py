@@ -33,6 +33,7 @@ from barpc.sensor.geometry import (
     ground_sample_distance,
     view_angles,
 )
+from barpc.sensor.splined import RowSpline
 
 SCHEMA = 2  # Version of summary.json
 MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken
@@ -75,6 +76,7 @@ Side = Annotated[int, {"minimum": 1}]
 Share = Annotated[float, {"minimum": 0, "maximum": 1}]
 Pixel = tuple[Number, Number]
 Vector = tuple[Number, Number, Number]
+_ROWS = 400  # of an image, over which a spline is averaged
 _ABOVE = "m above the ellipsoid"
 _Plain = float | str | bool | None
 _Value = _Plain | tuple[_Plain, ...] | tuple[tuple[_Plain, ...], ...]
@@ -110,6 +112,10 @@ class CorrectionEntry(Record):
     translation_m: Vector | None = said("Translation T, ECEF", "m", default=None)
     translation_norm_m: Number = said("Its length", "m", "translation", ".2f", default=None)
     drift_urad: tuple[Vector, ...] | None = said("Drift, for each power of the row", "urad", default=None)
+    jitter_px: Number = said("RMS over the rows of the spline that follows in the image", "px", default=None)
+    jitter_rows: Number = said("Rows between its knots", "px", default=None)
+    detector_px: Number = said("RMS of the steps between detectors", "px", default=None)
+    detectors: tuple[float, ...] | None = said("Columns where another detector begins", "px", default=None)
 
 
 class CenterEntry(Record):
@@ -797,9 +803,8 @@ def medians(values: Array, group: IntArray, num: int) -> Array:
 
 def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
     """The correction of a view, at the ground point (3,) in the middle of its image."""
-    sensor, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
-    assert isinstance(sensor, Corrected | ImageCorrected)
-    correction, covariance = sensor.correction, adjustment.covariance.view(i)
+    sensor, model = adjustment.bases[i], adjustment.cameras.unknowns.model
+    correction, covariance = adjustment.corrections[i], adjustment.covariance.view(i)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     common = (model, adjustment.params[i].tolist(), sigma)
     if not isinstance(correction, Correction):
@@ -816,7 +821,26 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
         translation_m=correction.translation.tolist(),
         translation_norm_m=float(np.linalg.norm(correction.translation)),
         drift_urad=(correction.drift * 1e6).tolist(),
+        **_in_image(adjustment.splines[i]),
     )
+
+
+def _in_image(spline: RowSpline | None) -> dict[str, Any]:
+    """What follows the correction in the image."""
+    if spline is None:
+        return {}
+    found: dict[str, Any] = {}
+    if len(spline.coeffs):
+        rows = spline.row_offset + spline.row_scale * np.linspace(-1, 1, _ROWS)
+        along = replace(spline, edges=np.zeros(0), steps=np.zeros((0, 2))).at(np.column_stack([rows, rows]))
+        found |= {"jitter_px": _size(along), "jitter_rows": spline.spacing}
+    if len(spline.steps):
+        found |= {"detector_px": _size(spline.steps), "detectors": tuple((spline.edges + 0.5).tolist())}
+    return found
+
+
+def _size(displacement: Array) -> float:
+    return float(np.sqrt((displacement**2).sum(axis=-1).mean()))
 
 
 def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array]:

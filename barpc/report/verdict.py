@@ -52,8 +52,8 @@ def _failure(view: ViewEntry, run: Run) -> str:
     tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
     if run.adjustment is not None and view.name in run.adjustment.left_out:
         return "not tied to the other images: its camera was left as it was"
-    grids = getattr(run.options, "grids", False)  # they hold what the RPC does not
-    if view.fit is not None and not grids and not max(map(_known, view.fit.max_px)) <= tolerance:
+    beyond = _follows_more(view) or getattr(run.options, "grids", False)  # grids hold what the RPC does not
+    if view.fit is not None and not beyond and not max(map(_known, view.fit.max_px)) <= tolerance:
         return f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range"
     return ""
 
@@ -76,7 +76,7 @@ def _doubt(view: ViewEntry, run: Run) -> str:
         return f"shows the same pixels as {run.copies[view.name]}: give each image once"
     if run.adjustment is not None:
         i = run.number[view.name]
-        found = _oddity(i, run.adjustment) or _left(i, run.adjustment)
+        found = _oddity(i, run.adjustment) or _left(i, run.adjustment) or _beyond(view)
         if found:
             return found
     error = _known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
@@ -111,6 +111,27 @@ def _oddity(i: int, adjustment: Adjustment) -> str:
         size = max(smooth.rms[i], smooth.shared[i])
         return f"an error of {size:.2f} px that changes {along} is left: {why}"
     return ""
+
+
+def _beyond(view: ViewEntry) -> str:
+    """What one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
+    if view.fit is None or not _follows_more(view):
+        return ""
+    left = float(np.linalg.norm([_known(value) for value in view.fit.rmse_px]))
+    most = max(map(_known, view.fit.max_px))
+    return (
+        ""
+        if left <= SMOOTH_LEFT
+        else (
+            "its corrected camera follows attitude jitter or steps between detectors, of which one RPC leaves "
+            f"{left:.2f} px (RMS; {most:.2f} px at most): use what holds more than an RPC does"
+        )
+    )
+
+
+def _follows_more(view: ViewEntry) -> bool:
+    """Whether a camera was corrected by more than one RPC holds."""
+    return view.correction is not None and bool(view.correction.jitter_px or view.correction.detector_px)
 
 
 def _left(i: int, adjustment: Adjustment) -> str:
@@ -257,6 +278,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     if prior.drift_sigma and np.isfinite(prior.drift_sigma).all():  # an earlier run's are in its matrix
         sizes = f"{_lengths(prior.drift_sigma)} at the first and last row"
         lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
+    lines += _jitter_lines(views)
     if len(run.tracks) or run.gcps is not None:
         lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
     lines += _reference_lines(run)
@@ -283,6 +305,29 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         if np.isfinite(ground).all():
             seen += f" and {_lengths(ground)} on the ground (east, north, up)"
         lines.append(f"{len(run.check_points.names)} check points, not used above, are met to {seen} (RMS).")
+    return lines
+
+
+def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
+    """What follows the corrections in the images."""
+    lines = []
+    found = [view.correction for view in views if view.correction is not None]
+    if waving := [one for one in found if one.jitter_px is not None]:
+        sizes = ", ".join(f"{one.jitter_px:.2f}" for one in waving[:_MOST_NAMED])
+        rows = median([one.jitter_rows for one in waving])
+        lines.append(
+            f"Jitter along the rows is followed by splines, a knot every {rows:.0f} rows: {sizes} px RMS"
+            f"{', ...' if len(waving) > _MOST_NAMED else ''}. Tie points do not see what all images have in common "
+            "along the epipolar lines: control points, a DEM or a reference do."
+        )
+    if stepping := [one for one in found if one.detectors]:
+        most, size = (
+            max(len(one.detectors or ()) for one in stepping),
+            median([one.detector_px for one in stepping]),
+        )
+        lines.append(
+            f"Detectors begin at up to {_count(most, 'column')} of an image, {size:.2f} px RMS apart."
+        )
     return lines
 
 
