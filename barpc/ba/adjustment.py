@@ -220,16 +220,17 @@ def _given_edges(block: Block, options: AdjustOptions) -> Array:
 
 
 def _spline_counts(block: Block, options: AdjustOptions) -> list[int]:
-    """Numbers of splines to try, the fewest first, as many as the observations hold: those of the poorest view."""
+    """Numbers of splines to try, the fewest first, as many as the observations of a view hold."""
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF:
         return [0] if options.detectors else []
+    most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // _PER_SPLINE
     if options.spacing:
-        return [max(int(np.ceil(rows / options.spacing)) + 3, _FEWEST)]
-    count = np.bincount(block.view[block.use], minlength=len(block.views))
-    most = min(float(np.median(count)) / _PER_SPLINE, _MOST_SPLINES / len(block.views))
+        return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), _FEWEST)]
+    most = min(most, _MOST_SPLINES // len(block.views))
     wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
-    return [n for n in np.unique(np.maximum(wanted, _FEWEST)).tolist() if n <= most]
+    dense = np.unique(np.maximum(wanted, _FEWEST)).tolist()
+    return [0] * bool(options.detectors) + [n for n in dense if n <= most]
 
 
 def _with_waves(
@@ -258,7 +259,7 @@ def _bent_by_control(
     if found.tested is None or found.tested.agrees:
         return False
     free = _solve(block.without(block.point >= block.num_tracks), outer, options, dem, centers, None)
-    return not (free.is_skew or free.has_trend)
+    return not (free.is_skew or free.has_trend or free.has_waves)
 
 
 def _solve(

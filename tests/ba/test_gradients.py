@@ -16,6 +16,7 @@ from barpc.ba.cameras import Cameras
 from barpc.ba.ground import flat_heights, ground_control, reference_control, terrain_heights
 from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.unknowns import make_unknowns
+from barpc.ba.waves import Waves
 from barpc.ba.weights import LOSSES
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.options import AUTO, Model
@@ -46,14 +47,16 @@ def ecef(views: tuple[View, ...]) -> np.ndarray:
 
 
 def _setup(views, model, drift, ecef, scale=5.0):
-    """Cameras that see ten points each, at the rows where their corrected sensors see them."""
-    unknowns, bounds = make_unknowns(views, model, drift), np.array([0, 10, 20, 30])
+    """Cameras that see ten points each, where their corrected sensors see them."""
+    waves = Waves(9, np.array([[5000.0, 12000.0], [9000.0, np.inf], [np.inf, np.inf]])) if drift == 2 else None
+    unknowns, bounds = make_unknowns(views, model, drift, waves=waves), np.array([0, 10, 20, 30])
     assert unknowns.size
     params = np.random.default_rng(3).normal(0, scale, (3, unknowns.size))
+    params[:, unknowns.in_waves] *= 0.1
     ground = ground_from_ecef(ecef.T).reshape(3, 10, 3)
     sensors = unknowns.corrected(params, views)
-    row = np.concatenate([sensor.project(part)[:, 1] for sensor, part in zip(sensors, ground, strict=True)])
-    return Cameras(views, unknowns, row), params, bounds
+    seen = np.concatenate([sensor.project(part) for sensor, part in zip(sensors, ground, strict=True)]).T
+    return Cameras(views, unknowns, seen), params, bounds
 
 
 @pytest.mark.parametrize(("model", "drift"), MODELS)
@@ -80,7 +83,8 @@ def test_views_together_project_like_each_corrected_sensor_alone(views, ecef, mo
     for v, sensor in enumerate(sensors):
         part = slice(bounds[v], bounds[v + 1])
         alone = sensor.project(ground_from_ecef(ecef[:, part].T))
-        np.testing.assert_allclose(image[:, part].T, alone, rtol=0, atol=2e-7)
+        near = 2e-7 if cameras.unknowns.waves is None else 1e-3  # a drift at the row seen, or a spline aside
+        np.testing.assert_allclose(image[:, part].T, alone, rtol=0, atol=near)
 
 
 @pytest.mark.parametrize("drift", [1, 2])

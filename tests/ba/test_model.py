@@ -40,9 +40,12 @@ def choose(
         after = SimpleNamespace(error=1.0, whole_rms=1.0)
         if options.model == "affine":
             after = SimpleNamespace(error=error, whole_rms=rms)
-        return SimpleNamespace(is_skew=skew, has_trend=trend, after=after, model=options.model, tested=None)
+        in_space = SimpleNamespace(cameras=SimpleNamespace(unknowns=SimpleNamespace(geometric=True)))
+        said = {"is_skew": skew, "has_trend": trend, "has_waves": False, "tested": None}
+        return SimpleNamespace(**said, after=after, model=options.model, problem=in_space)
 
     monkeypatch.setattr(adjustment, "_solve", solved)
+    monkeypatch.setattr(adjustment, "_followed", lambda found, *_: found)
     prior = given.pop("prior", None)
     found, in_space = adjustment._choose_model(None, None, AdjustOptions(**given), None, None, prior)
     return found.model, in_space, asked

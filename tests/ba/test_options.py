@@ -74,6 +74,8 @@ ROWS = [
     Row("model", "rotation", "rotation+translation", unknowns, 1),
     Row("model", "shift", "affine", unknowns, 1),
     Row("drift", 0, 2, unknowns, 1),
+    Row("jitter", "off", "5000", unknowns, 1),
+    Row("detectors", (), (10000.0,), unknowns, 1),
     Row("sigma_attitude", 0.2, 20.0, rotation, 1),
     Row("sigma_position", 0.2, 20.0, last, 1, rest={"drift": 0}),
     Row("sigma_drift", 0.01, 10.0, last, 1, rest={"drift": 1}),

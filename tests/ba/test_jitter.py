@@ -1,0 +1,196 @@
+"""Jitter and steps between detectors, flown by an independent simulator: followed where they are, as large as they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba.incremental import BlockPrior, block_prior
+from barpc.ba.waves import Waves
+from barpc.errors import InputError
+from barpc.fit import fit_rpc
+from barpc.sensor.splined import Splined
+from benchmarks.referee import cases, judge, make, solve
+from tests.ba.test_referee import hills
+
+TABLE = cases()
+SEEDS = (0, 1, 2)
+EDGES = tuple(np.arange(1, 8) * 2500.0)
+
+
+@cache
+def scene(name, seed=0, **changed):
+    return make(replace(TABLE[name], seed=seed, **changed), hills)
+
+
+@cache
+def solved(name, seed=0, jitter="auto", detectors=(), **changed):
+    made = scene(name, seed, **changed)
+    sensors, found = solve(made, AdjustOptions(jitter=jitter, detectors=detectors))
+    return found, judge(made, sensors)
+
+
+def medians(name, value, **options):
+    return float(np.median([value(solved(name, seed, **options)[1]) for seed in SEEDS]))
+
+
+def shaken(made, view, wave):
+    """The scene with the rows of one view displaced by a wave (col, row) [px] of the row."""
+
+    def moved(tracks):
+        rows = tracks.view == view
+        xy = tracks.xy.copy()
+        xy[rows] += wave(xy[rows, 1])
+        return replace(tracks, xy=xy)
+
+    return replace(made, tracks=moved(made.tracks), check=moved(made.check))
+
+
+def test_jitter_is_followed_to_the_noise_and_heights_are_not_bent():
+    assert medians("jitter 0.5 at 1 Hz", lambda j: j.across, jitter="off") > 0.4
+    assert 0.005 < medians("jitter 0.5 at 1 Hz", lambda j: j.across) < 0.0155
+    for seed in SEEDS:
+        found, after = solved("jitter 0.5 at 1 Hz", seed)
+        _, off = solved("jitter 0.5 at 1 Hz", seed, jitter="off")
+        before = judge(scene("jitter 0.5 at 1 Hz", seed), [v.sensor for v in scene("jitter 0.5 at 1 Hz", seed).views])
+        assert after.shape < 1.05 * min(before.shape, off.shape)
+        assert all(spline is not None and not len(spline.edges) for spline in found.splines)
+        assert not found.smooth.shared.any()
+        assert (np.abs(after.move) < 4 * found.gauge.sigma).all()
+
+
+def test_a_spline_that_is_subtracted_makes_it_worse():
+    made = scene("jitter 0.5 at 1 Hz", 1)
+    found, after = solved("jitter 0.5 at 1 Hz", 1)
+    turned = [
+        Splined(sensor.sensor, replace(sensor.correction, coeffs=-sensor.correction.coeffs)) for sensor in found.sensors
+    ]
+    without = judge(made, found.bases)
+    assert judge(made, turned).across > 1.8 * without.across > 20 * after.across
+
+
+def test_fast_jitter_gets_denser_knots():
+    found, after = solved("jitter 0.1 at 5 Hz", 1)
+    assert found.splines[0].spacing <= 1000.0
+    assert 0.005 < after.across < 0.05 < 0.15 < solved("jitter 0.1 at 5 Hz", 1, jitter="off")[1].across
+
+
+def test_all_errors_together_with_detectors_found_and_given():
+    assert medians("all", lambda j: j.across, jitter="off") > 0.4
+    assert 0.01 < medians("all", lambda j: j.across) < 0.06
+    assert 0.005 < medians("all", lambda j: j.across, detectors=EDGES) < 0.03
+    for seed in SEEDS:
+        made = scene("all", seed)
+        delivered = judge(made, [view.sensor for view in made.views]).shape
+        for options in ({}, {"detectors": EDGES}):
+            assert solved("all", seed, **options)[1].shape < min(delivered, solved("all", seed, jitter="off")[1].shape)
+
+
+def test_detectors_are_found_where_they_begin():
+    found, after = solved("steps 0.1 px", 1)
+    for spline in found.splines:
+        assert 5 <= len(spline.edges) <= 7
+        assert np.abs(spline.edges[:, None] - EDGES).min(axis=1).max() < 120.0
+    assert after.across < 0.05 < 0.1 < solved("steps 0.1 px", 1, jitter="off")[1].across
+
+
+@pytest.mark.parametrize("name", ["no drift", "drift 3", "distortion 0.1 px", "no drift, 10 % outliers"])
+def test_nothing_is_found_where_nothing_is(name):
+    for seed in SEEDS[:2]:
+        found, _ = solved(name, seed)
+        assert found.splines == (None, None, None)
+        np.testing.assert_array_equal(found.params, solved(name, seed, jitter="off")[0].params)
+
+
+def test_splines_that_are_asked_for_cost_a_clean_block_little():
+    for seed in SEEDS[:2]:
+        found, after = solved("no drift", seed, jitter="4000")
+        assert found.splines[0].spacing == pytest.approx(4000.0)
+        assert after.across < 1.2 * solved("no drift", seed)[1].across
+        assert max(np.abs(spline.coeffs).max() for spline in found.splines) < 0.05
+
+
+def test_knots_are_no_denser_than_the_observations_hold():
+    few, after = solved("jitter 0.5 at 1 Hz", 0, tracks=250)
+    off = solved("jitter 0.5 at 1 Hz", 0, tracks=250, jitter="off")[1]
+    assert after.across <= off.across
+    given, _ = solved("jitter 0.5 at 1 Hz", 0, tracks=250, jitter="100")
+    count = np.bincount(scene("jitter 0.5 at 1 Hz", 0, tracks=250).tracks.view).max()
+    for found in (few, given):
+        assert all(spline is None or 7 <= len(spline.coeffs) <= max(count / 30, 7) for spline in found.splines)
+    assert given.splines[0] is not None
+
+
+def test_one_view_of_three_with_jitter_is_the_one_that_is_corrected():
+    def wave(row):
+        angle = 2 * np.pi * row / 11000 + 0.7
+        return np.column_stack([0.6 * np.sin(angle), 0.3 * np.cos(angle)])
+
+    made = shaken(scene("no drift"), 1, wave)
+    sensors, found = solve(made)
+    rows = np.linspace(0, 19999, 300)
+    size = [spline.at(np.column_stack([rows, rows]))[:, 0].std() for spline in found.splines]
+    assert 0.25 < size[1] < 0.5  # 0.42, of which a drift of degree 2 takes some
+    assert max(size[0], size[2]) < 0.4 * size[1]
+    assert judge(made, sensors).across < 0.02 < 0.2 < judge(made, solve(made, AdjustOptions(jitter="off"))[0]).across
+
+
+def test_the_same_tracks_give_the_same_bytes():
+    first, again = (solve(scene("all", 1))[1] for _ in range(2))
+    np.testing.assert_array_equal(first.params, again.params)
+    assert first.splines == again.splines
+
+
+def test_the_covariance_counts_the_splines():
+    found, _ = solved("jitter 0.5 at 1 Hz", 1)
+    q = found.params.shape[1]
+    part = found.cameras.unknowns.in_waves
+    sigma = np.sqrt(np.diag(found.covariance.view(2)))[part]
+    assert q - part.start == 20
+    assert (0.001 < sigma).all()
+    assert (sigma < 1.5).all()
+
+
+def test_a_later_run_goes_on_from_splines(tmp_path):
+    made = scene("all", 1)
+    found, after = solved("all", 1)
+    block_prior(found).save(tmp_path / "prior.npz")
+    prior = BlockPrior.load(tmp_path / "prior.npz")
+    few = made.tracks.select(made.tracks.point % 10 == 0)
+    again = adjust_tracks(made.views, few, prior=prior)
+    assert judge(made, again.sensors).across == pytest.approx(after.across, abs=0.01)
+    assert [len(spline.edges) for spline in again.splines] == [len(spline.edges) for spline in found.splines]
+
+
+def test_the_best_single_rpc_is_fitted_to_the_camera_with_jitter():
+    found, _ = solved("jitter 0.5 at 1 Hz", 1)
+    view, camera = scene("jitter 0.5 at 1 Hz", 1).views[2], found.sensors[2]
+    image = np.random.default_rng(0).uniform(0, 1, (1000, 2)) * view.size
+    ground = camera.localize(image, np.random.default_rng(1).uniform(*view.alt_range, 1000))
+    fit = fit_rpc(camera, view.size, view.alt_range)
+    plain = fit_rpc(camera.sensor, view.size, view.alt_range)
+    left, without = (np.sqrt(((one.rpc.project(ground) - image) ** 2).sum(axis=1).mean()) for one in (fit, plain))
+    assert 0.02 < left < 0.3 * without
+    assert np.linalg.norm(fit.rmse_ckp) == pytest.approx(left, rel=0.1)
+    assert fit.min_denominator > 0
+
+
+def test_splines_leave_to_the_drift_what_it_can_do():
+    waves = Waves(13)
+    u, index = np.linspace(-1, 1, 4001), np.zeros(4001, dtype=np.int64)
+    (basis,) = waves.basis(u, u, index)
+    assert basis.shape == (10, 4001)
+    np.testing.assert_allclose(basis @ np.vander(u, 3) / len(u), 0.0, atol=2e-3)
+    changes = (np.diff(np.sign(basis), axis=1) != 0).sum(axis=1)
+    assert (np.diff(changes) >= 0).all()
+    assert (changes[0], changes[-1]) == (3, 12)
+
+
+@pytest.mark.parametrize("wrong", [{"jitter": "often"}, {"jitter": -5}, {"jitter": "nan"}, {"detectors": (5.0, 4.0)}])
+def test_what_is_no_spacing_and_no_order_of_columns_is_refused(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        AdjustOptions(**wrong)
