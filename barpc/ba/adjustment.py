@@ -200,7 +200,7 @@ def _followed(found: _Solution, block: Block, outer: Block, options: AdjustOptio
     """
     given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
     best, misses = found, 0
-    for count in _spline_counts(block, options):
+    for count in _spline_counts(block, options, found.has_waves):
         if misses == _MISSES or not (asked or best.has_waves):
             break
         tried = _with_waves(found, block, outer, options, Waves(count, _given_edges(block, options)))
@@ -219,7 +219,7 @@ def _given_edges(block: Block, options: AdjustOptions) -> Array:
     return np.tile(np.array(options.detectors, dtype=np.float64) - 0.5, (len(block.views), 1))
 
 
-def _spline_counts(block: Block, options: AdjustOptions) -> list[int]:
+def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
     """Numbers of splines to try, the fewest first, as many as the observations of a view hold."""
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF:
@@ -230,7 +230,8 @@ def _spline_counts(block: Block, options: AdjustOptions) -> list[int]:
     most = min(most, _MOST_SPLINES // len(block.views))
     wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
     dense = np.unique(np.maximum(wanted, _FEWEST)).tolist()
-    return [0] * bool(options.detectors) + [n for n in dense if n <= most]
+    dense = [n for n in dense if n <= most and has_waves]
+    return dense or [0] * bool(options.detectors)
 
 
 def _with_waves(
