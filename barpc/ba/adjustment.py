@@ -201,7 +201,7 @@ def _followed(found: _Solution, block: Block, outer: Block, options: AdjustOptio
     given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
     best, misses = found, 0
     for count in _spline_counts(block, options, found.has_waves):
-        if misses == _MISSES or not (asked or best.has_waves):
+        if misses == _MISSES or not (best.has_waves or (asked and best is found)):
             break
         tried = _with_waves(found, block, outer, options, Waves(count, _given_edges(block, options)))
         if not options.detectors and tried.has_waves:

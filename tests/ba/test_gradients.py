@@ -48,7 +48,9 @@ def ecef(views: tuple[View, ...]) -> np.ndarray:
 
 def _setup(views, model, drift, ecef, scale=5.0):
     """Cameras that see ten points each, where their corrected sensors see them."""
-    waves = Waves(9, np.array([[5000.0, 12000.0], [9000.0, np.inf], [np.inf, np.inf]])) if drift == 2 else None
+    waves = (
+        Waves(9, np.array([[5000.0, 12000.0], [9000.0, np.inf], [np.inf, np.inf]])) if drift == 2 else None
+    )
     unknowns, bounds = make_unknowns(views, model, drift, waves=waves), np.array([0, 10, 20, 30])
     assert unknowns.size
     params = np.random.default_rng(3).normal(0, scale, (3, unknowns.size))

@@ -1,4 +1,4 @@
-"""Jitter and steps between detectors, flown by an independent simulator: followed where they are, as large as they are."""
+"""Jitter and steps between detectors, flown by an independent simulator: followed where they are, as they are."""
 
 from __future__ import annotations
 
@@ -56,7 +56,9 @@ def test_jitter_is_followed_to_the_noise_and_heights_are_not_bent():
     for seed in SEEDS:
         found, after = solved("jitter 0.5 at 1 Hz", seed)
         _, off = solved("jitter 0.5 at 1 Hz", seed, jitter="off")
-        before = judge(scene("jitter 0.5 at 1 Hz", seed), [v.sensor for v in scene("jitter 0.5 at 1 Hz", seed).views])
+        before = judge(
+            scene("jitter 0.5 at 1 Hz", seed), [v.sensor for v in scene("jitter 0.5 at 1 Hz", seed).views]
+        )
         assert after.shape < 1.05 * min(before.shape, off.shape)
         assert all(spline is not None and not len(spline.edges) for spline in found.splines)
         assert not found.smooth.shared.any()
@@ -67,7 +69,8 @@ def test_a_spline_that_is_subtracted_makes_it_worse():
     made = scene("jitter 0.5 at 1 Hz", 1)
     found, after = solved("jitter 0.5 at 1 Hz", 1)
     turned = [
-        Splined(sensor.sensor, replace(sensor.correction, coeffs=-sensor.correction.coeffs)) for sensor in found.sensors
+        Splined(sensor.sensor, replace(sensor.correction, coeffs=-sensor.correction.coeffs))
+        for sensor in found.sensors
     ]
     without = judge(made, found.bases)
     assert judge(made, turned).across > 1.8 * without.across > 20 * after.across
@@ -121,7 +124,9 @@ def test_knots_are_no_denser_than_the_observations_hold():
     given, _ = solved("jitter 0.5 at 1 Hz", 0, tracks=250, jitter="100")
     count = np.bincount(scene("jitter 0.5 at 1 Hz", 0, tracks=250).tracks.view).max()
     for found in (few, given):
-        assert all(spline is None or 7 <= len(spline.coeffs) <= max(count / 30, 7) for spline in found.splines)
+        assert all(
+            spline is None or 7 <= len(spline.coeffs) <= max(count / 30, 7) for spline in found.splines
+        )
     assert given.splines[0] is not None
 
 
@@ -136,11 +141,16 @@ def test_one_view_of_three_with_jitter_is_the_one_that_is_corrected():
     size = [spline.at(np.column_stack([rows, rows]))[:, 0].std() for spline in found.splines]
     assert 0.25 < size[1] < 0.5  # 0.42, of which a drift of degree 2 takes some
     assert max(size[0], size[2]) < 0.4 * size[1]
-    assert judge(made, sensors).across < 0.02 < 0.2 < judge(made, solve(made, AdjustOptions(jitter="off"))[0]).across
+    assert (
+        judge(made, sensors).across
+        < 0.02
+        < 0.2
+        < judge(made, solve(made, AdjustOptions(jitter="off"))[0]).across
+    )
 
 
 def test_the_same_tracks_give_the_same_bytes():
-    first, again = (solve(scene("all", 1))[1] for _ in range(2))
+    first, again = solved("all", 1)[0], solve(scene("all", 1))[1]
     np.testing.assert_array_equal(first.params, again.params)
     assert first.splines == again.splines
 
@@ -151,8 +161,8 @@ def test_the_covariance_counts_the_splines():
     part = found.cameras.unknowns.in_waves
     sigma = np.sqrt(np.diag(found.covariance.view(2)))[part]
     assert q - part.start == 20
-    assert (0.001 < sigma).all()
-    assert (sigma < 1.5).all()
+    assert sigma.min() > 0.001
+    assert sigma.max() < 1.5
 
 
 def test_a_later_run_goes_on_from_splines(tmp_path):
@@ -173,7 +183,9 @@ def test_the_best_single_rpc_is_fitted_to_the_camera_with_jitter():
     ground = camera.localize(image, np.random.default_rng(1).uniform(*view.alt_range, 1000))
     fit = fit_rpc(camera, view.size, view.alt_range)
     plain = fit_rpc(camera.sensor, view.size, view.alt_range)
-    left, without = (np.sqrt(((one.rpc.project(ground) - image) ** 2).sum(axis=1).mean()) for one in (fit, plain))
+    left, without = (
+        np.sqrt(((one.rpc.project(ground) - image) ** 2).sum(axis=1).mean()) for one in (fit, plain)
+    )
     assert 0.02 < left < 0.3 * without
     assert np.linalg.norm(fit.rmse_ckp) == pytest.approx(left, rel=0.1)
     assert fit.min_denominator > 0
@@ -190,7 +202,9 @@ def test_splines_leave_to_the_drift_what_it_can_do():
     assert changes[-1] >= 10
 
 
-@pytest.mark.parametrize("wrong", [{"jitter": "often"}, {"jitter": -5}, {"jitter": "nan"}, {"detectors": (5.0, 4.0)}])
+@pytest.mark.parametrize(
+    "wrong", [{"jitter": "often"}, {"jitter": -5}, {"jitter": "nan"}, {"detectors": (5.0, 4.0)}]
+)
 def test_what_is_no_spacing_and_no_order_of_columns_is_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
         AdjustOptions(**wrong)
