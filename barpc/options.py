@@ -332,9 +332,6 @@ class AdjustOptions(Options):
     )
 
     def __post_init__(self) -> None:
-        rows: Any = self.jitter
-        if type(rows) in (int, float):
-            object.__setattr__(self, "jitter", f"{rows:g}")
         super().__post_init__()
         if not (self.jitter in (AUTO, OFF) or self.spacing > 0):
             raise InputError(f"jitter {self.jitter!r} is not auto, off or a number of rows above 0")

@@ -149,7 +149,8 @@ def test_what_a_field_can_hold_is_taken_as_it_is(table: str, name: str, one: Dec
     elif kind is int:
         given += [np.int64(rule.least or 1)]
     elif kind is str and not rule.choices(kind):
-        given += ["s3://bucket/x"] if rule.unit == "url" else ["view_00", Path("view_00")]
+        words = {"url": ["s3://bucket/x"], "auto|off|rows": ["off", "1500", "2e3"]}
+        given += words.get(rule.unit, ["view_00", Path("view_00")])
     rest = {"dem": "dem.tif"} if name in ("geoid", "reference", "reference_sigma") else {}
     rest |= {"reference": ("ortho.tif",)} if name == "reference_sigma" else {}
     for value in given:
