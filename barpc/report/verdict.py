@@ -76,7 +76,7 @@ def _doubt(view: ViewEntry, run: Run) -> str:
         return f"shows the same pixels as {run.copies[view.name]}: give each image once"
     if run.adjustment is not None:
         i = run.number[view.name]
-        found = _oddity(i, run.adjustment) or _left(i, run.adjustment) or _beyond(view)
+        found = _oddity(i, run.adjustment) or _left(i, run.adjustment) or _beyond(view, run)
         if found:
             return found
     error = _known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
@@ -113,19 +113,20 @@ def _oddity(i: int, adjustment: Adjustment) -> str:
     return ""
 
 
-def _beyond(view: ViewEntry) -> str:
+def _beyond(view: ViewEntry, run: Run) -> str:
     """What one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
-    if view.fit is None or not _follows_more(view):
+    told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
+    if view.fit is None or told or not _follows_more(view):
         return ""
-    left = float(np.linalg.norm([_known(value) for value in view.fit.rmse_px]))
-    most = max(map(_known, view.fit.max_px))
+    left, most = (
+        float(np.linalg.norm([_known(v) for v in view.fit.rmse_px])),
+        max(map(_known, view.fit.max_px)),
+    )
+    if left <= SMOOTH_LEFT:
+        return ""
     return (
-        ""
-        if left <= SMOOTH_LEFT
-        else (
-            "its corrected camera follows attitude jitter or steps between detectors, of which one RPC leaves "
-            f"{left:.2f} px (RMS; {most:.2f} px at most): use what holds more than an RPC does"
-        )
+        "its corrected camera follows attitude jitter or steps between detectors, of which one RPC leaves "
+        f"{left:.2f} px (RMS; {most:.2f} px at most): use its grids, --tiles or --resample"
     )
 
 
