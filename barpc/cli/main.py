@@ -41,6 +41,7 @@ COMMANDS = {
     "localize": "Image points to ground points, at an altitude or on a DEM.",
     "triangulate": "Corresponding image points to ground points.",
     "convert": "Write RPCs in other formats, cut out windows, hand images over.",
+    "export": "Hand a finished run to renderers, COLMAP, s2p, CARS, ASP or a catalogue.",
     "report": "Make report.html of a finished run again, or compare two runs.",
 }
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""

@@ -81,7 +81,7 @@ def _view(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]) -> dic
 def _rpc_difference(
     folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]
 ) -> tuple[float | None, float | None]:
-    first, second = map(_written_rpc, folders, views)
+    first, second = map(written_rpc, folders, views)
     if first is None or second is None:
         return None, None
     with np.errstate(all="ignore"):  # where the second has no value there is no difference
@@ -94,7 +94,7 @@ def _rpc_difference(
     return float(np.hypot(*difference.T).max()), float(np.hypot(*relative.T).max())
 
 
-def _written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
+def written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
     """The first RPC that can be read of those that a run wrote for a view, in its own folder, whatever it names."""
     for name in view.outputs:
         try:

@@ -31,18 +31,26 @@ from barpc.scene import BoolArray, IntArray
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
 
-RESIDUALS = ("lon", "lat", "height_above_datum", "mean_residual", "num_observations", "mean_residual_before")
+RESIDUALS = (
+    "lon",
+    "lat",
+    "height_above_datum",
+    "mean_residual",
+    "num_observations",
+    "mean_residual_before",
+    "track",
+)
 """Columns of residuals.csv, properties of residuals.geojson; one row a track. Heights: above the ellipsoid."""
 
 OBSERVATIONS = ("view", "track", "col", "row", "col_before", "row_before", "col_after", "row_after", "used")
 """Columns of observations.csv, one row an observation: residuals are projected - observed [px]."""
 
 _FAR = 1e12  # px, deg and m: no number of a table comes near
-_NUMBERS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
+_RESIDUAL_CELLS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
 
 
 def _per_track(run: Run) -> Array:
-    """Rows of `RESIDUALS` (n, 6)."""
+    """Rows of `RESIDUALS` (n, 7)."""
     tracks, keep, num = run.tracks, run.keep, run.tracks.num_points
     count = np.bincount(tracks.point[keep], minlength=num)
     means = []
@@ -50,13 +58,15 @@ def _per_track(run: Run) -> Array:
         norm = np.hypot(*ties.residuals[keep].T)
         with np.errstate(invalid="ignore"):
             means.append(np.bincount(tracks.point[keep], norm, minlength=num) / count)
-    return np.asarray(np.column_stack([run.ground, means[0], count, means[1]])[run.written_tracks])
+    return np.asarray(
+        np.column_stack([run.ground, means[0], count, means[1], np.arange(num)])[run.written_tracks]
+    )
 
 
 def _residual_rows(run: Run, empty: str) -> Iterable[list[str]]:
-    for lon, lat, alt, mean, count, before in _per_track(run).tolist():
+    for lon, lat, alt, mean, count, before, track in _per_track(run).tolist():
         row = [f"{lon:.9f}", f"{lat:.9f}", f"{alt:.4f}", f"{mean:.4f}", f"{count:.0f}"]
-        yield [*row, _number(before, 4, empty)]
+        yield [*row, _number(before, 4, empty), f"{track:.0f}"]
 
 
 def _residuals_csv(run: Run, _: Summary) -> bytes:
@@ -85,7 +95,7 @@ def _observations_csv(run: Run, _: Summary) -> bytes:
     columns = (tracks.view[rows], tracks.point[rows], numbers, run.keep[rows], whole)
     lines = [",".join(OBSERVATIONS)]
     for view, track, row, used, full in zip(*(column.tolist() for column in columns), strict=True):
-        text = _NUMBERS(*row) if full else ",".join(_number(value, 4) for value in row)
+        text = _RESIDUAL_CELLS(*row) if full else ",".join(_number(value, 4) for value in row)
         lines.append(f"{names[view]},{track},{text},{used:d}")
     return ("\n".join(lines) + "\n").encode()
 
@@ -185,12 +195,13 @@ PICTURES = "pictures.json"
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """observations.csv: index of the view (K,), col, row (K, 2) [px], whether it was kept (K,).
+    """observations.csv: index of the view, number of the track (K,), col, row (K, 2) [px], whether it was kept (K,).
 
     `before`, `after` (K, 2): projected - observed [px]; NaN where there is none.
     """
 
     view: IntArray
+    track: IntArray
     xy: Array
     before: Array
     after: Array
@@ -223,13 +234,14 @@ class Pictures:
 class RunFiles:
     """What lies in the folder of a run.
 
-    `points` (n, 4): lon, lat [deg], altitude [m], mean residual [px] of the tie points; `outlines`: the rings (m, 2) of
-    every view's footprint, lon, lat [deg], closed, cut at the antimeridian.
+    `points` (n, 4): lon, lat [deg], altitude [m], mean residual [px] of the tie points, whose numbers are `tracks`
+    (n,); `outlines`: the rings (m, 2) of every view's footprint, lon, lat [deg], closed, cut at the antimeridian.
     """
 
     summary: Summary
     observations: Observations
     points: Array
+    tracks: IntArray
     outlines: Sequence[Sequence[Array]]
     pictures: Pictures
 
@@ -290,10 +302,10 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     if len(outlines) != len(names):
         raise InputError(f"{folder / 'footprints.geojson'}: {len(outlines)} outlines of {len(names)} images")
     observations = _read(folder / "observations.csv", TABLE, lambda text: _observations(text, names))
-    points = _read(folder / "residuals.csv", TABLE, _points)
+    points, tracks = _read(folder / "residuals.csv", TABLE, _points)
     there = os.path.lexists(folder / PICTURES)
     pictures = _read(folder / PICTURES, SUMMARY, _pictures) if there else Pictures({}, ())
-    return RunFiles(summary, observations, points, outlines, pictures)
+    return RunFiles(summary, observations, points, tracks, outlines, pictures)
 
 
 _BASE64 = re.compile(r"[A-Za-z0-9+/]{4,400000}={0,2}")
@@ -355,11 +367,19 @@ def _observations(text: str, names: Sequence[str]) -> Observations:
     view = np.array([index[from_cell(name)] for name in columns[0]], dtype=np.int64)
     numbers = _floats(columns[2:8], 2)
     used = np.array([cell == "1" for cell in columns[8]], dtype=bool)
-    return Observations(view, numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
+    return Observations(view, _numbers(columns[1]), numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
 
 
-def _points(text: str) -> Array:
-    return _in_degrees(_floats(_columns(text, RESIDUALS)[:4], 3))
+def _points(text: str) -> tuple[Array, IntArray]:
+    columns = _columns(text, RESIDUALS)
+    return _in_degrees(_floats(columns[:4], 3)), _numbers(columns[6])
+
+
+def _numbers(cells: Sequence[str]) -> IntArray:
+    """Numbers of tracks."""
+    if not all(cell.isdecimal() and len(cell) <= 18 for cell in cells):
+        raise ValueError("a number of a track is none")
+    return np.array(list(map(int, cells)), dtype=np.int64)
 
 
 def _in_degrees(places: Array) -> Array:

@@ -138,7 +138,7 @@ def test_fifty_images_make_less_than_3_mb_in_seconds(tmp_path):
 def many_times(found: RunFiles, copies: int) -> RunFiles:
     """A run's files as if its scene lay there many times, side by side, every image with a reservation."""
     summary, seen, num = found.summary, found.observations, len(found.summary.views)
-    views, pairs, outlines, points = [], [], [], []
+    views, pairs, outlines, points, tracks = [], [], [], [], []
     for copy in range(copies):
         step = [0.4 * (copy % 40), 0.4 * (copy // 40)]
         for view in summary.views:
@@ -147,14 +147,17 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
         pairs += [replace(pair, a=f"{copy}_{pair.a}", b=f"{copy}_{pair.b}") for pair in summary.pairs]
         outlines += [[ring + step for ring in rings] for rings in found.outlines]
         points.append(found.points + [*step, 0.0, 0.0])
+        tracks.append(found.tracks)
     lines = [f"{view.name}: doubtful: look for clouds, water, change, or wrong matches." for view in views]
-    columns = (seen.xy, seen.before, seen.after, seen.used)
+    columns = (seen.track, seen.xy, seen.before, seen.after, seen.used)
     observations = Observations(
         np.concatenate([seen.view + copy * num for copy in range(copies)]),
         *(np.concatenate([column] * copies) for column in columns),
     )
     told = replace(summary, views=tuple(views), pairs=tuple(pairs), verdict=tuple(lines))
-    return RunFiles(told, observations, np.concatenate(points), outlines, found.pictures)
+    return RunFiles(
+        told, observations, np.concatenate(points), np.concatenate(tracks), outlines, found.pictures
+    )
 
 
 @pytest.mark.parametrize("num", [300, 1000])

@@ -1,0 +1,131 @@
+"""For catalogues and GIS: a STAC item an image, tie points with their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barpc.export.neural import Files, as_json, rpc_of
+from barpc.export.scene import Scene, Shot, link
+from barpc.geodesy import Array, enu_basis, metres_per_unit, wrap_longitude
+from barpc.geojson import polygon
+from barpc.sensor.geometry import footprint
+
+_EXTENSIONS = ("projection/v2.0.0", "view/v1.0.0")
+_UNKNOWN = {"start_datetime": "1957-10-04T00:00:00Z", "end_datetime": "9999-12-31T23:59:59Z"}
+"""When an image was taken of which no file says it: since there are satellites."""
+_TYPES = {
+    ".tif": "image/tiff; application=geotiff",
+    ".vrt": "application/xml",
+    ".xml": "application/xml",
+    ".json": "application/json",
+    ".ntf": "application/vnd.nitf",
+}
+_AXES = [(i, j) for i in range(3) for j in range(i, 3)]
+_VARIANCES = tuple(f"var_{'enu'[i]}{'enu'[j]}" for i, j in _AXES)
+
+
+def stac(scene: Scene, out: Path) -> Files:
+    """``<image>.json``: a STAC item of every image with its files in the run folder."""
+    return {f"{shot.name}.json": as_json(_item(scene, shot, out)) for shot in scene.shots}
+
+
+def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
+    view = shot.entry
+    ring = footprint(shot.rpc, shot.size, scene.origin[2])
+    west, east = (float(wrap_longitude(lon)) for lon in (ring[:, 0].min(), ring[:, 0].max()))
+    time = shot.light.time
+    when = {"datetime": time if time is None or "T" in time else f"{time}T00:00:00Z"}
+    seen = {
+        "gsd": view.gsd_m,
+        "view:incidence_angle": view.incidence_deg,
+        "view:azimuth": view.azimuth_deg,
+        "view:sun_azimuth": shot.light.azimuth,
+        "view:sun_elevation": shot.light.elevation,
+    }
+    schemas = [f"https://stac-extensions.github.io/{name}/schema.json" for name in _EXTENSIONS]
+    return {
+        "type": "Feature",
+        "stac_version": "1.0.0",
+        "stac_extensions": schemas,
+        "id": shot.name,
+        "geometry": polygon(ring),
+        "bbox": [west, float(ring[:, 1].min()), east, float(ring[:, 1].max())],
+        "properties": {
+            **when,
+            **(_UNKNOWN if time is None else {}),
+            **{key: value for key, value in seen.items() if value is not None},
+            "proj:code": None,
+            "proj:shape": [shot.size[1], shot.size[0]],
+            "processing:software": {"barpc": scene.summary.barpc},
+            "rpc": rpc_of(shot),
+        },
+        "links": [],
+        "assets": {name: _asset(scene.folder / name, out) for name in view.outputs}
+        | {"image": {"href": link(shot.file, out), "roles": ["source"]}},
+    }
+
+
+def _asset(path: Path, out: Path) -> dict[str, Any]:
+    of_pixels = path.suffix.lower() in (".vrt", ".tif", ".ntf")
+    kind = _TYPES.get(path.suffix.lower(), "text/plain")
+    return {"href": link(path, out), "type": kind, "roles": ["data" if of_pixels else "metadata"]}
+
+
+def points(scene: Scene, _out: Path) -> Files:
+    """``points.csv`` and ``points.ply``: every tie point with the covariance of its intersection, east, north, up [m2].
+
+    It is what the noise of the observations leaves with cameras as they are; what is common to all points, the place of
+    the scene, is stated in the head of both.
+    """
+    covariance = _covariances(scene)
+    sums = np.array([covariance[:, i, j] for i, j in _AXES]).T
+    place = scene.summary.scene
+    sigma = "unknown" if place is None else ", ".join(f"{v:.4g}" for v in place.sigma_enu_m if v is not None)
+    said = f"covariance [m2] of the intersection alone; noise {scene.noise:.4g} px;"
+    said += f" the scene's own place east, north, up is known to [m]: {sigma}"
+    lines = [f"# {said}", ",".join(("track", "lon", "lat", "alt", *_VARIANCES))]
+    for track, place_of, row in zip(scene.tracks.tolist(), scene.points.tolist(), sums.tolist(), strict=True):
+        lon, lat, alt = place_of
+        cells = (f"{value:.6g}" if np.isfinite(value) else "" for value in row)
+        lines.append(f"{track},{lon:.9f},{lat:.9f},{alt:.4f},{','.join(cells)}")
+    return {"points.csv": ("\n".join(lines) + "\n").encode(), "points.ply": _ply(scene, sums, said)}
+
+
+def _ply(scene: Scene, sums: Array, said: str) -> bytes:
+    kind = np.dtype(
+        [*((axis, "<f8") for axis in "xyz"), ("track", "<i4"), *((name, "<f4") for name in _VARIANCES)]
+    )
+    rows = np.empty(len(sums), dtype=kind)
+    columns = [*scene.world(scene.points).T, scene.tracks, *sums.T]
+    for name, values in zip(kind.names or (), columns, strict=True):
+        rows[name] = values
+    lon, lat, alt = scene.origin
+    head = ["ply", "format binary_little_endian 1.0", f"comment {said}"]
+    head.append(
+        f"comment x east, y north, z up [m] of lon {lon:.9f} lat {lat:.9f} alt {alt:.4f} (WGS84, ellipsoid)"
+    )
+    head.append(f"element vertex {len(rows)}")
+    head += [*(f"property double {axis}" for axis in "xyz"), "property int track"]
+    head += [*(f"property float {name}" for name in _VARIANCES), "end_header"]
+    return ("\n".join(head) + "\n").encode() + rows.tobytes()
+
+
+def _covariances(scene: Scene) -> Array:
+    """Covariance (P, 3, 3) of the points, east, north, up [m2]: the inverse of what their observations tell."""
+    normal = np.zeros((len(scene.points), 3, 3))
+    for shot in scene.shots:
+        ground = scene.points[shot.index]
+        rows = shot.rpc.project_jacobian(ground)[1] / metres_per_unit(ground)[:, None, :]
+        rows = rows @ enu_basis(ground) @ enu_basis(scene.origin).T
+        np.add.at(normal, shot.index, rows.swapaxes(1, 2) @ rows)
+    known = np.isfinite(normal).all(axis=(1, 2)) & (np.linalg.cond(normal + 1e-300 * np.eye(3)) < 1e12)
+    out = np.full_like(normal, np.nan)
+    out[known] = scene.noise**2 * np.linalg.inv(normal[known])
+    return out
+
+
+CATALOGUE: Mapping[str, Any] = {"stac": stac, "points": points}

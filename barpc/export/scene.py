@@ -1,0 +1,229 @@
+"""A finished run as exports need it: images, corrected RPCs, tie points, and a metric frame on the ground."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+
+from barpc.errors import InputError
+from barpc.export.approx import Samples
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
+from barpc.remote import is_url
+from barpc.report.compare import written_rpc
+from barpc.report.summary import Summary, ViewEntry
+from barpc.report.tables import RunFiles, read_summary, read_tables
+from barpc.rpcio import CARRIERS
+from barpc.rpcio.light import Light, light_of
+from barpc.scene import IntArray
+from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_enu
+from barpc.sensor.rpc import RPC
+
+MARGIN = 20.0
+"""m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
+_SHARE = 0.5  # per cent of the tie points at either end that do not count for it
+_NODES, _CHECKED = (11, 5), (21, 9)  # of the grids on which cameras are fitted, and their errors measured
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """An image of a run with its corrected camera.
+
+    `file`: what holds its pixels: the image, or a URL; `carrier`: the run's VRT or copy, with the RPC in it, if there
+    is one; `index` (n,), `xy` (n, 2), `track` (n,): its tie points, places among the scene's points, and where it shows
+    them [px].
+    """
+
+    entry: ViewEntry
+    rpc: RPC
+    file: str
+    carrier: Path | None
+    light: Light
+    index: IntArray
+    xy: Array
+
+    @property
+    def name(self) -> str:
+        """Its name in the run."""
+        return self.entry.name
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width, height [px]."""
+        return self.entry.size
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A run: its shots in order, its tie points (P, 3), lon, lat [deg], alt [m], and the altitudes that it spans."""
+
+    folder: Path
+    summary: Summary
+    shots: tuple[Shot, ...]
+    points: Array
+    tracks: IntArray
+    alt_range: tuple[float, float]
+    noise: float
+    """Standard deviation of an observed coordinate [px], by what the adjustment left."""
+
+    @cached_property
+    def origin(self) -> Array:
+        """Lon, lat [deg], alt [m] of the frame's origin."""
+        middle = sum(self.alt_range) / 2
+        rings = [footprint(shot.rpc, shot.size, middle) for shot in self.shots]
+        places = np.concatenate(rings) if not len(self.points) else self.points[:, :2]
+        lon = wrap_longitude(places[:, 0], places[0, 0])
+        return np.array([wrap_longitude((lon.min() + lon.max()) / 2), np.median(places[:, 1]), middle])
+
+    @property
+    def world_to_ecef(self) -> Array:
+        """The matrix (4, 4) that takes east, north, up of the origin [m] to ECEF."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = enu_basis(self.origin).T, ecef_from_ground(self.origin)
+        return matrix
+
+    def world(self, ground: Array) -> Array:
+        """East, north, up (N, 3) of the origin [m] of ground points (N, 3)."""
+        away = ecef_from_ground(ground) - ecef_from_ground(self.origin)
+        return np.asarray(away @ enu_basis(self.origin).T)
+
+    def samples(self, shot: Shot, checked: bool = False) -> Samples:
+        """Points over an image and the scene's altitudes; to measure errors on, more of them."""
+        image, alt = image_grid(shot.size, self.alt_range, _CHECKED if checked else _NODES)
+        ground = shot.rpc.localize(image, alt)
+        known = np.isfinite(ground).all(axis=1)
+        if known.sum() < 12:
+            raise InputError(f"{shot.name}: its RPC sees no ground between {self.alt_range} m")
+        return Samples(self.world(ground[known]), image[known])
+
+    def view_of(self, shot: Shot) -> dict[str, Any]:
+        """How a shot sees the middle of its own ground: what `approx.fit_pinhole` starts from."""
+        pixel = (np.array(shot.size) - 1.0) / 2
+        ground = shot.rpc.localize(pixel, np.array(self.origin[2]))
+        local = enu_basis(ground) @ enu_basis(self.origin).T  # of the world's axes there
+        derivative = shot.rpc.project_jacobian(ground)[1] / metres_per_unit(ground)
+        stand = camera_center(shot.rpc, shot.size, self.alt_range).ecef
+        far = float(np.linalg.norm(stand - ecef_from_ground(ground)))
+        sight = sight_enu(shot.rpc, ground) @ local
+        return {
+            "at": self.world(ground),
+            "pixel": pixel,
+            "rows": derivative @ local,
+            "sight": sight,
+            "far": far,
+        }
+
+    def file_names(self) -> list[str]:
+        """What each image is called where files stand in one folder: its own name where no other has it."""
+        names = [PurePath(shot.file).name for shot in self.shots]
+        several = Counter(name.casefold() for name in names)
+        return [
+            name
+            if several[name.casefold()] == 1
+            else shot.name + PurePath(name).suffix * (PurePath(name).suffix != PurePath(shot.name).suffix)
+            for name, shot in zip(names, self.shots, strict=True)
+        ]
+
+
+def link(target: Path | str, folder: Path) -> str:
+    """A file as a text in a folder names it: relative, with slashes, so that both may move; a URL as it is."""
+    if is_url(str(target)):
+        return str(target)
+    absolute = os.path.abspath(target)  # noqa: PTH100  (no link is followed: it may be meant)
+    return Path(os.path.relpath(absolute, folder.absolute())).as_posix()
+
+
+def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Scene:
+    """The scene of a run folder; altitudes [m] by its tie points unless they are given.
+
+    Raises
+    ------
+    InputError
+        No finished adjustment, without RPC files, or one whose files contradict each other.
+    """
+    summary = read_summary(folder)
+    if summary.kind != "adjust":
+        raise InputError(f"{folder}: a run of the kind {summary.kind}, without corrected cameras")
+    files = read_tables(summary, folder)
+    order = np.argsort(files.tracks, kind="stable")
+    index, found = _places(files.tracks[order], files.observations.track)
+    counted = found & files.observations.used
+    if alt_range is None:
+        alt_range = _altitudes(files.points[:, 2], summary)
+    shots = []
+    for number, view in enumerate(summary.views):
+        if PurePath(view.name).name != view.name or view.name in (".", ".."):
+            raise InputError(
+                f"{folder}: its summary names an image {view.name!r}, which is no name of a file"
+            )
+        rpc = written_rpc(folder, view)
+        if rpc is None:
+            raise InputError(
+                f"{folder}: no RPC file of {view.name} that can be read: run the adjustment again"
+            )
+        rows = counted & (files.observations.view == number)
+        camera = None if view.rpc_source is None else view.rpc_source.path
+        carrier = _carrier(folder, view)
+        shots.append(
+            Shot(
+                view,
+                rpc,
+                view.path,
+                carrier,
+                light_of(view.path, camera),
+                order[index[rows]],
+                files.observations.xy[rows],
+            )
+        )
+    noise = _noise(files, counted)
+    return Scene(folder, summary, tuple(shots), files.points[:, :3], files.tracks, alt_range, noise)
+
+
+def _places(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:
+    """Where numbers (K,) stand in an ascending list, and whether they do."""
+    if not len(known):
+        return np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=bool)
+    at = np.minimum(np.searchsorted(known, asked), len(known) - 1)
+    return at, known[at] == asked
+
+
+def _altitudes(alt: Array, summary: Summary) -> tuple[float, float]:
+    """The altitudes of a scene: those of its tie points and a margin, or of its cameras without any."""
+    if not len(alt):
+        ranges = np.array([view.alt_range_m for view in summary.views])
+        return float(ranges[:, 0].min()), float(ranges[:, 1].max())
+    low, high = np.percentile(alt, [_SHARE, 100.0 - _SHARE])
+    margin = MARGIN + 0.1 * (high - low)
+    return float(np.floor(low - margin)), float(np.ceil(high + margin))
+
+
+def _carrier(folder: Path, view: ViewEntry) -> Path | None:
+    """The raster with the corrected RPC that a run wrote for an image, in its own folder."""
+    ends = tuple(end for row in CARRIERS.values() for end in row.suffixes)
+    for name in view.outputs:
+        if name.lower().endswith(ends) and "\0" not in name and (folder / name).is_file():
+            path = (folder / name).absolute()
+            if path.resolve().parent == folder.resolve():
+                return path
+    return None
+
+
+def _noise(files: RunFiles, counted: Any) -> float:
+    """Standard deviation [px] of a coordinate: what is left, over the observations that points did not take."""
+    left = files.observations.after[counted]
+    left = left[np.isfinite(left).all(axis=1)]
+    free = left.size - 3 * len(np.unique(files.observations.track[counted]))
+    return float(np.sqrt(np.square(left).sum() / free)) if free > 0 else float("nan")
+
+
+def pairs_of(scene: Scene) -> Sequence[tuple[str, str]]:
+    """The pairs that stereo is made of: those with tie points and an angle that shows heights; else all of them."""
+    pairs = [(p.a, p.b, p.convergence_deg or 0.0) for p in scene.summary.pairs]
+    good = [(a, b) for a, b, angle in pairs if 2.0 <= angle <= 50.0]
+    return good or [(a, b) for a, b, _ in pairs]
