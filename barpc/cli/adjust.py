@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from barpc.cli.images import Config, corrected, expanded, read_config, with_cameras
 from barpc.cli.options import ADJUSTMENT, MATCH, RUN, TIE, image_paths, run_options, with_flags
 from barpc.cli.progress import executor_for, progress_told
-from barpc.cli.terminal import echo, print_comparison, print_summary, tell_gate
+from barpc.cli.terminal import echo, print_comparison, print_summary, say, tell_gate
 
 if TYPE_CHECKING:
+    from barpc.options import RunOptions
     from barpc.pipeline import AdjustResult
 
 _images = click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
@@ -24,9 +26,24 @@ _out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="F
 @click.command("adjust")
 @_images
 @_out_dir
+@click.option(
+    "--from",
+    "source",
+    type=(click.Choice(["s2p", "cars", "sat-bundleadjust"]), str),
+    metavar="TOOL FILE",
+    help="Images and cameras of a configuration of s2p, cars (both are written back with the corrected cameras) or "
+    "sat-bundleadjust.",
+)
 @with_flags(*RUN, *TIE, *ADJUSTMENT)
 @click.pass_obj
-def adjust(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
+def adjust(
+    obj: dict[str, Any],
+    /,
+    images: tuple[str, ...],
+    out_dir: str,
+    source: tuple[str, str] | None,
+    **flags: Any,
+) -> int:
     r"""Correct the cameras of overlapping images and write fresh RPCs.
 
     Tie points are matched across the images, a bundle adjustment estimates a rotation and a translation of
@@ -39,10 +56,16 @@ def adjust(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flag
       barpc adjust a.tif b.tif --gcp points.gcp --dem srtm.tif --geoid egm96.gtx -o adjusted
       barpc adjust scene/*.tif --reference ortho.tif --dem srtm.tif --geoid egm96.gtx -o adjusted
       barpc adjust --image-list images.txt -j 8 --keep-going -o adjusted
+      barpc adjust img_a.tif img_b.tif --rpc img_a.tif=cameras/1.xml --rpc img_b.tif=cameras/2.xml -o adjusted
+      barpc adjust --from s2p config.json -o adjusted
+
+    IMAGE may be a folder or a pattern: its rasters in the order of their names.
     """
     from barpc import pipeline
 
-    return _run(obj, pipeline.adjust, images, flags, out_dir=out_dir)
+    if source is None:
+        return _run(obj, pipeline.adjust, images, flags, out_dir=out_dir)
+    return _run_from(obj, read_config(*source), images, flags, out_dir)
 
 
 @click.command("match")
@@ -84,7 +107,7 @@ def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, 
     from barpc import pipeline
 
     if against is not None:
-        return _compare(image_paths(images, flags["image_list"]), Path(against), flags["as_json"])
+        return _compare(_given(images, flags), Path(against), flags["as_json"])
     return _run(obj, pipeline.check, images, flags)
 
 
@@ -129,10 +152,54 @@ def _run(
     **where: str,
 ) -> int:
     """Run an entry of the pipeline with what the command line says and what the verb has `fixed`, and tell."""
-    paths = image_paths(images, flags["image_list"])
+    paths = _given(images, flags)
     options = replace(run_options(flags, flags["options_file"]), **(fixed or {}))
+    return _tell(obj, flags, _result(obj, work, paths, options, flags, where))
+
+
+def _given(images: tuple[str, ...], flags: Mapping[str, Any]) -> list[str]:
+    return with_cameras(expanded(image_paths(images, flags["image_list"])), flags["rpcs"])
+
+
+def _result(
+    obj: Mapping[str, Any],
+    work: Callable[..., AdjustResult],
+    images: Sequence[Any],
+    options: RunOptions,
+    flags: Mapping[str, Any],
+    where: Mapping[str, str],
+) -> AdjustResult:
     with executor_for(flags["jobs"]) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
-        result = work(paths, options=options, executor=executor, progress=progress, **where)
+        return work(images, options=options, executor=executor, progress=progress, **where)
+
+
+def _run_from(
+    obj: Mapping[str, Any], config: Config, images: tuple[str, ...], flags: dict[str, Any], out_dir: str
+) -> int:
+    """Adjust the images of a configuration, and write it with their corrected cameras into the run folder."""
+    if images or flags["image_list"]:
+        raise click.UsageError("images come from the command line or from --from, not from both")
+    from barpc import pipeline
+    from barpc.pipeline.outputs import output_names
+    from barpc.workspace import Workspace
+
+    options = run_options(flags, flags["options_file"])
+    if config.tool == "cars":
+        options = replace(options, rpc_formats=tuple(dict.fromkeys((*options.rpc_formats, "geom"))))
+    name = config.path.name
+    if name in output_names((), options, Path(out_dir)):
+        raise click.UsageError(f"{config.path}: a run writes a file of this name itself; rename it")
+    found = config.images(options.allow_remote)
+    result = _result(obj, pipeline.adjust, found, options, flags, {"out_dir": out_dir})
+    if len(result.views) < len(config.items) or not result.run.fits:
+        say(f"{name} is not written: not every image that it lists has a new RPC")
+    elif config.tool != "sat-bundleadjust":
+        with Workspace(out_dir, overwrite=True, keep=[config.path], names=[name], adds=True) as workspace:
+            workspace.write_text(name, corrected(config, workspace.folder, result.views))
+    return _tell(obj, flags, result)
+
+
+def _tell(obj: Mapping[str, Any], flags: Mapping[str, Any], result: AdjustResult) -> int:
     if flags["as_json"]:
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:

@@ -13,7 +13,10 @@ import click
 import numpy as np
 
 from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cli.images import expanded
 from barpc.cli.terminal import as_json, echo, say, tell_gate
+from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, opened_dem
+from barpc.dem import Dem
 from barpc.errors import FitError, InputError, OutputError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.fit.certificate import Sample
@@ -61,8 +64,12 @@ Box = tuple[float, float, float, float]
 @click.option("--window", type=(int, int, int, int), help="Cut out COL ROW WIDTH HEIGHT [px].")
 @click.option("--bbox", type=(float, float, float, float), help="Cut out WEST SOUTH EAST NORTH [deg].")
 @click.option(
-    "--alt", type=float, help="Altitude of the ground of --bbox [m].  [default: the camera's middle]"
+    "--alt",
+    type=float,
+    help="Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]",
 )
+@dem_option
+@geoid_option
 @click.option("--overwrite", is_flag=True, help="Replace an existing file, or files of an earlier run.")
 @as_json
 def convert(
@@ -74,6 +81,8 @@ def convert(
     window: Window | None,
     bbox: Box | None,
     alt: float | None,
+    dem: str | None,
+    geoid: str | None,
     overwrite: bool,
     as_json: bool,
 ) -> int:
@@ -96,7 +105,9 @@ def convert(
         if window or bbox:
             raise click.UsageError("--window and --bbox go with a TARGET, not with -o")
         names = [name.strip() for name in (formats or "txt").split(",") if name.strip()]
-        return _hand_off(files, Path(out_dir), rpcs, carrier or "vrt", names, overwrite, as_json)
+        return _hand_off(
+            tuple(expanded(files)), Path(out_dir), rpcs, carrier or "vrt", names, overwrite, as_json
+        )
     if len(files) != 2 or rpcs or carrier:
         raise click.UsageError("give SOURCE and TARGET, or images and -o DIR (with it: --rpc, --images)")
     source, target = files
@@ -113,7 +124,7 @@ def convert(
         camera = replace(camera, model=fit.rpc)
     check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
     if cut:
-        window = _window(camera, window, bbox, alt)
+        window = _window(camera, image, window, bbox, alt, opened_dem(dem, geoid, alt))
         write_crop(camera.rpc, image, target, window, overwrite=overwrite)
         text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
         echo(json.dumps({"path": target, "window": window}) if as_json else text)
@@ -182,7 +193,9 @@ def check_target(
         say(f"{target} is read in place of the RPC that {image} had")
 
 
-def _window(camera: Camera, window: Window | None, bbox: Box | None, alt: float | None) -> Window:
+def _window(
+    camera: Camera, path: Path, window: Window | None, bbox: Box | None, alt: float | None, dem: Dem | None
+) -> Window:
     """The window, or the pixels that a box on the ground covers, cut to the image."""
     if bbox is None and window is not None:
         return window
@@ -190,13 +203,17 @@ def _window(camera: Camera, window: Window | None, bbox: Box | None, alt: float 
         raise click.UsageError("give either --window or --bbox")
     west, south, east, north = bbox
     east += 360.0 * (east < west)  # a box across the antimeridian
-    alt = camera.altitude if alt is None else alt
     t = (image_border((1, 1), 16) + 0.5) * [east - west, north - south] + [west, south]
-    image = camera.model.project(np.column_stack([t, np.full(len(t), alt)]))
-    low = np.maximum(np.floor(image.min(axis=0) + 0.5), 0)
-    high = np.minimum(np.ceil(image.max(axis=0) + 0.5), camera.extent)
+    level = np.full(len(t), altitude_of(camera, path, alt)) if dem is None else dem(t[:, 0], t[:, 1])
+    ground = np.column_stack([t, level])
+    image = camera.model.project(ground)
+    whole = np.array([np.floor(image.min(axis=0) + 0.5), np.ceil(image.max(axis=0) + 0.5)])
+    low, high = np.maximum(whole[0], 0), np.minimum(whole[1], camera.extent)
     if not (np.isfinite(image).all() and (high > low).all()):
-        raise click.UsageError(f"--bbox {bbox} does not meet {camera.path} at {alt:g} m")
+        missed = exchanged(camera, np.nan_to_num(ground)) or f"does not meet {camera.path}"
+        raise click.UsageError(f"--bbox {bbox}: {missed} (ground at {np.median(level):g} m)")
+    if (kept := float(np.prod((high - low) / (whole[1] - whole[0])))) < 1.0:
+        say(f"{path}: --bbox reaches beyond the image; {100 * (1 - kept):.2g} % of it is cut off")
     (col, row), (width, height) = low.astype(int).tolist(), (high - low).astype(int).tolist()
     return col, row, width, height
 

@@ -17,8 +17,11 @@ import numpy as np
 
 from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cli.images import expanded
 from barpc.cli.terminal import as_json, echo
-from barpc.errors import RpcError
+from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, ground_at, opened_dem
+from barpc.dem import Dem
+from barpc.errors import InputError, RpcError
 from barpc.fit.certificate import smallest_denominator
 from barpc.geojson import collection, feature, polygon
 from barpc.sensor import geometry
@@ -30,7 +33,13 @@ from barpc.sensor.rpc import RPC
 @click.option(
     "--at", type=(float, float, float), help="Ground point of the angles: LON LAT ALT.  [default: the centre]"
 )
-@click.option("--alt", type=float, help="Altitude of the ground [m].  [default: the middle of the camera's]")
+@click.option(
+    "--alt",
+    type=float,
+    help="Altitude of the ground [m].  [default: of the run's tie points, else the middle of the camera's]",
+)
+@dem_option
+@geoid_option
 @click.option(
     "--footprint", "outlines", is_flag=True, help="Print outlines on the ground as GeoJSON instead."
 )
@@ -40,6 +49,8 @@ def info(
     images: tuple[str, ...],
     at: tuple[float, float, float] | None,
     alt: float | None,
+    dem: str | None,
+    geoid: str | None,
     outlines: bool,
     doctor: bool,
     as_json: bool,
@@ -63,14 +74,18 @@ def info(
         return _examine(as_json)
     if not images:
         raise click.UsageError("give at least one IMAGE")
+    images, terrain = tuple(expanded(images)), opened_dem(dem, geoid, alt)
     cameras = [open_camera(image) for image in images]
     if outlines:
-        echo(json.dumps(_outlines(images, cameras, alt)))
+        echo(json.dumps(_outlines(images, cameras, alt, terrain)))
         return 0
-    reports = [_describe(camera, alt, at) for camera in cameras]
+    if at is not None and (wrong := exchanged(cameras[0], np.array([at]))):
+        raise InputError(f"--at {at}: {wrong}")
+    alts = [_altitude(image, camera, alt, terrain) for image, camera in zip(images, cameras, strict=True)]
+    reports = [_describe(camera, height, at) for camera, height in zip(cameras, alts, strict=True)]
     if len(cameras) > 1:
         for i, report in enumerate(reports):
-            report["pairs"] = _pairs(images, cameras, i, alt, at)
+            report["pairs"] = _pairs(images, cameras, i, alts[i], at)
     if as_json:
         echo(json.dumps(reports))
     else:
@@ -87,12 +102,28 @@ def _print(images: Sequence[str], reports: Sequence[Mapping[str, Any]]) -> None:
                     echo(f"  {key.replace('_', ' ')}: {_text(line)}")
 
 
-def _outlines(images: Sequence[str], cameras: Sequence[Camera], alt: float | None) -> dict[str, Any]:
+def _altitude(image: str, camera: Camera, alt: float | None, terrain: Dem | None) -> float:
+    """Altitude of the ground in the middle of an image [m]; that of the camera where no size tells the middle."""
+    if camera.size is None:
+        return camera.altitude if alt is None else alt
+    if terrain is None:
+        return altitude_of(camera, split_spec(image)[0], alt)
+    found = ground_at(camera, (np.array([camera.size]) - 1) / 2, 0.0, terrain)[0, 2]
+    if not np.isfinite(found):
+        raise InputError(f"{image}: the DEM has no height in the middle of it")
+    return float(found)
+
+
+def _outlines(
+    images: Sequence[str], cameras: Sequence[Camera], alt: float | None, terrain: Dem | None
+) -> dict[str, Any]:
     """GeoJSON (RFC 7946: cut at the antimeridian) of the images' outlines."""
     features = []
     for image, camera in zip(images, cameras, strict=True):
-        height = camera.altitude if alt is None else alt
-        ring = geometry.footprint(camera.model, camera.extent, height)
+        height = _altitude(image, camera, alt, terrain)
+        border = geometry.image_border(camera.extent)
+        level = height if terrain is None else ground_at(camera, border, height, terrain)[:, 2]
+        ring = geometry.footprint(camera.model, camera.extent, level)
         if not np.isfinite(ring).all():
             raise RpcError(f"{image}: no ground point at its image's border at {height:g} m")
         path = split_spec(image)[0]
@@ -101,10 +132,10 @@ def _outlines(images: Sequence[str], cameras: Sequence[Camera], alt: float | Non
 
 
 def _pairs(
-    images: Sequence[str], cameras: Sequence[Camera], i: int, alt: float | None, at: tuple[float, ...] | None
+    images: Sequence[str], cameras: Sequence[Camera], i: int, alt: float, at: tuple[float, ...] | None
 ) -> list[dict[str, Any]]:
     """What an image and each later one see together at its centre: the angle between their rays, and B/H."""
-    first, height = cameras[i], np.asarray(cameras[i].altitude if alt is None else alt)
+    first, height = cameras[i], np.asarray(alt)
     point = first.model.localize((np.array(first.extent) - 1) / 2, height) if at is None else np.array(at)
     rows = []
     for image, camera in list(zip(images, cameras, strict=True))[i + 1 :]:
@@ -114,7 +145,7 @@ def _pairs(
     return rows
 
 
-def _describe(camera: Camera, alt: float | None, at: tuple[float, ...] | None) -> dict[str, Any]:
+def _describe(camera: Camera, alt: float, at: tuple[float, ...] | None) -> dict[str, Any]:
     """Everything that is told of a camera, with plain values."""
     report: dict[str, Any] = {
         "rpc": f"{camera.format} in {camera.path}",
@@ -125,7 +156,7 @@ def _describe(camera: Camera, alt: float | None, at: tuple[float, ...] | None) -
     if isinstance(camera.model, RPC):
         report |= _box(camera.model)
     if camera.size is not None:
-        report |= _geometry(camera, camera.size, camera.altitude if alt is None else alt, at)
+        report |= _geometry(camera, camera.size, alt, at)
     return report
 
 

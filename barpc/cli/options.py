@@ -131,6 +131,13 @@ def _jobs(_context: click.Context, _parameter: click.Parameter, value: str) -> i
 
 
 _RUN_OPTIONS = (
+    click.option(
+        "--rpc",
+        "rpcs",
+        multiple=True,
+        metavar="IMAGE=FILE",
+        help="The camera of an image, whatever its name and place (repeatable).",
+    ),
     click.option("--image-list", metavar="FILE", help="More image paths from a file, one a line."),
     click.option("--options", "options_file", metavar="FILE", help="Options from a TOML file; flags win."),
     click.option(

@@ -12,16 +12,15 @@ from typing import Any
 import click
 import numpy as np
 
-from barpc.cameras import open_camera
+from barpc.cameras import open_camera, split_spec
 from barpc.cli.terminal import as_json, echo, tell_gate
-from barpc.dem import Dem, localize_on_terrain
+from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, ground_at, opened_dem
 from barpc.errors import InputError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.sensor import geometry
 from barpc.sidefile import TABLE, opened_text
 
 _NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option
-_geoid = click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
 
 
 def _points(columns: str) -> Callable[..., Any]:
@@ -33,8 +32,8 @@ def _points(columns: str) -> Callable[..., Any]:
 @click.argument("numbers", nargs=-1, type=float, metavar="[LON LAT ALT]...")
 @_points("lon, lat, alt")
 @click.option("--alt", type=float, help="Altitude of points without one [m above the ellipsoid].")
-@click.option("--dem", metavar="FILE", help="Take the altitudes from a DEM.")
-@_geoid
+@dem_option
+@geoid_option
 @as_json
 def project(
     image: str,
@@ -52,13 +51,15 @@ def project(
       barpc project image.tif 5.44 43.26 180
       barpc project image.tif --points ground.csv --json
     """
-    terrain = Dem.open(dem, geoid) if dem else None
+    terrain = opened_dem(dem, geoid)
     camera = open_camera(image)
     ground = read_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else alt)
     if terrain is not None:
         ground[:, 2] = terrain(ground[:, 0], ground[:, 1])
     found = camera.model.project(ground)
     _print_points(("col", "row"), found, (6, 6), as_json)
+    if wrong := exchanged(camera, np.nan_to_num(ground)):
+        return tell_gate(f"{image}: {wrong}", [])
     return _tell_failures(found, "could not be projected")
 
 
@@ -67,10 +68,12 @@ def project(
 @click.argument("numbers", nargs=-1, type=float, metavar="[COL ROW]...")
 @_points("col, row and perhaps alt")
 @click.option(
-    "--alt", type=float, help="Altitude of points without one [m].  [default: the middle of the camera's]"
+    "--alt",
+    type=float,
+    help="Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]",
 )
-@click.option("--dem", metavar="FILE", help="Intersect the lines of sight with a DEM.")
-@_geoid
+@dem_option
+@geoid_option
 @as_json
 def localize(
     image: str,
@@ -88,12 +91,12 @@ def localize(
       barpc localize image.tif 512.5 300 --alt 180
       barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96_15.gtx
     """
+    terrain = opened_dem(dem, geoid)
     camera = open_camera(image)
-    at = read_points(numbers, points, ("col", "row", "alt"), fill=camera.altitude if alt is None else alt)
-    if dem is not None:
-        ground = localize_on_terrain(camera.model, at[:, :2], Dem.open(dem, geoid), camera.alt_range)
-    else:
-        ground = camera.model.localize(at[:, :2], at[:, 2])
+    at = read_points(numbers, points, ("col", "row", "alt"), fill=np.nan)
+    if terrain is None and (without := np.isnan(at[:, 2])).any():
+        at[without, 2] = altitude_of(camera, split_spec(image)[0], alt)
+    ground = ground_at(camera, at[:, :2], at[:, 2], terrain)
     _print_points(("lon", "lat", "alt"), ground, (10, 10, 4), as_json)
     return _tell_failures(ground, "have no ground point")
 

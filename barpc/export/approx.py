@@ -14,6 +14,11 @@ from barpc.geodesy import Array
 
 _STEPS = 40  # of Levenberg's method
 _REWEIGHTED = 8
+_TIMES = (
+    1.0,
+    2.0,
+    3.0,
+)  # an image that is affine along its flight is best seen from farther away than it was
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +106,7 @@ def fit_pinhole(samples: Samples, at: Array, pixel: Array, rows: Array, sight: A
     sight : (3,), unit vector to the sensor there
     far : float, distance of the sensor [m]
     """
-    starts = [_start(sign, at, pixel, rows, sight, far) for sign in (1.0, -1.0)]
+    starts = [_start(sign, at, pixel, rows, sight, times * far) for times in _TIMES for sign in (1.0, -1.0)]
     found = [_refined(start, samples) for start in starts]
     return min(found, key=lambda pinhole: samples.error(pinhole.project(samples.world)))
 

@@ -32,7 +32,7 @@ def export_run(
     folder : path, of a finished adjustment
     target : str, a row of `TARGETS`
     out : path, a new folder; files in it point at images and run relative to it
-    alt_range : (low, high), optional, altitudes of the scene [m above the ellipsoid]; None: the tie points', and a margin
+    alt_range : (low, high), optional, altitudes of the scene [m above the ellipsoid]; None: by its tie points
     overwrite : bool, replace what an earlier export wrote there
 
     Returns
