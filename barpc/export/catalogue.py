@@ -49,7 +49,7 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
     schemas = [f"https://stac-extensions.github.io/{name}/schema.json" for name in _EXTENSIONS]
     return {
         "type": "Feature",
-        "stac_version": "1.0.0",
+        "stac_version": "1.1.0",
         "stac_extensions": schemas,
         "id": shot.name,
         "geometry": polygon(ring),

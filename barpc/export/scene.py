@@ -24,6 +24,7 @@ from barpc.rpcio.light import Light, light_of
 from barpc.scene import IntArray
 from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_enu
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import plain_path
 
 MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
@@ -158,10 +159,9 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
         alt_range = _altitudes(files.points[:, 2], summary)
     shots = []
     for number, view in enumerate(summary.views):
-        if PurePath(view.name).name != view.name or view.name in (".", ".."):
-            raise InputError(
-                f"{folder}: its summary names an image {view.name!r}, which is no name of a file"
-            )
+        plain_path(view.name)
+        if PurePath(view.name).name != view.name or view.name == "..":
+            raise InputError(f"{folder}: its summary names an image {view.name}, which is no name of a file")
         rpc = written_rpc(folder, view)
         if rpc is None:
             raise InputError(

@@ -1,0 +1,403 @@
+"""Exports against the readers they are made for, and against rpcm and PROJ, which share nothing with us."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barpc.cli import main
+from barpc.errors import InputError, OutputError
+from barpc.export import TARGETS, export_run
+from barpc.export.approx import Samples, factored, fit_affine, fit_projective, project_affine
+from barpc.rpcio import read_rpc
+from barpc.rpcio.light import light_of
+from barpc.sensor.geometry import image_grid
+
+
+def exported(run: Path, target: str, tmp_path: Path, **options: object) -> Path:
+    export_run(run, target, tmp_path / target, **options)
+    return tmp_path / target
+
+
+def read(path: Path) -> dict:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def ecef(lon: np.ndarray, lat: np.ndarray, alt: np.ndarray) -> np.ndarray:
+    pyproj = pytest.importorskip("pyproj")
+    to = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    return np.column_stack(to.transform(lon, lat, alt))
+
+
+def box(rpc, size: tuple[int, int], alts: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """ECEF of points all over an image and the altitudes, by PROJ, and where the RPC shows them."""
+    image, alt = image_grid(size, alts, (9, 4))
+    ground = rpc.localize(image, alt)
+    return ecef(*ground.T), image
+
+
+def seen_by(frame: dict, world: np.ndarray) -> np.ndarray:
+    """Pixels, from the corner of the first, as a reader of nerfstudio's files projects points of its world."""
+    pose = np.linalg.inv(np.array(frame["transform_matrix"]))
+    right, up, back = (np.column_stack([world, np.ones(len(world))]) @ pose.T)[:, :3].T
+    return np.column_stack(
+        [frame["fl_x"] * right / -back + frame["cx"], frame["fl_y"] * -up / -back + frame["cy"]]
+    )
+
+
+def test_every_rpc_dictionary_is_the_written_rpc_for_rpcm(run_dir, tmp_path):
+    rpcm = pytest.importorskip("rpcm")
+    views = read(run_dir / "summary.json")["views"]
+    records = exported(run_dir, "satnerf", tmp_path)
+    found = [read(records / f"{view['name']}.json")["rpc"] for view in views]
+    found += [image["rpc"] for image in read(exported(run_dir, "s2p", tmp_path) / "config.json")["images"]]
+    items = exported(run_dir, "stac", tmp_path)
+    found += [read(items / f"{view['name']}.json")["properties"]["rpc"] for view in views]
+    assert len(found) == 9
+    for view, rpc in zip(views * 3, found, strict=True):
+        model = rpcm.RPCModel(rpc, dict_format="rpcm")
+        truth = rpcm.rpc_from_rpc_file(str(run_dir / f"{view['name']}_RPC.TXT"))
+        image, alt = image_grid(view["size"], view["alt_range_m"], (7, 4))
+        lon, lat, _ = read_rpc(run_dir / f"{view['name']}_RPC.TXT").localize(image, alt).T
+        off = np.subtract(model.projection(lon, lat, alt), truth.projection(lon, lat, alt))
+        assert np.abs(off).max() < 1e-6
+
+
+def test_satnerf_files_hold_what_its_loader_reads(run_dir, tmp_path):
+    rpcm = pytest.importorskip("rpcm")
+    out = exported(run_dir, "satnerf", tmp_path)
+    names = (out / "train.txt").read_text().split("\n")
+    assert names == [f"{view['name']}.json" for view in read(run_dir / "summary.json")["views"]]
+    assert sorted(path.name for path in out.glob("*.json")) == sorted(names)  # its loader takes every one
+    points = np.load(out / "pts3d.npy")
+    records = [read(out / name) for name in names]
+    assert [one["img"] for one in records] == ["north.tif", f"{names[1][:-5]}.tif", f"{names[2][:-5]}.tif"]
+    assert [one["sun_elevation"] for one in records] == [52.25, None, None]
+    assert [one["sun_azimuth"] for one in records] == [150.5, None, None]
+    assert [one["acquisition_date"] for one in records] == ["2013-04-17T10:32:15.5Z", None, None]
+    pyproj = pytest.importorskip("pyproj")
+    back = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    for one in records:
+        assert (one["width"], one["height"]) == (900, 700)
+        seen = np.array(one["keypoints"]["2d_coordinates"])
+        at = points[one["keypoints"]["pts3d_indices"]]
+        model = rpcm.RPCModel(one["rpc"], dict_format="rpcm")
+        lon, lat, alt = back.transform(*at.T)
+        lon = lon + 360.0 * np.rint((one["rpc"]["lon_offset"] - lon) / 360.0)  # rpcm knows no turns
+        off = np.hypot(*(np.column_stack(model.projection(lon, lat, alt)) - seen).T)
+        assert len(seen) > 150
+        assert 0.01 < np.median(off) < 0.5  # not half a pixel off, nor made of the projections
+        high = one["max_alt"]
+        assert one["min_alt"] < alt.min() < alt.max() < high
+        top = ecef(*model.localization(*seen.T, np.full(len(seen), high)), np.full(len(seen), high))
+        np.testing.assert_allclose(one["keypoints"]["depths"], np.linalg.norm(top - at, axis=1), atol=1e-3)
+        parts = one["geojson"]["coordinates"]
+        rings = [np.array(part[0] if one["geojson"]["type"] == "MultiPolygon" else part) for part in parts]
+        assert all((np.abs(ring[:, 0]) <= 180).all() for ring in rings)
+        assert len(rings) == (2 if abs(one["geojson"]["center"][0]) > 100 else 1)
+
+
+def test_nerfstudio_s_pinholes_are_as_near_as_they_say(run_dir, tmp_path):
+    out = exported(run_dir, "nerfstudio", tmp_path)
+    found, alts = read(out / "transforms.json"), read(out / "transforms.json")["alt_range"]
+    to_world = np.linalg.inv(np.array(found["world_to_ecef"]))
+    views = read(run_dir / "summary.json")["views"]
+    for view, frame in zip(views, found["frames"], strict=True):
+        rpc = read_rpc(run_dir / f"{view['name']}_RPC.TXT")
+        at, image = box(rpc, view["size"], alts)
+        world = at @ to_world[:3, :3].T + to_world[:3, 3]
+        assert np.abs(world).max() < 5000
+        off = np.hypot(*(seen_by(frame, world) - 0.5 - image).T).max()
+        assert off < 0.3
+        assert 0.8 * off < frame["pinhole_error_px"] < 1.2 * off
+        skewed, near = frame["skew_pinhole"], frame["affine"]
+        seen = (world @ np.array(skewed["R"]).T + skewed["t"]) @ np.array(skewed["K"]).T
+        assert (seen[:, 2] > 0).all()
+        off = np.hypot(*(seen[:, :2] / seen[:, 2:] - 0.5 - image).T).max()
+        assert 0.8 * off < skewed["error_px"] < 1.2 * off
+        matrix = np.array(near["matrix"])
+        off = np.hypot(*(world @ matrix[:, :3].T + matrix[:, 3] - 0.5 - image).T).max()
+        assert 0.8 * off < near["error_px"] < 1.2 * off
+        assert Path(out, frame["file_path"]).resolve() == Path(view["path"]).resolve()
+        turn = np.array(frame["transform_matrix"])[:3, :3]
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(turn) == pytest.approx(1.0)
+        assert np.array(frame["transform_matrix"])[2, 3] > 300e3  # it looks down from its orbit
+
+
+def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    out = exported(southern, "colmap", tmp_path)
+    model = pycolmap.Reconstruction(str(out))
+    stated = read(out / "world.json")
+    assert (model.num_images(), model.num_reg_images()) == (3, 3)
+    assert model.num_points3D() > 250
+    assert all(camera.model.name == "PINHOLE" for camera in model.cameras.values())
+    off, said = [], []
+    for point in model.points3D.values():
+        misses = []
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            seen = image.camera.img_from_cam(image.cam_from_world() * point.xyz)
+            misses.append(np.linalg.norm(seen - image.points2D[element.point2D_idx].xy))
+            assert image.points2D[element.point2D_idx].point3D_id in model.points3D
+        off.append(np.mean(misses))
+        said.append(point.error)
+    np.testing.assert_allclose(off, said, atol=1e-6)
+    assert 0.01 < np.median(off) < 0.4
+    assert set(stated["pinhole_error_px"]) == {image.name for image in model.images.values()}
+    rows = np.array(stated["world_to_ecef"])
+    np.testing.assert_allclose(rows[:3, :3] @ rows[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path):
+    run = shutil.copytree(southern, tmp_path / "run")
+    summary = read(run / "summary.json")
+    summary["views"][0]["path"] = "/images/with space.tif"
+    (run / "summary.json").write_text(json.dumps(summary))
+    with pytest.raises(InputError, match="space"):
+        export_run(run, "colmap", tmp_path / "out")
+
+
+def test_eogs_has_affine_cameras_in_utm_with_their_errors(run_dir, tmp_path):
+    pyproj = pytest.importorskip("pyproj")
+    models = read(exported(run_dir, "eogs", tmp_path) / "affine_models.json")
+    views = read(run_dir / "summary.json")["views"]
+    south = "southern" if run_dir.parent.name.startswith("south") else ""
+    for view, one in zip(views, models, strict=True):
+        model = one["model"]
+        if south:
+            assert (model["n"], model["l"]) == (19, "H")
+        utm = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{32700 + model['n']}", always_xy=True)
+        image, alt = image_grid(view["size"], (one["min_alt"], one["max_alt"]), (9, 4))
+        lon, lat, _ = read_rpc(run_dir / f"{view['name']}_RPC.TXT").localize(image, alt).T
+        metres = np.column_stack([*utm.transform(lon, lat), alt])
+        world = (metres - model["center"]) / model["scale"]
+        assert 0.9 < np.linalg.norm(world, axis=1).max() < 1.0 + 1e-9 or view is not views[0]
+        found = world @ np.array(model["coef_"]).T + model["intercept_"]
+        np.testing.assert_allclose(found[:, 2], alt, atol=1e-6)
+        off = (found[:, :2] + 1) / 2 * view["size"] - 0.5 - image
+        largest = np.hypot(*off.T).max()
+        assert 0.8 * largest < one["affine_error_px"] < 1.2 * largest < 0.5
+    assert models[1]["sun_model"] is None
+    sun = models[0]["sun_model"]
+    # seen from the sun, two points of one ray of it fall together
+    ray = np.array(sun["sun_dir_ecef"])
+    np.testing.assert_allclose((np.array(sun["coef_"]) @ ray)[:2], 0.0, atol=1e-9)
+    assert np.degrees(np.arctan2(ray[0], ray[1])) == pytest.approx(150.5)
+    assert np.degrees(np.arcsin(ray[2] / np.linalg.norm(ray))) == pytest.approx(52.25)
+
+
+def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
+    plyfile = pytest.importorskip("plyfile")
+    out = exported(southern, "points", tmp_path)
+    comment, *lines = (out / "points.csv").read_text().splitlines()
+    assert comment.startswith("# covariance")
+    rows = list(csv.DictReader(lines))
+    table = {int(row["track"]): row for row in rows_of(southern / "residuals.csv")}
+    assert {int(row["track"]) for row in rows} == set(table)
+    assert all(row["alt"] == table[int(row["track"])]["height_above_datum"] for row in rows)
+    ply = plyfile.PlyData.read(str(out / "points.ply"))["vertex"]
+    assert len(ply) == len(rows)
+    names = ("var_ee", "var_en", "var_eu", "var_nn", "var_nu", "var_uu")
+    values = np.array([[float(row[name]) for name in names] for row in rows])
+    np.testing.assert_allclose(np.stack([ply[name] for name in names], axis=1), values, rtol=1e-4)
+    matrix = values[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    assert (np.linalg.eigvalsh(matrix) > 0).all()
+    assert (values[:, 5] > 2 * values[:, 0]).mean() > 0.9  # heights are worse than places
+    # by a Monte Carlo of one point: image noise in, scatter of the intersection out
+    rng, track = np.random.default_rng(3), rows[7]["track"]
+    seen = [r for r in rows_of(southern / "observations.csv") if r["track"] == track]
+    noise = float(comment.split("noise ")[1].split(" px")[0])
+    from barpc.geodesy import ecef_from_ground, enu_basis
+    from barpc.sensor.geometry import triangulate
+
+    models = [read_rpc(southern / f"{r['view']}_RPC.TXT") for r in seen if r["used"] == "1"]
+    xy = np.array([[float(r["col"]), float(r["row"])] for r in seen if r["used"] == "1"])
+    many = 2000
+    noisy = xy + rng.normal(0, noise, (many, *xy.shape))
+    view, point = np.tile(np.arange(len(models)), many), np.repeat(np.arange(many), len(models))
+    found = triangulate(models, view, point, noisy.reshape(-1, 2), alt=float(rows[7]["alt"])).points
+    origin = [float(rows[7][key]) for key in ("lon", "lat", "alt")]
+    scatter = np.cov(((found - ecef_from_ground(origin)) @ enu_basis(origin).T).T)
+    np.testing.assert_allclose(np.diag(scatter), np.diag(matrix[7]), rtol=0.15)
+
+
+def test_stereo_configurations_parse_and_name_files_relative_to_themselves(southern, tmp_path):
+    yaml = pytest.importorskip("yaml")
+    config = read(exported(southern, "s2p", tmp_path) / "config.json")
+    views = read(southern / "summary.json")["views"]
+    where = [(tmp_path / "s2p" / image["img"]).resolve() for image in config["images"]]
+    assert where == [Path(view["path"]).resolve() for view in views]
+    assert not any(Path(image["img"]).is_absolute() for image in config["images"])
+    out = exported(southern, "cars", tmp_path)
+    given = yaml.safe_load((out / "inputs.yaml").read_text(encoding="utf-8"))["input"]
+    assert list(given["sensors"]) == [view["name"] for view in views]
+    assert all(len(pair) == 2 and set(pair) <= set(given["sensors"]) for pair in given["pairing"])
+    out_asp = exported(southern, "asp", tmp_path)
+    cameras = (out_asp / "cameras.txt").read_text().split()
+    for view, camera in zip(views, cameras, strict=True):
+        truth = read_rpc(southern / f"{view['name']}_RPC.TXT")
+        assert truth.off(read_rpc(out / given["sensors"][view["name"]]["geomodel"]["path"])).max() < 1e-6
+        assert truth.off(read_rpc(out_asp / camera)).max() < 1e-6
+
+
+def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, tmp_path):
+    pystac = pytest.importorskip("pystac")
+    out = exported(run_dir, "stac", tmp_path)
+    views = read(run_dir / "summary.json")["views"]
+    for view in views:
+        content = read(out / f"{view['name']}.json")
+        item = pystac.Item.from_dict(content)
+        from pystac.validation.stac_validator import JsonSchemaSTACValidator
+
+        validator = JsonSchemaSTACValidator()  # the core's schemas come with it; those of extensions lie on the net
+        validator.validate_core(content, pystac.STACObjectType.ITEM, "1.1.0", href=None)
+        assert item.properties["proj:shape"] == [700, 900]
+        west, south, east, north = item.bbox
+        assert south < north
+        assert (west > east) == (abs(west) > 100)
+        for name in view["outputs"]:
+            assert (out / item.assets[name].href).resolve() == (run_dir / name).resolve()
+    assert read(out / f"{views[0]['name']}.json")["properties"]["datetime"] == "2013-04-17T10:32:15.5Z"
+    assert read(out / f"{views[1]['name']}.json")["properties"]["datetime"] is None
+
+
+def test_altitudes_may_be_given(southern, tmp_path):
+    out = exported(southern, "nerfstudio", tmp_path, alt_range=(-200.0, 2000.0))
+    assert read(out / "transforms.json")["alt_range"] == [-200.0, 2000.0]
+    with pytest.raises(InputError, match="lower one first"):
+        export_run(southern, "nerfstudio", tmp_path / "x", alt_range=(5.0, 5.0))
+
+
+@pytest.mark.parametrize("target", list(TARGETS))
+def test_nothing_is_replaced_that_is_not_an_earlier_export(target, southern, tmp_path):
+    out = exported(southern, target, tmp_path)
+    before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    with pytest.raises(OutputError, match="not empty"):
+        export_run(southern, target, out)
+    export_run(southern, target, out, overwrite=True)
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+    foreign = sorted(before)[0]
+    (out / foreign).write_text("mine")
+    with pytest.raises(OutputError, match="not replaced"):
+        export_run(southern, target, out, overwrite=True)
+    assert (out / foreign).read_text() == "mine"
+
+
+def test_the_run_s_own_folder_is_never_an_export(southern):
+    with pytest.raises(OutputError, match="one of its own"):
+        export_run(southern, "s2p", southern, overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["../out", "a/b", "..", "x\0y"])
+def test_a_run_that_lies_about_names_writes_and_reads_nothing_outside(name, southern, tmp_path):
+    run = shutil.copytree(southern, tmp_path / "run")
+    summary = read(run / "summary.json")
+    old = summary["views"][0]["name"]
+    text = (run / "summary.json").read_text().replace(json.dumps(old), json.dumps(name))
+    (run / "summary.json").write_text(text)
+    table = (run / "observations.csv").read_text().replace(f"\n{old},", f'\n"{name}",')
+    (run / "observations.csv").write_text(table)
+    with pytest.raises((InputError, OutputError)):
+        export_run(run, "satnerf", tmp_path / "out")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+
+
+def test_rpc_files_are_taken_from_the_run_s_own_folder_alone(southern, tmp_path):
+    run = shutil.copytree(southern, tmp_path / "run")
+    summary = read(run / "summary.json")
+    view = summary["views"][0]
+    shutil.move(run / f"{view['name']}_RPC.TXT", tmp_path / "elsewhere_RPC.TXT")
+    (run / "link_RPC.TXT").symlink_to(tmp_path / "elsewhere_RPC.TXT")
+    view["outputs"] = {"link_RPC.TXT": {}, "..": {}}
+    (run / "summary.json").write_text(json.dumps(summary))
+    with pytest.raises(InputError, match="no RPC file"):
+        export_run(run, "s2p", tmp_path / "out")
+
+
+def test_a_run_without_an_adjustment_says_so(southern, tmp_path):
+    run = shutil.copytree(southern, tmp_path / "run")
+    text = (run / "summary.json").read_text()
+    (run / "summary.json").write_text(text.replace('"kind": "adjust"', '"kind": "match"'))
+    with pytest.raises(InputError, match="without corrected cameras"):
+        export_run(run, "s2p", tmp_path / "out")
+    with pytest.raises(InputError, match=r"no summary\.json"):
+        export_run(tmp_path / "none", "s2p", tmp_path / "out")
+
+
+def test_the_verb_prints_what_it_wrote(southern, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["export", str(southern), str(tmp_path / "a b"), "--to", "s2p", "--json"])
+    assert stop.value.code in (0, None)
+    assert json.loads(capsys.readouterr().out) == [str(tmp_path / "a b" / "config.json")]
+
+
+def test_the_verb_offers_every_target():
+    from barpc.cli.export import _TARGETS
+
+    assert tuple(TARGETS) == _TARGETS
+
+
+def test_simple_cameras_are_found_exactly_where_they_hold():
+    rng = np.random.default_rng(0)
+    world = rng.uniform(-500, 500, (60, 3))
+    matrix = np.array([[2.0, 0.1, 0.3, 400.0], [-0.1, -2.0, 0.2, 300.0]])
+    flat = Samples(world, world @ matrix[:, :3].T + matrix[:, 3])
+    np.testing.assert_allclose(fit_affine(flat), matrix, atol=1e-9)
+    assert flat.error(project_affine(fit_affine(flat), world)) < 1e-9
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    turn *= np.linalg.det(turn)
+    calibration = np.array([[3000.0, 40.0, 500.0], [0.0, 2900.0, 300.0], [0.0, 0.0, 1.0]])
+    shift = np.array([10.0, -20.0, 6000.0])
+    seen = (world @ turn.T + shift) @ calibration.T
+    found = factored(fit_projective(Samples(world, seen[:, :2] / seen[:, 2:])))
+    for one, truth in zip(found, (calibration, turn, shift), strict=True):
+        np.testing.assert_allclose(one, truth, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("a.IMD", 'BEGIN_GROUP = IMAGE_1\n\tfirstLineTime = 2015-09-30T10:56:56.973685Z;\n\tmeanSunAz = 162.1;\n'
+         "\tminSunEl = 1.0;\n\tmeanSunEl = 40.3;\n", (40.3, 162.1, "2015-09-30T10:56:56.973685Z")),
+        ("a.xml", "<IMD><MINSUNAZ>1.0</MINSUNAZ><MEANSUNAZ>1.621000000000000e+02</MEANSUNAZ>"
+         "<MEANSUNEL>4.030000000000000e+01</MEANSUNEL></IMD>", (40.3, 162.1, None)),
+        ("a_metadata.json", '{"properties": {"acquired": "2020-01-02T03:04:05.6Z", "sun_azimuth": 150, '
+         '"sun_elevation": -1.5}}', (-1.5, 150.0, "2020-01-02T03:04:05.6Z")),
+        ("a.xml", "<SUN_ELEVATION>10</SUN_ELEVATION><SUN_ELEVATION>12</SUN_ELEVATION><SUN_ELEVATION>30</SUN_ELEVATION>"
+         "<IMAGING_DATE>2013-99-17</IMAGING_DATE>", (12.0, None, None)),
+        ("a.xml", "nothing", (None, None, None)),
+    ],
+)  # fmt: skip
+def test_sun_and_time_are_read_from_what_lies_beside_an_image(name, text, expected, tmp_path):
+    (tmp_path / name).write_text(text)
+    light = light_of(str(tmp_path / "a.tif"))
+    assert (light.elevation, light.azimuth, light.time) == expected
+
+
+def test_metadata_that_is_no_file_is_passed_over(tmp_path):
+    (tmp_path / "a.xml").symlink_to("/dev/zero")
+    assert light_of(str(tmp_path / "a.tif"), "/dev/zero").time is None
+    assert light_of("https://host/a.tif", "https://host/b.xml").time is None
+
+
+def test_the_points_of_renderers_are_a_ply(southern, tmp_path):
+    plyfile = pytest.importorskip("plyfile")
+    out = exported(southern, "nerfstudio", tmp_path)
+    assert read(out / "transforms.json")["ply_file_path"] == "points.ply"
+    vertex = plyfile.PlyData.read(io.BytesIO((out / "points.ply").read_bytes()))["vertex"]
+    assert len(vertex) == len((southern / "residuals.csv").read_text().splitlines()) - 1
+    assert vertex["red"].tolist() == [128] * len(vertex)
+    assert "numpy" in sys.modules
