@@ -262,7 +262,9 @@ def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, t
         item = pystac.Item.from_dict(content)
         from pystac.validation.stac_validator import JsonSchemaSTACValidator
 
-        validator = JsonSchemaSTACValidator()  # the core's schemas come with it; those of extensions lie on the net
+        validator = (
+            JsonSchemaSTACValidator()
+        )  # the core's schemas come with it; those of extensions lie on the net
         validator.validate_core(content, pystac.STACObjectType.ITEM, "1.1.0", href=None)
         assert item.properties["proj:shape"] == [700, 900]
         west, south, east, north = item.bbox

@@ -1,0 +1,174 @@
+"""Where altitudes come from that nobody gave, coordinates the wrong way round, and boxes beyond an image."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.cameras import open_camera
+from barpc.cli.terrain import altitude_of
+from barpc.rpcio import read_rpc, write_rpc_copy
+from tests.cli.test_images import run
+from tests.report.conftest import run_of_block, written
+from tests.rpcio.conftest import make_rpc, write_image
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    raw = write_image(tmp_path / "raw.tif", shape=(1, 400, 600))
+    write_rpc_copy(make_rpc().crop(900, 900), raw, tmp_path / "in" / "scene.tif")
+    return tmp_path / "in" / "scene.tif"
+
+
+@pytest.fixture
+def dem(tmp_path: Path) -> Path:
+    """A plane that rises by 1000 m a degree to the east, 60 m at 5.4 degrees."""
+    path, step = tmp_path / "dem.tif", 0.002
+    lon = 5.2 + step * (np.arange(250) + 0.5)
+    heights = np.tile(60 + 1000 * (lon - 5.4), (250, 1)).astype(np.float64)
+    where = rasterio.Affine(step, 0, 5.2, 0, -step, 43.5)
+    shape = {
+        "width": 250,
+        "height": 250,
+        "count": 1,
+        "dtype": "float64",
+        "crs": "EPSG:4979",
+        "transform": where,
+    }
+    with rasterio.open(path, "w", driver="GTiff", **shape) as out:
+        out.write(heights, 1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "run"
+    found = run_of_block(3, 200, size=(900, 700))
+    written(
+        replace(found, views=tuple(replace(v, path=f"/images/{v.name}.tif") for v in found.views)), folder
+    )
+    return folder
+
+
+@pytest.mark.parametrize("verb", ["info", "localize", "footprint", "crop"])
+def test_the_middle_of_the_rpc_is_taken_aloud(verb, image, tmp_path, capsys):
+    box = ("--bbox", 5.3995, 43.1993, 5.4005, 43.2)
+    verbs = {
+        "info": ("info", image),
+        "localize": ("localize", image, 10, 20),
+        "footprint": ("info", "--footprint", image),
+        "crop": ("convert", image, tmp_path / "part.tif", *box),
+    }
+    assert run(*verbs[verb]) == 0
+    said = capsys.readouterr().err
+    rpc = read_rpc(image)
+    middle = rpc.ground_offset[2]
+    at = rpc.localize([299.5, 199.5], middle)
+    off = np.linalg.norm(rpc.project(at + [0, 0, 50.0]) - rpc.project(at - [0, 0, 50.0]))
+    assert f"taken at {middle:g} m, the middle" in said
+    told = float(said.split("100 m more or less are ")[1].split(" px")[0])
+    assert told == pytest.approx(off, rel=0.02)
+    assert run(*verbs[verb], "--alt", 123, *(["--overwrite"] if verb == "crop" else [])) == 0
+    assert "middle" not in capsys.readouterr().err
+
+
+def test_altitudes_that_a_table_brings_need_no_word(image, tmp_path, capsys):
+    (tmp_path / "points.csv").write_text("col,row,alt\n1,2,100\n")
+    assert run("localize", image, "--points", tmp_path / "points.csv") == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_run_s_own_files_know_its_tie_points(finished, capsys):
+    summary = json.loads((finished / "summary.json").read_text())
+    (name,) = summary["views"][1]["outputs"]
+    camera = open_camera(finished / name)
+    assert altitude_of(camera, finished / name) == summary["altitude_m"]
+    assert run("localize", finished / name, 100, 200, "--json") == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)[0]["alt"] == pytest.approx(summary["altitude_m"], abs=1e-3)
+    assert abs(summary["altitude_m"] - camera.altitude) > 1.0  # else this would show nothing
+    assert captured.err == ""
+
+
+def test_a_damaged_summary_and_a_stranger_s_file_know_nothing(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    (name, other) = sorted(path.name for path in folder.glob("*_RPC.TXT"))[:2]
+    shutil.copy(folder / name, folder / "stranger_RPC.TXT")
+    stranger = open_camera(folder / "stranger_RPC.TXT")
+    assert altitude_of(stranger, folder / "stranger_RPC.TXT") == stranger.altitude
+    damaged = shutil.copytree(finished, tmp_path / "damaged")
+    (damaged / "summary.json").write_text("{")
+    camera = open_camera(damaged / other)
+    assert altitude_of(camera, damaged / other) == camera.altitude
+    assert capsys.readouterr().err.count("the middle of its altitudes") == 2
+
+
+def test_a_dem_is_asked_where_one_is_given(image, dem, tmp_path, capsys):
+    rpc = read_rpc(image)
+    assert run("info", image, "--dem", dem, "--json") == 0
+    captured = capsys.readouterr()
+    lon, lat = json.loads(captured.out)[0]["center_deg"]
+    seen = rpc.project([lon, lat, 60 + 1000 * (lon - 5.4)])
+    np.testing.assert_allclose(seen, [299.5, 199.5], atol=1e-2)
+    assert captured.err == ""
+    assert run("info", "--footprint", image, "--dem", dem) == 0
+    ring = np.array(json.loads(capsys.readouterr().out)["features"][0]["geometry"]["coordinates"][0])
+    corners = rpc.project(np.column_stack([ring, 60 + 1000 * (ring[:, 0] - 5.4)]))
+    outside = np.maximum(np.abs(corners[:, 0] - 299.5) - 300, np.abs(corners[:, 1] - 199.5) - 200)
+    np.testing.assert_allclose(outside, 0.0, atol=1e-2)
+    box = [*ring[:, :2].mean(axis=0) - 2e-4, *ring[:, :2].mean(axis=0) + 2e-4]
+    assert run("convert", image, tmp_path / "part.tif", "--bbox", *box, "--dem", dem, "--json") == 0
+    col, row, width, height = json.loads(capsys.readouterr().out)["window"]
+    lon, lat = np.meshgrid(np.linspace(box[0], box[2], 9), np.linspace(box[1], box[3], 9))
+    inside = rpc.project(np.stack([lon, lat, 60 + 1000 * (lon - 5.4)], axis=-1)).reshape(-1, 2)
+    low, high = inside.min(axis=0), inside.max(axis=0)
+    assert (np.abs(low - 0.5 - [col, row] + 0.5) < 1.5).all()
+    assert (np.abs(high + 0.5 - [col + width, row + height] + 0.5) < 1.5).all()
+
+
+@pytest.mark.parametrize("verb", ["info", "localize", "convert"])
+def test_an_altitude_and_a_dem_contradict_each_other(verb, image, dem, tmp_path, capsys):
+    more = {"localize": (1, 2), "convert": (tmp_path / "x.tif", "--bbox", 5, 43, 6, 44)}.get(verb, ())
+    expected = 0 if verb == "localize" else 2  # there --alt is for points of a table
+    assert run(verb, image, *more, "--alt", 5, "--dem", dem) == expected
+    assert run(verb, image, *more, "--geoid", dem) == 2
+    assert "--geoid goes with --dem" in capsys.readouterr().err
+
+
+def test_a_dem_without_a_height_there_is_an_error(image, dem, tmp_path, capsys):
+    with rasterio.open(dem, "r+") as out:
+        out.transform = rasterio.Affine(0.002, 0, 15.2, 0, -0.002, 43.5)
+    assert run("info", image, "--dem", dem) == 1
+    assert "no height in the middle" in capsys.readouterr().err
+
+
+def test_exchanged_coordinates_are_recognised(image, tmp_path, capsys):
+    assert run("project", image, 43.1995, 5.4005, 200) == 3
+    assert "longitude and latitude exchanged" in capsys.readouterr().err
+    assert run("project", image, 5.4005, 43.1995, 200) == 0
+    assert run("project", image, 15.4005, 43.1995, 200) == 0  # far off, and no better the other way round
+    assert "exchanged" not in capsys.readouterr().err
+    assert run("info", image, "--at", 43.1995, 5.4005, 200) == 1
+    assert "exchanged" in capsys.readouterr().err
+    box = (43.1993, 5.3995, 43.2, 5.4005)
+    assert run("convert", image, tmp_path / "part.tif", "--alt", 100, "--bbox", *box) == 2
+    assert "exchanged" in capsys.readouterr().err
+
+
+def test_what_a_box_loses_at_the_border_is_said(image, tmp_path, capsys):
+    rpc = read_rpc(image)
+    inside = rpc.localize(np.array([[250.0, 150.0], [300.0, 200.0]]), np.full(2, 100.0))
+    box = [*inside[:, :2].min(axis=0), *inside[:, :2].max(axis=0)]
+    assert run("convert", image, tmp_path / "a.tif", "--alt", 100, "--bbox", *box) == 0
+    assert "cut off" not in capsys.readouterr().err
+    far = rpc.localize(np.array([[599.5, 199.5]]), np.array([100.0]))[0]  # half of it lies beyond
+    box = [far[0] - 4e-4, far[1] - 4e-4, far[0] + 4e-4, far[1] + 4e-4]
+    assert run("convert", image, tmp_path / "b.tif", "--alt", 100, "--bbox", *box) == 0
+    share = float(capsys.readouterr().err.split("image; ")[1].split(" %")[0])
+    assert 40 < share < 60
