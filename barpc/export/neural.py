@@ -74,9 +74,9 @@ def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
     }
 
 
-def satnerf(scene: Scene, _out: Path) -> Files:
+def satnerf(scene: Scene, out: Path) -> Files:
     """``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``."""
-    rows = zip(scene.shots, scene.file_names(), strict=True)
+    rows = zip(scene.shots, scene.file_names(out), strict=True)
     files = {f"{shot.name}.json": as_json(_record(scene, shot, img)) for shot, img in rows}
     names = list(files)
     points = io.BytesIO()
@@ -91,7 +91,7 @@ def satnerf(scene: Scene, _out: Path) -> Files:
 def eogs(scene: Scene, out: Path) -> Files:
     """As `satnerf`, and ``affine_models.json``: affine cameras in its frame of UTM metres, and their largest errors."""
     frame = _Utm(scene)
-    rows = zip(scene.shots, scene.file_names(), strict=True)
+    rows = zip(scene.shots, scene.file_names(out), strict=True)
     models = [_record(scene, shot, img) | frame.models(scene, shot) for shot, img in rows]
     return {**satnerf(scene, out), "affine_models.json": as_json(models)}
 
@@ -237,7 +237,7 @@ def colmap(scene: Scene, out: Path) -> Files:
     world = scene.world(scene.points)
     cameras, images, errors = [], [], {}
     seen: dict[int, list[tuple[int, int, float]]] = {}
-    for number, (shot, name) in enumerate(zip(scene.shots, scene.file_names(), strict=True), start=1):
+    for number, (shot, name) in enumerate(zip(scene.shots, scene.file_names(out), strict=True), start=1):
         if any(char.isspace() for char in name):
             raise InputError(
                 f"{shot.file}: COLMAP ends the name of an image at a space; give a link without one"
@@ -259,7 +259,7 @@ def colmap(scene: Scene, out: Path) -> Files:
         mean = float(np.mean([error for *_, error in seen[point]]))
         points.append(_line(point + 1, *world[point].tolist(), 128, 128, 128, mean, *track))
     about = {"world_to_ecef": scene.world_to_ecef, "alt_range": scene.alt_range, "pinhole_error_px": errors}
-    about["images"] = {n: link(s.file, out) for s, n in zip(scene.shots, scene.file_names(), strict=True)}
+    about["images"] = {n: link(s.file, out) for s, n in zip(scene.shots, scene.file_names(out), strict=True)}
     texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": points}
     return {name: ("\n".join(lines) + "\n").encode() for name, lines in texts.items()} | {
         "world.json": as_json(about)

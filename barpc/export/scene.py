@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -120,16 +119,11 @@ class Scene:
             "far": far,
         }
 
-    def file_names(self) -> list[str]:
-        """What each image is called where files stand in one folder: its own name where no other has it."""
-        names = [PurePath(shot.file).name for shot in self.shots]
-        several = Counter(name.casefold() for name in names)
-        return [
-            name
-            if several[name.casefold()] == 1
-            else shot.name + PurePath(name).suffix * (PurePath(name).suffix != PurePath(shot.name).suffix)
-            for name, shot in zip(names, self.shots, strict=True)
-        ]
+    def file_names(self, out: Path) -> list[str]:
+        """What a file in `out` calls the images: by name where all lie in one folder, else relative to `out`."""
+        if len({PurePath(shot.file).parent for shot in self.shots}) == 1:
+            return [PurePath(shot.file).name for shot in self.shots]
+        return [link(shot.file, out) for shot in self.shots]
 
 
 def link(target: Path | str, folder: Path) -> str:
@@ -154,7 +148,9 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
     files = read_tables(summary, folder)
     order = np.argsort(files.tracks, kind="stable")
     index, found = _places(files.tracks[order], files.observations.track)
-    counted = found & files.observations.used
+    counted = np.flatnonzero(found & files.observations.used)
+    counted = counted[np.argsort(files.observations.view[counted], kind="stable")]
+    starts = np.searchsorted(files.observations.view[counted], np.arange(len(summary.views) + 1))
     if alt_range is None:
         alt_range = _altitudes(files.points[:, 2], summary)
     shots = []
@@ -167,7 +163,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
             raise InputError(
                 f"{folder}: no RPC file of {view.name} that can be read: run the adjustment again"
             )
-        rows = counted & (files.observations.view == number)
+        rows = counted[starts[number] : starts[number + 1]]
         camera = None if view.rpc_source is None else view.rpc_source.path
         carrier = _carrier(folder, view)
         shots.append(

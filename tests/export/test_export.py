@@ -82,7 +82,8 @@ def test_satnerf_files_hold_what_its_loader_reads(run_dir, tmp_path):
     assert sorted(path.name for path in out.glob("*.json")) == sorted(names)  # its loader takes every one
     points = np.load(out / "pts3d.npy")
     records = [read(out / name) for name in names]
-    assert [one["img"] for one in records] == ["north.tif", f"{names[1][:-5]}.tif", f"{names[2][:-5]}.tif"]
+    paths = [Path(view["path"]) for view in read(run_dir / "summary.json")["views"]]
+    assert [(out / one["img"]).resolve() for one in records] == paths  # in several folders: from OUT
     assert [one["sun_elevation"] for one in records] == [52.25, None, None]
     assert [one["sun_azimuth"] for one in records] == [150.5, None, None]
     assert [one["acquisition_date"] for one in records] == ["2013-04-17T10:32:15.5Z", None, None]
@@ -136,9 +137,25 @@ def test_nerfstudio_s_pinholes_are_as_near_as_they_say(run_dir, tmp_path):
         assert np.array(frame["transform_matrix"])[2, 3] > 300e3  # it looks down from its orbit
 
 
+def in_one_folder(run: Path, tmp_path: Path, folder: str = "/images") -> Path:
+    """A copy of a run whose images lie together."""
+    copy = shutil.copytree(run, tmp_path / "run")
+    summary = read(copy / "summary.json")
+    for view in summary["views"]:
+        view["path"] = f"{folder}/{view['name']}.tif"
+    (copy / "summary.json").write_text(json.dumps(summary))
+    return copy
+
+
+def test_images_of_one_folder_are_called_by_their_names(southern, tmp_path):
+    run = in_one_folder(southern, tmp_path)
+    for name in exported(run, "satnerf", tmp_path).glob("*.json"):
+        assert read(name)["img"] == f"{name.stem}.tif"
+
+
 def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
-    out = exported(southern, "colmap", tmp_path)
+    out = exported(in_one_folder(southern, tmp_path), "colmap", tmp_path)
     model = pycolmap.Reconstruction(str(out))
     stated = read(out / "world.json")
     assert (model.num_images(), model.num_reg_images()) == (3, 3)
@@ -162,12 +179,8 @@ def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, 
 
 
 def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path):
-    run = shutil.copytree(southern, tmp_path / "run")
-    summary = read(run / "summary.json")
-    summary["views"][0]["path"] = "/images/with space.tif"
-    (run / "summary.json").write_text(json.dumps(summary))
-    with pytest.raises(InputError, match="space"):
-        export_run(run, "colmap", tmp_path / "out")
+    with pytest.raises(InputError, match="space"):  # of a folder's name
+        export_run(southern, "colmap", tmp_path / "out")
 
 
 def test_eogs_has_affine_cameras_in_utm_with_their_errors(run_dir, tmp_path):
@@ -285,6 +298,7 @@ def test_altitudes_may_be_given(southern, tmp_path):
 
 @pytest.mark.parametrize("target", list(TARGETS))
 def test_nothing_is_replaced_that_is_not_an_earlier_export(target, southern, tmp_path):
+    southern = in_one_folder(southern, tmp_path)
     out = exported(southern, target, tmp_path)
     before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
     with pytest.raises(OutputError, match="not empty"):
