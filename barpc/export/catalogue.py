@@ -122,9 +122,11 @@ def _covariances(scene: Scene) -> Array:
         rows = shot.rpc.project_jacobian(ground)[1] / metres_per_unit(ground)[:, None, :]
         rows = rows @ enu_basis(ground) @ enu_basis(scene.origin).T
         np.add.at(normal, shot.index, rows.swapaxes(1, 2) @ rows)
-    known = np.isfinite(normal).all(axis=(1, 2)) & (np.linalg.cond(normal + 1e-300 * np.eye(3)) < 1e12)
+    normal[~np.isfinite(normal).all(axis=(1, 2))] = 0.0
+    values, axes = np.linalg.eigh(normal)
+    known = values[:, 0] > 1e-12 * values[:, 2]
     out = np.full_like(normal, np.nan)
-    out[known] = scene.noise**2 * np.linalg.inv(normal[known])
+    out[known] = scene.noise**2 * (axes[known] / values[known, None]) @ axes[known].swapaxes(1, 2)
     return out
 
 

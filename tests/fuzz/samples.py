@@ -20,11 +20,13 @@ from barpc.ba import BlockPrior
 from barpc.ba.incremental import apply_prior
 from barpc.ba.priors import CameraPrior
 from barpc.cameras import open_camera
+from barpc.cli.images import read_config
 from barpc.cli.options import image_paths
 from barpc.cli.points import read_points
 from barpc.cli.terminal import print_comparison
 from barpc.dem import Dem
 from barpc.errors import RpcError
+from barpc.export import export_run
 from barpc.frozen import from_arrays, load_npz, to_arrays
 from barpc.options import read_options
 from barpc.pipeline.inputs import read_pairs
@@ -36,6 +38,7 @@ from barpc.report.tables import read_summary
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.grids import SIGN, read_correction
+from barpc.rpcio.light import light_of
 from barpc.rpcio.text import decode
 from barpc.rpcio.tiff import put_tag
 from barpc.scene import View
@@ -331,6 +334,13 @@ def _report(path: Path) -> object:
     return report_html(read_summary(path.parent), path.parent)
 
 
+def _export(path: Path) -> object:
+    with tempfile.TemporaryDirectory() as folder:
+        for target in ("satnerf", "cars", "stac", "points"):
+            export_run(path.parent, target, Path(folder) / target)
+    return None
+
+
 # --- Sentinel-1 -------------------------------------------------------------------------------------------
 
 _BURSTS = Product(num_bursts=2, lines_per_burst=60, burst_cycle=50, num_states=17)
@@ -485,6 +495,26 @@ SAMPLES: dict[str, Sample] = {
         lambda: b"left.tif\n# x\nright.tif\n",
         (mutate_text,),
     ),
+    "configuration s2p": Sample(
+        "config.json",
+        lambda path: read_config("s2p", str(path)),
+        lambda: b'{"images": [{"img": "a.tif", "rpc": {"x": 1}}, {"img": "b.tif", "rpc": "b.rpc"}]}',
+        (mutate_json,),
+    ),
+    "configuration cars": Sample(
+        "inputs.json",
+        lambda path: read_config("cars", str(path)),
+        lambda: (
+            b'{"input": {"sensors": {"a": {"image": "a.tif", "geomodel": {"path": "a.geom"}}, "b": {"image": "b"}}}}'
+        ),
+        (mutate_json,),
+    ),
+    "metadata": Sample(
+        "product.xml",
+        lambda path: light_of("image.tif", str(path)),
+        lambda: b"<X><IMAGING_DATE>2013-04-17</IMAGING_DATE><SUN_ELEVATION>5e1</SUN_ELEVATION></X>",
+        (mutate_text,),
+    ),
     "area": Sample("aoi.geojson", read_area, lambda: AREA, (mutate_json,)),
     "dem": Sample("dem.tif", _use_dem, _dem, (_mutate_transform(_dem), mutate_header), share=0.2),
     "dem hgt": Sample("N43E005.hgt", _use_dem, cache(lambda: bytes(2 * 1201**2)), (), share=0.02),
@@ -508,6 +538,8 @@ SAMPLES: dict[str, Sample] = {
     ),
     "summary": _run_sample("summary.json", _report, mutate_json, mutate_values, mutate_values, share=0.6),
     "comparison": _run_sample("summary.json", _compare, mutate_json, mutate_values, mutate_values, share=0.6),
+    "exported": _run_sample("summary.json", _export, mutate_json, mutate_values, mutate_values, share=0.3),
+    "exported residuals": _run_sample("residuals.csv", _export, mutate_text, share=0.1),
     "observations": _run_sample("observations.csv", _report, mutate_text, share=0.1),
     "residuals": _run_sample("residuals.csv", _report, mutate_text, share=0.1),
     "footprints": _run_sample("footprints.geojson", _report, mutate_json, mutate_values, share=0.2),
