@@ -144,7 +144,9 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
     """
     summary = read_summary(folder)
     if summary.kind != "adjust":
-        raise InputError(f"{folder}: a run of the kind {summary.kind}, without corrected cameras")
+        raise InputError(
+            f"{folder / 'summary.json'}: a run of the kind {summary.kind}, without corrected cameras"
+        )
     files = read_tables(summary, folder)
     order = np.argsort(files.tracks, kind="stable")
     index, found = _places(files.tracks[order], files.observations.track)
@@ -157,11 +159,11 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
     for number, view in enumerate(summary.views):
         plain_path(view.name)
         if PurePath(view.name).name != view.name or view.name == "..":
-            raise InputError(f"{folder}: its summary names an image {view.name}, which is no name of a file")
+            raise InputError(f"{folder / 'summary.json'}: an image is called {view.name}, no name of a file")
         rpc = written_rpc(folder, view)
         if rpc is None:
             raise InputError(
-                f"{folder}: no RPC file of {view.name} that can be read: run the adjustment again"
+                f"{folder / 'summary.json'}: names no RPC file of {view.name} that can be read: run it again"
             )
         rows = counted[starts[number] : starts[number + 1]]
         camera = None if view.rpc_source is None else view.rpc_source.path
