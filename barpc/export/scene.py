@@ -203,12 +203,10 @@ def _altitudes(alt: Array, summary: Summary) -> tuple[float, float]:
 
 def _carrier(folder: Path, view: ViewEntry) -> Path | None:
     """The raster with the corrected RPC that a run wrote for an image, in its own folder."""
-    ends = tuple(end for row in CARRIERS.values() for end in row.suffixes)
-    for name in view.outputs:
-        if name.lower().endswith(ends) and "\0" not in name and (folder / name).is_file():
-            path = (folder / name).absolute()
-            if path.resolve().parent == folder.resolve():
-                return path
+    for name in (view.name + end for row in CARRIERS.values() for end in row.suffixes):
+        path = (folder / name).absolute()
+        if name in view.outputs and path.is_file() and path.resolve().parent == folder.resolve():
+            return path
     return None
 
 
