@@ -24,7 +24,7 @@ from barpc.report.records import Cell, Column, Number, Record, plain, said, valu
 from barpc.report.run import Run
 from barpc.scene import IntArray
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction, ImageCorrected
+from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import (
     Several,
     base_to_height,
