@@ -1,7 +1,7 @@
 """The one door through which cameras come in: an image, an RPC file, a radar product, a grid of ground points.
 
 `OPENERS` is the table of kinds. A file may be given with choices behind commas: ``product.SAFE,swath=iw1,pol=vv``,
-``image.tif,camera=rpcs/image.RPB``, ``METADATA.XML,band=2,size=1000:900``.
+``image.tif,camera=rpcs/image.RPB``, ``METADATA.XML,band=2,size=1000:900``, ``image.tif,model=physical``.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from barpc.errors import ImageError, InputError
+from barpc.errors import ImageError, InputError, RpcError
 from barpc.pointio.ground import Correspondences, correspondence_kind, read_correspondences, read_grid
 from barpc.raster import driver_of, open_raster
 from barpc.remote import Place, located, place
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
+from barpc.rpcio.sources import metadata_beside
 from barpc.sensor import SensorModel
 from barpc.sensor.correction_grid import GridCorrected
 from barpc.sensor.direct_grid import DirectGrid
@@ -82,6 +83,8 @@ class Opener:
     """(path, **choices) -> Camera."""
     choices: Mapping[str, Reader] = field(default_factory=dict)
     """What may be given behind the file, and how its text is read (ValueError or KeyError: not so)."""
+    whole: bool = False
+    """Whether it states the size of its image: of pixels of another size it is no camera."""
 
 
 def open_camera(spec: str | Path, **choices: Any) -> Camera:
@@ -95,6 +98,7 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
         The same as values; they go before those in `spec`. For every kind: ``camera`` (the file with the camera of the
         image `spec`), ``size`` (width, height). RPC: ``first_pixel`` (the file's coordinate of the first pixel's
         centre), ``band``. Sentinel-1: those of `sentinel1.open_product`. Grid: ``altitudes`` of its layers.
+        Physical model, where ``model`` is "physical": those of `linescan.read_linescan`, and ``altitudes`` (low, high).
 
     Raises
     ------
@@ -124,7 +128,9 @@ def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
     if isinstance(size, str):
         size = _read(_size, "size", size, file)
     elif size is None:  # of the image's own pixels; those of a grid are not the image's
-        size = _pixels(path) if holder is not None or camera.size is None else None
+        size = _pixels(path) if holder is not None or opener.whole or camera.size is None else None
+    if opener.whole and size not in (None, camera.size):
+        raise InputError(f"{path}: is {size} px large, its physical model in {camera.path} of {camera.size}")
     return camera if size is None else replace(camera, size=size)
 
 
@@ -236,6 +242,35 @@ def _numbers(text: str) -> list[float]:
     return [float(part) for part in text.split(":")]
 
 
+def _is_physical(_path: Place, _head: bytes, choices: Mapping[str, Any]) -> bool:
+    return choices.get("model") == "physical"
+
+
+def _open_physical(
+    path: Place, model: str, altitudes: Sequence[float] | None = None, **choices: Any
+) -> Camera:
+    from barpc.sensor.linescan import read_linescan
+
+    if not isinstance(path, Path):
+        raise ImageError(f"{path}: a {model} model is read from disk only")
+    file = path if driver_of(read_head(path, IMAGE, _HEAD)) is None else metadata_beside(path)
+    found = read_linescan(file, **choices)
+    low, high = _stated_altitudes(file) if altitudes is None else altitudes
+    return Camera(found.model, file, found.kind, found.size, (low, high))
+
+
+def _stated_altitudes(file: Path) -> tuple[float, float]:
+    """The altitudes of the RPC that was delivered with a physical model; all ground on Earth where there is none."""
+    for name in (file.name, f"RPC_{file.name[4:]}"):
+        try:
+            return altitude_range(read_rpc_source(file.parent / name).rpc)
+        except (ImageError, RpcError):
+            continue
+    return -500.0, 9000.0
+
+
+_YES_NO = {"yes": True, "no": False}.__getitem__
+
 OPENERS: dict[str, Opener] = {
     "rpc": Opener(
         lambda _path, _head, _choices: True,
@@ -247,13 +282,24 @@ OPENERS: dict[str, Opener] = {
     "correction": Opener(
         lambda _path, head, _choices: driver_of(head) == "GTiff" and SIGN.encode() in head, _open_correction
     ),
+    "physical": Opener(
+        _is_physical,
+        _open_physical,
+        {
+            "model": str,
+            "band": str,
+            "altitudes": _numbers,
+            **dict.fromkeys(("aberration", "refraction"), _YES_NO),
+        },
+        whole=True,
+    ),
     "sentinel-1": Opener(
         _is_sentinel1,
         _open_sentinel1,
         {
             **dict.fromkeys(("swath", "pol", "orbit"), str),
             "burst": int,
-            "atmosphere": {"yes": True, "no": False}.__getitem__,
+            "atmosphere": _YES_NO,
             "bistatic": {"annotated": "annotated", "full": "full"}.__getitem__,
         },
     ),

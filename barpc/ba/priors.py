@@ -14,6 +14,7 @@ from barpc.ba.waves import FIRST_SIGMA
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
+from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 
 DEFAULT_ACCURACY = (
@@ -108,6 +109,14 @@ def stated_accuracy(view: View) -> float:
     return stated if stated is not None and stated > USABLE_ACCURACY else DEFAULT_ACCURACY
 
 
+def _stated(view: View) -> tuple[float, float]:
+    """What a view states for its attitude, as metres on the ground, and for its position [m]."""
+    if isinstance(view.sensor, Pushbroom) and view.sensor.accuracy is not None:
+        attitude, position = view.sensor.accuracy
+        return max(attitude, USABLE_ACCURACY), max(position, USABLE_ACCURACY)
+    return (stated_accuracy(view),) * 2
+
+
 def prior_sigmas(
     views: tuple[View, ...], options: AdjustOptions, drift: int, off: Array | None = None, waves: int = 0
 ) -> Array:
@@ -115,13 +124,14 @@ def prior_sigmas(
 
     A view that is known to be `off` (N,) [m] by more than it states is not held to that.
     """
-    stated = np.array([stated_accuracy(view) for view in views])
+    stated = np.array([_stated(view) for view in views])
     if off is not None:
-        stated = np.fmax(stated, off)
+        stated = np.fmax(stated, off[:, None])
     parts = []
-    for name, sigma in (("rotation", options.sigma_attitude), ("translation", options.sigma_position)):
+    given = (("rotation", options.sigma_attitude), ("translation", options.sigma_position))
+    for (name, sigma), own in zip(given, stated.T, strict=True):
         if name in options.first_model:
-            one = stated if sigma is None else np.full(len(views), sigma)
+            one = own if sigma is None else np.full(len(views), sigma)
             parts.append(np.tile(one[:, None], (1, 3)))
     parts += [np.full((len(views), 3), options.sigma_drift or DRIFT_SIGMA)] * drift
     if not parts:

@@ -64,6 +64,16 @@ def sidecars(image: Path | str) -> list[Sidecar]:
     return found
 
 
+def metadata_beside(image: Path) -> Path:
+    """The XML beside an image that may hold its physical model: Maxar's of its name, Airbus' ``DIM_*.XML``."""
+    present, product = files_of(image.parent), image.stem[4:]  # of IMG_<product>_R1C1
+    names = (f"{image.stem}.xml", f"dim_{product}.xml", f"dim_{product.rpartition('_')[0]}.xml")
+    for name in names:
+        if name.lower() in present:
+            return image.parent / present[name.lower()]
+    raise ImageError(f"{image}: no metadata with a physical model beside it ({' or '.join(names[:2])})")
+
+
 def _present(image: Place) -> Mapping[str, str]:
     """The files beside an image, by name in lower case; on another host those that count."""
     if isinstance(image, Path):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Self
+import re
+from typing import Any, Self
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -12,6 +13,22 @@ from barpc.geodesy import Array
 
 LARGEST = 1e9
 """No number of a document comes near."""
+
+_TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9})?)Z?")
+
+
+def seconds(time: Any, epoch: np.datetime64) -> Any:
+    """Seconds (float) from an epoch, exact to the nanosecond."""
+    return (time - epoch) / np.timedelta64(1, "ns") * 1e-9
+
+
+def parse_time(text: str, name: str) -> np.datetime64:
+    """A UTC time, "2021-02-16T15:12:07.524369", perhaps with a Z behind it or "UTC=" before."""
+    match = _TIME.fullmatch(text.strip())
+    try:
+        return np.datetime64(match["time"] if match else "none", "ns")
+    except ValueError as error:
+        raise RpcFormatError(f"{name}: {text[:40]!r} is not a UTC time") from error
 
 
 class Fields:
@@ -31,15 +48,32 @@ class Fields:
         """Every element of this path, none too."""
         return [type(self)(element, self.name) for element in self.element.findall(path)]
 
-    def numbers(self, path: str) -> Array:
-        """The finite numbers (N,) of a field; RpcFormatError where it is missing or holds others."""
+    def one(self, path: str) -> Self:
+        """The first element of this path; RpcFormatError where there is none."""
+        found = self.element.find(path)
+        if found is None:
+            raise RpcFormatError(f"{self.name}: no {path} below <{self.element.tag}>; is the file complete?")
+        return type(self)(found, self.name)
+
+    def time(self, path: str) -> np.datetime64:
+        """A UTC time; RpcFormatError where it is missing or none."""
+        return parse_time(self.text(path), self.name)
+
+    def numbers(self, path: str, count: int | None = None) -> Array:
+        """The finite numbers (N,) of a field; RpcFormatError where it is missing, holds others, or not `count`."""
         try:
             numbers = np.array(self.text(path).split(), dtype=np.float64)
         except ValueError as error:
             raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
         if not (np.abs(numbers) <= LARGEST).all():
             raise RpcFormatError(f"{self.name}: {path} holds a number that is not finite or absurdly large")
+        if count not in (None, len(numbers)):
+            raise RpcFormatError(f"{self.name}: {path} holds {len(numbers)} numbers, expected {count}")
         return numbers
+
+    def number(self, path: str) -> float:
+        """The only number of a field."""
+        return float(self.numbers(path, 1)[0])
 
     def positive(self, path: str, most: float = LARGEST) -> float:
         """The first number of a field; RpcFormatError where it is not above 0 and at most `most`."""

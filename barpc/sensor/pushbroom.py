@@ -7,7 +7,8 @@ along A(t) (l_x(c), l_y(c), 1), l being two polynomials of the column. A ground 
     p = A(t)^T (X - O(t)),    p_x / p_z = l_x(c),    p_y / p_z = l_y(c),
 
 two equations that Newton's method solves with analytic derivatives; the derivative of (c, t) by X follows
-from the same 2x2 system.
+from the same 2x2 system. Where light is bent on its way, X is lifted to where it seems to be from O(t), and p is
+the direction in which the moving camera sees it (`Light`).
 """
 
 from __future__ import annotations
@@ -32,10 +33,70 @@ from barpc.geodesy import (
 )
 from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
+LIGHT_SPEED = 299792458.0  # [m/s]
+EARTH_RATE = 7.292115e-5  # rotation of the Earth [rad/s]
 CHUNK = 4096  # points worked on at a time, so that what Newton's method needs stays in cache
 
+_AIR = (
+    2.316  # m: of refraction at sea level, times tan z / cos^2 z of the zenith distance z (Noerdlinger 1999)
+)
+_AIR_HEIGHT = 8000.0  # m: in which the air thins to 1/e
 _STEPS = 12
+_BENDS = 3  # light is bent by 3e-5: each step gains four digits
+_GRAZING = 0.1  # cosine of the zenith distance below which refraction is not this simple
 _SETTLED = 1e-4  # px: Newton is quadratic, what is left after a step of this size is below rounding
+
+
+@dataclass(frozen=True)
+class Light:
+    """What bends the line of sight of a camera.
+
+    A moving camera sees a point in the direction of (X - O) / |X - O| + b, b = V / c: V is the camera's velocity in the
+    inertial frame less that of the point, O' - omega x (X - O) in ECEF. Refraction lets a point seem farther from
+    the nadir, by metres that fall with the air above it.
+    """
+
+    aberration: bool = False
+    refraction: bool = False
+
+    def seen(self, ecef: Array, origin: Array, velocity: Array) -> Array:
+        """Vectors (3, N) [m] along which points (3, N) are seen from places (3, N) at velocities (3, N), ECEF."""
+        sight = ecef - origin
+        if self.refraction:
+            sight = sight + self._lift(ecef, sight)[0]
+        if self.aberration:
+            sight = sight + np.sqrt((sight * sight).sum(axis=0)) * _drag(sight, velocity)
+        return sight
+
+    def by_point(self, gradient: Array, ecef: Array, origin: Array, velocity: Array) -> Array:
+        """Derivatives (3, N) by the points of what has the `gradient` (3, N) by `seen`, to 1e-6 of them."""
+        sight = ecef - origin
+        out = gradient
+        if self.aberration:
+            along = sight / np.sqrt((sight * sight).sum(axis=0))
+            out = out + along * (gradient * _drag(sight, velocity)).sum(axis=0)
+        if self.refraction:
+            lift, vertical = self._lift(ecef, sight)
+            out = out - vertical * (gradient * lift).sum(axis=0) / _AIR_HEIGHT
+        return out
+
+    def _lift(self, ecef: Array, sight: Array) -> tuple[Array, Array]:
+        """By how much points seem displaced (3, N) [m], and the vertical (3, N); NaN near the horizon."""
+        ground = ground_from_ecef(ecef.T)
+        vertical, along = up(ground), sight / np.sqrt((sight * sight).sum(axis=0))
+        cosine = -(vertical * along).sum(axis=0)
+        with np.errstate(all="ignore"):
+            size = _AIR * np.exp(-ground[:, 2] / _AIR_HEIGHT) / cosine**3
+        return (along + cosine * vertical) * np.where(cosine > _GRAZING, size, np.nan), vertical
+
+
+def _drag(sight: Array, velocity: Array) -> Array:
+    """The velocity of a camera against the points (3, N) [m] away, over that of light."""
+    carried = np.stack([-sight[1], sight[0], np.zeros(sight.shape[1])]) * EARTH_RATE
+    return np.asarray((velocity - carried) / LIGHT_SPEED)
+
+
+STRAIGHT = Light()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +110,15 @@ class Pushbroom(Frozen):
     mount : (3, 3), ecef_from_camera where w = 0: columns are the camera's x, y and z
     look : (2, K), l_x and l_y as polynomials of (col - look_origin), ascending powers [1/px^k]
     look_origin : float, column [px] from which `look` counts
-    line_period : float, time from one row to the next [s]
+    line_period : float, time from one row to the next [s]; negative where the image was turned over
     first_line : float, time of row 0 [s]
+    light : Light, what bends the line of sight
+    accuracy : (float, float) or None, stated standard deviations of attitude, as metres on the ground, and position [m]
 
     Raises
     ------
     RpcError
-        A wrong shape, a value that is not finite, a `mount` that is no rotation, a line period not positive.
+        A wrong shape, a value that is not finite, a `mount` that is no rotation, a line period of zero.
     """
 
     orbit: Curve
@@ -65,6 +128,8 @@ class Pushbroom(Frozen):
     look_origin: float
     line_period: float
     first_line: float = 0.0
+    light: Light = STRAIGHT
+    accuracy: tuple[float, float] | None = None
     _lon: float = field(init=False, repr=False, default=0.0)
 
     def __post_init__(self) -> None:
@@ -81,8 +146,8 @@ class Pushbroom(Frozen):
             raise RpcError("pushbroom: look has no slope, expected (2, K) with K of two or more")
         if not np.isfinite((self.look_origin, self.line_period, self.first_line)).all():
             raise RpcError("pushbroom: all numbers must be finite")
-        if not self.line_period > 0:
-            raise RpcError(f"pushbroom: line period {self.line_period} s is not positive")
+        if self.line_period == 0:
+            raise RpcError("pushbroom: a line period of zero")
         if np.abs(self.mount @ self.mount.T - np.eye(3)).max() > 1e-9 or np.linalg.det(self.mount) < 0:
             raise RpcError("pushbroom: mount is not a rotation matrix")
         if not self._span[1] - self._span[0] > 2 * EXTRAPOLATION:
@@ -122,13 +187,13 @@ class Pushbroom(Frozen):
         return pointwise(lambda *part: [self._meet(*part)], CHUNK, [(3,)], image, alt)[0]
 
     def line_of_sight(self, image: Array) -> tuple[Array, Array]:
-        """Camera centres [m] and unit directions to the ground, (..., 3) in ECEF, of image points (..., 2) [px]."""
+        """Camera centres [m] and unit directions of sight, (..., 3) in ECEF, of image points (..., 2) [px]."""
         image = np.asarray(image, dtype=np.float64)
         origin, direction = self._rays(image.reshape(-1, 2))
         return origin.T.reshape(*image.shape[:-1], 3), direction.T.reshape(*image.shape[:-1], 3)
 
     def _rays(self, image: Array) -> tuple[Array, Array]:
-        """Camera centres and unit directions to the ground, (3, N), of image points (N, 2)."""
+        """Camera centres and unit directions of sight, (3, N), of image points (N, 2)."""
         time = self.time(image[:, 1])
         tangents = self._look(image[:, 0])[0]
         inside = np.stack([tangents[0], tangents[1], np.ones(len(time))])
@@ -138,19 +203,17 @@ class Pushbroom(Frozen):
 
     def _meet(self, image: Array, alt: Array) -> Array:
         """Ground points (N, 3) where lines of sight (N, 2) reach altitudes (N,)."""
-        origin, direction = self._rays(image)
-        axes = np.array([[WGS84_A], [WGS84_A], [WGS84_B]]) + alt
-        o, d = origin / axes, direction / axes
-        a, b, c = (d * d).sum(axis=0), (o * d).sum(axis=0), (o * o).sum(axis=0) - 1.0
-        distance = c / (np.sqrt(b * b - a * c) - b)  # the nearer root, without cancellation
-        for _ in range(2):
-            ground = ground_from_ecef((origin + distance * direction).T)
-            distance += (alt - ground[:, 2]) / (up(ground) * direction).sum(axis=0)
-        ground = ground_from_ecef((origin + distance * direction).T)
-        ground[:, 0] = wrap_longitude(ground[:, 0], self._lon)
-        ground[:, 2] = alt
+        origin, seen = self._rays(image)
         time, (start, stop) = self.time(image[:, 1]), self._span
-        ground[~((distance > 0) & (time >= start) & (time <= stop))] = np.nan
+        ground = _reach(origin, seen, alt)
+        if self.light != STRAIGHT:
+            velocity, direction = self.orbit(time)[1], seen
+            for _ in range(_BENDS):
+                bent = self.light.seen(ecef_from_ground(ground).T, origin, velocity)
+                direction = direction + seen - bent / np.sqrt((bent * bent).sum(axis=0))
+                ground = _reach(origin, direction / np.sqrt((direction * direction).sum(axis=0)), alt)
+        ground[:, 0] = wrap_longitude(ground[:, 0], self._lon)
+        ground[~((time >= start) & (time <= stop))] = np.nan
         return ground
 
     def _look(self, col: Array) -> tuple[Array, Array]:
@@ -168,7 +231,7 @@ class Pushbroom(Frozen):
         origin, velocity = self.orbit(time)
         w, w_rate = self.attitude(time)
         turn = Turn(w)
-        p = turn.back(self.mount.T @ (ecef - origin))
+        p = turn.back(self.mount.T @ self.light.seen(ecef, origin, velocity))
         p_rate = cross(p, turn.rate(w_rate)) - turn.back(self.mount.T @ velocity)
         tangents = p[:2] / p[2]
         return tangents, (p_rate[:2] - tangents * p_rate[2]) / p[2], p[2]
@@ -189,7 +252,7 @@ class Pushbroom(Frozen):
             time = np.clip(time + d_time, start, stop)
             col = col + d_col
             settled = (
-                (np.abs(d_time) < _SETTLED * self.line_period) & (np.abs(d_col) < _SETTLED) & (depth > 0)
+                (np.abs(d_time) < _SETTLED * abs(self.line_period)) & (np.abs(d_col) < _SETTLED) & (depth > 0)
             )
             if not (~settled & np.isfinite(col) & np.isfinite(time)).any():
                 break
@@ -205,13 +268,32 @@ class Pushbroom(Frozen):
     def _by_ecef(self, ecef: Array, image: Array) -> Array:
         """d(col, row)/dX (N, 2, 3) [px/m] at ECEF points (3, N) seen at image points (2, N)."""
         time = self.time(image[1])
-        turn = Turn(self.attitude(time)[0])
+        turn, motion = Turn(self.attitude(time)[0]), self.orbit(time)
         tangents, rate, depth = self._seen(ecef, time)
         slope = self._look(image[0])[1]
         zero, one = np.zeros(len(time)), np.ones(len(time))
-        by_x = self.mount @ turn.forth(np.stack([one, zero, -tangents[0]])) / depth  # d(tangent x)/dX
-        by_y = self.mount @ turn.forth(np.stack([zero, one, -tangents[1]])) / depth
+        by_x = self.light.by_point(
+            self.mount @ turn.forth(np.stack([one, zero, -tangents[0]])) / depth, ecef, *motion
+        )  # d(tangent x)/dX
+        by_y = self.light.by_point(
+            self.mount @ turn.forth(np.stack([zero, one, -tangents[1]])) / depth, ecef, *motion
+        )
         det = rate[1] * slope[0] - rate[0] * slope[1]
         row = (slope[1] * by_x - slope[0] * by_y) / det / self.line_period
         col = (rate[1] * by_x - rate[0] * by_y) / det
         return np.moveaxis(np.stack([col, row]), 2, 0)
+
+
+def _reach(origin: Array, direction: Array, alt: Array) -> Array:
+    """Ground points (N, 3) where straight lines (3, N) come down to altitudes (N,); NaN where they miss."""
+    axes = np.array([[WGS84_A], [WGS84_A], [WGS84_B]]) + alt
+    o, d = origin / axes, direction / axes
+    a, b, c = (d * d).sum(axis=0), (o * d).sum(axis=0), (o * o).sum(axis=0) - 1.0
+    distance = c / (np.sqrt(b * b - a * c) - b)  # the nearer root, without cancellation
+    for _ in range(2):
+        ground = ground_from_ecef((origin + distance * direction).T)
+        distance += (alt - ground[:, 2]) / (up(ground) * direction).sum(axis=0)
+    ground = ground_from_ecef((origin + distance * direction).T)
+    ground[:, 2] = alt
+    ground[~(distance > 0)] = np.nan
+    return ground

@@ -27,6 +27,7 @@ from barpc.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve
+from barpc.sensor.document import parse_time, seconds
 from barpc.sensor.geometry import view_angles
 from barpc.sensor.sentinel1 import (
     RangeDoppler,
@@ -38,7 +39,6 @@ from barpc.sensor.sentinel1 import (
     open_product,
     read_annotation,
 )
-from barpc.sensor.sentinel1.annotation import parse_time, seconds
 from barpc.sidefile import parse_xml
 from tests.sensor.s1_product import GRD, INTERVAL, IW, SAMPLING, START, STRIPMAP, Product
 

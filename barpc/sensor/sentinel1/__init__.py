@@ -19,7 +19,8 @@ import numpy as np
 from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError
 from barpc.geodesy import Array
 from barpc.sensor.curve import Orbit, fit_orbit
-from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation, seconds
+from barpc.sensor.document import seconds
+from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation
 from barpc.sensor.sentinel1.frames import Bistatic, Delays, GroundFrame, SlantFrame
 from barpc.sensor.sentinel1.range_doppler import RangeDoppler, build, extent, grid_residuals
 from barpc.sidefile import MAX_XML, PRODUCT, opened, read_head

@@ -6,12 +6,10 @@ of the files exactly.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,15 +17,13 @@ import numpy.typing as npt
 from barpc.errors import RpcFormatError
 from barpc.geodesy import Array
 from barpc.sensor.curve import MARGIN
-from barpc.sensor.document import Fields
+from barpc.sensor.document import Fields, seconds
 from barpc.sidefile import parse_xml
 
 TimeArray = npt.NDArray[np.datetime64]
 
 MISSIONS = {"S1A": "Sentinel-1A", "S1B": "Sentinel-1B", "S1C": "Sentinel-1C", "S1D": "Sentinel-1D"}
 """Mission of an annotation -> mission of an orbit file."""
-
-_TIME = re.compile(r"(UTC=)?(?P<time>20\d\d-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?)Z?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +154,7 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
             "give annotation/s1?-*.xml, not calibration, noise or rfi"
         )
     info, timing = "imageAnnotation/imageInformation/", "swathTiming/"
-    values, processing = _Fields(root, name), "imageAnnotation/processingInformation/"
+    values, processing = Fields(root, name), "imageAnnotation/processingInformation/"
     downlink = "generalAnnotation/downlinkInformationList/downlinkInformation/downlinkValues/"
     return Annotation(
         name=name,
@@ -193,7 +189,7 @@ def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
     """
     mission, start, stop = annotation.mission, annotation.first_line_time, annotation.last_line_time
     root = parse_xml(path, strip_namespaces=True)
-    vectors = _Fields(root, str(path)).all("Data_Block/List_of_OSVs/OSV")
+    vectors = Fields(root, str(path)).all("Data_Block/List_of_OSVs/OSV")
     if not vectors:
         raise RpcFormatError(f"{path}: not a Sentinel-1 orbit file (no List_of_OSVs)")
     owner = root.findtext("Earth_Explorer_Header/Fixed_Header/Mission", "").strip()
@@ -213,38 +209,17 @@ def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
     return _states([vectors[i] for i in near], "UTC", ("X", "Y", "Z", "VX", "VY", "VZ"), str(path))
 
 
-def seconds(time: Any, epoch: np.datetime64) -> Any:
-    """Seconds (float) from an epoch, exact to the nanosecond."""
-    return (time - epoch) / np.timedelta64(1, "ns") * 1e-9
-
-
-def parse_time(text: str, name: str) -> np.datetime64:
-    """A UTC time of an annotation ("2021-02-16T15:12:07.524369") or an orbit file ("UTC=...")."""
-    match = _TIME.fullmatch(text.strip())
-    try:
-        return np.datetime64(match["time"] if match else "none", "ns")
-    except ValueError as error:
-        raise RpcFormatError(f"{name}: {text[:40]!r} is not a UTC time") from error
-
-
-class _Fields(Fields):
-    """Fields of an annotation or an orbit file, whose times are UTC."""
-
-    def time(self, path: str) -> np.datetime64:
-        return parse_time(self.text(path), self.name)
-
-
-def _times(rows: Sequence[_Fields], tag: str) -> TimeArray:
+def _times(rows: Sequence[Fields], tag: str) -> TimeArray:
     return np.array([row.time(tag) for row in rows], dtype="datetime64[ns]")
 
 
-def _states(vectors: Sequence[_Fields], time: str, tags: Sequence[str], source: str) -> StateVectors:
+def _states(vectors: Sequence[Fields], time: str, tags: Sequence[str], source: str) -> StateVectors:
     """State vectors whose time is named `time`, and x, y, z of position and of velocity by `tags`."""
     table = np.reshape([[v.numbers(tag)[0] for tag in tags] for v in vectors], (-1, 6))
     return StateVectors(_times(vectors, time), table[:, :3], table[:, 3:], source)
 
 
-def _annotated_states(root: _Fields) -> StateVectors:
+def _annotated_states(root: Fields) -> StateVectors:
     vectors = root.all("generalAnnotation/orbitList/orbit")
     if any(v.text("frame") != "Earth Fixed" for v in vectors):
         raise RpcFormatError(f"{root.name}: orbit state vectors are not Earth fixed; give an orbit file")
@@ -253,7 +228,7 @@ def _annotated_states(root: _Fields) -> StateVectors:
     return _states(vectors, "time", tags, source.strip())
 
 
-def _burst(burst: _Fields) -> Burst:
+def _burst(burst: Fields) -> Burst:
     first, last = (burst.numbers(tag).astype(np.int64) for tag in ("firstValidSample", "lastValidSample"))
     if first.shape != last.shape:
         raise RpcFormatError(
@@ -262,7 +237,7 @@ def _burst(burst: _Fields) -> Burst:
     return Burst(burst.time("azimuthTime"), first, last)
 
 
-def _ground_range(root: _Fields) -> GroundRange | None:
+def _ground_range(root: Fields) -> GroundRange | None:
     rows = root.all("coordinateConversion/coordinateConversionList/coordinateConversion")
     if not rows:
         return None
@@ -278,7 +253,7 @@ def _ground_range(root: _Fields) -> GroundRange | None:
     return GroundRange(time, origin, np.array(forward), np.array(backward))
 
 
-def _grid(root: _Fields) -> GridPoints:
+def _grid(root: Fields) -> GridPoints:
     points = root.all("geolocationGrid/geolocationGridPointList/geolocationGridPoint")
     if not points:
         raise RpcFormatError(f"{root.name}: no geolocation grid; is the file complete?")

@@ -16,7 +16,8 @@ import numpy as np
 from barpc.errors import InputError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, enu_basis, up
-from barpc.sensor.sentinel1.annotation import Annotation, seconds
+from barpc.sensor.document import seconds
+from barpc.sensor.sentinel1.annotation import Annotation
 
 SPEED_OF_LIGHT = 299792458.0  # in vacuum [m/s]
 

@@ -26,12 +26,12 @@ from barpc.geodesy import (
 )
 from barpc.sensor.circle import aside, dot, on_circle
 from barpc.sensor.curve import Curve, Orbit, fit_orbit
+from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import (
     Annotation,
     burst_rows,
     read_annotation,
     read_orbit_file,
-    seconds,
 )
 from barpc.sensor.sentinel1.frames import (
     SPEED_OF_LIGHT,

@@ -1,0 +1,140 @@
+"""The camera of a pushbroom image from samples of orbit and attitude, after they were found to be of one image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barpc.errors import RpcError, RpcFormatError
+from barpc.geodesy import Array, ecef_from_ground
+from barpc.sensor.curve import EXTRAPOLATION, Curve, attitude_through
+from barpc.sensor.pushbroom import Pushbroom
+
+_GAP = 4.0  # times the usual step: a longer one is a gap that nothing bridges
+_BEYOND = 2.0  # steps that an image may reach beyond the samples
+_FASTEST = 0.3  # rad/s: no imaging satellite turns so fast
+_UNIT = 1e-3  # by which the length of a quaternion may miss 1
+_RADII = (6.5e6, 8e6)  # m from the Earth's centre
+_OFF = 700.0  # m/s: by more than the Earth's rotation no stated velocity differs from that of the positions
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """What a vendor samples over time, in seconds from the time of row 0."""
+
+    name: str  # the file, for messages
+    times: Array  # (N,) of the positions
+    positions: Array  # (N, 3) of the camera, ECEF [m]
+    velocities: Array  # (N, 3), stated [m/s]: they must agree with the positions
+    ticks: Array  # (M,) of the attitudes
+    quaternions: Array  # (M, 4) ecef_from_camera, scalar first, of either sign
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """How rows and columns look out of the camera; see `Pushbroom`."""
+
+    look: Array
+    look_origin: float
+    line_period: float
+    size: tuple[int, int]  # width, height [px]
+
+
+@dataclass(frozen=True, eq=False)
+class Linescan:
+    """A vendor's physical model and the image that it is of."""
+
+    model: Pushbroom
+    size: tuple[int, int]
+    kind: str = ""  # whose
+
+
+def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | None = None) -> Linescan:
+    """The camera of some samples; `sigma` are stated standard deviations of attitude [rad] and position [m].
+
+    RpcFormatError for samples that cannot be those of one image.
+    """
+    name, last = samples.name, detector.line_period * (detector.size[1] - 1)
+    span = (min(0.0, last), max(0.0, last))
+    _check_times(samples.times, span, "positions", name)
+    _check_times(samples.ticks, span, "attitudes", name)
+    _check_orbit(samples)
+    _check_turn(samples)
+    try:
+        mount, attitude = attitude_through(samples.ticks, samples.quaternions)
+        model = Pushbroom(
+            Curve.through(samples.times, samples.positions),
+            attitude,
+            mount,
+            detector.look,
+            detector.look_origin,
+            detector.line_period,
+        )
+    except RpcError as error:
+        raise RpcFormatError(f"{name}: {error}") from error
+    middle = model.localize((np.array(detector.size) - 1) / 2, np.zeros(()))
+    if not np.isfinite(middle).all():
+        raise RpcFormatError(
+            f"{name}: its camera does not look at the Earth; is the attitude that of the image?"
+        )
+    if sigma is not None and min(sigma) > 0:
+        place = model.position((detector.size[1] - 1) / 2)
+        far = float(np.linalg.norm(ecef_from_ground(middle) - place))
+        model = replace(model, accuracy=(sigma[0] * far, sigma[1]))
+    return Linescan(model, detector.size)
+
+
+def _check_times(times: Array, span: tuple[float, float], what: str, name: str) -> None:
+    steps = np.diff(times)
+    if len(times) < 4 or not (steps > 0).all():
+        raise RpcFormatError(
+            f"{name}: {len(times)} {what}, or their times do not rise; four or more are needed"
+        )
+    usual = float(np.median(steps))
+    margin = min(EXTRAPOLATION, _BEYOND * usual)
+    if times[0] - margin > span[0] or times[-1] + margin < span[1]:
+        raise RpcFormatError(
+            f"{name}: the image lasts from {span[0]:.2f} to {span[1]:.2f} s, its {what} from {times[0]:.2f} to "
+            f"{times[-1]:.2f} s; is the list complete?"
+        )
+    gap = (steps > _GAP * usual) & (times[1:] > span[0]) & (times[:-1] < span[1])
+    if gap.any():
+        at = int(np.argmax(gap))
+        raise RpcFormatError(
+            f"{name}: no {what} from {times[at]:.2f} to {times[at + 1]:.2f} s, within the image: they come every "
+            f"{usual:.3g} s"
+        )
+
+
+def _check_orbit(samples: Samples) -> None:
+    radius = np.linalg.norm(samples.positions, axis=1)
+    if not ((radius > _RADII[0]) & (radius < _RADII[1])).all():
+        raise RpcFormatError(
+            f"{samples.name}: positions {radius.min():.4g} to {radius.max():.4g} m from the Earth's centre, no "
+            "satellite's orbit; metres and ECEF are expected"
+        )
+    moved = np.gradient(samples.positions, samples.times, axis=0)
+    off = np.linalg.norm(moved - samples.velocities, axis=1)[1:-1]
+    if not off.max() < _OFF:
+        raise RpcFormatError(
+            f"{samples.name}: positions move by {off.max():.4g} m/s otherwise than their stated velocities; are the "
+            "times right?"
+        )
+
+
+def _check_turn(samples: Samples) -> None:
+    q = samples.quaternions
+    length = np.linalg.norm(q, axis=1)
+    if not (np.abs(length - 1.0) < _UNIT).all():
+        raise RpcFormatError(
+            f"{samples.name}: a quaternion of length {length[np.abs(length - 1).argmax()]:.4g}, not 1"
+        )
+    half = np.arccos(np.minimum(np.abs((q[1:] * q[:-1]).sum(axis=1)) / (length[1:] * length[:-1]), 1.0))
+    rate = 2.0 * half / np.diff(samples.ticks)
+    if not rate.max() < _FASTEST:
+        at = int(rate.argmax())
+        raise RpcFormatError(
+            f"{samples.name}: the attitude turns by {rate[at]:.3g} rad/s at {samples.ticks[at]:.2f} s, as no "
+            "satellite does; a damaged quaternion"
+        )
