@@ -17,6 +17,8 @@ WGS84_A = 6378137.0  # semi-major axis [m]
 WGS84_F = 1.0 / 298.257223563  # flattening
 WGS84_B = WGS84_A * (1.0 - WGS84_F)  # semi-minor axis [m]
 WGS84_E2 = WGS84_F * (2.0 - WGS84_F)  # first eccentricity, squared
+EARTH_RATE = 7.292115e-5  # rotation of the Earth [rad/s]
+SPEED_OF_LIGHT = 299792458.0  # in vacuum [m/s]
 
 _EP2 = WGS84_E2 / (1.0 - WGS84_E2)  # second eccentricity, squared
 _CHUNK = 8192  # points worked on at a time, so that temporaries stay in cache

@@ -21,6 +21,8 @@ import numpy.typing as npt
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import (
+    EARTH_RATE,
+    SPEED_OF_LIGHT,
     WGS84_A,
     WGS84_B,
     Array,
@@ -33,8 +35,6 @@ from barpc.geodesy import (
 )
 from barpc.sensor.curve import EXTRAPOLATION, Curve, Turn, cross
 
-LIGHT_SPEED = 299792458.0  # [m/s]
-EARTH_RATE = 7.292115e-5  # rotation of the Earth [rad/s]
 CHUNK = 4096  # points worked on at a time, so that what Newton's method needs stays in cache
 
 _AIR = (
@@ -93,7 +93,7 @@ class Light:
 def _drag(sight: Array, velocity: Array) -> Array:
     """The velocity of a camera against the points (3, N) [m] away, over that of light."""
     carried = np.stack([-sight[1], sight[0], np.zeros(sight.shape[1])]) * EARTH_RATE
-    return np.asarray((velocity - carried) / LIGHT_SPEED)
+    return np.asarray((velocity - carried) / SPEED_OF_LIGHT)
 
 
 STRAIGHT = Light()
@@ -152,6 +152,14 @@ class Pushbroom(Frozen):
             raise RpcError("pushbroom: mount is not a rotation matrix")
         if not self._span[1] - self._span[0] > 2 * EXTRAPOLATION:
             raise RpcError("pushbroom: orbit and attitude share no time")
+
+    @property
+    def advice(self) -> str:
+        """What to do where no RPC follows this model; empty where its motion is one polynomial."""
+        sampled = (
+            "the attitude may swing within the image, which no RPC follows: raise the tolerance or fit a part"
+        )
+        return sampled if len(self.attitude.coeffs) > 1 else ""
 
     @property
     def _span(self) -> tuple[float, float]:

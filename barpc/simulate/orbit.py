@@ -8,12 +8,11 @@ import numpy as np
 from numpy.polynomial.polynomial import polyfit
 from scipy.spatial.transform import Rotation
 
-from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.geodesy import EARTH_RATE, Array, ecef_from_ground, enu_basis
 from barpc.sensor.curve import Curve, about_middle
 from barpc.sensor.pushbroom import Pushbroom
 
 GM = 3.986004418e14  # gravitational constant of the Earth (WGS84) [m^3/s^2]
-EARTH_RATE = 7.292115e-5  # rotation of the Earth (WGS84) [rad/s]
 PITCH = 10.0  # views of one site are spread from -PITCH to +PITCH degrees of incidence along the flight
 ROLL = 8.0  # largest incidence across the flight [deg]
 _DEGREE = 4  # of the polynomials of time for position and attitude

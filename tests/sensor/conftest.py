@@ -15,7 +15,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.pushbroom import Light, Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sicd import open_sicd
 from barpc.sensor.splined import RowSpline, Splined
@@ -55,6 +55,13 @@ def _row_spline() -> RowSpline:
 
 def _pushbroom(lon: float) -> Pushbroom:
     return fly(np.array([lon, 43.2, 500.0]), Look(25.0, 100.0), (20000, 19000), 0.5)
+
+
+def _turned_over() -> Pushbroom:
+    """The last row first, under aberration and refraction."""
+    given = _pushbroom(5.4)
+    last = given.first_line + 18999 * given.line_period
+    return replace(given, first_line=last, line_period=-given.line_period, light=Light(True, True))
 
 
 def _range_doppler(lon: float) -> Case:
@@ -123,6 +130,9 @@ MODELS: dict[str, Callable[[], Case]] = {
     ),
     "pushbroom": lambda: Case(_pushbroom(5.4), (20000, 19000), (0.0, 1000.0)),
     "pushbroom across the antimeridian": lambda: Case(_pushbroom(180.0), (20000, 19000), (0.0, 1000.0)),
+    "pushbroom that sees bent light, turned over": lambda: Case(
+        _turned_over(), (20000, 19000), (0.0, 1000.0)
+    ),
     "localisation grid": lambda: Case(_grid(5.4), (20000, 19000), (0.0, 1000.0)),
     "localisation grid across the antimeridian": lambda: Case(_grid(180.0), (20000, 19000), (0.0, 1000.0)),
     "corrected pushbroom": lambda: Case(

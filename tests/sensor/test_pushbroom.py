@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from barpc.errors import RpcError
-from barpc.geodesy import ecef_from_ground, ground_from_ecef, metres_per_unit
+from barpc.geodesy import EARTH_RATE, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve, attitude_through
 from barpc.sensor.geometry import view_angles
 from barpc.sensor.pushbroom import Pushbroom
-from barpc.simulate.orbit import EARTH_RATE, GM, Look, fly
+from barpc.simulate.orbit import GM, Look, fly
 
 TARGET = np.array([5.4, 43.3, 200.0])
 SIZE = (20000, 20000)

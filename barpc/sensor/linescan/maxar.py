@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import Array
 from barpc.sensor.document import Fields, seconds
-from barpc.sensor.linescan.samples import Detector, Linescan, Samples, build
+from barpc.sensor.linescan.samples import Detector, Linescan, Samples, build, unit
 from barpc.sensor.pushbroom import Light
 
 ROOT, KIND = "isd", "maxar physical model"
@@ -39,11 +39,10 @@ def read(root: Fields, band: str | None = None) -> Linescan:
     size = (int(root.positive("IMD/NUMCOLUMNS", _MOST)), int(root.positive("IMD/NUMROWS", _MOST)))
     period, first = _lines(root, size[1])
     (times, orbit), (ticks, attitude) = (_table(root, part, first) for part in _TABLES)
-    quaternions = attitude[:, [4, 1, 2, 3]]  # in the file the scalar comes last
-    body = Rotation.from_quat(_turned(root, attitude[:, 1:5]))
+    body = Rotation.from_quat(unit(attitude[:, 1:5], root.name))
     camera = root.one("GEO/CAMERA_ATTITUDE")
     mounting = np.array([camera.number(f"QCS{k}") for k in (1, 2, 3, 4)])
-    quaternions = (body * Rotation.from_quat(_turned(root, mounting[None]))).as_quat(scalar_first=True)
+    quaternions = (body * Rotation.from_quat(unit(mounting[None], root.name))).as_quat(scalar_first=True)
     arm = np.array([root.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"])
     positions = orbit[:, 1:4]
     if arm.any():
@@ -55,12 +54,6 @@ def read(root: Fields, band: str | None = None) -> Linescan:
     samples = Samples(root.name, times, positions, orbit[:, 4:7], ticks, quaternions)
     detector = Detector(_look(root, band), 0.0, period, size)
     return build(samples, detector, _sigma(orbit, attitude))
-
-
-def _turned(root: Fields, quaternions: Array) -> Array:
-    if not quaternions.any(axis=1).all():
-        raise RpcFormatError(f"{root.name}: a quaternion of length 0, not 1")
-    return quaternions
 
 
 def _lines(root: Fields, rows: int) -> tuple[float, np.datetime64]:

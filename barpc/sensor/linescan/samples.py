@@ -85,6 +85,16 @@ def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | Non
     return Linescan(model, detector.size)
 
 
+def unit(quaternions: Array, name: str) -> Array:
+    """Quaternions (N, 4) of length 1; RpcFormatError where theirs is another."""
+    length = np.linalg.norm(quaternions, axis=1)
+    if not (np.abs(length - 1.0) < _UNIT).all():
+        raise RpcFormatError(
+            f"{name}: a quaternion of length {length[np.abs(length - 1).argmax()]:.4g}, not 1"
+        )
+    return np.asarray(quaternions / length[:, None])
+
+
 def _check_times(times: Array, span: tuple[float, float], what: str, name: str) -> None:
     steps = np.diff(times)
     if len(times) < 4 or not (steps > 0).all():
@@ -124,13 +134,8 @@ def _check_orbit(samples: Samples) -> None:
 
 
 def _check_turn(samples: Samples) -> None:
-    q = samples.quaternions
-    length = np.linalg.norm(q, axis=1)
-    if not (np.abs(length - 1.0) < _UNIT).all():
-        raise RpcFormatError(
-            f"{samples.name}: a quaternion of length {length[np.abs(length - 1).argmax()]:.4g}, not 1"
-        )
-    half = np.arccos(np.minimum(np.abs((q[1:] * q[:-1]).sum(axis=1)) / (length[1:] * length[:-1]), 1.0))
+    q = unit(samples.quaternions, samples.name)
+    half = np.arccos(np.minimum(np.abs((q[1:] * q[:-1]).sum(axis=1)), 1.0))
     rate = 2.0 * half / np.diff(samples.ticks)
     if not rate.max() < _FASTEST:
         at = int(rate.argmax())

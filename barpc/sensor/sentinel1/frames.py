@@ -15,11 +15,9 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.frozen import Frozen
-from barpc.geodesy import Array, enu_basis, up
+from barpc.geodesy import SPEED_OF_LIGHT, Array, enu_basis, up
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation
-
-SPEED_OF_LIGHT = 299792458.0  # in vacuum [m/s]
 
 _INVERSION_STEPS = 8
 Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`

@@ -18,6 +18,7 @@ import numpy as np
 from barpc.errors import BarpcWarning, InputError, RpcError, RpcFormatError
 from barpc.frozen import Frozen
 from barpc.geodesy import (
+    SPEED_OF_LIGHT,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
@@ -34,7 +35,6 @@ from barpc.sensor.sentinel1.annotation import (
     read_orbit_file,
 )
 from barpc.sensor.sentinel1.frames import (
-    SPEED_OF_LIGHT,
     Bistatic,
     Delays,
     Frame,

@@ -1,0 +1,308 @@
+"""Physical models in vendors' metadata, against what the samples mean and against the RPC of the same image."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from barpc.ba.priors import prior_sigmas
+from barpc.errors import BarpcError, InputError, RpcFormatError
+from barpc.geodesy import ecef_from_ground, enu_basis
+from barpc.options import AdjustOptions
+from barpc.rpcio import read_rpc
+from barpc.scene import View
+from barpc.sensor.linescan import read_linescan
+from barpc.sensor.pushbroom import STRAIGHT, Light
+from tests.sensor.linescan_files import Flight, dimap, inertial_sight, isd, stamp
+
+FLIGHT = Flight()
+IMAGE = np.array(
+    [[0.0, 0.0], [3999.0, 0.0], [1234.5, 7000.25], [0.0, 19999.0], [3999.0, 19999.0], [2000.0, 333.0]]
+)
+
+
+def read(tmp_path, text, **choices):
+    path = tmp_path / "metadata.xml"
+    path.write_text(text)
+    return read_linescan(path, **choices)
+
+
+def misses(model, truth, alt=500.0):
+    """How far off [px] the model sees the ground points of the truth."""
+    return np.abs(model.project(truth.ground(IMAGE, alt)) - IMAGE).max()
+
+
+# --- Maxar --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"angle": 0.7, "along": 1.5}, {"camera": Rotation.from_rotvec([0.002, -0.03, 0.5])}],
+    ids=["plain", "turned detector", "turned camera"],
+)
+def test_an_isd_means_what_its_samples_say(tmp_path, how):
+    text, truth = isd(FLIGHT, **how)
+    found = read(tmp_path, text, aberration=False, refraction=False)
+    assert found.size == FLIGHT.size
+    assert misses(found.model, truth) < 5e-4
+    wrong = replace(found.model, look_origin=found.model.look_origin + 1)
+    assert misses(wrong, truth) == pytest.approx(1.0, abs=0.1)
+
+
+def test_rows_that_were_turned_over_run_back_in_time(tmp_path):
+    text, truth = isd(FLIGHT)
+    last = FLIGHT.size[1] - 1
+    end = f"{last * FLIGHT.period!r}"
+    back = re.sub(
+        r"<TLCLIST>0.0 0.0</TLCLIST><TLCLIST>.*?</TLCLIST>",
+        f"<TLCLIST>0.0 {end}</TLCLIST><TLCLIST>{last}.0 0.0</TLCLIST>",
+        text,
+    )
+    back = re.sub(r"<FIRSTLINETIME>.*?<", f"<FIRSTLINETIME>{stamp(last * FLIGHT.period)}<", back)
+    model = read(tmp_path, back, aberration=False, refraction=False).model
+    assert model.line_period == pytest.approx(-FLIGHT.period, rel=1e-9)
+    seen = model.project(truth.ground(IMAGE, 200.0))
+    np.testing.assert_allclose(seen, np.column_stack([IMAGE[:, 0], last - IMAGE[:, 1]]), atol=2e-3)
+
+
+@pytest.mark.parametrize(("scan", "sign"), [("Forward", 1), ("Reverse", -1)])
+def test_one_entry_of_line_times_goes_by_the_rate_and_the_direction(tmp_path, scan, sign):
+    text, _ = isd(FLIGHT)
+    text = re.sub(r"(<TLCLIST>0.0 0.0</TLCLIST>)<TLCLIST>.*?</TLCLIST>", r"\1", text).replace(
+        "<NUMTLC>2", "<NUMTLC>1"
+    )
+    text = text.replace(">Forward<", f">{scan}<")
+    if sign > 0:
+        assert read(tmp_path, text).model.line_period == pytest.approx(FLIGHT.period, rel=1e-12)
+    else:  # the samples begin at row 0
+        with pytest.raises(RpcFormatError, match="image lasts from -1"):
+            read(tmp_path, text)
+
+
+def test_aberration_is_that_of_the_inertial_frame(tmp_path):
+    text, _ = isd(FLIGHT)
+    model = read(tmp_path, text, refraction=False).model
+    assert model.light == Light(aberration=True)
+    ground = model.localize(IMAGE, np.full(len(IMAGE), 300.0))
+    origin, seen = model.line_of_sight(IMAGE)
+    velocity = model.orbit(model.time(IMAGE[:, 1]))[1].T
+    for k in range(len(IMAGE)):
+        np.testing.assert_allclose(
+            inertial_sight(ground[k], origin[k], velocity[k]), seen[k], rtol=0, atol=2e-10
+        )
+    straight = replace(model, light=STRAIGHT).localize(IMAGE, np.full(len(IMAGE), 300.0))
+    off = np.linalg.norm(ecef_from_ground(ground) - ecef_from_ground(straight), axis=1)
+    assert ((off > 15) & (off < 25)).all()
+
+
+@pytest.mark.parametrize("alt", [0.0, 3000.0])
+def test_refraction_is_that_of_a_ray_through_the_air(tmp_path, alt):
+    text, _ = isd(FLIGHT)
+    model = read(tmp_path, text, aberration=False).model
+    assert model.light == Light(refraction=True)
+    ground = model.localize(IMAGE[2], np.array(alt))
+    straight = replace(model, light=STRAIGHT).localize(IMAGE[2], np.array(alt))
+    enu = enu_basis(ground)
+    shift = enu @ (ecef_from_ground(ground) - ecef_from_ground(straight))
+    to_nadir = enu @ (model.position(IMAGE[2, 1]) - ecef_from_ground(ground))
+    zenith = np.arctan2(np.hypot(*to_nadir[:2]), to_nadir[2])
+    heights = np.linspace(alt, 80e3, 40001)
+    sine = np.sin(zenith) / (1 + 2.8e-4 * np.exp(-heights / 8e3))  # Snell
+    bent = np.trapezoid(np.tan(zenith) - np.tan(np.arcsin(sine)), heights)
+    assert bent == pytest.approx(1.3 * np.exp(-alt / 8e3), rel=0.1)
+    assert shift[:2] @ to_nadir[:2] / np.hypot(*to_nadir[:2]) == pytest.approx(bent, rel=0.05)
+
+
+def test_stated_covariances_are_the_priors_of_the_view(tmp_path):
+    found = read(tmp_path, isd(FLIGHT)[0])
+    view = View("a", "", found.size, found.model, (0.0, 500.0))
+    far = np.linalg.norm(
+        found.model.position(10000) - ecef_from_ground(found.model.localize(IMAGE[2], np.array(0.0)))
+    )
+    wanted = [2 * np.sqrt(12e-12 / 3) * far] * 3 + [np.sqrt(0.02)] * 3
+    np.testing.assert_allclose(prior_sigmas((view,), AdjustOptions(), 0), [wanted], rtol=1e-3)
+    assert prior_sigmas((view,), AdjustOptions(sigma_attitude=3.0), 0)[0, 0] == 3.0
+    silent = replace(view, sensor=read(tmp_path, isd(FLIGHT, covariance=False)[0]).model)
+    np.testing.assert_array_equal(prior_sigmas((silent,), AdjustOptions(), 0), np.full((1, 6), 7.5))
+
+
+# What the files of two satellites say, against their RPC over five altitudes: mean and spread [px]. That RPC was
+# fitted with strong damping, of WV03 without aberration and refraction and of WV01 with both, and an attitude that
+# swings is beyond any RPC: the spread is the fit's. The mean is the model's.
+@pytest.mark.parametrize(
+    ("name", "bent", "mean", "spread"),
+    [
+        ("1040010074793300.xml", False, (-0.03, 0.02), (0.87, 0.48)),
+        ("10200100A1865800.r100.xml", True, (-0.02, -0.12), (1.69, 1.10)),
+    ],
+)
+def test_the_model_is_that_of_the_rpc_in_the_same_file(shared_data, name, bent, mean, spread):
+    path = shared_data / "physical_maxar" / name
+    found, rpc = read_linescan(path, aberration=bent, refraction=bent), read_rpc(path)
+    image = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 15) for n in found.size)), -1).reshape(-1, 2)
+    low, high = rpc.ground_offset[2] - rpc.ground_scale[2], rpc.ground_offset[2] + rpc.ground_scale[2]
+    off = np.array(
+        [
+            rpc.project(found.model.localize(image, np.full(len(image), alt))) - image
+            for alt in np.linspace(low, high, 5)
+        ]
+    )
+    np.testing.assert_allclose(off.mean(axis=(0, 1)), mean, atol=0.15)
+    np.testing.assert_allclose(off.std(axis=(0, 1)), spread, atol=0.15)
+    straight = read_linescan(path, aberration=not bent, refraction=not bent).model
+    other = rpc.project(straight.localize(image, np.full(len(image), low))) - image
+    assert np.hypot(*other.mean(axis=0)) > 20
+
+
+# --- DIMAP --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("poly", [True, False])
+@pytest.mark.parametrize("unit", [1e-3, 1e-6])
+def test_a_dimap_means_what_its_parts_say(tmp_path, poly, unit):
+    flight = Flight(swing=0.0)
+    text, truth = dimap(flight, poly=poly, unit=unit)
+    found = read(tmp_path, text)
+    assert found.size == flight.size
+    assert found.model.light == STRAIGHT
+    assert found.model.line_period == pytest.approx(flight.period, rel=1e-12)
+    assert misses(found.model, truth) < 2e-3
+    assert misses(replace(found.model, look_origin=found.model.look_origin - 1), truth) > 0.9
+
+
+def test_the_attitude_of_an_image_after_midnight_counts_from_its_day(tmp_path):
+    flight = Flight(swing=0.0)
+    text, truth = dimap(flight)
+    seconds = float(re.search(r"<OFFSET>(.*?)<", text)[1])
+    assert seconds > 86399
+    early = text.replace(f"<OFFSET>{seconds!r}", f"<OFFSET>{seconds - 86400!r}")
+    assert misses(read(tmp_path, early).model, truth) < 2e-3
+
+
+# --- files that lie -----------------------------------------------------------------------------------------
+
+ISD, DIMAP = isd(FLIGHT)[0], dimap(FLIGHT)[0]
+_ROW = re.compile(r"<(ATT|EPHEM)LIST>[^<]*</\1LIST>\n")
+
+
+def cut(text, tag, keep):
+    """Without the rows of a list that `keep` refuses, and with a number of points that says so."""
+    rows = re.findall(rf"<{tag}>[^<]*</{tag}>\n", text)
+    for k, row in enumerate(rows):
+        if not keep(k):
+            text = text.replace(row, "")
+    return text.replace(f"<NUMPOINTS>{len(rows)}<", f"<NUMPOINTS>{sum(map(keep, range(len(rows))))}<")
+
+
+def other(text, tag, row, change):
+    """One row of a list with other numbers."""
+    found = re.findall(rf"<{tag}>([^<]*)</{tag}>", text)[row]
+    return text.replace(found, " ".join(map(repr, change([float(v) for v in found.split()]))))
+
+
+LIES = {
+    "no GEO": (re.sub(r"(?s)<GEO>.*</GEO>", "", ISD), "no GEO"),
+    "a list cut short": (_ROW.sub("", ISD, count=20), "of 80|of 79|holds"),
+    "samples of another time": (
+        ISD.replace("2026-05-07T23:59:59.2", "2026-05-07T23:58:59.2", 2),
+        "image lasts|FIRSTLINE",
+    ),
+    "a gap": (
+        cut(cut(ISD, "ATTLIST", lambda k: not 30 < k < 50), "EPHEMLIST", lambda k: not 30 < k < 50),
+        "no positions from|no attitudes from",
+    ),
+    "a component's sign": (other(ISD, "ATTLIST", 7, lambda v: [v[0], -v[1], *v[2:]]), "turns by"),
+    "a zero quaternion": (other(ISD, "ATTLIST", 7, lambda v: [v[0], 0, 0, 0, 0, *v[5:]]), "length 0"),
+    "a short quaternion": (
+        other(ISD, "ATTLIST", 7, lambda v: [v[0], *(0.9 * x for x in v[1:5]), *v[5:]]),
+        "length 0.9",
+    ),
+    "a row that lacks a number": (other(ISD, "ATTLIST", 7, lambda v: v[:-1]), "hold 14, 15 numbers"),
+    "kilometres": (
+        re.sub(
+            r"(<EPHEMLIST>\S+ )(\S+) (\S+) (\S+)",
+            lambda m: m[1] + " ".join(repr(float(m[k]) / 1e3) for k in (2, 3, 4)),
+            ISD,
+        ),
+        "metres",
+    ),
+    "nan": (other(ISD, "EPHEMLIST", 3, lambda v: [v[0], float("nan"), *v[2:]]), "not finite"),
+    "words": (ISD.replace("<DETPITCH>0.008", "<DETPITCH>eight"), "not a list of numbers"),
+    "two interval lengths": (
+        ISD.replace("<TIMEINTERVAL>0.02", "<TIMEINTERVAL>0.03"),
+        "otherwise than their stated|image lasts",
+    ),
+    "an infinite line rate": (
+        re.sub(r"<TLCLIST>20000.0 .*?<", "<TLCLIST>20000.0 0.0<", ISD),
+        "TLCLIST gives",
+    ),
+    "a first row of its own": (
+        re.sub(r"<FIRSTLINETIME>.*?<", "<FIRSTLINETIME>2026-05-07T23:59:58Z<", ISD),
+        "FIRSTLINETIME",
+    ),
+    "a resampled product": (ISD.replace(">LV1B<", ">LV2A<"), "only 1B"),
+    "a distortion": (ISD.replace("<POLYORDER>-1", "<POLYORDER>2"), "distortion"),
+    "two detectors": (
+        re.sub(r"(<DETECTOR_ARRAY>.*</DETECTOR_ARRAY>)", r"\1\1", ISD, flags=re.S),
+        "2 detector arrays",
+    ),
+    "rows without end": (re.sub(r"<NUMROWS>\d+", "<NUMROWS>1e300", ISD), "absurdly large"),
+    "an entity": (ISD.replace("<isd>", '<!DOCTYPE isd [<!ENTITY a "b">]><isd>'), "DOCTYPE"),
+    "an RPC alone": ("<isd><RPB/></isd>", "no IMD/PRODUCTLEVEL"),
+    "another document": ("<product/>", "no physical camera model"),
+    "DIMAP of an ortho": (
+        re.sub(r"(?s)<Refined_Model>.*</Refined_Model>", "", DIMAP),
+        "no Geometric_Data/Refined_Model",
+    ),
+    "a line period of hours": (re.sub(r"<LINE_PERIOD>.*?<", "<LINE_PERIOD>0.5<", DIMAP), "in no unit"),
+    "no ephemeris": (re.sub(r"<Point>.*</Point>", "", DIMAP), "0 positions"),
+    "no look angles": (DIMAP.replace("XLOS_1", "XLOS_9"), "without YLOS_0"),
+    "a coefficient short": (DIMAP.replace("<DEGREE>3", "<DEGREE>2", 1), "4 numbers, expected 3"),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_file_that_lies_gives_one_line(tmp_path, lie):
+    text, words = LIES[lie]
+    with pytest.raises(RpcFormatError, match=words) as told:
+        read(tmp_path, text)
+    assert "\n" not in str(told.value)
+    assert "metadata.xml" in str(told.value)
+
+
+def test_bands_are_told_apart_by_name(tmp_path):
+    second = ISD.replace("<BAND_P>", "<BAND_N>").replace("</BAND_P>", "</BAND_N>")
+    both = ISD.replace(
+        "</BAND_P>",
+        "</BAND_P>"
+        + re.search("(?s)<BAND_N>.*</BAND_N>", second)[0].replace("<DETORIGINX>0.0", "<DETORIGINX>0.8"),
+    )
+    with pytest.raises(InputError, match="band=NAME of P, N"):
+        read(tmp_path, both)
+    first, other_band = (read(tmp_path, both, band=name).model for name in ("p", "N"))
+    moved = other_band.project(first.localize(IMAGE, np.zeros(len(IMAGE)))) - IMAGE
+    assert (np.abs(np.abs(moved[:, 1]) - 108) < 8).all()
+    assert np.abs(moved[:, 0]).max() < 3
+    with pytest.raises(InputError, match="band=NAME"):
+        read(tmp_path, both, band="R")
+
+
+def test_damage_anywhere_is_one_line(tmp_path):
+    rng = np.random.default_rng(4)
+    short = isd(Flight(size=(500, 3000)))[0], dimap(Flight(size=(500, 3000)))[0]
+    for k in range(60):
+        text = bytearray(short[k % 2].encode())
+        for at in rng.integers(60, len(text), 3):
+            text[at] = rng.choice(list(b"<>0x-e.9 /"))
+        path = tmp_path / "damaged.xml"
+        path.write_bytes(text[: rng.integers(1, len(text)) if k % 7 == 0 else None])
+        said = ""
+        try:
+            read_linescan(path)
+        except BarpcError as error:
+            said = str(error)
+        assert "\n" not in said
