@@ -173,7 +173,28 @@ def parse(data: bytes, name: str, options: ReadOptions | None = None) -> tuple[R
     for row in FORMATS.values():
         if row.sniff(content):
             return row.read(content, name, options or ReadOptions()), row.name
-    raise RpcFormatError(f"{name}: no RPC format recognised (known: {', '.join(FORMATS)})")
+    raise RpcFormatError(
+        f"{name}: no RPC format recognised (known: {', '.join(FORMATS)}); {_contents(content)}"
+    )
+
+
+_NAMED = re.compile(
+    r'^[ \t]*+([A-Za-z][\w.]{0,40}+)[ \t]*+[:=]|<([A-Za-z][\w.]{0,40}+)|"(\w{1,40}+)"[ \t]*+:', re.MULTILINE
+)
+_TELLING = re.compile(r"(?i)coef|off|scale|num|den|rpc|rfm|lat|lon|samp|line")
+_LOOKED, _SHOWN = 1 << 20, 8
+_PHYSICAL = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b")
+
+
+def _contents(content: str) -> str:
+    """The names of the fields in a text, those first that an RPC may have; of a list its name."""
+    if _PHYSICAL(content):
+        return "it holds a physical camera model: give FILE,model=physical"
+    words = ("".join(found).rstrip("0123456789_") for found in _NAMED.findall(content[:_LOOKED]))
+    names = list(dict.fromkeys(filter(None, words)))
+    shown = sorted(names, key=lambda word: _TELLING.search(word) is None)[:_SHOWN]
+    more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
+    return f"fields found: {', '.join(shown)}{more}" if names else "no field with a name is in it"
 
 
 def write_rpc(rpc: RPC, path: Path | str, *, format: str | None = None, overwrite: bool = False) -> None:

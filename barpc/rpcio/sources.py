@@ -207,6 +207,11 @@ def _image_source(path: Place, head: bytes, options: ReadOptions) -> RpcSource:
     else:
         raise ImageError(
             f"{path}: no RPC in the image and none beside it (.RPB, _RPC.TXT, .XML, .geom and others)"
+            + (
+                "; HDF5 files are not read: write its coefficients as an _RPC.TXT"
+                if head.startswith(_HDF5)
+                else ""
+            )
         )
     return replace(source, notes=source.notes + ((f"not used: {', '.join(ignored)}",) if ignored else ()))
 
@@ -225,6 +230,7 @@ def _sidecar_source(image: Place, sidecar: Sidecar, options: ReadOptions) -> Rpc
     return RpcSource(rpc.window(*window), name, sidecar.path, (note,))
 
 
+_HDF5 = b"\x89HDF"
 _Window = tuple[float, float, float, float]
 _WHOLE: _Window = (0.0, 0.0, 1.0, 1.0)  # corner, steps
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.errors import OutputError, RpcFormatError
+from barpc.errors import ImageError, OutputError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
 from barpc.rpcio.fields import number
 from barpc.rpcio.formats import parse
@@ -225,3 +225,76 @@ def test_a_number_is_read_with_its_unit_left_out(text, value):
 def test_what_is_no_finite_number_is_refused_with_file_and_key(text):
     with pytest.raises(RpcFormatError, match="file: KEY is not"):
         number(text, "file", "KEY")
+
+
+# --- how other constellations write the known syntaxes ------------------------------------------------------
+
+# Written here after public descriptions, of no product: BlackSky and SkySat are told of as `_rpc.txt` with these keys
+# (ossimlabs/ossim, pull request 264), GDAL's manual has KOMPSAT's and EROS' .rpc and Maxar's .RPB and XML. ZY-3, GF-7,
+# SuperView and Jilin-1 are delivered as .rpb or _rpc.txt; their signs and blanks are taken to be as theirs.
+
+
+def _signed(text: str) -> str:
+    return re.sub(r": (\d)", r": +\1", text)
+
+
+def _units(text: str) -> str:
+    units = {"LINE": "pixels", "SAMP": "pixels", "LAT": "degrees", "LONG": "degrees", "HEIGHT": "meters"}
+    return re.sub(
+        r"(?m)^((LINE|SAMP|LAT|LONG|HEIGHT)_(OFF|SCALE): \S+)$", lambda m: f"{m[1]} {units[m[2]]}", text
+    )
+
+
+CONSTELLATIONS = {
+    "BlackSky, Satellogic: _rpc.txt in any order": ("txt", lambda t: "\n".join(sorted(t.splitlines()))),
+    "KOMPSAT, ZY-3, Jilin-1: signs and units": ("txt", lambda t: _units(_signed(t))),
+    "GF-7, SuperView: .rpb with CRLF and tabs": (
+        "rpb",
+        lambda t: t.replace('"????"', '"GF7"').replace("\n", "\r\n").replace(" = ", "=\t"),
+    ),
+    "GF-7: a list that closes on a line of its own": ("rpb", lambda t: t.replace(");", "\n\t\t\t);")),
+    "Legion: image support data in full": (
+        "xml",
+        lambda t: t.replace("<isd>", "<isd><IMD><IMAGE><SATID>LG01</SATID></IMAGE></IMD><EPH/><ATT/><GEO/>"),
+    ),
+}
+
+
+@pytest.mark.parametrize("constellation", CONSTELLATIONS)
+def test_a_constellation_s_way_of_writing_is_read(constellation, rpc):
+    kind, change = CONSTELLATIONS[constellation]
+    assert FORMATS[kind].write is not None
+    text = FORMATS[kind].write(rpc)
+    assert change(text) != text
+    assert parse(change(text).encode(), "memory") == (rpc, kind)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("rowOff: 1\ncolOff: 2\nrowNum_1: 3\nrowNum_2: 4\n", "fields found: rowOff, colOff, rowNum$"),
+        (
+            "<Doc><Date>x</Date><RFM><LineNum>1 2</LineNum></RFM></Doc>",
+            "fields found: RFM, LineNum, Doc, Date$",
+        ),
+        ('{"date": 1, "camera": {"rpcCoeffs": [1, 2]}}', "fields found: rpcCoeffs, date, camera$"),
+        ("\n".join(f"{c}ame: 1" for c in "abcdefghijk"), "fields found: aame, .*, hame and 3 more$"),
+        ("1 2 3 4", "no field with a name is in it$"),
+        ("<isd><ATT><ATTLISTList><ATTLIST>1</ATTLIST></ATTLISTList></ATT></isd>", "model=physical$"),
+        (
+            "<Dimap_Document><Geometric_Data><Refined_Model/></Geometric_Data></Dimap_Document>",
+            "model=physical$",
+        ),
+    ],
+)
+def test_an_unknown_file_is_refused_with_the_names_of_its_fields(text, found):
+    with pytest.raises(RpcFormatError, match=found) as told:
+        parse(text.encode(), "memory")
+    assert "known: txt, rpb" in str(told.value)
+
+
+def test_hdf5_is_named_as_what_is_not_read(tmp_path):
+    path = tmp_path / "PRS_L1.he5"
+    path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(200))
+    with pytest.raises(ImageError, match="HDF5 files are not read"):
+        read_rpc(path)
