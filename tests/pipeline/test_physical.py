@@ -1,0 +1,151 @@
+"""Runs on the physical models of images: found beside them, corrected like any camera, an RPC fitted to the result."""
+
+from __future__ import annotations
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from barpc.cameras import open_camera
+from barpc.errors import ImageError, InputError
+from barpc.geodesy import ecef_from_ground
+from barpc.options import RunOptions
+from barpc.pipeline import adjust
+from barpc.pointio.matches import write_matches
+from barpc.rpcio import read_rpc, write_rpc
+from barpc.rpcio.xml import write_maxar
+from barpc.scene import Tracks
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.geometry import triangulate
+from barpc.sensor.linescan import read_linescan
+from barpc.sensor.pushbroom import Light
+from barpc.simulate.orbit import Look
+from tests.rpcio.conftest import make_rpc, write_image
+from tests.sensor.linescan_files import Flight, dimap, isd
+
+SIZE = (900, 6000)
+LOOKS = [Look(12.0, 12.0), Look(3.0, 100.0), Look(12.0, 192.0)]
+KINDS = {"maxar": (isd, "{}.XML"), "dimap": (dimap, "DIM_{}.XML")}
+
+
+def blank(path):
+    """An image in which nothing varies: no two such are compared."""
+    profile = {"driver": "GTiff", "width": SIZE[0], "height": SIZE[1], "count": 1, "dtype": "uint8"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", **profile, compress="deflate") as out:
+            out.write(np.ones((1, SIZE[1], SIZE[0]), dtype=np.uint8))
+    return path
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def folder(request, tmp_path_factory):
+    """Three images without pixels of their own, their metadata beside them; one has a vendor's RPC, too."""
+    path = tmp_path_factory.mktemp(request.param)
+    write, name = KINDS[request.param]
+    for k, look in enumerate(LOOKS):
+        text, _ = write(Flight(size=SIZE, look=look, swing=0.0))
+        (path / name.format(f"scene{k}")).write_text(text)
+        stem = f"IMG_scene{k}" if request.param == "dimap" else f"scene{k}"
+        blank(path / f"{stem}.tif")
+    return path
+
+
+def images(folder):
+    return [f"{path},model=physical" for path in sorted(folder.glob("*.tif"))]
+
+
+def test_an_adjustment_on_physical_models(folder, tmp_path):
+    models = [open_camera(image).model for image in images(folder)]
+    rng = np.random.default_rng(8)
+    turned = []
+    for model in models:  # what the platform really did: 4 urad and 2 m off
+        centre = model.position((SIZE[1] - 1) / 2)
+        turned.append(Corrected(model, Correction(rng.normal(0, 4e-6, 3), rng.normal(0, 2, 3), centre)))
+    seen = np.column_stack([rng.uniform(30, SIZE[0] - 30, 300), rng.uniform(30, SIZE[1] - 30, 300)])
+    ground = turned[1].localize(seen, rng.uniform(0, 300, 300))
+    xy = np.stack([camera.project(ground) for camera in turned])
+    ground = ground[((xy > 0) & (xy < np.array(SIZE) - 1)).all(axis=(0, 2))]
+    xy = np.stack([camera.project(ground) for camera in turned], axis=1) + rng.normal(
+        0, 0.02, (len(ground), 3, 2)
+    )
+    assert len(ground) > 150
+    half = len(ground) // 2
+    tracks = Tracks(
+        np.tile(np.arange(3), half),
+        np.repeat(np.arange(half), 3),
+        xy[:half].reshape(-1, 2),
+        np.full(3 * half, 0.02),
+    )
+    stems = [path.stem for path in sorted(folder.glob("*.tif"))]
+    write_matches(tmp_path / "ties.csv", tracks, stems)
+    options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True)
+    result = adjust(images(folder), tmp_path / "out", options)
+    view, point = np.tile(np.arange(3), len(ground) - half), np.repeat(np.arange(len(ground) - half), 3)
+
+    def miss(cameras):
+        found = triangulate(cameras, view, point, xy[half:].reshape(-1, 2), alt=150.0)
+        return np.sqrt(np.nanmean(found.residuals**2))
+
+    fresh = [read_rpc(tmp_path / "out" / f"{stem}_RPC.TXT") for stem in stems]
+    assert miss(models) > 0.3
+    assert 0.005 < miss(result.adjustment.sensors) < 0.03
+    assert 0.005 < miss(fresh) < 0.03
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert len(summary["views"]) == 3
+
+
+def test_the_rpc_stays_the_default(tmp_path):
+    text, _ = isd(Flight(size=SIZE, swing=0.0))
+    image = blank(tmp_path / "a.tif")
+    (tmp_path / "a.XML").write_text(text)
+    write_rpc(make_rpc(), tmp_path / "a.RPB")
+    assert open_camera(image).format == "rpb"
+    camera = open_camera(f"{image},model=physical")
+    assert (camera.format, camera.path, camera.size) == ("maxar physical model", tmp_path / "a.XML", SIZE)
+    assert camera.model == read_linescan(tmp_path / "a.XML").model
+    assert camera.alt_range == (-500.0, 9000.0)
+    assert open_camera(f"{image},model=physical,altitudes=100:900").alt_range == (100.0, 900.0)
+    straight = open_camera(f"{image},model=physical,aberration=no,refraction=no").model
+    assert (straight.light, camera.model.light) == (Light(), Light(True, True))
+    point = camera.model.localize([100.0, 100.0], np.array(0.0))
+    off = np.linalg.norm(
+        ecef_from_ground(point) - ecef_from_ground(straight.localize([100.0, 100.0], np.array(0.0)))
+    )
+    assert 10 < off < 30
+    elsewhere = tmp_path / "far" / "b.xml"
+    elsewhere.parent.mkdir()
+    (tmp_path / "a.XML").rename(elsewhere)
+    assert open_camera(f"{image},camera={elsewhere},model=physical").model == camera.model
+    with pytest.raises(ImageError, match="no metadata with a physical model beside it"):
+        open_camera(f"{image},model=physical")
+
+
+def test_the_rpc_beside_a_physical_model_tells_its_altitudes(tmp_path):
+    text, _ = isd(Flight(size=SIZE, swing=0.0))
+    rpb = _rpb()
+    (tmp_path / "a.XML").write_text(text.replace("</isd>", f"{rpb}</isd>"))
+    low, high = open_camera(tmp_path / "a.XML", model="physical").alt_range
+    assert (low, high) == (pytest.approx(166.6667 - 142.8571), pytest.approx(166.6667 + 142.8571))
+
+
+def _rpb():
+    text = write_maxar(make_rpc())
+    return text[text.index("<RPB>") : text.index("</isd>")]
+
+
+def test_pixels_of_another_size_are_refused(tmp_path):
+    text, _ = isd(Flight(size=SIZE, swing=0.0))
+    image = write_image(tmp_path / "a.tif", (1, 40, 60))
+    (tmp_path / "a.XML").write_text(text)
+    for spec in (f"{image},model=physical", f"{image},camera={tmp_path / 'a.XML'},model=physical"):
+        with pytest.raises(
+            InputError, match=r"\(60, 40\) px large, its physical model in .* of \(900, 6000\)"
+        ):
+            open_camera(spec)
+    with pytest.raises(InputError, match="model is no choice for the kind rpc"):
+        open_camera(f"{tmp_path / 'a.XML'},model=rigorous")
