@@ -67,6 +67,7 @@ def fit(
       barpc fit image.tif -o new/image_RPC.TXT --alt-range -100 2500
       barpc fit points.csv,size=20000:19000 -o points.RPB --tolerance 1
       barpc fit S1A_IW_SLC__1SDV_....SAFE,swath=iw1,pol=vv -o iw1_RPC.TXT
+      barpc fit image.tif,model=physical -o new/image_RPC.TXT --tolerance 0.5
     """
     from barpc.cameras import split_spec
 

@@ -62,6 +62,8 @@ def info(
     annotation, a SICD image (XML or NITF), or a localisation grid; choices stand behind it:
     ",size=W:H" and ",camera=FILE" (all); ",first_pixel=0.5" and ",band=2" (RPC); ",swath=iw1" (or mosaic),
     ",pol=vv", ",burst=3", ",orbit=X.EOF", ",atmosphere=yes", ",bistatic=full" (Sentinel-1); ",altitudes=0:500" (grid).
+    ",model=physical" takes the orbit and attitude in Maxar's or Airbus' XML, given or beside an image, in place of the
+    RPC; with it ",aberration=no", ",refraction=no", ",band=N", ",altitudes=0:500".
 
     \b
     Examples:

@@ -43,6 +43,7 @@ from barpc.rpcio.text import decode
 from barpc.rpcio.tiff import put_tag
 from barpc.scene import View
 from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.linescan import read_linescan
 from barpc.sensor.sentinel1 import open_product
 from barpc.sensor.sicd import open_sicd
 from barpc.tie.pairs import read_area
@@ -50,6 +51,7 @@ from barpc.workspace import Workspace
 from tests.pointio.test_foreign import binary, colmap
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
+from tests.sensor.linescan_files import Flight, dimap, isd
 from tests.sensor.radar_documents import document, nitf
 from tests.sensor.s1_product import Product
 
@@ -385,6 +387,16 @@ def _sicd_nitf() -> bytes:
         return nitf(document("PFA"), Path(folder) / "image.ntf").read_bytes()
 
 
+# --- physical models --------------------------------------------------------------------------------------
+
+_FLIGHT = Flight(size=(200, 1500))
+
+
+def _use_linescan(path: Path) -> object:
+    camera = read_linescan(path).model
+    return camera.project(camera.localize(np.array([[100.0, 20.0]]), np.array([100.0])))
+
+
 # --- lists and tables -------------------------------------------------------------------------------------
 
 
@@ -558,6 +570,8 @@ SAMPLES: dict[str, Sample] = {
     ),
     "sicd": Sample("image.xml", _use_sicd, lambda: document("INCA").encode(), (mutate_xml,), share=0.2),
     "sicd nitf": Sample("image.ntf", _use_sicd, _sicd_nitf, (), share=0.2),
+    "isd": Sample("image.XML", _use_linescan, lambda: isd(_FLIGHT)[0].encode(), (mutate_xml,)),
+    "dimap model": Sample("DIM_image.XML", _use_linescan, lambda: dimap(_FLIGHT)[0].encode(), (mutate_xml,)),
     "product zip": Sample("S1A.zip", _use_product, _safe, (), share=0.2),
     "orbit": Sample("S1A.EOF", _use_orbit, _BURSTS.eof, (mutate_xml,), _beside_orbit, share=0.2),
 }

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barpc.ba.priors import prior_sigmas
-from barpc.errors import BarpcError, InputError, RpcFormatError
+from barpc.errors import BarpcError, FitError, InputError, RpcFormatError
+from barpc.fit import fit_rpc
 from barpc.geodesy import ecef_from_ground, enu_basis
 from barpc.options import AdjustOptions
 from barpc.rpcio import read_rpc
@@ -156,6 +157,13 @@ def test_the_model_is_that_of_the_rpc_in_the_same_file(shared_data, name, bent, 
     straight = read_linescan(path, aberration=not bent, refraction=not bent).model
     other = rpc.project(straight.localize(image, np.full(len(image), low))) - image
     assert np.hypot(*other.mean(axis=0)) > 20
+
+
+def test_a_fit_to_an_attitude_that_swings_says_why_it_fails(tmp_path):
+    model = read(tmp_path, isd(Flight(swing=2e-5))[0]).model
+    with pytest.raises(FitError, match="attitude may swing within the image"):
+        fit_rpc(model, FLIGHT.size, (0.0, 500.0))
+    assert FLIGHT.sensor.advice == ""
 
 
 # --- DIMAP --------------------------------------------------------------------------------------------------
