@@ -59,10 +59,13 @@ class Fields:
         """A UTC time; RpcFormatError where it is missing or none."""
         return parse_time(self.text(path), self.name)
 
-    def numbers(self, path: str, count: int | None = None) -> Array:
-        """The finite numbers (N,) of a field; RpcFormatError where it is missing, holds others, or not `count`."""
+    def numbers(self, path: str, count: int | None = None, between: str = " ") -> Array:
+        """The finite numbers (N,) of a field; RpcFormatError where it is missing, holds others, or not `count`.
+
+        `between` is a character that may separate them, beside blanks.
+        """
         try:
-            numbers = np.array(self.text(path).split(), dtype=np.float64)
+            numbers = np.array(self.text(path).replace(between, " ").split(), dtype=np.float64)
         except ValueError as error:
             raise RpcFormatError(f"{self.name}: {path} is not a list of numbers ({error})") from error
         if not (np.abs(numbers) <= LARGEST).all():

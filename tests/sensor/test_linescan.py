@@ -182,6 +182,14 @@ def test_a_dimap_means_what_its_parts_say(tmp_path, poly, unit):
     assert misses(replace(found.model, look_origin=found.model.look_origin - 1), truth) > 0.9
 
 
+def test_commas_may_stand_between_coordinates(tmp_path):
+    text, truth = dimap(FLIGHT, poly=False)
+    commas = re.sub(r"<LOCATION_XYZ>(\S+) (\S+) (\S+)<", r"<LOCATION_XYZ>\1, \2,\3<", text)
+    assert commas != text
+    assert read(tmp_path, commas).model == read(tmp_path, text).model
+    assert misses(read(tmp_path, commas).model, truth) < 2e-3
+
+
 def test_the_attitude_of_an_image_after_midnight_counts_from_its_day(tmp_path):
     flight = Flight(swing=0.0)
     text, truth = dimap(flight)

@@ -43,7 +43,7 @@ def read(root: Fields, band: str | None = None) -> Linescan:
     points = model.all("Ephemeris/Point_List/Point")
     times = _times(points, first)
     positions, velocities = (
-        np.array([point.numbers(tag, 3) for point in points]).reshape(-1, 3)
+        np.array([point.numbers(tag, 3, ",") for point in points]).reshape(-1, 3)
         for tag in ("LOCATION_XYZ", "VELOCITY_XYZ")
     )
     ticks, quaternions = _attitude(model.one("Attitudes"), first, (size[1] - 1) * period)
