@@ -242,12 +242,19 @@ def _numbers(text: str) -> list[float]:
     return [float(part) for part in text.split(":")]
 
 
+def _interval(text: str) -> tuple[float, float]:
+    low, high = _numbers(text)
+    if not -1e4 <= low < high <= 1e5:
+        raise ValueError(text)
+    return low, high
+
+
 def _is_physical(_path: Place, _head: bytes, choices: Mapping[str, Any]) -> bool:
     return choices.get("model") == "physical"
 
 
 def _open_physical(
-    path: Place, model: str, altitudes: Sequence[float] | None = None, **choices: Any
+    path: Place, model: str, altitudes: tuple[float, float] | None = None, **choices: Any
 ) -> Camera:
     from barpc.sensor.linescan import read_linescan
 
@@ -288,7 +295,7 @@ OPENERS: dict[str, Opener] = {
         {
             "model": str,
             "band": str,
-            "altitudes": _numbers,
+            "altitudes": _interval,
             **dict.fromkeys(("aberration", "refraction"), _YES_NO),
         },
         whole=True,

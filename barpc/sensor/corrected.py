@@ -143,6 +143,11 @@ class Corrected:
     sensor: SensorModel  # the model as delivered, P
     correction: Correction  # R, T and C
 
+    @property
+    def advice(self) -> str:
+        """What to do where no RPC follows the model; empty where it does not know."""
+        return str(getattr(self.sensor, "advice", ""))
+
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]."""
         ecef = ecef_from_ground(ground)

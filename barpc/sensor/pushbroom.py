@@ -157,7 +157,8 @@ class Pushbroom(Frozen):
     def advice(self) -> str:
         """What to do where no RPC follows this model; empty where its motion is one polynomial."""
         sampled = (
-            "the attitude may swing within the image, which no RPC follows: raise the tolerance or fit a part"
+            "the attitude may swing within the image, which no RPC follows: raise the tolerance, fit a part, or"
+            " let 'barpc adjust --grids' write what the RPC leaves"
         )
         return sampled if len(self.attitude.coeffs) > 1 else ""
 

@@ -147,5 +147,8 @@ def test_pixels_of_another_size_are_refused(tmp_path):
             InputError, match=r"\(60, 40\) px large, its physical model in .* of \(900, 6000\)"
         ):
             open_camera(spec)
+    for wrong in ("100", "1:2:3", "900:100", "nan:5", "low:high"):
+        with pytest.raises(InputError, match=f"altitudes={wrong} cannot be read"):
+            open_camera(f"{tmp_path / 'a.XML'},model=physical,altitudes={wrong}")
     with pytest.raises(InputError, match="model is no choice for the kind rpc"):
         open_camera(f"{tmp_path / 'a.XML'},model=rigorous")

@@ -16,6 +16,7 @@ from barpc.geodesy import ecef_from_ground, enu_basis
 from barpc.options import AdjustOptions
 from barpc.rpcio import read_rpc
 from barpc.scene import View
+from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.pushbroom import STRAIGHT, Light
 from tests.sensor.linescan_files import Flight, dimap, inertial_sight, isd, stamp
@@ -163,6 +164,8 @@ def test_a_fit_to_an_attitude_that_swings_says_why_it_fails(tmp_path):
     model = read(tmp_path, isd(Flight(swing=2e-5))[0]).model
     with pytest.raises(FitError, match="attitude may swing within the image"):
         fit_rpc(model, FLIGHT.size, (0.0, 500.0))
+    still = Corrected(model, Correction(np.zeros(3), np.zeros(3), model.position(0)))
+    assert still.advice == model.advice
     assert FLIGHT.sensor.advice == ""
 
 
