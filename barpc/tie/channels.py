@@ -1,8 +1,9 @@
 """Contrast-blind dense matching: patches as channels of oriented gradients, correlated.
 
 Where a season, a sun or a sensor changes grey values, edges keep their place and their direction, not their sign. Every
-pixel becomes a vector of gradient magnitudes by direction modulo 180 degrees, blurred over neighbours in place and
-direction and normalised (CFOG, Ye et al. 2019), without its mean: what has no direction says nothing. Templates are
+pixel becomes its gradient with twice its angle, which is the same for both signs, blurred over neighbours and
+normalised: what has no direction says nothing. These are two numbers; more orientations (CFOG, Ye et al. 2019) say
+no more. Templates are
 correlated densely within a search area; beside it lies a decoy area of the same size, where nothing true can be: a
 peak counts where it is higher than the decoy's, and where the way back ends where it began.
 """
@@ -19,8 +20,9 @@ from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 from barpc.tie.raster import FloatImage
 
-ORIENTATIONS = 9
-_FIRST, _BLUR = 0.8, 1.2  # px: before the gradients, and of the channels
+CHANNELS = 2
+COARSE, FINE = (0.8, 1.2), (1.0, 0.7)
+"""How far pictures are blurred [px] before the gradients, and the channels: to be found, and to be found exactly."""
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
 _EDGE = 6  # px beside invalid ones that know of them
 _BATCH = 32  # templates that are correlated at a time
@@ -30,23 +32,19 @@ _GAP = 5  # px between a search area and its decoy: where a true peak ends
 _SHOWN = 0.9  # of a template must be a picture
 
 
-def channels(pixels: FloatImage, valid: BoolArray) -> FloatImage:
-    """Oriented-gradient channels (ORIENTATIONS, H, W) of a picture (H, W); zeros beside what is not valid."""
+def channels(pixels: FloatImage, valid: BoolArray, blurs: tuple[float, float] = COARSE) -> FloatImage:
+    """Channels (CHANNELS, H, W) of a picture (H, W), blurred twice [px]; zeros beside what is not valid."""
     cv2.setNumThreads(1)
     filled = np.where(valid, pixels, np.float32(pixels[valid].mean() if valid.any() else 0.0))
-    smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), _FIRST)
+    smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), blurs[0])
     east, south = cv2.Scharr(smooth, cv2.CV_32F, 1, 0), cv2.Scharr(smooth, cv2.CV_32F, 0, 1)
-    angle = np.pi * np.arange(ORIENTATIONS, dtype=np.float32) / ORIENTATIONS
-    found = np.stack([np.abs(east * np.cos(a) + south * np.sin(a)) for a in angle])
-    for one in found:
-        cv2.GaussianBlur(one, (0, 0), _BLUR, dst=one)
-    found = 0.5 * found + 0.25 * (np.roll(found, 1, axis=0) + np.roll(found, -1, axis=0))
-    size = np.sqrt((found**2).sum(axis=0))
+    length = np.sqrt(east**2 + south**2)
+    doubled = np.stack([east**2 - south**2, 2.0 * east * south]) / (length + np.float32(1e-12))
+    found = np.stack([cv2.GaussianBlur(part, (0, 0), blurs[1]) for part in doubled])
+    size = cv2.GaussianBlur(length, (0, 0), blurs[1])
     known = cv2.erode(valid.astype(np.uint8), np.ones((2 * _EDGE + 1,) * 2, np.uint8), borderValue=1) > 0
     weak = _WEAK * float(np.median(size[known])) if known.any() else 0.0
-    found -= found.mean(axis=0)
-    found *= known / (size + np.float32(weak + 1e-12))
-    return np.asarray(found, np.float32)
+    return np.asarray(found * (known / (size + np.float32(weak + 1e-12))), np.float32)
 
 
 def correlation(template: FloatImage, search: FloatImage) -> FloatImage:

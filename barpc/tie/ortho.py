@@ -18,7 +18,7 @@ from barpc.frozen import Frozen
 from barpc.geodesy import Array, metres_per_unit
 from barpc.raster import open_raster
 from barpc.scene import BoolArray, View
-from barpc.tie.channels import ORIENTATIONS, channels
+from barpc.tie.channels import CHANNELS, channels
 from barpc.tie.raster import Box, FloatImage, grow, levelled, read_pixels
 
 Terrain = Callable[[Array, Array], Array]
@@ -137,7 +137,7 @@ def of_image(view: View, band: int, patch: Patch) -> FloatImage:
 
 def of_reference(paths: Sequence[str], patch: Patch) -> FloatImage:
     """Channels (C, H, W) of a patch, of the first of several orthoimages that shows a place."""
-    nodes, whole = patch.nodes(), np.zeros((ORIENTATIONS, *patch.shape), np.float32)
+    nodes, whole = patch.nodes(), np.zeros((CHANNELS, *patch.shape), np.float32)
     for path in paths:
         sheet = Sheet.read(path)
         seen, valid = picture(path, sheet.bands, sheet.size, sheet.image(nodes), patch.shape)
@@ -159,11 +159,9 @@ def picture(
     Where it is finer than the grid, it is averaged first.
     """
     nothing = np.zeros(shape, np.float32), np.zeros(shape, dtype=bool)
-    rows, cols = (_between(np.arange(n, dtype=np.float64), n) for n in shape)
-    at = np.stack([rows @ nodes[..., i] @ cols.T for i in (0, 1)], axis=2)
-    if not np.isfinite(at).all():
+    if not np.isfinite(nodes).all():
         return nothing
-    low, high = np.floor(at.min(axis=(0, 1))).astype(int), np.ceil(at.max(axis=(0, 1))).astype(int)
+    low, high = np.floor(nodes.min(axis=(0, 1))).astype(int), np.ceil(nodes.max(axis=(0, 1))).astype(int)
     if (high < 0).any() or (low >= size).any():
         return nothing
     sides = (nodes[-1, 0] - nodes[0, 0]) / (shape[0] - 1), (nodes[0, -1] - nodes[0, 0]) / (shape[1] - 1)
@@ -178,7 +176,9 @@ def picture(
         return nothing
     if (left := apart / thin) > 1.1:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * (left**2 - 1.0) ** 0.5), np.float32)
-    x, y = np.moveaxis(((at - box[:2] + 0.5) / thin - 0.5).astype(np.float32), 2, 0)
+    rows, cols = (_between(np.arange(n, dtype=np.float64), n) for n in shape)
+    nodes = (nodes - box[:2] + 0.5) / thin - 0.5
+    x, y = ((rows @ nodes[..., i] @ cols.T).astype(np.float32) for i in (0, 1))
     found = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     inside = cv2.remap(valid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
     return np.asarray(found, np.float32), np.asarray(inside > _KNOWN)
