@@ -21,7 +21,7 @@ from barpc.scene import BoolArray, IntArray
 from barpc.tie.raster import FloatImage
 
 CHANNELS = 2
-COARSE, FINE = (0.8, 1.2), (1.0, 0.7)
+COARSE, FINE = (0.8, 0.8), (1.0, 0.7)
 """How far pictures are blurred [px] before the gradients, and the channels: to be found, and to be found exactly."""
 _WEAK = 0.5  # of the median gradient: what is weaker is noise
 _EDGE = 6  # px beside invalid ones that know of them

@@ -29,20 +29,21 @@ Files = Sequence[tuple[str, tuple[int, int]]]
 
 PATCH = 24
 """How far a patch reaches to each side when matches are registered [px]."""
-SIGMA = 0.15
+SIGMA = 0.1
 """Standard deviation of a coordinate after that, at least [px]."""
 _HALF = 16  # px: a template reaches so far to each side
 _PAD = 8  # px around what is compared, where channels do not know what lies beyond
 _TILE = 256  # px: points of a tile share a picture
 _BATCH = 32  # templates that are correlated at a time
 _PITCH = 8  # px between points, at least
-_POINTS = 200, 300, 500  # looked for: of the cameras' error, in long bands, in short ones
+_POINTS = 200, 500, 1000  # looked for: of the cameras' error, in long bands, in short ones
 _LONG, _LONGER = 48.0, 130.0  # px of half a band
 _SMALLEST = 60  # px of a side of the common part, in the coarsest picture
 _SHOWN = 0.9  # of a template must be a picture
 _BACK = 1.5  # px that the way back may miss by
 _FINER = 3  # px to each side that a finer picture is searched
 _FINEST = 3  # and the last one, of half the step
+_INNER = 16  # px: the last look sees less, so that it is the place itself that is found
 
 
 class Structure:
@@ -226,7 +227,7 @@ def register_places(
     for rows in grouped(*np.floor(reference[:, ::-1] / (step * _TILE)).T):
         at, turn = reference[rows], np.median(linear[rows], axis=0)
         near, found, _ = _found(files, band, step, at, start[rows], turn, PATCH)
-        tile = Tile.of(files, band, 0.5 * step, at, near, turn, np.full(2, _FINEST), 2 * PATCH, FINE)
+        tile = Tile.of(files, band, 0.5 * step, at, near, turn, np.full(2, _FINEST), 2 * _INNER, FINE)
         best, score[rows] = tile.peaks(tile.surfaces())
         inside = np.abs(np.rint(best) - tile.whole).max(axis=1) < _FINEST
         place[rows], ok[rows] = tile.in_b(best), found & inside
