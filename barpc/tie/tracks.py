@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from barpc.errors import TiePointError
 from barpc.geodesy import Array, ground_from_ecef
@@ -19,7 +20,7 @@ from barpc.sensor.geometry import triangulate
 from barpc.tie.features import KeypointFiles, locate
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
-from barpc.tie.matching import STRUCTURE, PairReport, match, matcher_named
+from barpc.tie.matching import STRUCTURE, THIN, PairReport, match, matcher_named
 from barpc.tie.ortho import Terrain
 from barpc.tie.pairs import Area, Pair, require_connected, select_pairs
 from barpc.tie.register import refine
@@ -31,6 +32,8 @@ logger = logging.getLogger(__name__)
 _DEFAULTS = TieOptions()
 _NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
+_SAME = 2.2  # px that registration may move a point by, rounding included
+_APART = 1e7  # px, more than an image measures
 _QUOTAS = (4, 8, 16)
 """Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
 
@@ -70,8 +73,9 @@ def find_tracks(
     area : Area, optional
         Tie points only here, as the cameras see it; None: everywhere.
     given : mapping of (int, int), ascending, to Matches
-        Pairs that others have matched: verified and registered as the rest, which is matched here. Where too few can be
-        registered (radar against optical, other seasons) they are taken at their places, as exact as they were found.
+        Pairs that others have matched: verified and registered as the rest, which is matched here; on channels where
+        grey values do not compare. Where too few can be registered they are taken at their places, as exact as they
+        were found.
     terrain : callable, optional
         lon, lat (n,) [deg] -> altitude [m above the ellipsoid], NaN outside: where structure is looked for.
 
@@ -102,12 +106,26 @@ def find_tracks(
     spreads = {p.views: r.spread for p, r in zip(pairs, reports, strict=True) if r.status == "ok"}
     linked = thin(linked, sizes, int(_SPARE * most))
     structural = [p.views for p, r in zip(pairs, reports, strict=True) if r.matcher == STRUCTURE]
-    tracks = refine(views, linked, spreads, options, structural=structural, **work)
     verified = {p.views: m for p, m in zip(pairs, found, strict=True) if p.views in given and len(m)}
+    structural += _unlike(views, verified, options, work)
+    tracks = refine(views, linked, spreads, options, structural=structural, **work)
     tracks = _with_unregistered(views, tracks, verified, options)
     tracks = thin(inside(views, tracks, area), sizes, most)
     require_tracks(views, tracks, pairs, reports, options)
     return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
+
+
+def _unlike(
+    views: Sequence[View], given: GivenMatches, options: TieOptions, work: Mapping[str, Any]
+) -> list[tuple[int, int]]:
+    """The given pairs whose grey values do not compare: too few of their matches could be registered by these."""
+    some = {
+        pair: m.select(np.linspace(0, len(m) - 1, min(len(m), THIN)).astype(int)) for pair, m in given.items()
+    }
+    linked = link([*some], [*some.values()])
+    before, after = pair_counts(linked), pair_counts(refine(views, linked, {}, options, **work))
+    shares = {pair: after.get(pair, 0) / max(before.get(pair, 0), 1) for pair in given}
+    return [pair for pair, share in shares.items() if share < 0.5 and share * len(given[pair]) < THIN]
 
 
 def _with_unregistered(
@@ -126,6 +144,10 @@ def _with_unregistered(
         logger.warning(words, views[i].name, views[j].name, count, len(known), known.sigma)
     sizes, most = [view.size for view in views], options.points_per_image
     more = thin(link(lost, [given[pair] for pair in lost]), sizes, most)
+    known, asked = (np.column_stack([_APART * part.view, part.xy]) for part in (tracks, more))
+    near = np.isfinite(cKDTree(known).query(asked, distance_upper_bound=_SAME)[0])
+    twice = np.bincount(more.point[near], minlength=more.num_points) >= 2
+    more = more.select(~twice[more.point])
     return Tracks(
         np.concatenate([tracks.view, more.view]),
         np.concatenate([tracks.point, tracks.num_points + more.point]),
