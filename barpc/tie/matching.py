@@ -59,7 +59,8 @@ _NEIGHBOURS = 12
 _LOOSE = 0.95, 0.05  # ratio and false share of the second attempt
 _LEAST = 8  # matches of it
 _LEAST_REACH = 5.0  # px of half a segment, below which matches say nothing of altitudes
-_MARGIN = 150.0  # m beyond known altitudes: how wrong cameras make them
+_MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
+_BESIDE = 100.0  # px beyond the other image at which terrain counts
 _PROBES = 12  # pixels along a side at which the terrain is asked
 
 
@@ -191,23 +192,38 @@ def match(
     tasks = [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
     found: list[tuple[Matches, PairReport]] = ordered(executor, match_pair, tasks, "match", progress)
     thin = [k for k, (_, report) in enumerate(found) if not _enough(report)]
-    if options.matcher != _DEFAULTS.matcher or not thin:  # who names a matcher wants that one
+    named = options.matcher != _DEFAULTS.matcher
+    if not thin or (named and (options.matcher != STRUCTURE or terrain is None)):  # a name is what is wanted
         return found
     known = _altitudes(
         [(tasks[k][0], matches) for k, (matches, report) in enumerate(found) if _enough(report)]
     )
     none, other = join([]), replace(options, matcher=STRUCTURE)
     again = [
-        (_within(tasks[k][0], terrain, known), (none, none), pairs[k], other)
+        ([_within(tasks[k][0], terrain, known, margin) for margin in _MARGINS], (none, none), pairs[k], other)
         for k in thin
         if "keypoints" not in found[k][1].status
     ]
-    tried: list[tuple[Matches, PairReport]] = ordered(executor, match_pair, again, STRUCTURE, progress)
+    tried: list[tuple[Matches, PairReport]] = ordered(executor, _match_within, again, STRUCTURE, progress)
     of_pair = dict(zip((task[2].views for task in again), tried, strict=True))
     return [
         _better(one, of_pair[pair.views]) if pair.views in of_pair else one
         for pair, one in zip(pairs, found, strict=True)
     ]
+
+
+def _match_within(
+    several: Sequence[tuple[View, View]],
+    keypoints: tuple[Keypoints, Keypoints],
+    pair: Pair,
+    options: TieOptions,
+) -> tuple[Matches, PairReport]:
+    """`match_pair` of two views used for some altitudes, and for fewer where it finds few: with less to confuse."""
+    tried = [match_pair(several[0], keypoints, pair, options)]
+    for views in several[1:]:
+        if not _enough(tried[-1][1]) and views[0].alt_range != several[0][0].alt_range:
+            tried.append(match_pair(views, keypoints, pair, options))
+    return _better(*tried)
 
 
 def _altitudes(ties: Sequence[tuple[tuple[View, View], Matches]]) -> tuple[float, float] | None:
@@ -222,7 +238,10 @@ def _altitudes(ties: Sequence[tuple[tuple[View, View], Matches]]) -> tuple[float
 
 
 def _within(
-    views: tuple[View, View], terrain: Terrain | None, known: tuple[float, float] | None
+    views: tuple[View, View],
+    terrain: Terrain | None,
+    known: tuple[float, float] | None,
+    margin: float = _MARGINS[0],
 ) -> tuple[View, View]:
     """Two views used for fewer altitudes: those of the terrain, or else known ones, with a margin."""
     low, high = common_range(*views)
@@ -231,11 +250,14 @@ def _within(
         xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
         ground = views[0].sensor.localize(xy, np.full(len(xy), 0.5 * (low + high)))
         heights = terrain(ground[:, 0], ground[:, 1])
-        heights = heights[np.isfinite(heights)]
+        other = views[1].sensor.project(np.column_stack([ground[:, :2], heights]))
+        with np.errstate(invalid="ignore"):
+            seen = ((other > -_BESIDE) & (other < np.add(views[1].size, _BESIDE))).all(axis=1)
+        heights = heights[seen & np.isfinite(heights)]
         known = (float(heights.min()), float(heights.max())) if len(heights) else known
-    if known is None or known[0] - _MARGIN > high or known[1] + _MARGIN < low:
+    if known is None or known[0] - margin > high or known[1] + margin < low:
         return views
-    within = max(low, known[0] - _MARGIN), min(high, known[1] + _MARGIN)
+    within = max(low, known[0] - margin), min(high, known[1] + margin)
     return replace(views[0], alt_range=within), replace(views[1], alt_range=within)
 
 
