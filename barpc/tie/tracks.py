@@ -144,16 +144,20 @@ def _with_unregistered(
         logger.warning(words, views[i].name, views[j].name, count, len(known), known.sigma)
     sizes, most = [view.size for view in views], options.points_per_image
     more = thin(link(lost, [given[pair] for pair in lost]), sizes, most)
-    known, asked = (np.column_stack([_APART * part.view, part.xy]) for part in (tracks, more))
-    near = np.isfinite(cKDTree(known).query(asked, distance_upper_bound=_SAME)[0])
-    twice = np.bincount(more.point[near], minlength=more.num_points) >= 2
-    more = more.select(~twice[more.point])
+    more = more.select(~_twice(tracks, more)[more.point])
     return Tracks(
         np.concatenate([tracks.view, more.view]),
         np.concatenate([tracks.point, tracks.num_points + more.point]),
         np.concatenate([tracks.xy, more.xy]),
         np.concatenate([tracks.sigma, more.sigma]),
     )
+
+
+def _twice(tracks: Tracks, others: Tracks) -> BoolArray:
+    """Which of other tracks, two of whose observations stand beside registered ones, show a ground point again."""
+    known, asked = (np.array([_APART * part.view, *part.xy.T]).T for part in (tracks, others))
+    near = np.isfinite(cKDTree(known).query(asked, distance_upper_bound=_SAME)[0])
+    return np.asarray(np.bincount(others.point[near], minlength=others.num_points) >= 2)
 
 
 def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
