@@ -91,7 +91,7 @@ class _Search:
             wanted, count = (4, _POINTS[1]) if half > _LONGER else (2, _POINTS[1 + (half < _LONG)])
         else:
             width = self._prediction.half_width  # a twentieth of the image, or the altitudes, may be wide
-            wanted, count = int(max(width / 10.0, min(half / 80.0, 4.0), 2.0)), _POINTS[0]
+            wanted, count = int(max(width / 20.0, min(half / 80.0, 4.0), 2.0)), _POINTS[0]
         boxes = np.array(windows)
         side = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) - boxes[:, :2].min(axis=0)
         step = 1 << int(np.ceil(np.log2(wanted)))
