@@ -219,9 +219,8 @@ def angles(seeds: int) -> None:
                 except BarpcError as error:
                     print(f"{start} {' '.join(str(error).split())[:90]} |", flush=True)
                     continue
-                errors = np.abs(scene.errors(0, 1, *common_tracks(found.tracks, 0, 1)))
-                axis = frame(first, second, np.array([[350.0, 350.0]])).axis
-                errors = errors if abs(axis[1]) > abs(axis[0]) else errors[:, ::-1]
+                errors = scene.errors(0, 1, *common_tracks(found.tracks, 0, 1))
+                errors = np.abs(frame(first, second, np.array([[350.0, 350.0]])).turn(errors))[:, ::-1]
                 spread, report = 1.4826 * np.median(errors, axis=0), found.pairs[0]
                 off = [f"{(errors[:, 0] > most).mean():.3f}" for most in (1.0, 2.0)]
                 kind = report.matcher + ", loosened" * report.loosened
