@@ -156,6 +156,8 @@ def wanted(kind: Any, rule: Rule) -> str:
 def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
     """A value as its field holds it; InputError names the field where it is of another type or out of range."""
     parts, found = get_args(kind), None
+    if get_origin(kind) is tuple and rule.unit == "file" and isinstance(value, (str, os.PathLike)):
+        value = (value,)  # of files one is as good as a list of one
     if get_origin(kind) is Mapping:
         if isinstance(value, Mapping):
             return {str(key): checked(f"{name}.{key}", parts[1], rule, item) for key, item in value.items()}
@@ -461,15 +463,13 @@ class RunOptions(Options):
         unit="url",
         spoken=True,
     )
-    matches: str | None = option(
-        None,
+    matches: tuple[str, ...] = option(
+        (),
         """Matches of pairs (CSV, npz, COLMAP, hloc, ASP), to be verified and registered; the other pairs are matched. A
         folder: of files LEFT__RIGHT of a pair.""",
         unit="file",
     )
-    matches_only: bool = option(
-        False, "Take the matches of the file as tie points as they are, and match nothing."
-    )
+    matches_only: bool = option(False, "Take the given matches as tie points as they are, and match nothing.")
     overlap_list: str | None = option(
         None, "Match only these pairs: two image names or paths a line.", unit="file"
     )
@@ -515,7 +515,7 @@ class RunOptions(Options):
             raise InputError("reference is given without dem: an orthoimage tells no heights")
         if self.reference_sigma is not None and not self.reference:
             raise InputError("reference_sigma is given without reference")
-        if self.matches_only and self.matches is None:
+        if self.matches_only and not self.matches:
             raise InputError("matches_only is given without matches: there would be no tie points")
         if self.store is not None and not BUCKET.fullmatch(self.store):
             raise InputError(f"store {self.store!r} is no s3://BUCKET/FOLDER")

@@ -192,10 +192,10 @@ def test_a_flag_says_what_is_declared(target: str) -> None:
 def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
     path = tmp_path / "o.toml"
     path.write_text('fixed_run = "earlier"\n[tie]\nband = 2\nsearch = 9\n[adjust]\nfixed = ["a"]\n')
-    flags = {"flag_tie_band": 3, "flag_adjust_fixed": ("b", "c"), "flag_matches": None, "flag_gcp": ()}
+    flags = {"flag_tie_band": 3, "flag_adjust_fixed": ("b", "c"), "flag_matches": (), "flag_gcp": ()}
     found = run_options(flags, str(path))
     assert (found.tie.band, found.tie.search, found.adjust.fixed) == (3, 9.0, ("b", "c"))
-    assert (found.fixed_run, found.matches, found.gcp) == ("earlier", None, ())
+    assert (found.fixed_run, found.matches, found.gcp) == ("earlier", (), ())
 
 
 def test_the_schema_and_the_records_agree(tmp_path: Path) -> None:

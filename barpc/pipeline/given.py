@@ -10,7 +10,8 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.geodesy import Array
-from barpc.pointio.matches import read_links, read_matches
+from barpc.pointio.links import Links
+from barpc.pointio.matches import read_links, tracks_of
 from barpc.scene import IntArray, Tracks, View
 from barpc.tie import Matches
 from barpc.tie.epipolar import grouped
@@ -20,25 +21,16 @@ logger = logging.getLogger(__name__)
 _MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
 
 
-def given_tracks(path: str | Path, views: Sequence[View]) -> Tracks:
-    """The tie points of a file as they are."""
-    tracks = read_matches(path, [view.name for view in views])
-    _require_inside(path, views, tracks.view, tracks.xy)
-    return tracks
+def given_tracks(paths: Sequence[str | Path], views: Sequence[View]) -> Tracks:
+    """The tie points of files as they are."""
+    return tracks_of(_linked(paths, views), ", ".join(map(str, paths)))
 
 
 def given_matches(
-    path: str | Path, views: Sequence[View], *, partly: bool = False
+    paths: Sequence[str | Path], views: Sequence[View], *, partly: bool = False
 ) -> dict[tuple[int, int], Matches]:
-    """The matches of a file, pair by pair; a file without any is an error, but for a part (`partly`) of the images."""
-    try:
-        links = read_links(path, [view.name for view in views])
-    except InputError as error:
-        if not partly:
-            raise
-        logger.warning("%s", error)
-        return {}
-    _require_inside(path, views, links.view, links.xy)
+    """The matches of files, pair by pair; one without any is an error, but for a part (`partly`) of the images."""
+    links = _linked(paths, views, partly)
     swapped = links.view[links.ends[:, 0]] > links.view[links.ends[:, 1]]
     ends = np.where(swapped[:, None], links.ends[:, ::-1], links.ends)
     places = links.xy[ends].reshape(-1, 4)  # so that the order of the file does not matter
@@ -50,6 +42,21 @@ def given_matches(
         if pair[0] != pair[1]:
             found[pair] = Matches(links.xy[chosen], np.zeros(len(chosen)), -1 - chosen)
     return found
+
+
+def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = False) -> Links:
+    """What the files say of the views, all of it inside their images."""
+    parts = [Links.of_pairs([])]
+    for path in paths:
+        try:
+            parts.append(read_links(path, [view.name for view in views]))
+        except InputError as error:
+            if not partly:
+                raise
+            logger.warning("%s", error)
+            continue
+        _require_inside(path, views, parts[-1].view, parts[-1].xy)
+    return Links.joined(parts[1:] or parts)
 
 
 def _require_inside(path: str | Path, views: Sequence[View], view: IntArray, xy: Array) -> None:

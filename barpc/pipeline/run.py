@@ -330,7 +330,7 @@ def _with_ties(
 ) -> Run:
     """The run with tie points: from a file, or matched, with the corrected cameras in a later pass."""
     views = run.views
-    if options.matches is not None and options.matches_only:
+    if options.matches and options.matches_only:
         return replace(run, tracks=given_tracks(options.matches, views))
     if len(views) < 2:
         return run
@@ -342,7 +342,7 @@ def _with_ties(
         given["only"] = read_pairs(options.overlap_list, views, [path for path, _ in run.left_out])
     if options.aoi is not None:
         given["area"] = read_area(options.aoi)
-    if options.matches is not None:
+    if options.matches:
         given["given"] = given_matches(options.matches, views, partly=bool(run.left_out))
     try:
         ties = find_tracks(views, options.tie, **given)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,15 +41,30 @@ class Links:
             start + np.arange(2 * len(first)).reshape(2, -1).T
             for start, (_, _, first, _) in zip(starts, given, strict=False)
         ]
-        order = np.lexsort((xy[:, 1], xy[:, 0], view))
-        table = np.column_stack([view, xy])[order]
+        joined = np.concatenate(ends) if given else np.zeros((0, 2), dtype=np.int64)
+        return Links(view.astype(np.int64), xy, np.full(len(xy), SIGMA), joined).merged()
+
+    @staticmethod
+    def joined(parts: Sequence[Links]) -> Links:
+        """The matches of several files."""
+        starts = np.cumsum([0, *(len(part.view) for part in parts)])
+        view, xy, sigma = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("view", "xy", "sigma")
+        )
+        ends = [start + part.ends for start, part in zip(starts, parts, strict=False)]
+        whole = Links(view, xy, sigma, np.concatenate(ends))
+        return whole.merged() if len(parts) > 1 else parts[0]
+
+    def merged(self) -> Links:
+        """Points of a view at the very same place as one, the most certain."""
+        table = np.column_stack([self.view, self.xy])
+        order = np.lexsort((self.sigma, *table.T[::-1]))
         new = np.ones(len(table), dtype=bool)
-        new[1:] = (table[1:] != table[:-1]).any(axis=1)
+        new[1:] = (np.diff(table[order], axis=0) != 0).any(axis=1)
         number = np.empty(len(table), dtype=np.int64)
         number[order] = np.cumsum(new) - 1
-        kept = table[new]
-        joined = number[np.concatenate(ends)] if given else np.zeros((0, 2), dtype=np.int64)
-        return Links(kept[:, 0].astype(np.int64), kept[:, 1:], np.full(len(kept), SIGMA), joined)
+        kept = order[new]
+        return Links(self.view[kept], self.xy[kept], self.sigma[kept], number[self.ends])
 
     @staticmethod
     def of_tracks(view: IntArray, track: IntArray, xy: Array, sigma: Array) -> Links:

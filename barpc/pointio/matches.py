@@ -30,7 +30,7 @@ from barpc.pointio.pairfiles import (
     pair_of,
     read_pair_files,
 )
-from barpc.scene import IntArray, Tracks
+from barpc.scene import Tracks
 from barpc.sidefile import TABLE, opened_text, read_head
 
 _COLUMNS = ("image", "col", "row", "track")
@@ -62,8 +62,7 @@ def read_matches(path: Path | str, names: Sequence[str]) -> Tracks:
 
     As `read_links`; points that are linked, by way of others too, are one track.
     """
-    links = read_links(path, names)
-    return _tracks(Path(path), links.view, links.tracks(), links.xy, links.sigma)
+    return tracks_of(read_links(path, names), path)
 
 
 def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> None:
@@ -171,8 +170,9 @@ def _table(path: Path, file: Arrays, views: ViewNames) -> Links:
     return Links.of_tracks(view[keep], point[keep], xy[keep], spread[keep])
 
 
-def _tracks(path: Path, view: IntArray, point: IntArray, xy: Array, sigma: Array) -> Tracks:
-    """Tracks sorted by point and view, without those that are seen once, or twice in one view."""
+def tracks_of(links: Links, path: Path | str) -> Tracks:
+    """Tracks of linked points, sorted by view, without those that are seen once, or twice in one view."""
+    view, point, xy, sigma = links.view, links.tracks(), links.xy, links.sigma
     order = np.lexsort((view, point))
     view, point, xy, sigma = view[order], point[order], xy[order], sigma[order]
     twice = np.zeros(len(view), dtype=bool)

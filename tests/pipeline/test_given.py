@@ -75,11 +75,11 @@ def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) 
     rows = [f"{names[0]},5,{t},{t}\n{names[1]},{width + far},{t},{t}\n" for t in range(9)]
     (tmp_path / "m.csv").write_text("image,col,row,track\n" + "".join(rows))
     if not fails:
-        assert read(tmp_path / "m.csv", views)
+        assert read([tmp_path / "m.csv"], views)
         return
     said = f"m.csv: 9 of 18 points lie outside .* in view_01, {width} x {height} pixels"
     with pytest.raises(InputError, match=said):
-        read(tmp_path / "m.csv", views)
+        read([tmp_path / "m.csv"], views)
 
 
 def test_an_image_that_is_left_out_leaves_the_rest_of_the_matches(shared_data, tmp_path) -> None:
@@ -89,6 +89,32 @@ def test_an_image_that_is_left_out_leaves_the_rest_of_the_matches(shared_data, t
     result = check([*IMAGES, *stray], RunOptions(matches=str(ties), keep_going=True))
     assert [view.name for view in result.views] == [path.stem for path in IMAGES]
     assert len(result.run.matched) == 3
+
+
+def test_several_files_are_one(tmp_path) -> None:
+    """Points at the same place of an image are one, with the smaller sigma; a file that says nothing is an error."""
+    views = load_views(IMAGES).views
+    one, two, none = (tmp_path / name for name in ("one.csv", "two.csv", "none.csv"))
+    names = [view.name for view in views]
+    rows = [
+        f"{names[i]},{5 + t},{7 + i},{t},{sigma}\n" for t in range(9) for i, sigma in ((0, 0.3), (1, 0.2))
+    ]
+    one.write_text("image,col,row,track,sigma\n" + "".join(rows))
+    rows = [f"{names[i]},{5 + t},{7 + i},x{t},0.25\n" for t in range(4, 12) for i in (1, 2)]
+    two.write_text("image,col,row,track,sigma\n" + "".join(rows))
+    tracks = given_tracks([one, two], views)
+    assert np.bincount(np.bincount(tracks.point)).tolist() == [0, 0, 7, 5]
+    assert sorted(tracks.sigma[tracks.view == 1]) == [0.2] * 9 + [0.25] * 3
+    assert {pair: len(found) for pair, found in given_matches([one, two], views).items()} == {
+        (0, 1): 9,
+        (1, 2): 8,
+    }
+    assert given_tracks([two, one], views).xy.tolist() == tracks.xy.tolist()
+    none.write_text("image,col,row,track\n")
+    with pytest.raises(InputError, match=r"none\.csv: no track"):
+        given_matches([one, none], views)
+    assert given_matches([none, one], views, partly=True).keys() == {(0, 1)}
+    assert given_matches([none], views, partly=True) == {}
 
 
 MODULE = """

@@ -53,9 +53,9 @@ def run(scene: Path, tmp_path: Path) -> Run:
     """`run(gcp=...)`: the three images, matches of the first run unless others are asked for."""
 
     def make(out: str = "out", matches: str | None = "first/matches.csv", **options: Any) -> AdjustResult:
-        given = None if matches is None else str(scene / matches)
+        given = () if matches is None else str(scene / matches)
         images = options.pop("given", sorted(scene.glob("*.tif")))
-        options = {"matches_only": given is not None, **options}
+        options = {"matches_only": matches is not None, **options}
         return adjust(images, tmp_path / out, RunOptions(matches=given, **options))
 
     return make

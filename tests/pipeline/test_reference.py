@@ -125,7 +125,7 @@ def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, ca
 
 
 def test_one_image_is_enough(options, truth, tmp_path):
-    run = adjust(IMAGES[:1], tmp_path / "run", replace(options, matches=None, matches_only=False))
+    run = adjust(IMAGES[:1], tmp_path / "run", replace(options, matches=(), matches_only=False))
     points = [p for p in truth["check_points"] if run.run.views[0].name in p["image"]]
     ground = np.array([p["ground"] for p in points])
     image = np.array([p["image"][run.run.views[0].name] for p in points])
