@@ -36,6 +36,7 @@ class View(Frozen):
     size : (int, int), width, height [px]
     sensor : SensorModel, the camera as delivered
     alt_range : (float, float), altitudes [m above the ellipsoid] that the camera is used for
+    date : str, the day the image was taken (2013-04-17); empty where nobody says
     """
 
     name: str
@@ -43,6 +44,7 @@ class View(Frozen):
     size: tuple[int, int]
     sensor: SensorModel
     alt_range: tuple[float, float]
+    date: str = ""
 
     def __post_init__(self) -> None:
         if min(self.size) < 1:

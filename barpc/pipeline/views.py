@@ -22,6 +22,7 @@ from barpc.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
 from barpc.remote import Place, Remote, located
+from barpc.rpcio.dates import date_taken
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import IMAGE, plain_path, versioned
@@ -170,6 +171,7 @@ def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str])
         size = (int(dataset.width), int(dataset.height))
         if not 1 <= band <= dataset.count:
             raise ImageError(f"{file}: has {dataset.count} band(s), no band {band}")
+        tags = dataset.tags()
     if isinstance(image, View):
         camera = Camera(image.sensor, file, "given", image.size, image.alt_range)
         if image.size != size:
@@ -179,7 +181,9 @@ def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str])
         camera = open_split(file if isinstance(file, Remote) else path, choices, size=size)
         if camera.format in ("grid", "correction") and "camera" not in choices:
             raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
-    view = View(name, file if isinstance(file, Remote) else str(file), size, camera.model, _altitudes(camera))
+    pixels = file if isinstance(file, Remote) else str(file)
+    day = (image.date if isinstance(image, View) else "") or date_taken(file, camera.path, tags)
+    view = View(name, pixels, size, camera.model, _altitudes(camera), day)
     ring = footprint(view.sensor, size, view.altitude)
     if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
         raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")

@@ -216,6 +216,11 @@ class KeypointFiles:
         """Number of keypoints."""
         return sum(self.counts)
 
+    def strongest(self, most: int) -> KeypointFiles:
+        """About `most` keypoints, the same share of every tile."""
+        share = min(1.0, most / max(len(self), 1))
+        return replace(self, counts=tuple(int(np.ceil(share * count)) for count in self.counts))
+
     def load(self, wanted: Sequence[Box] | None = None) -> tuple[Keypoints, IntArray]:
         """Keypoints of some tiles (None: of all), by row and column in a tile, and their numbers within the view."""
         parts, numbers, first = [], [np.empty(0, dtype=np.int64)], 0

@@ -58,6 +58,7 @@ _FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
 _LOOSE = 0.95, 0.05  # ratio and false share of the second attempt
 _LEAST = 8  # matches of it
+_QUICK = 500  # keypoints of a view that tell what a pair promises
 _LEAST_REACH = 5.0  # px of half a segment, below which matches say nothing of altitudes
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
 _BESIDE = 100.0  # px beyond the other image at which terrain counts
@@ -82,6 +83,7 @@ class PairReport:
     overlap: float = float("nan")  # common area over that of the smaller footprint
     matcher: str = "guided"  # that found the matches
     loosened: bool = False  # whether with loosened thresholds, in a second attempt
+    reason: str = ""  # why the pair was tried
 
 
 def match_pair(
@@ -95,7 +97,7 @@ def match_pair(
     Where few or none are found, loosened thresholds are tried, and what finds more counts.
     """
     first = _attempt(views, keypoints, pair, options)
-    if _enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
+    if enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
         return first
     if options.matcher == STRUCTURE and first[1].matches < _LEAST:  # thresholds do not say where it looks
         return first
@@ -109,7 +111,8 @@ def match_pair(
     return _better(first, (found, replace(report, loosened=True)))
 
 
-def _enough(report: PairReport) -> bool:
+def enough(report: PairReport) -> bool:
+    """Whether a pair has matches enough not to be tried again: fewer where little is in common."""
     common = report.overlap * min(report.keypoints)
     least = min(THIN, max(FEW, SHARE * common)) if common > 0 else THIN
     return report.status == "ok" and report.verified >= least
@@ -128,7 +131,15 @@ def _attempt(
 ) -> tuple[Matches, PairReport]:
     """All passes over a pair with one matcher and its thresholds."""
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
-    report = PairReport(names, "ok", counts, angle=pair.angle, overlap=pair.overlap, matcher=options.matcher)
+    report = PairReport(
+        names,
+        "ok",
+        counts,
+        angle=pair.angle,
+        overlap=pair.overlap,
+        matcher=options.matcher,
+        reason=pair.reason,
+    )
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
@@ -174,6 +185,18 @@ def _loaded(
     return (first[0], second[0]), (first[1], second[1])
 
 
+def quick_score(
+    views: tuple[View, View], keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions
+) -> int:
+    """How many of a few keypoints match, at most 5 % of them falsely: what a pair promises, at little cost."""
+    few = (keypoints[0].strongest(_QUICK), keypoints[1].strongest(_QUICK))
+    if not (len(few[0]) and len(few[1])):
+        return 0
+    search = _Search(views, _loaded(views, few, options)[0], replace(options, ratio=_LOOSE[0]))
+    coarse = search.offset()
+    return 0 if coarse is None else len(search.trusted(coarse, _LOOSE[1])[0])
+
+
 def match(
     views: Sequence[View],
     keypoints: Sequence[Keypoints | KeypointFiles],
@@ -181,23 +204,23 @@ def match(
     options: TieOptions = _DEFAULTS,
     *,
     terrain: Terrain | None = None,
+    before: Sequence[tuple[tuple[View, View], Matches]] = (),
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
     """Matches of every pair, each with its report: `match_pair` over all pairs, and `STRUCTURE` where it finds few.
 
-    `terrain`, or else the matches of other pairs, tell the altitudes at which that one looks.
+    `terrain`, or else the matches of other pairs, some of them found `before`, tell the altitudes at which that looks.
     """
     ends = [(pair, *pair.views) for pair in pairs]
     tasks = [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
     found: list[tuple[Matches, PairReport]] = ordered(executor, match_pair, tasks, "match", progress)
-    thin = [k for k, (_, report) in enumerate(found) if not _enough(report)]
+    thin = [k for k, (_, report) in enumerate(found) if not enough(report)]
     named = options.matcher != _DEFAULTS.matcher
     if not thin or (named and (options.matcher != STRUCTURE or terrain is None)):  # a name is what is wanted
         return found
-    known = _altitudes(
-        [(tasks[k][0], matches) for k, (matches, report) in enumerate(found) if _enough(report)]
-    )
+    good = [(tasks[k][0], matches) for k, (matches, report) in enumerate(found) if enough(report)]
+    known = _altitudes([*before, *good])
     none, other = join([]), replace(options, matcher=STRUCTURE)
     again = [
         ([_within(tasks[k][0], terrain, known, margin) for margin in _MARGINS], (none, none), pairs[k], other)
@@ -221,7 +244,7 @@ def _match_within(
     """`match_pair` of two views used for some altitudes, and for fewer where it finds few: with less to confuse."""
     tried = [match_pair(several[0], keypoints, pair, options)]
     for views in several[1:]:
-        if not _enough(tried[-1][1]) and views[0].alt_range != several[0][0].alt_range:
+        if not enough(tried[-1][1]) and views[0].alt_range != several[0][0].alt_range:
             tried.append(match_pair(views, keypoints, pair, options))
     return _better(*tried)
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely import affinity
 
 from barpc.errors import DisconnectedError, InputError, TiePointError
@@ -29,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 _BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined
 _ANGLE_DECAY = 15.0  # deg
+GIVEN = "given"
+"""Why a pair is tried that others have matched."""
 _MALFORMED = (
     ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, shapely.GEOSException,
 )  # fmt: skip
@@ -121,6 +121,8 @@ class Pair:
     views: tuple[int, int]  # their indices, ascending
     overlap: float  # common area over that of the smaller footprint
     angle: float  # of convergence in the middle of the common area [deg]
+    reason: str = "overlap and angle"  # why it is tried
+    likeness: int | None = None  # its quick score: of a few keypoints so many match; None: not asked
 
     @property
     def score(self) -> float:
@@ -196,7 +198,7 @@ def _overlapping_at(prints: Footprints, views: Sequence[View], options: TieOptio
     return [Pair((i, j), share, turn) for i, j, share, turn in zip(*found, strict=True)]
 
 
-def select_pairs(
+def possible_pairs(
     views: Sequence[View],
     options: TieOptions,
     *,
@@ -204,14 +206,14 @@ def select_pairs(
     area: Area | None = None,
     given: Collection[tuple[int, int]] = (),
 ) -> list[Pair]:
-    """The pairs of views to match, ascending: the best partners of every view, and what else connects them all.
+    """The pairs of views that can be matched, ascending.
 
     Parameters
     ----------
     views : sequence of View
         At least two.
     options : TieOptions
-        `min_overlap`, `angles`, `neighbours`.
+        `min_overlap`, `angles`.
     only : sequence of (int, int)
         These pairs, all that overlap, and no others.
     area : Area, optional
@@ -240,9 +242,10 @@ def select_pairs(
     )
     for i, j in sorted(wanted - {pair.views for pair in pairs}):
         logger.warning("%s - %s: listed, but they do not overlap as asked", views[i].name, views[j].name)
-    chosen = pairs if wanted or not pairs else _best(pairs, len(views), options.neighbours)
-    found = {**{pair: Pair(pair, *(float("nan"),) * 2) for pair in given}, **{p.views: p for p in pairs}}
-    return [found[pair] for pair in sorted({*given, *(pair.views for pair in chosen)})]
+    found = {pair: Pair(pair, *(float("nan"),) * 2) for pair in given}
+    found |= {pair.views: pair for pair in pairs}
+    said = {**dict.fromkeys(wanted, "listed"), **dict.fromkeys(given, GIVEN)}
+    return [replace(p, reason=said.get(views, p.reason)) for views, p in sorted(found.items())]
 
 
 def _candidates(
@@ -266,20 +269,6 @@ def _candidates(
         if worth and pair.views not in known:
             pairs.append(pair)
     return sorted(pairs, key=lambda pair: pair.views)
-
-
-def _best(pairs: Sequence[Pair], num_views: int, neighbours: int) -> list[Pair]:
-    """The best partners of every view, and the best tree that connects all views, ascending."""
-    ranked = sorted(pairs, key=lambda pair: (-pair.score, pair.views))
-    ends = tuple(np.array([pair.views for pair in ranked], dtype=np.int32).T)  # of csgraph, always
-    rank = np.arange(1, len(ranked) + 1)
-    tree = minimum_spanning_tree(coo_array((rank, ends), shape=(num_views, num_views))).data
-    chosen, taken = [], np.zeros(num_views, dtype=int)
-    for pair, connects in zip(ranked, np.isin(rank, tree), strict=True):
-        if connects or taken[list(pair.views)].min() < neighbours:
-            chosen.append(pair)
-            taken[list(pair.views)] += 1
-    return sorted(chosen, key=lambda pair: pair.views)
 
 
 def require_connected(views: Sequence[View], links: Sequence[tuple[int, int]], why: str) -> None:

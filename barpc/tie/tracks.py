@@ -17,15 +17,16 @@ from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
+from barpc.tie.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
 from barpc.tie.features import KeypointFiles, locate
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
-from barpc.tie.matching import STRUCTURE, THIN, PairReport, match, matcher_named
+from barpc.tie.matching import STRUCTURE, THIN, PairReport, enough, match, matcher_named, quick_score
 from barpc.tie.ortho import Terrain
-from barpc.tie.pairs import Area, Pair, require_connected, select_pairs
+from barpc.tie.pairs import Area, Pair, possible_pairs, require_connected
 from barpc.tie.register import refine
-from barpc.tie.store import store_of
-from barpc.tie.tasks import Progress
+from barpc.tie.store import Store, store_of
+from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 
@@ -88,18 +89,14 @@ def find_tracks(
     ImageError
         An image cannot be read.
     """
-    matcher = matcher_named(options.matcher)
-    pairs = select_pairs(views, options, only=only, area=area, given=given)
-    known, others = ([p for p in pairs if (p.views in given) is there] for there in (True, False))
     work: dict[str, Any] = {"executor": executor, "progress": progress}
     with store_of(executor) as store:
-        keypoints = [KeypointFiles(store)] * len(views)
-        if matcher.detects and others:
-            keypoints = locate(views, options, store, pairs=others, area=area, **work)
-        own = iter(match(views, keypoints, others, options, terrain=terrain, **work))
-    theirs = iter(verify(views, given, known, options, **work))
-    matched = [next(theirs if pair.views in given else own) for pair in pairs]
-    found, reports = [matches for matches, _ in matched], tuple(report for _, report in matched)
+        trials = _Trials(views, options, store, area, given, terrain, work)
+        pool = possible_pairs(views, options, only=only, area=area, given=given)
+        trials.run(pool, all_of_them=bool(only))
+    tried = sorted(trials.tried.items())
+    pairs, found = [pair for _, (pair, _, _) in tried], [matches for _, (_, matches, _) in tried]
+    reports = tuple(report for _, (_, _, report) in tried)
     require_matches(views, pairs, reports)
     sizes, most = [view.size for view in views], options.points_per_image
     linked = inside(views, link([pair.views for pair in pairs], found), area)
@@ -112,7 +109,83 @@ def find_tracks(
     tracks = _with_unregistered(views, tracks, verified, options)
     tracks = thin(inside(views, tracks, area), sizes, most)
     require_tracks(views, tracks, pairs, reports, options)
-    return TieResult(tracks, reports, tuple(len(k) for k in keypoints))
+    return TieResult(tracks, reports, tuple(len(k) for k in trials.keypoints))
+
+
+class _Trials:
+    """Pairs that are tried, round by round, until every view is tied by two paths or nothing is left to try."""
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        options: TieOptions,
+        store: Store,
+        area: Area | None,
+        given: GivenMatches,
+        terrain: Terrain | None,
+        work: dict[str, Any],
+    ) -> None:
+        self._views, self._options, self._store, self._area = views, options, store, area
+        self._given, self._terrain, self._work = given, terrain, work
+        self._compares = options.matcher == _DEFAULTS.matcher  # by keypoints
+        self.keypoints = [KeypointFiles(store)] * len(views)
+        self.tried: dict[tuple[int, int], tuple[Pair, Matches, PairReport]] = {}
+        self._scores: dict[tuple[int, int], int] = {}
+
+    def run(self, pool: Sequence[Pair], all_of_them: bool) -> None:
+        """Try the best pairs of a pool, or all, and others in place of those that fail."""
+        num, most = len(self._views), self._options.neighbours
+        chosen = pool if all_of_them else best_pairs(pool, num, most)
+        if len(chosen) < len(pool) and self._compares and several_dates(self._views):
+            pool = best_pairs(pool, num, COMPARED)
+            self._locate(pool)
+            pool = self._judged(pool)
+            chosen = best_pairs(pool, num, most)
+        else:
+            self._locate(chosen)
+        for tries in (*TRIES, 0):
+            self._try(chosen)
+            left = [pair for pair in pool if pair.views not in self.tried]
+            links = [pair.views for pair, _, report in self.tried.values() if report.status == "ok"]
+            crossing = further_pairs(left, num, links, COMPARED)
+            if not (crossing and tries):
+                break
+            chosen = further_pairs(self._judged(crossing), num, links, tries)
+
+    def _locate(self, pairs: Sequence[Pair]) -> None:
+        """Find the keypoints that pairs need."""
+        others = [pair for pair in pairs if pair.views not in self._given]
+        if others and matcher_named(self._options.matcher).detects:
+            views, options = self._views, self._options
+            self.keypoints = locate(views, options, self._store, pairs=others, area=self._area, **self._work)
+
+    def _judged(self, pairs: Sequence[Pair]) -> list[Pair]:
+        """Pairs with their quick scores, where keypoints can tell."""
+        new = [
+            p for p in pairs if self._compares and p.views not in self._given and p.views not in self._scores
+        ]
+        tasks = [(*self._ends(pair), self._options) for pair in new]
+        scores = ordered(self._work["executor"], quick_score, tasks, "compare", self._work["progress"])
+        self._scores |= {pair.views: score for pair, score in zip(new, scores, strict=True)}
+        known = self._scores
+        return [judged(self._views, p, known[p.views]) if p.views in known else p for p in pairs]
+
+    def _ends(self, pair: Pair) -> tuple[tuple[View, View], tuple[KeypointFiles, KeypointFiles]]:
+        i, j = pair.views
+        return (self._views[i], self._views[j]), (self.keypoints[i], self.keypoints[j])
+
+    def _try(self, pairs: Sequence[Pair]) -> None:
+        known, others = ([p for p in pairs if (p.views in self._given) is there] for there in (True, False))
+        before = [
+            (self._ends(pair)[0], found) for pair, found, report in self.tried.values() if enough(report)
+        ]
+        views, options = self._views, self._options
+        own = match(
+            views, self.keypoints, others, options, terrain=self._terrain, before=before, **self._work
+        )
+        theirs = verify(views, self._given, known, options, **self._work)
+        for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
+            self.tried[pair.views] = pair, found, report
 
 
 def _unlike(

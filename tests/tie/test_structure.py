@@ -9,12 +9,11 @@ import pytest
 
 from barpc.errors import TiePointError
 from barpc.scene import View
-from barpc.tie import Matches, PairReport, TieOptions, common_tracks, find_tracks, matching
+from barpc.tie import Matches, PairReport, TieOptions, common_tracks, find_tracks, matching, select_pairs
 from barpc.tie.epipolar import robust_affine
 from barpc.tie.features import join
 from barpc.tie.matcher import NO_MATCHES
 from barpc.tie.matching import STRUCTURE, _altitudes, _better, _match_within, _within, match_pair
-from barpc.tie.pairs import select_pairs
 from barpc.tie.raster import read_pixels
 from barpc.tie.structure import register_places
 from tests.scenes.season import SEASONS, disguised
