@@ -257,6 +257,7 @@ class ViewEntry(Record):
         ".3f",
         default=None,
     )
+    date: str | None = said("Day it was taken, where its metadata say so", default=None)
 
 
 class OffsetEntry(Record):
@@ -322,6 +323,10 @@ class PairEntry(Record):
         "px",
         "noise",
         ".2f",
+        default=None,
+    )
+    chosen_by: str | None = said(
+        "Why it was tried: overlap and angle, same date, quick score, connects all, second path, listed, given",
         default=None,
     )
 
@@ -684,6 +689,7 @@ def _views(run: Run) -> tuple[ViewEntry, ...]:
             camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
             fit=_fit_entry(run.fits[i]) if run.fits else None,
             outputs=dict(run.written[i]) if run.written else {},
+            date=view.date or None,
             status="adjusted",
             advice="",
         )
@@ -734,6 +740,7 @@ def _pairs(run: Run) -> tuple[PairEntry, ...]:
             tied = report.matcher + ", loosened" * report.loosened
             share, noise = report.control_share, report.spread
             entry = replace(entry, matching=plain(report), tied_by=tied, decoy_share=share, noise_px=noise)
+            entry = replace(entry, chosen_by=report.reason)
         entries.append(entry)
     return tuple(entries)
 

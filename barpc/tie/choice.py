@@ -1,8 +1,8 @@
-"""Which of the pairs that can be matched are: those that look most alike, and two paths to every view.
+"""Which of the pairs that can be matched are tried, and what in place of those that fail.
 
-A pair of two dates may share no grey value. Where the views are of several dates, all pairs are compared by a few
-keypoints first (`barpc.tie.matching.quick_score`), and the choice goes by what was found; without dates by overlap and
-angle. What fails is replaced as long as a view hangs by one pair or none.
+Without dates, overlap and angle decide, and pairs that fail are replaced as long as views are not connected. Two dates
+may share no grey value: where the views are of several, pairs are compared by a few keypoints first
+(`barpc.tie.matching.quick_score`), those most alike are tried, and two paths lead to every view where there are two.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import replace
 from math import isfinite
 
 from barpc.options import TieOptions
-from barpc.scene import View
+from barpc.scene import View, connected_labels
 from barpc.tie.pairs import GIVEN, Area, Pair, possible_pairs
 
 Link = tuple[int, int]
@@ -23,7 +23,7 @@ SAME_DATE, CONNECTS, PATH = "same date", "connects all", "second path"
 COMPARED = 32
 """Partners of a view, the best by overlap and angle, that are compared with it."""
 TRIES = (2, 4, 8)
-"""Round by round: so many pairs lead to what hangs by one pair or none, where there are so many."""
+"""Round by round: so many pairs lead to what is not tied yet, where there are so many."""
 
 
 def select_pairs(
@@ -34,8 +34,9 @@ def select_pairs(
     area: Area | None = None,
     given: Collection[Link] = (),
 ) -> list[Pair]:
-    """The pairs of views to match, ascending, by overlap and angle: the best partners of every view, two paths to it.
+    """The pairs of views to match, ascending, by overlap and angle: the best partners of every view.
 
+    What connects all views is among them.
     Parameters and errors are those of `possible_pairs`; `options.neighbours` counts, too.
     """
     pairs = possible_pairs(views, options, only=only, area=area, given=given)
@@ -63,8 +64,8 @@ def _order(pair: Pair) -> tuple[int, int, float, Link]:
     return 1 + (pair.likeness == 0), -(pair.likeness or 0), -pair.score, pair.views
 
 
-def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int) -> list[Pair]:
-    """The best partners of every view, what connects all views, and a second path to each, ascending.
+def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bool = False) -> list[Pair]:
+    """The best partners of every view, and what connects all views, `twice` by two paths, ascending.
 
     Pairs of one date take half of a view's partners at first, then what others leave. Pairs that are given are kept.
     """
@@ -84,17 +85,27 @@ def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int) -> list[P
                 taken[i] += 1
                 taken[j] += 1
     left = [pair for pair in ranked if pair.views not in chosen]
-    more = further_pairs(left, num_views, list(chosen), TRIES[0])
+    more = further_pairs(left, num_views, list(chosen), TRIES[0], twice=True) if twice else []
     return sorted([*chosen.values(), *more], key=lambda pair: pair.views)
 
 
-def further_pairs(pairs: Sequence[Pair], num_views: int, links: Sequence[Link], tries: int) -> list[Pair]:
-    """Of pairs not tried yet the best, to make `tries` paths to what the links tie by one of them or by none."""
-    part = twice_tied(num_views, links)
-    crossing = sorted((p for p in pairs if part[p.views[0]] != part[p.views[1]]), key=_order)
+def further_pairs(
+    pairs: Sequence[Pair], num_views: int, links: Sequence[Link], tries: int, twice: bool = False
+) -> list[Pair]:
+    """Of pairs not tried yet the best, to make `tries` paths between views that no path ties, or (`twice`) only one.
+
+    Pairs that have nothing in common are only worth it where there is no path at all.
+    """
+    group = connected_labels(num_views, list(links)).tolist()
+    part = twice_tied(num_views, links) if twice else group
+    crossing = []
+    for pair in sorted(pairs, key=_order):
+        i, j = pair.views
+        if group[i] != group[j] or (part[i] != part[j] and pair.likeness != 0):
+            crossing.append(pair)
     ends = [(part[i], part[j]) for i, j in [*links, *(pair.views for pair in crossing)]]
     kept = (k - len(links) for k in forests(ends, num_views, tries))
-    return [replace(crossing[k], reason=PATH) for k in kept if k >= 0]
+    return [replace(crossing[k], reason=PATH if twice else CONNECTS) for k in kept if k >= 0]
 
 
 def _root(tree: list[int], node: int) -> int:

@@ -113,7 +113,7 @@ def find_tracks(
 
 
 class _Trials:
-    """Pairs that are tried, round by round, until every view is tied by two paths or nothing is left to try."""
+    """Pairs that are tried, round by round, until the views are tied or nothing is left to try."""
 
     def __init__(
         self,
@@ -135,22 +135,23 @@ class _Trials:
     def run(self, pool: Sequence[Pair], all_of_them: bool) -> None:
         """Try the best pairs of a pool, or all, and others in place of those that fail."""
         num, most = len(self._views), self._options.neighbours
+        twice = self._compares and several_dates(self._views)
         chosen = pool if all_of_them else best_pairs(pool, num, most)
-        if len(chosen) < len(pool) and self._compares and several_dates(self._views):
+        if twice and len(chosen) < len(pool):
             pool = best_pairs(pool, num, COMPARED)
             self._locate(pool)
             pool = self._judged(pool)
-            chosen = best_pairs(pool, num, most)
+            chosen = best_pairs(pool, num, most, twice)
         else:
             self._locate(chosen)
         for tries in (*TRIES, 0):
             self._try(chosen)
             left = [pair for pair in pool if pair.views not in self.tried]
             links = [pair.views for pair, _, report in self.tried.values() if report.status == "ok"]
-            crossing = further_pairs(left, num, links, COMPARED)
+            crossing = further_pairs(left, num, links, COMPARED, twice)
             if not (crossing and tries):
                 break
-            chosen = further_pairs(self._judged(crossing), num, links, tries)
+            chosen = further_pairs(self._judged(crossing), num, links, tries, twice)
 
     def _locate(self, pairs: Sequence[Pair]) -> None:
         """Find the keypoints that pairs need."""

@@ -18,7 +18,7 @@ from tests.scenes.images import ImageOptions, Scene
 from tests.scenes.render import expose, render
 from tests.scenes.season import CLASSES, _lit
 from tests.scenes.terrain import Float32, Grid, fractal
-from tests.scenes.texture import Surface
+from tests.scenes.texture import Surface, _albedo
 
 _ANCHORS = 4  # times of the year with tones of their own, which other days lie between
 
@@ -37,6 +37,8 @@ class Years:
         Of every image [px].
     seed : int
         Another number is another scene.
+    growth : float
+        How much of the ground is that of its time of the year alone, and not of the place: 0 to 1.
     snow : float
         Part of the ground under snow in the middle of the winter.
     clouds : tuple of float
@@ -50,6 +52,7 @@ class Years:
     views: tuple[int, ...]
     size: tuple[int, int] = (256, 256)
     seed: int = 0
+    growth: float = 0.3
     snow: float = 0.5
     clouds: tuple[float, ...] = ()
     shift: float = 12.0
@@ -125,6 +128,7 @@ class _Seasons:
             [rng.permutation(np.where(np.arange(CLASSES) % 2, -1.0, 1.0)) for _ in range(_ANCHORS)]
         )
         self._roof = rng.uniform(0.1, 0.8, (_ANCHORS, len(self._base.roof)))
+        self._grown = [_albedo(rng, shape, fractal(rng, shape, 0.9), step)[0] for _ in range(_ANCHORS)]
         self._drifts = fractal(rng, shape, 1.2)  # where snow stays longest
         self._white = 0.02 * fractal(rng, shape, 0.9)
 
@@ -137,6 +141,8 @@ class _Seasons:
             return np.asarray((1 - share) * table[first] + share * table[(first + 1) % _ANCHORS])
 
         today = of(self._tone)[self._kind] + of(self._sign)[self._kind] * (self._albedo - self._local)
+        grown = (1 - share) * self._grown[first] + share * self._grown[(first + 1) % _ANCHORS]
+        today = (1 - self._years.growth) * today + self._years.growth * grown
         today = today * (1.0 + 0.05 * fractal(rng, today.shape, 0.9))
         cover = self._years.snow * max(0.0, np.cos(2 * np.pi * phase))
         if cover:

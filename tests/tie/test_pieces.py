@@ -28,7 +28,7 @@ from barpc.tie.epipolar import (
 )
 from barpc.tie.features import Share, detect_tile, join
 from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matching import MATCHERS, PairReport, _enough, _latest, _Search
+from barpc.tie.matching import MATCHERS, PairReport, enough, _latest, _Search
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import survey, tiles
 from barpc.tie.register import (
@@ -631,8 +631,8 @@ def test_a_pair_is_tried_again_where_it_has_fewer_matches_than_it_should(
     keypoints, overlap, verified, enough
 ) -> None:
     report = PairReport(("v0", "v1"), "ok", keypoints, verified, verified, overlap=overlap)
-    assert _enough(report) == enough
-    assert not _enough(replace(report, status="too few matches"))
+    assert enough(report) == enough
+    assert not enough(replace(report, status="too few matches"))
 
 
 class Scripted:

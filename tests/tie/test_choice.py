@@ -1,0 +1,196 @@
+"""Which pairs are tried: views of many dates by what a few keypoints say, and two paths to every view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from barpc.options import RunOptions
+from barpc.pipeline import adjust
+from barpc.scene import connected_groups
+from barpc.tie import TieOptions, select_pairs
+from barpc.tie.choice import best_pairs, forests, further_pairs, judged, several_dates, twice_tied
+from barpc.tie.pairs import Pair
+from tests.scenes.dates import Years
+
+from .test_pairs import METRE, camera, views
+
+
+def pairs_of(rng: np.random.Generator, num: int, count: int) -> list[Pair]:
+    """Distinct random pairs, ascending, under random angles."""
+    every = [(i, j) for i in range(num) for j in range(i + 1, num)]
+    picked = sorted(rng.choice(len(every), min(count, len(every)), replace=False).tolist())
+    return [Pair(every[k], float(rng.uniform(0.1, 1)), float(rng.uniform(0, 40))) for k in picked]
+
+
+def joined(num: int, links: list[tuple[int, int]], i: int, j: int) -> bool:
+    return any(i in group and j in group for group in connected_groups(num, links))
+
+
+# --- paths --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_twice_tied_are_views_that_no_single_link_parts(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    num = int(rng.integers(2, 10))
+    links = [pair.views for pair in pairs_of(rng, num, int(rng.integers(0, 16)))]
+    label = twice_tied(num, links)
+    for i in range(num):
+        for j in range(i):
+            less = [links, *(links[:k] + links[k + 1 :] for k in range(len(links)))]
+            assert (label[i] == label[j]) == all(joined(num, some, i, j) for some in less), (links, i, j)
+
+
+def test_two_links_between_the_same_parts_are_two_paths() -> None:
+    assert len(set(twice_tied(2, [(0, 1), (0, 1)]))) == 1
+    assert len(set(twice_tied(2, [(0, 1)]))) == 2
+    assert twice_tied(3, []) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_two_forests_keep_two_paths_wherever_there_are_two(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    num = 9
+    links = [pair.views for pair in pairs_of(rng, num, 22)]
+    kept = [links[k] for k in forests(links, num, 2)]
+    assert len(kept) <= 2 * (num - 1) < len(links)
+    before, after = twice_tied(num, links), twice_tied(num, kept)
+    assert [[a == b for b in before] for a in before] == [[a == b for b in after] for a in after]
+
+
+def test_a_second_path_is_the_best_pair_that_makes_one_and_none_is_tried_that_makes_none() -> None:
+    """Two rings that one link joins: 0-1-2 and 3-4-5; a view beside them that hangs by one."""
+    links = [(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (3, 5), (2, 3), (5, 6)]
+    left = [Pair((0, 4), 0.5, 5.0), Pair((1, 5), 0.9, 5.0), Pair((4, 6), 0.3, 5.0)]
+    found = further_pairs(left, 7, links, 2, twice=True)
+    assert [(pair.views, pair.reason) for pair in found] == [((1, 5), "second path"), ((4, 6), "second path")]
+    assert [p.views for p in further_pairs(left, 7, links, 3, twice=True)] == [(1, 5), (0, 4), (4, 6)]
+    assert further_pairs(left, 7, [*links, (0, 5), (3, 6)], 2, twice=True) == []
+    assert further_pairs(left, 7, links, 2) == []
+    assert [p.views for p in further_pairs(left, 7, links[:-1], 2)] == [(4, 6)]
+
+
+def test_what_shares_nothing_is_tried_where_there_is_no_path_and_not_for_a_second_one() -> None:
+    hopeless = Pair((0, 2), 0.9, 5.0, likeness=0)
+    assert further_pairs([hopeless], 3, [(0, 1), (1, 2)], 2, twice=True) == []
+    assert [pair.views for pair in further_pairs([hopeless], 3, [(0, 1)], 2, twice=True)] == [(0, 2)]
+
+
+# --- the choice ---------------------------------------------------------------------------------------------
+
+
+def by_overlap_and_angle(pairs: list[Pair], num: int, neighbours: int) -> set[tuple[int, int]]:
+    """The best partners of every view and the best tree, by scipy's."""
+    ranked = sorted(pairs, key=lambda pair: (-pair.score, pair.views))
+    rank = np.arange(1, len(ranked) + 1)
+    ends = tuple(np.array([pair.views for pair in ranked], dtype=np.int32).T)
+    tree = minimum_spanning_tree(coo_array((rank, ends), shape=(num, num))).data
+    chosen, taken = set(), np.zeros(num, dtype=int)
+    for number, pair in zip(rank, ranked, strict=True):
+        if number in tree or taken[list(pair.views)].min() < neighbours:
+            chosen.add(pair.views)
+            taken[list(pair.views)] += 1
+    return chosen
+
+
+@pytest.mark.parametrize("neighbours", [1, 3, 8])
+@pytest.mark.parametrize("seed", range(4))
+def test_without_dates_overlap_and_angle_choose(seed: int, neighbours: int) -> None:
+    pairs = pairs_of(np.random.default_rng(seed), 24, 180)
+    found = {pair.views for pair in best_pairs(pairs, 24, neighbours)}
+    assert found == by_overlap_and_angle(pairs, 24, neighbours)
+    more = [pair.views for pair in best_pairs(pairs, 24, neighbours, twice=True)]
+    assert found <= set(more)
+    assert len(set(twice_tied(24, more))) == len(set(twice_tied(24, [pair.views for pair in pairs])))
+
+
+def dated(count: int, days: dict[int, str]) -> list:
+    row = views(*(camera(10 * METRE * k, lean=0.0) for k in range(count)))
+    return [replace(view, date=days.get(k, "")) for k, view in enumerate(row)]
+
+
+def test_only_what_is_known_to_differ_makes_several_dates() -> None:
+    assert not several_dates(dated(3, {}))
+    assert not several_dates(dated(3, {0: "2020-01-01", 1: "2020-01-01"}))
+    assert several_dates(dated(3, {0: "2020-01-01", 2: "2020-07-01"}))
+
+
+def test_pairs_of_one_date_go_first_unless_they_share_nothing() -> None:
+    two = dated(3, {0: "2020-01-01", 1: "2020-01-01", 2: "2020-07-01"})
+    pair = Pair((0, 1), 0.9, 5.0)
+    assert judged(two, pair, 30).reason == "same date"
+    assert judged(two, pair, 0).reason == "quick score 0"  # the date is not true, or there are clouds
+    assert judged(two, Pair((1, 2), 0.9, 5.0), 30).reason == "quick score 30"
+    assert judged(dated(3, {}), pair, 30).reason == "quick score 30"
+
+
+def test_half_of_the_partners_are_left_for_other_dates() -> None:
+    """Two dates of six views each; the other date's pairs overlap less."""
+    many = dated(12, {k: "2020-01-01" if k < 6 else "2020-07-01" for k in range(12)})
+    pairs = []
+    for i in range(12):
+        for j in range(i + 1, 12):
+            same = (i < 6) == (j < 6)
+            pairs.append(judged(many, Pair((i, j), 0.9 if same else 0.5, 5.0), 50 if same else 20))
+    found = best_pairs(pairs, 12, 4)
+    across = [pair.views for pair in found if (pair.views[0] < 6) != (pair.views[1] < 6)]
+    count = np.bincount(np.array(across).ravel(), minlength=12)
+    assert count.min() >= 1
+    assert len(across) >= 10
+    assert len(found) - len(across) >= 10
+    assert len(found) < 12 * 4
+
+
+def test_what_is_given_is_kept_and_takes_no_place() -> None:
+    row = views(*(camera(10 * METRE * k, lean=0.0) for k in range(12)))
+    plain = {pair.views for pair in select_pairs(row, TieOptions(neighbours=2))}
+    more = select_pairs(row, TieOptions(neighbours=2), given=[(0, 11)])
+    assert {pair.views for pair in more} == plain | {(0, 11)}
+    assert [pair.reason for pair in more if pair.views == (0, 11)] == ["given"]
+
+
+# --- images -------------------------------------------------------------------------------------------------
+
+ORDER = (3, 0, 5, 1, 6, 2, 4)
+"""Place in the year of every view: neighbours in it look alike, the rest of the pairs shares no ground at all."""
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory):
+    years = Years(
+        tuple(np.linspace(0.0, 0.72, 7)[list(ORDER)]),
+        tuple(range(7)),
+        size=(200, 200),
+        seed=3,
+        growth=1.0,
+        snow=0.0,
+    )
+    folder = tmp_path_factory.mktemp("chain")
+    for view, place in zip(years.write(folder), ORDER, strict=True):
+        text = f"BEGIN_GROUP = IMAGE_1\n\tfirstLineTime = 2020-0{place + 1}-15T10:00:00.000000Z;\nEND;\n"
+        (folder / f"{view.name}.IMD").write_text(text)
+    return years, sorted(folder.glob("*.tif"))
+
+
+def test_a_chain_of_seasons_is_found_where_overlap_and_angle_miss_it(chain, tmp_path) -> None:
+    years, images = chain
+    options = RunOptions(tie=TieOptions(neighbours=1))
+    result = adjust(images, tmp_path / "out", options)
+    known = [replace(view, date="") for view in result.run.views]
+    alike = [
+        pair.views
+        for pair in select_pairs(known, options.tie)
+        if abs(ORDER[pair.views[0]] - ORDER[pair.views[1]]) <= 2
+    ]
+    assert len(connected_groups(7, alike)) > 1  # what would be tried without the dates
+    assert len(result.run.matched) <= 12
+    assert len(result.views) == 7
+    assert years.errors(years.delivered).min() > 2
+    assert years.errors([view.sensor for view in result.views]).max() < 0.5
+    assert [view["date"] for view in result.summary["views"]] == [f"2020-0{k + 1}-15" for k in ORDER]
+    assert {pair["chosen_by"].split()[0] for pair in result.summary["pairs"]} >= {"quick"}
