@@ -20,7 +20,7 @@ Link = tuple[int, int]
 
 SAME_DATE, CONNECTS, PATH = "same date", "connects all", "second path"
 """Why a pair is tried."""
-COMPARED = 32
+COMPARED = 48
 """Partners of a view, the best by overlap and angle, that are compared with it."""
 TRIES = (2, 4, 8)
 """Round by round: so many pairs lead to what is not tied yet, where there are so many."""

@@ -138,20 +138,18 @@ class _Trials:
         twice = self._compares and several_dates(self._views)
         chosen = pool if all_of_them else best_pairs(pool, num, most)
         if twice and len(chosen) < len(pool):
-            pool = best_pairs(pool, num, COMPARED)
             self._locate(pool)
-            pool = self._judged(pool)
-            chosen = best_pairs(pool, num, most, twice)
+            chosen = best_pairs(self._judged(best_pairs(pool, num, COMPARED)), num, most, twice)
         else:
             self._locate(chosen)
         for tries in (*TRIES, 0):
             self._try(chosen)
             left = [pair for pair in pool if pair.views not in self.tried]
             links = [pair.views for pair, _, report in self.tried.values() if report.status == "ok"]
-            crossing = further_pairs(left, num, links, COMPARED, twice)
-            if not (crossing and tries):
+            crossing = self._judged(further_pairs(left, num, links, COMPARED, twice)) if tries else []
+            chosen = further_pairs(crossing, num, links, tries, twice)
+            if not chosen:
                 break
-            chosen = further_pairs(self._judged(crossing), num, links, tries, twice)
 
     def _locate(self, pairs: Sequence[Pair]) -> None:
         """Find the keypoints that pairs need."""

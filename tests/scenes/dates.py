@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from barpc.geodesy import Array
-from barpc.scene import View
+from barpc.scene import BoolArray, View
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC
 from tests.scenes.files import _write_image
@@ -90,14 +90,13 @@ class Years:
             out.append(View(shot.name, str(path), self.size, self.delivered[i], self.scene.alt_range))
         return out
 
-    def errors(self, sensors: list[RPC]) -> Array:
-        """RMS error (N,) [px] of exact places in each view, against where all views together say the points are."""
+    def errors(self, sensors: list[RPC], seen: BoolArray | None = None) -> Array:
+        """RMS error (N,) [px] of exact places in each view (`seen`: of these), from where all together say the points are."""
         axes = (np.linspace(-30.0, 30.0, 5) * self.size[0] / 256.0 / 111e3, np.linspace(-20.0, 20.0, 3))
-        east, north, up = np.meshgrid(axes[0], axes[0], axes[1])
-        ground = self.scene.target + np.stack(
-            [east.ravel() / np.cos(np.radians(43.3)), north.ravel(), up.ravel()], 1
-        )
-        xy = np.stack([shot.exact.project(ground) for shot in self.scene.shots], axis=1)
+        east, north, up = (axis.ravel() for axis in np.meshgrid(axes[0], axes[0], axes[1]))
+        ground = self.scene.target + np.stack([east / np.cos(np.radians(43.3)), north, up], axis=1)
+        shots = np.array(self.scene.shots, dtype=object)[slice(None) if seen is None else seen]
+        xy = np.stack([shot.exact.project(ground) for shot in shots], axis=1)
         n, views = xy.shape[:2]
         index = np.tile(np.arange(views), n), np.repeat(np.arange(n), views)
         found = triangulate(sensors, *index, xy.reshape(-1, 2), alt=float(self.scene.target[2]))

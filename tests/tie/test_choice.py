@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,12 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from barpc.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.scene import connected_groups
-from barpc.tie import TieOptions, select_pairs
+from barpc.tie import TieOptions, find_tracks, select_pairs, tracks
 from barpc.tie.choice import best_pairs, forests, further_pairs, judged, several_dates, twice_tied
-from barpc.tie.pairs import Pair
+from barpc.tie.features import KeypointFiles
+from barpc.tie.matcher import NO_MATCHES
+from barpc.tie.matching import PairReport
+from barpc.tie.pairs import Pair, possible_pairs
 from tests.scenes.dates import Years
 
 from .test_pairs import METRE, camera, views
@@ -154,10 +158,130 @@ def test_what_is_given_is_kept_and_takes_no_place() -> None:
     assert [pair.reason for pair in more if pair.views == (0, 11)] == ["given"]
 
 
+# --- what is tried, round by round ---------------------------------------------------------------------------
+
+
+class Looks:
+    """Views of which some pairs would tie: what is tried of them, and what is asked for a quick score."""
+
+    def __init__(self, monkeypatch, alike, neighbours: int = 3) -> None:
+        self.alike, self.compared, self.tried = alike, [], []
+        self._options = TieOptions(neighbours=neighbours)
+        monkeypatch.setattr(
+            tracks, "locate", lambda views, _, store, **rest: [KeypointFiles(store)] * len(views)
+        )
+        monkeypatch.setattr(tracks, "match", self._match)
+        monkeypatch.setattr(tracks, "quick_score", self._score)
+
+    def _ties(self, names) -> bool:
+        return self.alike(*(int(name[1:]) for name in names))
+
+    def _match(self, views, keypoints, pairs, *args, **rest):
+        ends = [tuple(views[i].name for i in pair.views) for pair in pairs]
+        self.tried.append([pair.views for pair in pairs])
+        return [
+            (NO_MATCHES, PairReport(names, "ok" if self._ties(names) else "unlike", (9, 9))) for names in ends
+        ]
+
+    def _score(self, views, keypoints, options) -> int:
+        self.compared.append(tuple(view.name for view in views))
+        return 50 * self._ties(self.compared[-1])
+
+    def run(self, row) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """The pairs that were tried, and those of them that tie."""
+        trials = tracks._Trials(
+            row, self._options, None, None, {}, None, {"executor": None, "progress": None}
+        )
+        trials.run(possible_pairs(row, self._options), False)
+        every = sorted(trials.tried)
+        assert sorted(pair for some in self.tried for pair in some) == every  # none twice
+        return every, [pair for pair, (_, _, report) in sorted(trials.tried.items()) if report.status == "ok"]
+
+
+PLACE = np.random.default_rng(7).permutation(40)
+
+
+def neighbours_in_the_year(i: int, j: int) -> bool:
+    """Forty views along a year that has an end: a chain."""
+    return abs(int(PLACE[i]) - int(PLACE[j])) == 1
+
+
+def days(count: int) -> dict[int, str]:
+    return {k: f"2020-{1 + k // 28:02d}-{1 + k % 28:02d}" for k in range(count)}
+
+
+def test_the_one_chain_through_forty_dates_is_found_at_once(monkeypatch) -> None:
+    looks = Looks(monkeypatch, neighbours_in_the_year)
+    tried, tied = looks.run(dated(40, days(40)))
+    assert connected_groups(40, tied) == [list(range(40))]
+    assert len(tied) == 39
+    assert len(tried) <= 40 * 3
+    assert len(looks.tried) == 1
+    assert len(set(looks.compared)) == len(looks.compared) <= 40 * 39 / 2
+
+
+@pytest.mark.parametrize(
+    "said", [{}, dict.fromkeys(range(40), "2020-01-01")], ids=["no dates", "all one date"]
+)
+def test_what_fails_is_replaced_though_no_date_tells(monkeypatch, said) -> None:
+    """Two partners in the year are alike: overlap and angle find few of these pairs."""
+    looks = Looks(monkeypatch, lambda i, j: abs(int(PLACE[i]) - int(PLACE[j])) <= 3)
+    row = dated(40, said)
+    first = [pair.views for pair in select_pairs(row, TieOptions(neighbours=3)) if looks.alike(*pair.views)]
+    assert len(connected_groups(40, first)) > 5
+    tried, tied = looks.run(row)
+    assert [sorted(pair) for pair in looks.tried[0]] == [
+        list(p.views) for p in select_pairs(row, looks._options)
+    ]
+    assert connected_groups(40, tied) == [list(range(40))]
+    assert len(tried) < 40 * 39 / 4
+
+
+def test_without_dates_nothing_more_is_asked_where_all_are_tied(monkeypatch) -> None:
+    looks = Looks(monkeypatch, lambda i, j: True, neighbours=1)
+    tried, _ = looks.run(dated(12, {}))
+    assert tried == [pair.views for pair in select_pairs(dated(12, {}), TieOptions(neighbours=1))]
+    assert looks.compared == []
+
+
+def test_dates_that_lie_cost_nothing(monkeypatch) -> None:
+    """Views of opposite seasons say that they are of one day; two pairs join the seasons."""
+    looks = Looks(monkeypatch, lambda i, j: (i - j) % 2 == 0 or (i, j) in ((0, 7), (3, 10)))
+    tried, tied = looks.run(dated(12, {k: f"2020-01-{1 + k // 2:02d}" for k in range(12)}))
+    assert len(set(twice_tied(12, tied))) == 1
+    assert not set(tried) & {(k, k + 1) for k in range(0, 12, 2)}
+
+
+def test_groups_that_nothing_joins_end_after_some_tries(monkeypatch) -> None:
+    looks = Looks(monkeypatch, lambda i, j: (i - j) % 2 == 0)
+    tried, tied = looks.run(dated(12, days(12)))
+    assert [len(group) for group in connected_groups(12, tied)] == [6, 6]
+    assert 1 + 2 <= len(tried) - len(tied) <= 1 + 2 + 4 + 8
+
+
+def test_a_year_that_closes_ties_every_view_by_two_paths(monkeypatch) -> None:
+    ring = Looks(monkeypatch, lambda i, j: abs(int(PLACE[i]) - int(PLACE[j])) in (1, 39), neighbours=1)
+    _, tied = ring.run(dated(40, days(40)))
+    assert len(set(twice_tied(40, tied))) == 1
+
+
+def test_a_view_under_clouds_is_given_up_after_some_tries_and_nothing_else_is_lost(monkeypatch) -> None:
+    looks = Looks(monkeypatch, lambda i, j: 5 not in (i, j))
+    tried, tied = looks.run(dated(40, days(40)))
+    assert [len(group) for group in connected_groups(40, tied)] == [39, 1]
+    assert 3 <= sum(5 in pair for pair in tried) <= 3 + 2 + 4 + 8
+
+
+def test_two_views_of_two_dates_are_not_compared_but_matched(monkeypatch) -> None:
+    looks = Looks(monkeypatch, lambda i, j: True)
+    assert looks.run(dated(2, days(2)))[0] == [(0, 1)]
+    assert looks.compared == []
+
+
 # --- images -------------------------------------------------------------------------------------------------
 
 ORDER = (3, 0, 5, 1, 6, 2, 4)
-"""Place in the year of every view: neighbours in it look alike, the rest of the pairs shares no ground at all."""
+"""Place in the year of every view: neighbours in it look alike, those three places apart do not."""
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +289,6 @@ def chain(tmp_path_factory):
     years = Years(
         tuple(np.linspace(0.0, 0.72, 7)[list(ORDER)]),
         tuple(range(7)),
-        size=(200, 200),
         seed=3,
         growth=1.0,
         snow=0.0,
@@ -180,7 +303,8 @@ def chain(tmp_path_factory):
 def test_a_chain_of_seasons_is_found_where_overlap_and_angle_miss_it(chain, tmp_path) -> None:
     years, images = chain
     options = RunOptions(tie=TieOptions(neighbours=1))
-    result = adjust(images, tmp_path / "out", options)
+    with ThreadPoolExecutor(2) as pool:
+        result = adjust(images, tmp_path / "out", options, executor=pool)
     known = [replace(view, date="") for view in result.run.views]
     alike = [
         pair.views
@@ -192,5 +316,6 @@ def test_a_chain_of_seasons_is_found_where_overlap_and_angle_miss_it(chain, tmp_
     assert len(result.views) == 7
     assert years.errors(years.delivered).min() > 2
     assert years.errors([view.sensor for view in result.views]).max() < 0.5
+    assert find_tracks(result.run.views, options.tie).tracks == result.run.tracks
     assert [view["date"] for view in result.summary["views"]] == [f"2020-0{k + 1}-15" for k in ORDER]
     assert {pair["chosen_by"].split()[0] for pair in result.summary["pairs"]} >= {"quick"}
