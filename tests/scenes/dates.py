@@ -91,7 +91,7 @@ class Years:
         return out
 
     def errors(self, sensors: list[RPC], seen: BoolArray | None = None) -> Array:
-        """RMS error (N,) [px] of exact places in each view (`seen`: of these), from where all together say the points are."""
+        """RMS error (N,) [px] of exact places in each view, or those `seen`, from where all say the points are."""
         axes = (np.linspace(-30.0, 30.0, 5) * self.size[0] / 256.0 / 111e3, np.linspace(-20.0, 20.0, 3))
         east, north, up = (axis.ravel() for axis in np.meshgrid(axes[0], axes[0], axes[1]))
         ground = self.scene.target + np.stack([east / np.cos(np.radians(43.3)), north, up], axis=1)
