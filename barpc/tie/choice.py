@@ -34,9 +34,8 @@ def select_pairs(
     area: Area | None = None,
     given: Collection[Link] = (),
 ) -> list[Pair]:
-    """The pairs of views to match, ascending, by overlap and angle: the best partners of every view.
+    """The pairs of views to match, ascending, by overlap and angle: the best partners of every view, and a tree of all.
 
-    What connects all views is among them.
     Parameters and errors are those of `possible_pairs`; `options.neighbours` counts, too.
     """
     pairs = possible_pairs(views, options, only=only, area=area, given=given)
@@ -98,6 +97,8 @@ def further_pairs(
     """
     group = connected_labels(num_views, list(links)).tolist()
     part = twice_tied(num_views, links) if twice else group
+    if len(set(part)) < 2:
+        return []
     crossing = []
     for pair in sorted(pairs, key=_order):
         i, j = pair.views

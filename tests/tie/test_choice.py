@@ -318,4 +318,5 @@ def test_a_chain_of_seasons_is_found_where_overlap_and_angle_miss_it(chain, tmp_
     assert years.errors([view.sensor for view in result.views]).max() < 0.5
     assert find_tracks(result.run.views, options.tie).tracks == result.run.tracks
     assert [view["date"] for view in result.summary["views"]] == [f"2020-0{k + 1}-15" for k in ORDER]
-    assert {pair["chosen_by"].split()[0] for pair in result.summary["pairs"]} >= {"quick"}
+    reasons = {pair["chosen_by"].split()[0] for pair in result.summary["pairs"] if pair.get("chosen_by")}
+    assert "quick" in reasons
