@@ -1,6 +1,6 @@
 """Blocks of many dates, each with its own season: which choice of pairs ties them.
 
-    python benchmarks/dates.py                      forty dates, every fourth with two views; today's choice and before
+    python benchmarks/dates.py                      forty views of forty dates; today's choice and the one before
     python benchmarks/dates.py --dates 12 --neighbours 2 --seeds 3
 
 Rendered with known cameras (`tests/scenes/dates.py`); the delivered RPCs are shifted and stretched in the image, which
@@ -37,12 +37,11 @@ from tests.scenes.dates import Years  # noqa: E402
 warnings.simplefilter("ignore")
 
 
-def block(dates: int, seed: int, size: int, growth: float) -> Years:
-    """A scene of so many dates at random times of the year."""
-    rng = np.random.default_rng([seed, 86])
-    twice = [*range(dates), *range(0, dates, 4)]
-    phases = tuple(rng.uniform(0, 1, dates).tolist())
-    return Years(phases, tuple(sorted(twice)), (size, size), seed, growth, snow=0.6)
+def block(dates: int, twice: int, seed: int, size: int, growth: float) -> Years:
+    """A scene of so many dates at random times of the year, some with two views."""
+    phases = np.random.default_rng(seed + 100).uniform(0, 1, dates).tolist()
+    views = sorted([*range(dates), *range(twice)])
+    return Years(tuple(phases), tuple(views), (size, size), seed, growth, snow=0.6)
 
 
 def run(years: Years, views: list[View], out: Path, neighbours: int) -> str:
@@ -71,6 +70,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--dates", type=int, default=40)
+    parser.add_argument("--twice", type=int, default=0, help="dates with two views")
     parser.add_argument("--neighbours", type=int, nargs="+", default=[3])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--size", type=int, default=256, help="side of the images [px]")
@@ -85,7 +85,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|")
     rounds = tracks.TRIES
     for seed in given.seeds:
-        years = block(given.dates, seed, given.size, given.growth)
+        years = block(given.dates, given.twice, seed, given.size, given.growth)
         days = [
             date(2015 + k % 5, 1, 1) + timedelta(int(365 * phase)) for k, phase in enumerate(years.phases)
         ]
