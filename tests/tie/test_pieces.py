@@ -28,7 +28,7 @@ from barpc.tie.epipolar import (
 )
 from barpc.tie.features import Share, detect_tile, join
 from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matching import MATCHERS, PairReport, enough, _latest, _Search
+from barpc.tie.matching import MATCHERS, PairReport, _latest, _Search, enough
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import survey, tiles
 from barpc.tie.register import (
@@ -615,7 +615,7 @@ def test_tracks_must_tie_every_pair_after_registration() -> None:
 
 
 @pytest.mark.parametrize(
-    ("keypoints", "overlap", "verified", "enough"),
+    ("keypoints", "overlap", "verified", "stands"),
     [
         ((5000, 4000), 1.0, 100, True),
         ((5000, 4000), 1.0, 99, False),
@@ -628,10 +628,10 @@ def test_tracks_must_tie_every_pair_after_registration() -> None:
     ],
 )
 def test_a_pair_is_tried_again_where_it_has_fewer_matches_than_it_should(
-    keypoints, overlap, verified, enough
+    keypoints, overlap, verified, stands
 ) -> None:
     report = PairReport(("v0", "v1"), "ok", keypoints, verified, verified, overlap=overlap)
-    assert enough(report) == enough
+    assert enough(report) == stands
     assert not enough(replace(report, status="too few matches"))
 
 
