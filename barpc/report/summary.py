@@ -24,7 +24,7 @@ from barpc.report.records import Cell, Column, Number, Record, plain, said, valu
 from barpc.report.run import Run
 from barpc.scene import IntArray
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.corrected import Corrected, Correction, ImageCorrected
 from barpc.sensor.geometry import (
     Several,
     base_to_height,
@@ -33,7 +33,7 @@ from barpc.sensor.geometry import (
     ground_sample_distance,
     view_angles,
 )
-from barpc.sensor.splined import RowSpline
+from barpc.sensor.splined import RowSpline, Splined
 
 SCHEMA = 2  # Version of summary.json
 MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken
@@ -810,8 +810,10 @@ def medians(values: Array, group: IntArray, num: int) -> Array:
 
 def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
     """The correction of a view, at the ground point (3,) in the middle of its image."""
-    sensor, model = adjustment.bases[i], adjustment.cameras.unknowns.model
-    correction, covariance = adjustment.corrections[i], adjustment.covariance.view(i)
+    whole, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
+    sensor, spline = (whole.sensor, whole.correction) if isinstance(whole, Splined) else (whole, None)
+    assert isinstance(sensor, Corrected | ImageCorrected)
+    correction, covariance = sensor.correction, adjustment.covariance.view(i)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     common = (model, adjustment.params[i].tolist(), sigma)
     if not isinstance(correction, Correction):
@@ -828,7 +830,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
         translation_m=correction.translation.tolist(),
         translation_norm_m=float(np.linalg.norm(correction.translation)),
         drift_urad=(correction.drift * 1e6).tolist(),
-        **_in_image(adjustment.splines[i]),
+        **_in_image(spline),
     )
 
 
