@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.cli.images import Config, corrected, expanded, read_config, with_cameras
-from barpc.cli.options import ADJUSTMENT, MATCH, RUN, TIE, image_paths, run_options, with_flags
+from barpc.cli.options import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, run_options, with_flags
 from barpc.cli.progress import executor_for, progress_told
 from barpc.cli.terminal import echo, print_comparison, print_summary, say, tell_gate
 
@@ -23,7 +23,7 @@ _images = click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
 _out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the results.")
 
 
-@click.command("adjust")
+@click.command("adjust", cls=Grouped)
 @_images
 @_out_dir
 @click.option(
@@ -69,7 +69,7 @@ def adjust(
     return _run_from(obj, read_config(*source), images, flags, out_dir)
 
 
-@click.command("match")
+@click.command("match", cls=Grouped)
 @_images
 @_out_dir
 @with_flags(*MATCH, *TIE)
@@ -89,7 +89,7 @@ def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags
     return _run(obj, pipeline.adjust, images, flags, {"stop_after": "matching"}, out_dir=out_dir)
 
 
-@click.command("check")
+@click.command("check", cls=Grouped)
 @_images
 @click.option("--against", metavar="PATH", help="Compare with this RPC (one image), or those of this folder.")
 @with_flags(*TIE)

@@ -65,10 +65,33 @@ def field_of(target: str) -> Declared:
     return declared(record)[name]
 
 
+class Grouped(click.Command):
+    """A verb of a run, whose help lists flags by what they are about."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """What the user gives, then tie points, cameras and ground."""
+        groups = {"Tie points": TIE, "Cameras": CAMERA, "Ground": GROUND}
+        of = {_parameter(target): words for words, targets in groups.items() for target in targets}
+        rows: dict[str, list[tuple[str, str]]] = {"Files and the run": [], **{words: [] for words in groups}}
+        for option in self.get_params(ctx):
+            row = option.get_help_record(ctx)
+            if row is not None:
+                rows[of.get(option.name or "", "Files and the run")].append(row)
+        for words, listed in rows.items():
+            if listed:
+                with formatter.section(words):
+                    formatter.write_dl(listed)
+
+
+def _parameter(target: str) -> str:
+    """What click calls the flag that sets a field."""
+    return "flag_" + target.replace(".", "_")
+
+
 def flag(target: str) -> Callable[[Function], Function]:
     """The click option that sets a field: its type, range, choices, help and default are the field's own."""
     one, name = field_of(target), flag_name(target)
-    rule, kind, parameter = one.rule, one.kind, "flag_" + target.replace(".", "_")
+    rule, kind, parameter = one.rule, one.kind, _parameter(target)
     if kind is bool:  # None: the options file decides
         return click.option(name, parameter, help=rule.help, is_flag=True, default=None)
     several = get_origin(kind) is tuple
@@ -89,7 +112,12 @@ def flag(target: str) -> Callable[[Function], Function]:
         except InputError as error:
             raise click.BadParameter(str(error)) from error
 
-    listed = "" if rule.rows else "|".join(map(str, rule.choices(kind)))
+    choices = [] if rule.rows else [str(choice) for choice in rule.choices(kind)]
+    listed = "|".join(choices)
+
+    def complete(_context: click.Context, _parameter: click.Parameter, begun: str) -> list[str]:
+        return [choice for choice in choices if choice.startswith(begun)]
+
     metavar = (
         ("NAMES" if several else "NAME")
         if rule.rows
@@ -103,7 +131,15 @@ def flag(target: str) -> Callable[[Function], Function]:
     how = " Names of 'barpc convert --help', commas between." if rule.rows else " (repeatable)"
     text = rule.help + (how if several else "") + (f"  [{'; '.join(notes)}]" if notes else "")
     repeats = several and not rule.rows
-    return click.option(name, parameter, help=text, metavar=metavar, callback=convert, multiple=repeats)
+    return click.option(
+        name,
+        parameter,
+        help=text,
+        metavar=metavar,
+        callback=convert,
+        multiple=repeats,
+        shell_complete=complete,
+    )
 
 
 def _shown(default: Any) -> str:
@@ -170,7 +206,7 @@ def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOption
     options = RunOptions() if options_file is None else read_options(options_file)
     values: dict[str, Any] = {}
     for target in (*TIE, *ADJUSTMENT, *RUN, REMOTE, "fit.tolerance", "fit.localisation"):
-        value = flags.get("flag_" + target.replace(".", "_"))
+        value = flags.get(_parameter(target))
         if value is None:
             continue
         *table, name = target.split(".")

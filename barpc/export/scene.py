@@ -19,7 +19,7 @@ from barpc.report.compare import written_rpc
 from barpc.report.summary import Summary, ViewEntry
 from barpc.report.tables import RunFiles, read_summary, read_tables
 from barpc.rpcio import CARRIERS
-from barpc.rpcio.light import Light, light_of
+from barpc.rpcio.acquisition import Light, light_of
 from barpc.scene import IntArray
 from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_enu
 from barpc.sensor.rpc import RPC

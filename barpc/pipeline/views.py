@@ -22,7 +22,7 @@ from barpc.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
 from barpc.remote import Place, Remote, located
-from barpc.rpcio.dates import date_taken
+from barpc.rpcio.acquisition import date_taken
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import IMAGE, plain_path, versioned

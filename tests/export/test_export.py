@@ -17,7 +17,7 @@ from barpc.errors import InputError, OutputError
 from barpc.export import TARGETS, export_run
 from barpc.export.approx import Samples, factored, fit_affine, fit_projective, project_affine
 from barpc.rpcio import read_rpc
-from barpc.rpcio.light import light_of
+from barpc.rpcio.acquisition import light_of
 from barpc.sensor.geometry import image_grid
 
 

@@ -36,9 +36,9 @@ from barpc.report.compare import compare_runs
 from barpc.report.page import report_html
 from barpc.report.tables import read_summary
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
+from barpc.rpcio.acquisition import light_of
 from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.grids import SIGN, read_correction
-from barpc.rpcio.light import light_of
 from barpc.rpcio.text import decode
 from barpc.rpcio.tiff import put_tag
 from barpc.scene import View
