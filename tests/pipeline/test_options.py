@@ -71,6 +71,36 @@ def images(run: Run, out: Path, scene: Path) -> None:
         assert _names(out / chosen) & {".vrt", ".tif"} == suffix
 
 
+def pictures(run: Run, out: Path, scene: Path) -> None:
+    run("with")
+    run("without", pictures=False)
+    assert [(out / name / "pictures.json").exists() for name in ("with", "without")] == [True, False]
+    assert "data:image/jpeg" not in (out / "without/report.html").read_text()
+
+
+def grids(run: Run, out: Path, scene: Path) -> None:
+    run("where needed")
+    run("always", grids=True)
+    written = {
+        name: {p.name[8:] for p in (out / name).glob("view_00_*.tif")} for name in ("where needed", "always")
+    }
+    assert written == {"where needed": set(), "always": {"grid.tif", "correction.tif"}}
+
+
+def tiles(run: Run, out: Path, scene: Path) -> None:
+    run("a", tiles=100)
+    names = sorted(p.name for p in (out / "a/view_00_tiles").iterdir())
+    assert len(names) == 9  # of an image of 260 px
+    assert all(name.endswith("_RPC.TXT") for name in names)
+
+
+def resample(run: Run, out: Path, scene: Path) -> None:
+    run("a", resample=True)
+    assert {p.name for p in (out / "a").glob("*_resampled.tif")} == {
+        f"view_0{k}_resampled.tif" for k in range(3)
+    }
+
+
 def rpc_formats(run: Run, out: Path, scene: Path) -> None:
     run("a", rpc_formats=("rpb", "geom"))
     assert _names(out / "a") & {".RPB", ".geom", ".TXT"} == {".RPB", ".geom"}
@@ -264,6 +294,7 @@ def store(run: Run, out: Path, scene: Path) -> None:  # what goes there: tests/r
 
 ROWS = {
     "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
+    "pictures": pictures, "grids": grids, "tiles": tiles, "resample": resample,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
