@@ -107,7 +107,7 @@ def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, ca
     alone = adjust(IMAGES, tmp_path / "alone", replace(options, reference=()))
     flags = [
         "--matches",
-        options.matches,
+        *options.matches,
         "--matches-only",
         "--dem",
         options.dem,
