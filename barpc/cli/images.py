@@ -23,10 +23,12 @@ _DEEP = 40  # levels of a configuration
 def expanded(specs: Sequence[str]) -> list[str]:
     """Files instead of folders (their rasters, by name; a radar product is one) and of patterns that no shell took.
 
-    InputError where a folder holds no raster, or a pattern finds nothing.
+    InputError for an empty name, a folder that holds no raster, a pattern that finds nothing.
     """
     found: list[str] = []
     for spec in specs:
+        if not spec:  # what an unset variable of a shell leaves, and the current folder to all who open it
+            raise InputError("an empty name among the images; give '.' for the current folder")
         name, choices = spec, ""
         if not os.path.lexists(spec) and not is_url(spec):
             name = os.fspath(_name_of(spec))

@@ -107,6 +107,12 @@ def corrupt_tile(path: Path) -> None:
     path.write_bytes(data)
 
 
+def empty(folder: Path) -> Path:
+    """A folder with nothing in it."""
+    folder.mkdir()
+    return folder
+
+
 def moved_away(scene: Scene, degrees: float = 1.0) -> list[Path]:
     """Copies of both images, far to the east of them."""
     found = []
@@ -212,9 +218,14 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     "a truncated image": (damaged(cut(0.5)), 1, ("view_01.tif",)),
     "an image cut in its header": (damaged(cut(0.0005)), 1, ("view_01.tif",)),
     "a corrupt tile": (damaged(corrupt_tile), 1, ("view_01.tif",)),
-    "a folder for an image": (lambda s: [s.a, s.folder], 1, ("a folder",)),
+    "a folder that holds an image, and the image": (lambda s: [s.a, s.folder], 1, ("is the same file",)),
+    "a folder without images": (
+        lambda s: [s.a, empty(s.folder / "nothing")],
+        1,
+        ("a folder without images",),
+    ),
     "a device for an image": (lambda s: [s.a, "/dev/null"], 1, ("/dev/null", "device")),
-    "an empty name": (lambda s: [s.a, ""], 1, ("a folder",)),
+    "an empty name": (lambda s: [s.a, ""], 1, ("an empty name",)),
     "a name with a zero byte": (lambda s: [s.a, "a\0b.tif"], 1, ("the character", "rename it")),
     "no RPC": (damaged(lambda p: rewrite(p, camera=None) and strip_rpc(p)), 1, ("view_01.tif", "no RPC")),
     "an unparsable sidecar": (
