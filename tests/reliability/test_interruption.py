@@ -300,7 +300,7 @@ def test_stages_are_told_with_seconds_and_memory(crops, tmp_path, caplog):
     spent = time.process_time() - start
     summary = json.loads((tmp_path / "out/summary.json").read_text())
     names = [stage["stage"] for stage in summary["stages"]]
-    told = "inputs, fingerprints, tie points, adjustment, fit, write, verify, block, summary, tables, report"
+    told = "inputs, fingerprints, tie points, adjustment, fit, write, verify, block, summary, pictures, tables, report"
     assert names == told.split(", ")
     assert 0.95 * spent < sum(stage["cpu_seconds"] for stage in summary["stages"]) <= spent
     for stage in summary["stages"]:
