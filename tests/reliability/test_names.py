@@ -75,12 +75,16 @@ class Page(HTMLParser):
         super().__init__()
         self.texts: list[str] = []
         self.tags: set[str] = set()
-        self.scripts = 0
+        self.scripts: list[str | None] = []
+        self.sources: list[str] = []
+        self.attributes: set[str] = set()
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list) -> None:
         self.tags.add(tag)
-        self.scripts += tag == "script"
+        self.attributes |= {name for name, _ in attrs}
+        self.scripts += [dict(attrs).get("type")] * (tag == "script")
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href", "srcset")]
 
     def handle_data(self, data: str) -> None:
         self.texts.append(data)
@@ -131,8 +135,11 @@ def test_a_name_goes_through_every_file_and_back(names, pristine, tmp_path):
     page = Page((out / "report.html").read_text(encoding="utf-8"))
     shown = " ".join(page.texts)
     assert all(name.strip() in shown or not name.isprintable() for name in names)
-    assert page.scripts == 1
-    assert "img" not in page.tags
+    assert page.scripts == ["application/json", None]
+    assert all(
+        source.startswith(("#", "data:image/jpeg;base64,")) or source == "data:," for source in page.sources
+    )
+    assert not any(name.startswith("on") for name in page.attributes)
 
 
 @pytest.mark.parametrize("where", ["image", "folder", "output"])
