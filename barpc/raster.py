@@ -56,6 +56,7 @@ GDAL_OPTIONS: dict[str, Any] = {
     "GDAL_HTTP_MAX_RETRY": 0,
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     "GDAL_CACHEMAX": 64 << 20,  # bytes, as rasterio sets it
+    "GDAL_NUM_THREADS": "1",  # threads open the file anew: what fails in one of them nobody hears of
 }
 """Settings under which every raster is read."""
 _ALONE: dict[str, Any] = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}

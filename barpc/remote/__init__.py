@@ -220,7 +220,9 @@ class RemoteFile(io.RawIOBase):
         return _blocks.get((str(self._at), self._at.size, self._at.tag, block))
 
     def _asked(self, first: int, last: int, ahead: int) -> dict[int, bytes | None]:
-        start, stop = first * BLOCK, min(last * BLOCK + ahead, self.size)
+        most = last + ahead // BLOCK
+        end = next((i for i in range(last, most) if self._known(i) is not None), most)
+        start, stop = first * BLOCK, min(end * BLOCK, self.size)
         part = _fetch(self._at, start, stop)
         if (part.size, part.tag) != (self._at.size, self._at.tag):
             raise OSError("it was changed on its host while it was read; run the same command again")
