@@ -111,7 +111,8 @@ def test_views_of_one_name_keep_their_own_keypoints(tmp_path, texture) -> None:
 
 
 def test_keypoints_are_kept_for_a_later_pass_with_another_camera(tmp_path, texture) -> None:
-    first = view(write_image(tmp_path / "a.tif", texture))
+    blocks = {"tiled": True, "blockxsize": 64, "blockysize": 64}
+    first = view(write_image(tmp_path / "a.tif", texture, **blocks))
     options = TieOptions(tile=192)
     with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as executor:
         for sensor in (None, "corrected"):
