@@ -36,7 +36,10 @@ def read_linescan(
     aberration, refraction : bool, optional
         What bends the line of sight (`Light`); None: both for Maxar, none for DIMAP, as their attitudes ask for it.
 
-    RpcFormatError where there is no such model, or it is damaged.
+    Raises
+    ------
+    RpcFormatError
+        There is no such model, or it is damaged.
     """
     root = Fields(parse_xml(path, strip_namespaces=True), str(path))
     vendor = _VENDORS.get(root.element.tag)
