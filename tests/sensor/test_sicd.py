@@ -127,7 +127,7 @@ def test_an_rpc_holds_the_image(kind, model_of):
     alt = np.clip(alt, *model.alt_range)
     miss = np.abs(fit.rpc.project(model.localize(image, alt)) - image).max(axis=0)
     assert (miss < 1e-4).all()
-    assert (miss <= 1.1 * fit.max_ckp).all()
+    assert (miss <= 1.1 * fit.max_ckp + 1e-8).all()
     assert (miss >= 0.1 * fit.rmse_ckp).all()
 
 
