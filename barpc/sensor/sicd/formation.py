@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,7 +30,7 @@ class Aperture(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Formation(Frozen):
+class Formation(Frozen, ABC):
     """How an image was formed.
 
     Parameters
@@ -48,10 +49,10 @@ class Formation(Frozen):
         position, velocity = orbit(time)
         return Aperture(position, velocity, *self._contour(x, y, time, position, velocity, orbit))
 
+    @abstractmethod
     def _contour(
         self, x: Array, y: Array, time: Array, position: Array, velocity: Array, orbit: Curve
-    ) -> tuple[Array, Array]:
-        raise NotImplementedError
+    ) -> tuple[Array, Array]: ...
 
 
 def _to(point: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
