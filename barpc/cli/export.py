@@ -47,7 +47,7 @@ def export(
         return 0
     for path in paths:
         echo(path)
-    if any(Path(run_dir).glob("*.vrt")):
+    if target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
         say(
             "the images stay where they are: move them together with both folders, or adjust with --images copy"
         )
