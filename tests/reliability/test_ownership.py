@@ -136,7 +136,7 @@ def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, tmp_path):
 
 
 @posix
-@pytest.mark.parametrize("step", [5, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [5, pytest.param(1, marks=pytest.mark.slow)])
 def test_killed_between_any_two_outputs_the_same_command_finishes(step):
     """adjust in all formats, with copies, over a finished run; match, apply: the same bytes."""
     command = [sys.executable, "-m", "tests.reliability.trials", "--every-output", str(step)]
