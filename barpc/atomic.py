@@ -15,6 +15,8 @@ from pathlib import Path
 from barpc.errors import OutputError
 
 _MARK = ".barpc-partial-"
+STATE, PARTIAL = ".barpc", "partial"
+"""Where a run folder keeps what is on its way, and is emptied at the next start: nothing there need last."""
 
 
 @contextmanager
@@ -29,11 +31,13 @@ def replacing(
     ----------
     path : Path or str, the file to be written; its folder is made where it is missing
     overwrite : bool, replace an existing file, else an OutputError
-    durable : bool, wait until the file is on the disk; not needed for what can be made again
+    durable : bool, wait until the file is on the disk; not needed for what can be made again, never for what is on
+        its way through a run folder's room
     room : Path, optional, where the temporary folder is made, on the same disk; None: beside `path`
     """
     path = Path(path)
     _refuse_existing(path, overwrite)
+    durable = durable and f"/{STATE}/{PARTIAL}/" not in path.as_posix()
     place = (room or path.parent) / f"{_MARK}{uuid.uuid4().hex[:12]}"
     partial = place / path.name
     try:

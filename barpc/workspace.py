@@ -35,15 +35,14 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc import __version__
-from barpc.atomic import replacing
+from barpc.atomic import PARTIAL, STATE, replacing
 from barpc.errors import BarpcError, OutputError
 from barpc.frozen import Arrays, load_npz
 from barpc.remote import Remote
 
 logger = logging.getLogger(__name__)
 
-STATE = ".barpc"
-STATE_FILE, NOTES, LOCK, PARTIAL, CACHE = "state.json", "outputs.jsonl", "lock", "partial", "cache"
+STATE_FILE, NOTES, LOCK, CACHE = "state.json", "outputs.jsonl", "lock", "cache"
 _FILES = (STATE_FILE, NOTES, LOCK)
 _MAX_STATE = 32 << 20  # bytes: larger state files (some 300,000 outputs) count as missing
 _CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)

@@ -27,7 +27,10 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
         "tolerance": ("barpc.ba.rounds.TOLERANCE",),
         "min_observations": ("barpc.ba.block.MIN_OBSERVATIONS",),
     },
-    FitOptions: {"tau": ("barpc.fit.solve.TAU",), "weighted": ("barpc.fit.solve.WEIGHTED",)},
+    FitOptions: {
+        "tau": ("barpc.fit.system.TAU", "barpc.fit.solve.TAU"),
+        "weighted": ("barpc.fit.solve.WEIGHTED",),
+    },
 }
 """Record -> name -> where the constant is read."""
 

@@ -10,7 +10,8 @@ import numpy as np
 from barpc.fit.certificate import Errors, smallest_value
 from barpc.fit.points import extent
 from barpc.fit.precision import Normalization
-from barpc.fit.solve import Problem, Solution, solve_problem
+from barpc.fit.solve import Solution, solve_problem
+from barpc.fit.system import Problem
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor.rpc import RPC

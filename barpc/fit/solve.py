@@ -1,11 +1,4 @@
-"""From points to the coefficients of an RPC: the linearised system, and one function a method.
-
-One coordinate y = a(x) / b(x), b_0 = 1, is linear in its unknowns once it is multiplied by b:
-
-    w (m(x), -y m'(x)) (a, b') = w y,      w = 1 / b(x)  or 1                       (eq. 3 of the paper)
-
-m are the twenty monomials in RPC00B order, m' those without the constant one. Every method works on the triangular
-factor of (M | y), made chunk by chunk: no condition number is squared, whatever the number of points.
+"""From points to the coefficients of an RPC: one function a method, on the linearised system (`barpc.fit.system`).
 
 ``ridge``, the default: least squares with a penalty scaled by the noise. Bayes' rule for coefficients of known size:
 with noise sigma in y and a coefficient expected within +- t, the penalty is (sigma / t)^2 x^2. Exact points have no
@@ -26,45 +19,36 @@ the compressed system, which has the same singular values.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-import numpy.typing as npt
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dtpqrt
 
 from barpc.errors import FitError
 from barpc.fit.certificate import BEYOND, least_value
 from barpc.fit.points import extent
 from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
+from barpc.fit.system import (
+    EPS,
+    TAU,
+    Compressed,
+    Problem,
+    Rounding,
+    expected_size,
+    noise_scaled,
+    solution,
+)
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
-from barpc.sensor.rational import MONOMIALS, monomials
 from barpc.sensor.rpc import RPC
 
-IntArray = npt.NDArray[np.int64]
-Rounding = Callable[[Array], Array]
-"""Coefficients (...) to the nearest ones that a file can hold."""
 Found = tuple[Array, list["Compressed"], Array, int]
 """Coefficients (4, 20); final systems of col and row, penalties included; their regularisation h (2,); passes."""
 
-CHUNK = 1024
-"""Rows taken into the triangle at a time: what is worked on stays in cache."""
-_BLOCK = 8  # columns of a Householder block
-ALL = np.arange(20)
-_DEPENDENT = 1e-9  # rms of what a monomial adds to those of lower degree, on these points
-_DEGREE = np.array([0, *(len(monomial) for monomial in MONOMIALS[1:])])
-_NUMERATOR = np.array([np.inf, np.inf, 0.1, 0.03])
-_DENOMINATOR = np.array([np.inf, 1.0, 0.1, 0.01])
-_SIGMA_STEPS = 2
 COMMON = "common-denominator"
 """The method that solves col and row together, first by a ridge and then, of a model, by Gauss-Newton."""
-TAU = 0.003
-"""Standard deviation that ``ridge`` expects of a denominator coefficient of degree one (no unit)."""
 WEIGHTED = 1
 """Further passes of ``ridge`` with the residuals weighted by 1 / denominator, where that varies."""
-_EPS = float(np.finfo(np.float64).eps)
 MAX_PASSES = 20
 TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
@@ -77,216 +61,6 @@ _GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
 
-@dataclass(frozen=True, eq=False)
-class Compressed:
-    """Triangle R (k + 1, k + 1) of the QR decomposition of (M | y) of one coordinate, M of `num_points` rows.
-
-    Its last column is Q' y, its last entry the norm of the part of y that no solution reaches.
-    """
-
-    triangle: Array
-    num_points: int
-
-    @property
-    def matrix(self) -> Array:
-        """(k, k): what stands for M."""
-        return self.triangle[:-1, :-1]
-
-    @property
-    def target(self) -> Array:
-        """(k,): what stands for y."""
-        return self.triangle[:-1, -1]
-
-    @property
-    def freedom(self) -> int:
-        """Points beyond the number of unknowns, at least one."""
-        return max(self.num_points - len(self.matrix), 1)
-
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of the noise in y, from the residual of the free solution."""
-        return abs(float(self.triangle[-1, -1])) / float(np.sqrt(self.freedom))
-
-    def squares(self, solution: Array) -> float:
-        """Sum of squares of M x - y."""
-        rest = self.matrix @ solution - self.target
-        return float(rest @ rest + self.triangle[-1, -1] ** 2)
-
-    def penalized(self, penalty: Array, toward: Array | float = 0.0) -> Compressed:
-        """The system with the rows diag(`penalty`) x = `toward` below."""
-        rows = np.column_stack([np.diag(penalty), np.broadcast_to(toward, penalty.shape)])
-        return Compressed(_take_in(self.triangle, rows), self.num_points)
-
-
-def _take_in(triangle: Array, rows: Array) -> Array:
-    """Triangular factor of `triangle` on top of `rows`."""
-    block = min(_BLOCK, len(triangle))
-    factor: Array = dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0]
-    return factor
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """Points, and the offsets and scales of the RPC that is to be fitted to them."""
-
-    ground: Array  # (N, 3) lon, lat [deg], alt [m]
-    image: Array  # (N, 2) [px]
-    norm: Normalization
-    active: IntArray = field(default_factory=lambda: ALL)  # monomials in use, the constant one first
-    weight: Array | None = None  # (N,)
-    common: bool = False  # one denominator of both coordinates
-    first: Compressed | None = None  # of col without a denominator, where it is known already
-
-    def screened(self) -> Problem:
-        """The same problem without the monomials that its points do not tell from those of lower degree.
-
-        All twenty stay where altitudes abound; of points at one altitude those without H, of two altitudes those of
-        degree one in H. A dependent one would make a = b = 0 a solution.
-        """
-        first = self.compressed(0)
-        adds = np.abs(np.diag(first.matrix)[: len(self.active)]) > _DEPENDENT * np.sqrt(len(self.image))
-        return replace(self, first=first) if adds.all() else replace(self, active=self.active[adds])
-
-    def rows(
-        self,
-        axis: int,
-        denominator: Array | None = None,
-        free: bool = True,
-        numerator: Array | None = None,
-    ) -> Iterator[tuple[slice, Array]]:
-        """Rows (n, k + 1) of (M | y) of col (`axis` 0) or row (1), some hundred points at a time.
-
-        A denominator (20,) weights the rows by 1 / b; its coefficients are unknowns too where `free`. With a numerator,
-        too, they are those of the linearised a / b.
-        """
-        m, norm = len(self.active), self.norm
-        k = 2 * m - 1 if free else m
-        for start in range(0, len(self.image), CHUNK):
-            part = slice(start, start + CHUNK)
-            x = np.subtract(self.ground[part].T, norm.ground_offset[:, None], order="C")
-            basis = monomials(x / norm.ground_scale[:, None])
-            y = (self.image[part, axis] - norm.image_offset[axis]) / norm.image_scale[axis]
-            used = basis if m == len(basis) else basis[self.active]
-            if numerator is not None and denominator is not None:
-                value, below = (numerator @ basis) / (denominator @ basis), denominator @ basis
-                y = below * (y - value) + value
-            else:
-                value = y
-            block = np.empty((k + 1, len(y)))
-            block[:m] = used
-            if free:
-                np.multiply(used[1:], -value, out=block[m:k])
-            block[k] = y
-            if denominator is not None:
-                block[: k + 1 if free else m] /= denominator @ basis
-            if self.weight is not None:
-                block *= self.weight[part]
-            yield part, block.T
-
-    def compressed(
-        self,
-        axis: int,
-        denominator: Array | None = None,
-        free: bool = True,
-        numerator: Array | None = None,
-    ) -> Compressed:
-        """The system of the rows of the same parameters."""
-        if self.first is not None and axis == 0 and denominator is None and free:
-            return self.first
-        size = 2 * len(self.active) if free else len(self.active) + 1
-        triangle: Array = np.zeros((size, size), order="F")
-        for _, rows in self.rows(axis, denominator, free, numerator):
-            triangle = _take_in(triangle, rows)
-        return Compressed(np.triu(triangle), len(self.image))
-
-    @property
-    def parts(self) -> tuple[tuple[int, ...], ...]:
-        """The coordinates that have unknowns in common."""
-        return ((0, 1),) if self.common else ((0,), (1,))
-
-    def system(
-        self, axes: Sequence[int], denominator: Array | None = None, numerators: Sequence[Array] = ()
-    ) -> Compressed:
-        """The system of a part: `compressed` of one coordinate, or both above each other with one denominator."""
-        above = numerators if len(numerators) else [None] * len(axes)
-        each = [self.compressed(i, denominator, numerator=a) for i, a in zip(axes, above, strict=True)]
-        if len(each) == 1:
-            return each[0]
-        m, (col, row) = len(self.active), (system.triangle for system in each)
-        row = row * self.aspect
-        nothing = np.zeros((len(col), m))
-        both = np.vstack([np.hstack([col[:, :m], nothing, col[:, m:]]), np.hstack([nothing, row])])
-        size = both.shape[1]
-        triangle = _take_in(np.zeros((size, size), order="F"), both)
-        return Compressed(np.triu(triangle), 2 * len(self.image))
-
-    @property
-    def aspect(self) -> float:
-        """What a row counts for beside a column where they are solved together: both in pixels."""
-        return float(self.norm.image_scale[1] / self.norm.image_scale[0])
-
-    def expanded(self, solution: Array, denominator: Array | None = None) -> Array:
-        """Numerators, one or two, and denominator (n + 1, 20) of a solution; monomials not in use are zero."""
-        m = len(self.active)
-        count = max(len(solution) // m, 1)
-        out = np.zeros((count + 1, 20))
-        out[:count, self.active] = solution[: count * m].reshape(count, m)
-        if denominator is not None:
-            out[-1] = denominator
-        else:
-            out[-1, 0], out[-1, self.active[1:]] = 1.0, solution[count * m :]
-        return out
-
-    def errors(self, axis: int, x: Array) -> Array:
-        """What a solution leaves of a coordinate (N,), in scales of the image."""
-        rows = self.rows(axis, self.expanded(x)[-1])
-        return np.concatenate([np.abs(block[:, :-1] @ x - block[:, -1]) for _, block in rows])
-
-    def packed(self, expanded: Array) -> Array:
-        """The solution (k,) that `expanded` makes numerators and denominator of."""
-        return np.concatenate([*expanded[:-1, self.active], expanded[-1, self.active[1:]]])
-
-
-def expected_size(active: IntArray, numerators: int = 1) -> Array:
-    """Size (k,) expected of each unknown, those of the denominator last; infinite where nothing is expected.
-
-    Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
-    of degree two, a hundredth of degree three: what vendors' RPCs show, with room.
-    """
-    degree = _DEGREE[active]
-    return np.concatenate([*[_NUMERATOR[degree]] * numerators, TAU * _DENOMINATOR[degree[1:]]])
-
-
-def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float]:
-    """The system with each unknown penalised by sigma / its expected size, and sigma.
-
-    The free solution lets noisy denominators shrink, and the residual with them; the residual of the
-    penalised one tells the noise better. Never quite singular: there is a floor at the rounding.
-    """
-    floor = 16 * _EPS * float(np.abs(system.matrix).max())
-    sigma = system.sigma
-    for _ in range(_SIGMA_STEPS):
-        penalty = np.where(np.isfinite(expected), np.maximum(sigma / expected, floor), 0.0)
-        penalised = system.penalized(penalty)
-        sigma = float(np.sqrt(system.squares(solution(penalised)) / system.freedom))
-    return penalised, sigma
-
-
-def solution(system: Compressed, quantize: Rounding | None = None) -> Array:
-    """The least-squares solution (k,), by back substitution.
-
-    Where quantized, each coefficient is rounded in turn and the ones still to come make up for it (Babai's nearest
-    plane).
-    """
-    matrix, target = system.matrix, system.target
-    if quantize is None:
-        return np.asarray(solve_triangular(matrix, target))
-    x = np.zeros(len(target))
-    for i in range(len(x) - 1, -1, -1):
-        x[i] = quantize((target[i] - matrix[i, i + 1 :] @ x[i + 1 :]) / matrix[i, i])
-    return x
-
-
 def corner(systems: Sequence[Compressed]) -> float:
     """Regularisation h at the corner of the L-curve of systems that share it: the largest curvature, by grids of h.
 
@@ -297,7 +71,7 @@ def corner(systems: Sequence[Compressed]) -> float:
     s = np.concatenate([part.S for part in parts])
     beta = np.concatenate([part.U.T @ system.target for part, system in zip(parts, systems, strict=True)])
     rest = sum(float(system.triangle[-1, -1]) ** 2 for system in systems)
-    low = max(float(s.min()), float(s.max()) * 16 * _EPS)
+    low = max(float(s.min()), float(s.max()) * 16 * EPS)
     high = float(s.max())
     for _ in range(4):
         h = np.geomspace(low, high, _SAMPLES)

@@ -24,7 +24,8 @@ from barpc.fit.points import (
     widened,
 )
 from barpc.fit.rpc import relative_weight, underlying_rpc
-from barpc.fit.solve import ALL, Problem, _curvature, expected_size, noise_scaled, solution, solve_lcurve
+from barpc.fit.solve import _curvature, solve_lcurve
+from barpc.fit.system import ALL, Problem, expected_size, noise_scaled, solution
 from barpc.sensor.rpc import RPC
 from tests.constants import CONSTANTS, chosen
 from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc

@@ -7,16 +7,8 @@ import pytest
 
 from barpc.fit import Normalization
 from barpc.fit.precision import PRECISIONS
-from barpc.fit.solve import (
-    ALL,
-    Compressed,
-    Problem,
-    _reweighted,
-    corner,
-    expected_size,
-    noise_scaled,
-    solution,
-)
+from barpc.fit.solve import _reweighted, corner
+from barpc.fit.system import ALL, Compressed, Problem, expected_size, noise_scaled, solution
 from barpc.geodesy import Array
 from tests.fit.cameras import Camera, random_points
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -67,6 +68,23 @@ def test_every_format_is_written_under_its_name_and_read_back(tmp_path, view, fi
         assert read_rpc(tmp_path / "out" / name) == fit.rpc
         assert readings["barpc"] < 1e-5, name
         assert {type(value) for value in readings.values()} <= {float, str}
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="the names of open files are not to be had")
+def test_every_file_is_put_on_the_disk_once_and_its_note_before_it(tmp_path, view, fit, monkeypatch) -> None:
+    seen, sync = [], os.fsync
+
+    def recorded(descriptor: int) -> None:
+        seen.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+        sync(descriptor)
+
+    with Workspace(tmp_path / "out") as run:
+        monkeypatch.setattr(os, "fsync", recorded)
+        write_view(run, view, fit, make_rpc(), "vrt", ("txt",))
+    mine = [name for name in seen if name.startswith(("scene", "outputs"))]
+    assert mine == ["outputs.jsonl", "scene.vrt", "outputs.jsonl", "scene_RPC.TXT"]
+    # the folder after every file, or a name could be lost
+    assert [seen[seen.index(name) + 1] for name in ("scene.vrt", "scene_RPC.TXT")] == ["out", "out"]
 
 
 class Elsewhere:
