@@ -37,8 +37,8 @@ JOURNEYS = {
     "model -> RPC": (
         ("fit/rpc.py", "fit_rpc", "any sensor model"),
         ("fit/points.py", "control_points", "-> a grid of ground and image points"),
-        ("fit/system.py", "Problem", "-> the linearised system, its triangle"),
         ("fit/solve.py", "solve", "-> coefficients, ridge first"),
+        ("fit/system.py", "Problem", "-> the linearised system, its triangle"),
         ("fit/certificate.py", "smallest_denominator", "-> no pole, by a bound"),
         ("fit/certificate.py", "roundtrip", "-> the certificate, on points that the fit has not seen"),
     ),
