@@ -18,7 +18,7 @@ from barpc.report.summary import Summary
 PAGE = Path(__file__).with_name("summary.md")
 HEAD = """# The values of summary.json
 
-<!-- Written by docs/generate_summary.py. Edit the records in barpc/report/summary.py, then run it again. -->
+<!-- Written by docs/generate_summary.py. Edit the records in barpc/report/summary/, then run it again. -->
 
 Pixel (0, 0) is the centre of the first one. A number that is not finite is null. An *optional* value may be missing.
 The same as a [JSON schema](summary.schema.json).

@@ -1,0 +1,178 @@
+"""The summary of a run: what summary.json holds. In here alone stands what a value is, its column, how it is measured.
+
+A new value is a field with what is `said` of it and a line in the function that measures its record; named among the
+columns of a table there, it stands in that, too. A module for each thing: views, pairs, scene, ground points.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from importlib.metadata import version as package_version
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from barpc import __version__
+from barpc.report.records import Number, Record, plain, said
+from barpc.report.run import Run
+from barpc.report.summary.ground import (
+    GCPS,
+    CheckPointEntry,
+    GcpEntry,
+    KnownPoint,
+    ReferenceEntry,
+    ReferenceViewEntry,
+    SeenEntry,
+    measure_check_points,
+    measure_gcps,
+    measure_reference,
+)  # fmt: skip
+from barpc.report.summary.pairs import OffsetEntry, PairEntry, measure_pairs
+from barpc.report.summary.scene import (
+    DATUM,
+    DatumEntry,
+    DemEntry,
+    ModeEntry,
+    SceneEntry,
+    measure_scene,
+    mode_in_words,
+)
+from barpc.report.summary.views import (
+    CELLS,
+    CenterEntry,
+    CorrectionEntry,
+    FitEntry,
+    SourceEntry,
+    ViewEntry,
+    cell_numbers,
+    measure_views,
+    shift_in_image,
+)  # fmt: skip
+from barpc.report.summary.words import ABOVE, STATUS_WORDS, Count, largest, listed, median, metres
+
+__all__ = [
+    "CELLS", "DATUM", "GCPS", "SCHEMA", "STATUS_WORDS", "CenterEntry", "CheckPointEntry", "CorrectionEntry",
+    "DatumEntry", "DemEntry", "FitEntry", "GcpEntry", "KnownPoint", "LeftOutEntry", "ModeEntry", "OffsetEntry",
+    "PairEntry", "ReferenceEntry", "ReferenceViewEntry", "SceneEntry", "SeenEntry", "SourceEntry", "StageEntry",
+    "Summary", "TablesEntry", "TracksEntry", "ViewEntry", "cell_numbers", "largest", "listed", "measure", "median",
+    "metres", "mode_in_words", "published_schema", "shift_in_image",
+]  # fmt: skip
+
+SCHEMA = 2  # Version of summary.json
+_Plain = float | str | bool | None
+_Value = _Plain | tuple[_Plain, ...] | tuple[tuple[_Plain, ...], ...]
+
+
+class LeftOutEntry(Record):
+    """A file that was left out."""
+
+    path: str = said("File")
+    reason: str = said("Why")
+
+
+class TracksEntry(Record):
+    """The tie points."""
+
+    num_tracks: Count = said("Tie points")
+    num_observations: Count = said("Their observations")
+    by_length: Mapping[str, int] = said("Number of views -> tie points seen in so many")
+
+
+class TablesEntry(Record):
+    """How much of the tie points the tables hold."""
+
+    num_usable_tracks: Count = said("Tie points with a ground position")
+    num_written_tracks: Count = said("Of these, in the tables (at most 200,000, evenly taken)")
+    complete: bool = said("Whether that is all")
+
+
+class StageEntry(Record):
+    """A stage of the run."""
+
+    MORE: ClassVar = _Plain
+    PAGE: ClassVar = "stage seconds cpu_seconds peak_memory_mb"
+
+    stage: str = said("Name", head="stage")
+    seconds: float = said("Wall time in seconds", head="seconds", form=".2f")
+    cpu_seconds: float = said("CPU time in seconds", head="CPU seconds", form=".2f")
+    peak_memory_mb: float = said("Peak memory so far", "MB", "peak memory", ".0f")
+
+
+class Summary(Record):
+    """summary.json of a run."""
+
+    schema: int = said("Version of this description", const=SCHEMA)
+    barpc: str = said("Release")
+    kind: Literal["adjust", "check", "match"] = said("Whether cameras were adjusted, looked at, or only tied")
+    status: Literal["good", "look", "bad"] = said("The verdict on the whole")
+    headline: str = said("The verdict in a sentence")
+    verdict: tuple[str, ...] = said("What was reached, what is unknown, what needs a look")
+    reasons: tuple[str, ...] = said("Those of its sentences that say why it is not good")
+    passed: bool = said("Whether it is good: no image, point or file has a reservation (exit code 0, else 3)")
+    out_dir: str = said("Where the results are")
+    altitude_m: Number = said("Median altitude of the tie points", ABOVE)
+    views: tuple[ViewEntry, ...] = said("The images", minItems=1)
+    pairs: tuple[PairEntry, ...] = said("Pairs with tie points in common")
+    left_out: tuple[LeftOutEntry, ...] = said("Files that were left out")
+    tracks: TracksEntry = said("Tie points")
+    tables: TablesEntry = said("What the tables hold")
+    scene: SceneEntry | None = said("The block as a whole; null for a check")
+    gcps: tuple[GcpEntry, ...] = said("Ground control")
+    check_points: tuple[CheckPointEntry, ...] = said("Points that stayed out of the adjustment")
+    stages: tuple[StageEntry, ...] = said("Stages of the run")
+    options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = said(
+        "Options of the run"
+    )
+    versions: Mapping[str, str] = said("Versions of Python and packages")
+    reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
+
+    @property
+    def adjusted(self) -> bool:
+        """Whether cameras were adjusted."""
+        return self.kind == "adjust"
+
+
+def published_schema() -> dict[str, Any]:
+    """The JSON schema of summary.json."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "summary.json of a barpc run",
+        "description": "Pixel (0, 0) is the centre of the first one. A number that is not finite is null.",
+        **Summary.json_schema(),
+    }
+
+
+def measure(run: Run) -> Summary:
+    """The summary of a run, without the verdict on it. Numbers may be NaN here."""
+    usable, written = int(np.isfinite(run.ground).all(axis=1).sum()), len(run.written_tracks)
+    lengths = np.bincount(np.bincount(run.tracks.point))
+    names = ("numpy", "scipy", "opencv-python-headless", "rasterio", "shapely")
+    return Summary(
+        schema=SCHEMA,
+        barpc=__version__,
+        kind=run.kind,
+        status="good",
+        headline="",
+        verdict=(),
+        reasons=(),
+        passed=True,
+        out_dir=run.out_dir,
+        altitude_m=run.altitude,
+        views=measure_views(run),
+        pairs=measure_pairs(run),
+        left_out=tuple(LeftOutEntry(path, reason) for path, reason in run.left_out),
+        tracks=TracksEntry(
+            num_tracks=run.tracks.num_points,
+            num_observations=len(run.tracks),
+            by_length={str(n): int(count) for n, count in enumerate(lengths) if n and count},
+        ),
+        tables=TablesEntry(usable, written, complete=written == usable),
+        scene=None if run.adjustment is None else measure_scene(run.adjustment),
+        gcps=measure_gcps(run),
+        check_points=measure_check_points(run),
+        reference=measure_reference(run),
+        stages=tuple(StageEntry.read(stage) for stage in run.stages),
+        options=plain(run.options),
+        versions={"python": platform.python_version(), **{name: package_version(name) for name in names}},
+    )

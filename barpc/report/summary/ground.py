@@ -1,0 +1,221 @@
+"""Points whose place is given: control, a reference, checks; what is said of each, and how it is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from barpc.ba import check_residuals
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.report.records import Column, Number, Record, said
+from barpc.report.run import Run
+from barpc.report.summary.words import ABOVE, Count, Pixel, Vector
+from barpc.scene import IntArray
+
+MAX_GCPS = 20  # GCPs that the terminal shows; summary and page have all
+GCPS = "Ground control: what all the others say of a point minus its given place"
+
+
+class KnownPoint(Record):
+    """A point whose place is given."""
+
+    name: str = said("Name")
+    lon: float = said("Longitude", "deg", minimum=-540, maximum=540)
+    lat: float = said("Latitude", "deg", minimum=-90, maximum=90)
+    alt_m: float = said("Altitude", ABOVE)
+
+
+_MISS = "Found minus given place, east, north, up; null where fewer than two views see it"
+
+
+class GcpEntry(KnownPoint):
+    """A ground control point."""
+
+    OWN: ClassVar = {"GCP": Column("GCP", lambda point: point.name)}
+    PAGE: ClassVar = "GCP status residual_enu_m residual_px w sigma_m"
+    TERMINAL: ClassVar = "GCP status residual_enu_m residual_px w"
+
+    sigma_m: tuple[float, float, float] = said("Stated", "m", "sigma east, north, up", ".2g")
+    residual_enu_m: Vector = said(
+        "What all the others say of it minus its given place, east, north, up; null where nothing tells",
+        "m",
+        ("east", "north", "up"),
+        "+.3f",
+    )
+    used: bool = said("Whether it holds the block", default=True)
+    status: Literal["used", "contradicts", "rejected", "not seen"] = said(
+        "used; contradicts: used, and off by more than 4 standard deviations; rejected: not used for that",
+        head="verdict",
+        default="used",
+    )
+    images: tuple[str, ...] = said("Views that show it", default=())
+    w: Number = said(
+        "Largest component of the residual over its standard deviation", "", "w", ".1f", default=None
+    )
+    redundancy: Number = said("How far the others can tell, 0 to 1", default=None)
+    residual_px: Number = said(
+        "The residual in the images that show it, RMS", "px", "in images", ".2f", default=None
+    )
+
+    @classmethod
+    def worst(cls, points: Sequence[GcpEntry]) -> list[GcpEntry]:
+        """At most `MAX_GCPS` points, in their order: those that are not used, and of the others the largest w."""
+        order = sorted(points, key=lambda point: (point.used, -(point.w or 0.0)))[:MAX_GCPS]
+        return [point for point in points if any(point is one for one in order)]
+
+
+class ReferenceViewEntry(Record):
+    """What a reference says of an image."""
+
+    PAGE: ClassVar = "name peak offset_en_m num_tried num_passed num_points scatter_m"
+
+    name: str = said("View", head="image")
+    peak: Number = said(
+        "By how many standard deviations the vote for one shift stands out; below 6.5 it is none",
+        "",
+        "peak",
+        ".1f",
+    )
+    offset_en_m: Pixel | None = said(
+        "How far off the camera as delivered shows everything, east, north",
+        "m",
+        ("off east", "north"),
+        "+.2f",
+    )
+    num_tried: Count = said("Points looked for", head="points tried")
+    num_passed: Count = said("That beat their decoy and came back", head="found")
+    num_points: Count = said("That agree with each other and held the block", head="used")
+    scatter_m: Number = said("Standard deviation of those across the line of sight", "m", "scatter", ".2f")
+
+
+class ReferenceEntry(Record):
+    """A reference orthoimage."""
+
+    used: bool = said("Whether it holds the block")
+    step_m: Number = said("Resolution at which it was matched", "m")
+    sigma_m: Number = said("Standard deviation of its own place, along an axis", "m")
+    num_points: Count = said("Points on the ground that hold the block")
+    views: tuple[ReferenceViewEntry, ...] = said("What it says of each image")
+
+
+class SeenEntry(Record):
+    """Where a check point is seen."""
+
+    view: str = said("Name")
+    residual_px: Pixel = said("Projected minus observed col, row", "px")
+
+
+def _rms(point: CheckPointEntry) -> float | None:
+    return float(np.sqrt(np.mean(np.square(point.seen).sum(axis=1)))) if point.seen else None
+
+
+class CheckPointEntry(KnownPoint):
+    """A known point that stayed out of the adjustment."""
+
+    OWN: ClassVar = {
+        "point": Column("check point", lambda point: point.name),
+        "images": Column("images", lambda point: len(point.seen)),
+        "rms": Column("in the images [px]", _rms, ".3f"),
+    }
+    PAGE: ClassVar = "point images rms residual_enu_m"
+
+    residual_enu_m: Vector = said(_MISS, "m", ("east", "north", "up"), "+.3f")
+    observations: tuple[SeenEntry, ...] = said("Where it is seen")
+
+    @property
+    def seen(self) -> list[Any]:
+        """Residuals in the images that see it."""
+        return [seen.residual_px for seen in self.observations if None not in seen.residual_px]
+
+
+# --- how they are measured --------------------------------------------------------------------------------
+
+
+def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
+    """Ground control, and what the adjustment said of it."""
+    points = run.gcps
+    if points is None:
+        return ()
+    tested = None if run.adjustment is None else run.adjustment.control
+    left = np.full_like(points.sigma, np.nan) if tested is None else tested.residual
+    entries = []
+    seen = _grouped(points.point, len(points.names))
+    places, sigmas = points.lonlatalt.tolist(), points.sigma.tolist()
+    for g, (name, (lon, lat, alt), sigma) in enumerate(zip(points.names, places, sigmas, strict=True)):
+        images = tuple(run.views[i].name for i in points.view[seen[g]])
+        status = "not seen" if not images else "used" if tested is None else tested.status(g)
+        entries.append(
+            GcpEntry(
+                name,
+                lon,
+                lat,
+                alt,
+                sigma,
+                left[g].tolist(),
+                used=status in ("used", "contradicts"),
+                status=status,  # type: ignore[arg-type]  # one of these words
+                images=images,
+                w=None if tested is None else tested.w[g],
+                redundancy=None if tested is None else tested.redundancy[g],
+                residual_px=_in_images(run, points.lonlatalt[g], points.view[seen[g]], left[g]),
+            )
+        )
+    return tuple(entries)
+
+
+def _grouped(index: IntArray, num: int) -> list[IntArray]:
+    """The places in `index` (n,) of each number below `num`."""
+    order = np.argsort(index, kind="stable")
+    return np.split(order, np.searchsorted(index[order], np.arange(1, num)))[:num]
+
+
+def _in_images(run: Run, given: Array, views: IntArray, residual: Array) -> float:
+    """How far a residual (3,), east, north, up [m], of a ground point moves it in the images that show it, RMS [px]."""
+    if run.after is None or not np.isfinite(residual).all():
+        return float("nan")
+    moved = ground_from_ecef(ecef_from_ground(given) + residual @ enu_basis(given))
+    moves = [run.after[v].project(moved) - run.after[v].project(given) for v in views]
+    return float(np.sqrt(np.mean(np.square(moves).sum(axis=1)))) if moves else float("nan")
+
+
+def measure_reference(run: Run) -> ReferenceEntry | None:
+    """What an orthoimage said of each image; None without one."""
+    found, adjustment = run.reference, run.adjustment
+    if found is None:
+        return None
+    control = None if adjustment is None else found.control
+    kept = np.zeros(len(run.views), np.int64)
+    points = 0
+    if control is not None and adjustment is not None:
+        rows = adjustment.reference_inlier
+        kept = np.bincount(control.points.view[rows], minlength=len(run.views))
+        points = len(np.unique(control.points.point[rows]))
+    views = tuple(
+        ReferenceViewEntry(
+            name=view.name,
+            peak=view.peak,
+            offset_en_m=view.offset if view.points else None,
+            num_tried=view.tried,
+            num_passed=view.passed,
+            num_points=int(count),
+            scatter_m=view.scatter,
+        )
+        for view, count in zip(found.views, kept, strict=True)
+    )
+    return ReferenceEntry(points > 0, found.step, found.sigma, points, views)
+
+
+def measure_check_points(run: Run) -> tuple[CheckPointEntry, ...]:
+    """Points that stayed out of the adjustment: image residuals of each observation, and the ground error."""
+    points = run.check_points
+    if points is None:
+        return ()
+    left = check_residuals(run.before if run.after is None else run.after, points)
+    seen = [SeenEntry(run.views[i].name, r) for i, r in zip(points.view, left.image.tolist(), strict=True)]
+    seen_of = [tuple(seen[row] for row in rows) for rows in _grouped(points.point, len(points.names))]
+    rows = zip(points.names, points.lonlatalt.tolist(), left.ground.tolist(), seen_of, strict=True)
+    return tuple(
+        CheckPointEntry(name, lon, lat, alt, miss, found) for name, (lon, lat, alt), miss, found in rows
+    )

@@ -1,0 +1,189 @@
+"""The pairs of a run: what is said of each, and how it is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from barpc.geodesy import Array
+from barpc.report.records import Cell, Column, Number, Record, plain, said
+from barpc.report.run import Run
+from barpc.report.summary.words import Count
+from barpc.scene import IntArray
+from barpc.sensor import SensorModel
+from barpc.sensor.geometry import (
+    Several,
+    base_to_height,
+    convergence_angle,
+    epipolar_offset,
+    ground_sample_distance,
+)
+
+MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken
+
+
+class OffsetEntry(Record):
+    """Distance of a pair's matches from their epipolar lines."""
+
+    median: float = said("Median signed distance from the epipolar line", "px")
+    spread: float = said("1.4826 times the median absolute deviation", "px")
+    rms: float = said("Root mean square", "px")
+    count: Count = said("Matches measured: at most 1000, evenly taken")
+
+
+def _offset_cell(offset: OffsetEntry | None) -> Cell | None:
+    if offset is None:
+        return None
+    return Cell(f"{offset.median:+.3f} ± {offset.spread:.3f}", float(f"{abs(offset.median):.6g}"))
+
+
+class PairEntry(Record):
+    """Two images with tie points in common."""
+
+    OWN: ClassVar = {
+        "pair": Column("pair", lambda pair: f"{pair.a} - {pair.b}"),
+        "before": Column("before [px]", lambda pair: _offset_cell(pair.epipolar_before), ".3f"),
+        "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
+    }
+    PAGE: ClassVar = (
+        "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px "
+        "before after"
+    )
+    TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
+    CSV: ClassVar = (
+        "a b num_matches convergence_deg base_to_height height_m_per_px epipolar_before.median epipolar_before.spread "
+        "epipolar_before.rms epipolar_after.median epipolar_after.spread epipolar_after.rms "
+        "tied_by decoy_share noise_px"
+    )
+
+    a: str = said("First view")
+    b: str = said("Second view")
+    num_matches: Count = said("Tie points that both see", head="matches")
+    convergence_deg: Number = said("Angle between the lines of sight", "deg", "angle", ".1f")
+    base_to_height: Number = said("B/H along the lines of sight", head="B/H", form=".2f")
+    height_m_per_px: Number = said(
+        "Height whose parallax is a pixel; null for parallel rays", "m", "height per px", ".3g"
+    )
+    epipolar_before: OffsetEntry | None = said("Through the delivered cameras")
+    epipolar_after: OffsetEntry | None = said("Through the new cameras")
+    matching: Mapping[str, Any] | None = said(
+        "What became of it in matching; null for tie points taken as given (matches_only)"
+    )
+    tied_by: str | None = said(
+        "Matcher that tied it, and whether with loosened thresholds; null as there",
+        head="tied by",
+        default=None,
+    )
+    decoy_share: Number = said(
+        "Share of its matches that bands which hold no true one say is false",
+        head="decoys",
+        form=".3f",
+        default=None,
+    )
+    noise_px: Number = said(
+        "Robust spread of its matches across the epipolar lines, before registration",
+        "px",
+        "noise",
+        ".2f",
+        default=None,
+    )
+    chosen_by: str | None = said(
+        "Why it was tried: overlap and angle, same date, quick score, connects all, second path, listed, given",
+        default=None,
+    )
+
+    @property
+    def offset_rms(self) -> tuple[float | None, float | None]:
+        """RMS of the offsets before and after."""
+        before, after = self.epipolar_before, self.epipolar_after
+        return None if before is None else before.rms, None if after is None else after.rms
+
+
+# --- how they are measured --------------------------------------------------------------------------------
+
+
+def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
+    """Every two images with tie points in common."""
+    reports = {report.names: report for report in run.matched}
+    geometry, before = _pair_geometry(run), _pair_offsets(run, run.before, run.altitudes_before)
+    after: list[OffsetEntry | None] = [None] * len(before)
+    if run.after is not None:
+        after = _pair_offsets(run, run.after, run.ground[:, 2])
+    entries = []
+    for ties, (angle, base, height), first, last in zip(run.pairs, geometry, before, after, strict=True):
+        names = (run.views[ties.views[0]].name, run.views[ties.views[1]].name)
+        report = reports.get(names)
+        entry = PairEntry(*names, len(ties.a), angle, base, height, first, last, None)
+        if report is not None:
+            tied = report.matcher + ", loosened" * report.loosened
+            share, noise = report.control_share, report.spread
+            entry = replace(entry, matching=plain(report), tied_by=tied, decoy_share=share, noise_px=noise)
+            entry = replace(entry, chosen_by=report.reason)
+        entries.append(entry)
+    return tuple(entries)
+
+
+def _pair_geometry(run: Run) -> list[list[float]]:
+    """Medians over about a hundred of each pair's points: convergence angle [deg], B/H, height of a pixel [m]."""
+    picks = [slice(None, None, max(1, len(ties.a) // 100)) for ties in run.pairs]
+    a, b, pair = _rows(run, picks)
+    seen = np.isfinite(run.ground[run.tracks.point[a]]).all(axis=1)
+    a, b, pair = a[seen], b[seen], pair[seen]
+    at = run.ground[run.tracks.point[a]]
+    first, second = (Several(run.before, run.tracks.view[rows]) for rows in (a, b))
+    base = base_to_height(first, second, at)
+    finer = np.minimum(ground_sample_distance(first, at)[1], ground_sample_distance(second, at)[1])
+    with np.errstate(divide="ignore"):
+        values = (convergence_angle(first, second, at), base, finer / base)
+    found = np.array([medians(value, pair, len(run.pairs)) for value in values]).T
+    return [list(row) for row in found.tolist()]
+
+
+def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[OffsetEntry | None]:
+    """The epipolar offsets of each pair's matches.
+
+    The tracks' altitudes (P,) [m] through these cameras are so near to where a pair's own rays pass each other that
+    two steps from there arrive.
+    """
+    counts = [len(ties.a) for ties in run.pairs]
+    picks = [np.linspace(0, n - 1, min(n, MAX_PER_PAIR)).astype(np.int64) for n in counts]
+    a, b, pair = _rows(run, picks)
+    height = alt[run.tracks.point[a]]
+    seen = np.isfinite(height)
+    a, b, pair = a[seen], b[seen], pair[seen]
+    first, second = (Several(sensors, run.tracks.view[rows]) for rows in (a, b))
+    offset, _ = epipolar_offset(first, second, run.tracks.xy[a], run.tracks.xy[b], height[seen], steps=2)
+    known = np.isfinite(offset)
+    offset, pair, num = offset[known], pair[known], len(counts)
+    center = medians(offset, pair, num)
+    spread = 1.4826 * medians(np.abs(offset - center[pair]), pair, num)
+    count, square = np.bincount(pair, minlength=num), np.bincount(pair, offset**2, minlength=num)
+    rms = np.sqrt(square / np.maximum(count, 1))
+    rows = zip(center.tolist(), spread.tolist(), rms.tolist(), count.tolist(), strict=True)
+    return [OffsetEntry(*row) if row[3] else None for row in rows]
+
+
+def _rows(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArray, IntArray]:
+    """Of all pairs together, those matches that are picked: their observations in both views, and which pair it is."""
+    none = np.empty(0, dtype=np.int64)
+    a = [ties.a[pick] for ties, pick in zip(run.pairs, picks, strict=True)]
+    b = [ties.b[pick] for ties, pick in zip(run.pairs, picks, strict=True)]
+    return (
+        np.concatenate([none, *a]),
+        np.concatenate([none, *b]),
+        np.repeat(np.arange(len(a)), [len(rows) for rows in a]),
+    )
+
+
+def medians(values: Array, group: IntArray, num: int) -> Array:
+    """The median (num,) of each group of values (n,); NaN without any."""
+    ordered = values[np.lexsort((values, group))]
+    count = np.bincount(group, minlength=num)
+    start, some = np.cumsum(count) - count, count > 0
+    out = np.full(num, np.nan)
+    low, high = ((start + (count - odd) // 2)[some] for odd in (1, 0))
+    out[some] = 0.5 * (ordered[low] + ordered[high])
+    return out

@@ -1,0 +1,155 @@
+"""The block as a whole: where it went, what holds it, what its images cannot tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from operator import attrgetter
+from typing import ClassVar
+
+import numpy as np
+
+from barpc.ba import Adjustment
+from barpc.ba.gauge import MOTIONS, Mode
+from barpc.report.records import Column, Number, Record, said
+from barpc.report.summary.words import Count, Vector, metres, percent_of
+
+_MODE_WORDS = {
+    "east": "the whole scene may lie {0} farther east or west",
+    "north": "the whole scene may lie {0} farther north or south",
+    "up": "all heights may be {0} too high or too low",
+    "tilt east": "the scene may be tilted: {0} up or down at its eastern and western edges",
+    "tilt north": "the scene may be tilted: {0} up or down at its northern and southern edges",
+    "turn": "the scene may be turned about the vertical: {0} at its edge",
+    "scale": "the scene may be too large or too small: {0} at its edge",
+}
+
+_DATUM_HEADS = {
+    "cameras": "cameras as delivered",
+    "earlier_run": "earlier run",
+    "fixed_views": "fixed views",
+    "gcps": "GCPs",
+    "heights": "heights",
+    "reference": "reference",
+}
+DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
+
+
+class ModeEntry(Record):
+    """A motion of the scene that the images cannot tell."""
+
+    sigma_m: Number = said("Posterior standard deviation", "m")
+    meaning: str = said("Its largest motion", enum=list(_MODE_WORDS))
+    motion_m: tuple[Number, ...] = said(
+        "East, north, up; tilts, turn, scale at the edge", "m", minItems=7, maxItems=7
+    )
+    words: str = said("The same in words", minLength=1)
+
+
+class DatumEntry(Record):
+    """What holds a motion of the scene: shares of what is known of it. Tie points have none."""
+
+    OWN: ClassVar = {"part": Column("motion", lambda one: one.part)} | {
+        name: Column(f"{head} [%]", percent_of(name), ".0f") for name, head in _DATUM_HEADS.items()
+    }
+
+    part: str = said("Motion of the scene", enum=list(_MODE_WORDS))
+    sigma_m: Number = said(
+        "Posterior standard deviation; at the edge for tilts, turn and scale", "m", "known to", ".2f"
+    )
+    cameras: Number = said("Accuracies of the cameras as delivered")
+    earlier_run: Number = said("The earlier run")
+    fixed_views: Number = said("Views that are fixed")
+    gcps: Number = said("Ground control points")
+    heights: Number = said("The DEM, or altitudes assumed for tie points seen under too small an angle")
+    reference: Number = said("A reference orthoimage", default=None)
+
+    @classmethod
+    def columns(cls, entries: Sequence[DatumEntry]) -> str:
+        """The columns of a table: sources that tell nothing of any motion are left out."""
+        told = [name for name in _DATUM_HEADS if any((getattr(one, name) or 0.0) >= 0.005 for one in entries)]
+        return " ".join(["part", "sigma_m", *told])
+
+
+class DemEntry(Record):
+    """What the DEM did, and how the tie points lie to it."""
+
+    num_held: Count = said("Tie points that it holds")
+    num_known: Count = said("Tie points where it has a height")
+    num_tracks: Count = said("Tie points that count")
+    offset_m: Number = said("Median of the tie points' altitudes minus the DEM's", "m")
+    spread_m: Number = said("1.4826 times the median absolute deviation of these", "m")
+
+
+class SceneEntry(Record):
+    """The block as a whole."""
+
+    shift_enu_m: Vector = said("Mean move of the tie points, east, north, up", "m")
+    sigma_enu_m: Vector = said("Posterior standard deviation of the scene's place", "m")
+    radius_m: Number = said(
+        "RMS distance of the tie points from their middle: the edge of tilts, turn and scale", "m"
+    )
+    weakest_modes: tuple[ModeEntry, ...] = said("What the images cannot tell, the weakest first")
+    noise: Number = said("Observed over stated standard deviation of the observations")
+    drift_degree: Count = said("Degree of the rotation in the row")
+    drift_sigma_m: tuple[float, ...] = said(
+        "Standard deviation of the drift at the first and last row, by degree", "m"
+    )
+    prior_ratio: Number = said("Squared corrections over stated variances and degrees of freedom")
+    cost_history: tuple[Number, ...] = said("Sum of squared whitened residuals, by linearisation")
+    num_held_in_height: Count = said("Tie points seen under too small an angle, held in height")
+    gcp_residuals_enu_m: tuple[Vector, ...] = said("Adjusted GCPs minus their given place", "m")
+    solver: str = said("What the solver did")
+    datum: tuple[DatumEntry, ...] = said("What holds the scene", default=())
+    dem: DemEntry | None = said("What the DEM did; null without one", default=None)
+    gcp_scatter: Number = said(
+        "RMS residual of the GCPs used over what their accuracies let expect", default=None
+    )
+    num_held_out: Count = said("Observations that took no part, to be measured on", default=0)
+    model: str = said("Unknowns of each view that were solved for", default="")
+    in_space_px: Number = said(
+        "Where an affine in the image was chosen: what a rotation and translation leave of the same tie points",
+        "px",
+        default=None,
+    )
+
+
+_DEM = attrgetter("held", "known", "total", "offset", "spread")
+
+
+def measure_scene(adjustment: Adjustment) -> SceneEntry:
+    """The block as a whole."""
+    gauge, prior, terrain = adjustment.gauge, adjustment.prior, adjustment.terrain
+    datum = [
+        DatumEntry(
+            part,
+            float(gauge.motion_sigma[m]),
+            **{key: float(row[m]) for key, row in adjustment.datum.items()},
+        )
+        for m, part in enumerate(MOTIONS)
+    ]
+    modes = [ModeEntry(m.sigma, m.meaning, m.motion.tolist(), mode_in_words(m)) for m in gauge.modes]
+    return SceneEntry(
+        shift_enu_m=gauge.shift.tolist(),
+        sigma_enu_m=gauge.sigma.tolist(),
+        radius_m=gauge.radius,
+        weakest_modes=tuple(modes),
+        datum=tuple(datum),
+        gcp_scatter=None if adjustment.control is None else adjustment.control.scatter,
+        dem=None if terrain is None else DemEntry(*_DEM(terrain)),
+        noise=adjustment.noise,
+        num_held_out=int(np.count_nonzero(adjustment.held_out)),
+        model=adjustment.cameras.unknowns.model,
+        in_space_px=adjustment.in_space_rms,
+        drift_degree=adjustment.cameras.unknowns.drift,
+        drift_sigma_m=tuple(prior.drift_sigma),
+        prior_ratio=prior.ratio,
+        cost_history=tuple(adjustment.cost_history),
+        num_held_in_height=int(np.count_nonzero(adjustment.held)),
+        gcp_residuals_enu_m=adjustment.gcp_residuals.tolist(),
+        solver=adjustment.status,
+    )
+
+
+def mode_in_words(mode: Mode) -> str:
+    """One weak mode of the scene as a sentence without its full stop."""
+    return _MODE_WORDS[mode.meaning].format(metres(mode.sigma))

@@ -1,0 +1,340 @@
+"""The images of a run: what is said of each, and how it is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from operator import attrgetter
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from barpc.ba import Adjustment
+from barpc.fit import RpcFit
+from barpc.geodesy import Array, ecef_from_ground
+from barpc.report.records import Cell, Column, Number, Record, said, value_of
+from barpc.report.run import Run
+from barpc.report.summary.words import (
+    ABOVE,
+    STATUS_WORDS,
+    Count,
+    Pixel,
+    Share,
+    Side,
+    Vector,
+    largest,
+    percent,
+)
+from barpc.scene import IntArray
+from barpc.sensor.corrected import Corrected, Correction, ImageCorrected
+from barpc.sensor.geometry import Several, ground_sample_distance, view_angles
+from barpc.sensor.splined import RowSpline, Splined
+
+CELLS = 8  # Cells of an image from left to right and from top to bottom
+_ROWS = 400  # of an image, over which a spline is averaged
+
+
+class SourceEntry(Record):
+    """Where a camera came from."""
+
+    format: str = said("Syntax it was read from", head="RPC read from")
+    path: str = said("File that holds it")
+    notes: tuple[str, ...] = said("What the user should know")
+
+
+class CorrectionEntry(Record):
+    """How a camera was corrected: in space, or by a shift and slope in the image (no `center_shift_px` then)."""
+
+    model: str = said("Unknowns of the adjustment")
+    unknowns: tuple[float, ...] = said("In metres (rotation: angle x distance), or px in the image")
+    sigma: tuple[float, ...] = said("Their posterior standard deviations, in the same units")
+    center_shift_px: Pixel | None = said(
+        "Move of the ground point in the middle, col, row", "px", "shift col, row", "+.2f", adjusted=True
+    )
+    center_sigma_px: Pixel | None = said(
+        "Its posterior standard deviation, with the scene's own uncertain place", "px"
+    )
+    shift_px: Pixel | None = said("Models in the image: shift col, row", "px", default=None)
+    slope: tuple[Pixel, ...] | None = said("Models in the image: by (col, row)", "px/px", default=None)
+    rotation_urad: Vector | None = said("Rotation vector R, ECEF axes", "urad", default=None)
+    angle_urad: Number = said("Its length", "urad", "rotation", ".2f", default=None)
+    translation_m: Vector | None = said("Translation T, ECEF", "m", default=None)
+    translation_norm_m: Number = said("Its length", "m", "translation", ".2f", default=None)
+    drift_urad: tuple[Vector, ...] | None = said("Drift, for each power of the row", "urad", default=None)
+    jitter_px: Number = said("RMS over the rows of the spline that follows in the image", "px", default=None)
+    jitter_rows: Number = said("Rows between its knots", "px", default=None)
+    detector_px: Number = said("RMS of the steps between detectors", "px", default=None)
+    detectors: tuple[float, ...] | None = said("Columns where another detector begins", "px", default=None)
+
+
+class CenterEntry(Record):
+    """Where a camera stands."""
+
+    ecef_m: Vector = said("Place, ECEF", "m")
+    altitude_m: Number = said("Above the ellipsoid", "m")
+    method: str = said("line, or nominal where that was not plausible", head="found by")
+
+
+class FitEntry(Record):
+    """The certificate of a refitted RPC: against P_BA, on points that the fit has not seen."""
+
+    rmse_px: Pixel = said("Error col, row on check points", "px", "RMSE col, row", ".1e")
+    max_px: Pixel = said("Largest error col, row on check points", "px")
+    min_denominator: Number = said(
+        "Over the box and 25 % around it, relative to its centre", "", "smallest denominator", ".3f"
+    )
+    roundtrip_px: Number = said(
+        "Largest move by projection and back; null where it fails", "px", "round trip", ".1e"
+    )
+    coverage: Number = said("Share of the image that the fit's points cover")
+    method: str = said("Solver", head="solver")
+    num_check_points: Count = said("Check points", head="check points")
+    localisation_m: Number = said(
+        "Largest distance on the ground of the localisation RPC from P_BA", "m", default=None
+    )
+
+
+def _verdict(view: ViewEntry) -> Cell:
+    return Cell(STATUS_WORDS[view.status], list(STATUS_WORDS).index(view.status), f"status {view.status}")
+
+
+def _rejected(view: ViewEntry) -> float | None:
+    every = view.num_observations + view.num_rejected
+    return percent(view.num_rejected / every) if every else None
+
+
+def _kilometres(view: ViewEntry) -> float | None:
+    altitude = value_of(view, "camera_center.altitude_m")
+    return None if altitude is None else float(altitude) / 1e3
+
+
+def _moves(view: ViewEntry) -> list[Cell]:
+    shift, sigma = (value_of(view, f"correction.center_{what}_px") for what in ("shift", "sigma"))
+    return [Cell(f"{value:+.3f} ± {error:.2f}", value) for value, error in zip(shift, sigma, strict=True)]
+
+
+class ViewEntry(Record):
+    """One image."""
+
+    OWN: ClassVar = {
+        "verdict": Column("verdict", _verdict),
+        "rejected": Column("rejected [%]", _rejected, ".1f"),
+        "covered": Column("covered [%]", lambda view: percent(view.tie_coverage), ".0f"),
+        "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
+        "kilometres": Column("camera centre [km]", _kilometres, ".0f"),
+        "largest": Column("largest [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e"),
+        "about": Column(
+            "RPC fit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".0e", adjusted=True
+        ),
+        "fitted": Column("covered [%]", lambda view: percent(value_of(view, "fit.coverage")), ".0f"),
+    }
+    PAGE: ClassVar = (
+        "name verdict num_observations rejected covered rmse_before rmse_after held_out_px correction.center_shift_px "
+        "gsd_m incidence_deg rpc_source.format"
+    )
+    TERMINAL: ClassVar = (
+        "name verdict num_observations rmse_before rmse_after correction.center_shift_px about"
+    )
+    CORRECTIONS: ClassVar = (
+        "name moves correction.angle_urad correction.translation_norm_m kilometres camera_center.method"
+    )
+    FITS: ClassVar = (
+        "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fitted fit.num_check_points fit.method"
+    )
+    FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
+
+    name: str = said("Unique in the run", head="image", minLength=1)
+    path: str = said("The image; empty for a view without pixels")
+    size: tuple[Side, Side] = said("Width, height", "px")
+    alt_range_m: tuple[float, float] = said("Altitudes that the camera is used for", ABOVE)
+    rpc_source: SourceEntry | None = said("Where the camera came from; null: not from a file")
+    gsd_m: Number = said("Ground sampling distance in the middle of the image", "m", "GSD", ".2f")
+    incidence_deg: Number = said(
+        "Angle between the vertical and the direction to the sensor", "deg", "incidence", ".1f"
+    )
+    azimuth_deg: Number = said("Direction to the sensor, clockwise from north", "deg")
+    num_observations: Count = said("Tie-point observations that count", head="tie points")
+    num_rejected: Count = said("Observations that the adjustment cut as wrong")
+    num_gcps: Count = said("Observations of ground control points")
+    tie_coverage: Share = said("Share of the cells of an 8 x 8 grid that hold a tie point")
+    rmse_before: Number = said("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
+    rmse_after: Number = said(
+        "The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True
+    )
+    smooth_px: Number = said("RMS of what is smooth in the residuals left, less noise", "px")
+    prior_scale: Number = said("By how much the camera's stated standard deviations were widened")
+    correction: CorrectionEntry | None = said("The correction; null for a check")
+    camera_center: CenterEntry | None = said("Centre about which the camera was turned")
+    fit: FitEntry | None = said("Certificate of the refitted RPC; null where none was fitted")
+    outputs: Mapping[str, Mapping[str, float | str | None]] = said(
+        "File -> consumer that reopened it -> difference to P_BA in px, or why it does not read it",
+        propertyNames={"pattern": "^[^/]+$"},
+    )
+    status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = said(
+        "Verdict on the image"
+    )
+    advice: str = said("What to do; empty when all is well")
+    held_out_px: Number = said(
+        "RMS reprojection error of tie points that took no part in the adjustment, by their median",
+        "px",
+        "not used",
+        ".3f",
+        default=None,
+    )
+    date: str | None = said("Day it was taken, where its metadata say so", default=None)
+
+
+# --- how they are measured --------------------------------------------------------------------------------
+
+_SOURCE = attrgetter("format", "path", "notes")
+_CENTER = attrgetter("ecef", "altitude", "method")
+_FIT = attrgetter("rmse_ckp", "max_ckp", "min_denominator", "roundtrip", "coverage", "method", "num_ckp")
+
+
+def _fit_entry(fit: RpcFit) -> FitEntry:
+    place = fit.localisation
+    return replace(FitEntry(*_FIT(fit)), localisation_m=None if place is None else place.max_m)
+
+
+def measure_views(run: Run) -> tuple[ViewEntry, ...]:
+    """Every image of a run; the verdict on it is still to come."""
+    num, tracks, keep, adjustment = len(run.views), run.tracks, run.keep, run.adjustment
+    after = run.ties_after
+    first = rmse_by_view(run.ties_before.residuals[keep], tracks.view[keep], num)
+    last = None if after is None else rmse_by_view(after.residuals[keep], tracks.view[keep], num)
+    count, lost = (np.bincount(tracks.view[rows], minlength=num) for rows in (keep, ~(keep | run.held_out)))
+    gcps = np.zeros(num, np.int64) if run.gcps is None else np.bincount(run.gcps.view, minlength=num)
+    covered, middle = _coverage(run), _middles(run)
+    incidence, azimuth = view_angles(Several(run.before, np.arange(num)), middle)
+    pixel = ground_sample_distance(Several(run.before, np.arange(num)), middle)[1]
+    entries = []
+    for i, view in enumerate(run.views):
+        entry = ViewEntry(
+            name=view.name,
+            path=view.path,
+            size=view.size,
+            alt_range_m=view.alt_range,
+            rpc_source=SourceEntry(*_SOURCE(run.sources[i])) if run.sources else None,
+            gsd_m=float(pixel[i]),
+            incidence_deg=float(incidence[i]),
+            azimuth_deg=float(azimuth[i]),
+            num_observations=int(count[i]),
+            num_rejected=int(lost[i]),
+            num_gcps=int(gcps[i]),
+            tie_coverage=float(covered[i]),
+            rmse_before=first[i],
+            rmse_after=None if last is None else last[i],
+            held_out_px=None if adjustment is None else adjustment.held_out_rms[i],
+            smooth_px=None if adjustment is None else adjustment.smooth.rms[i],
+            prior_scale=None if adjustment is None else adjustment.prior.scale[i],
+            correction=None if adjustment is None else _correction(adjustment, i, middle[i]),
+            camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
+            fit=_fit_entry(run.fits[i]) if run.fits else None,
+            outputs=dict(run.written[i]) if run.written else {},
+            date=view.date or None,
+            status="adjusted",
+            advice="",
+        )
+        entries.append(entry)
+    return tuple(entries)
+
+
+def _middles(run: Run) -> Array:
+    """The ground (N, 3) in the middle of each image, at the altitude of the scene."""
+    at = (np.array([view.size for view in run.views]) - 1) / 2
+    return Several(run.before, np.arange(len(at))).localize(at, np.full(len(at), run.altitude))
+
+
+def _coverage(run: Run) -> Array:
+    """Share (N,) of the cells of each image that hold a tie point."""
+    view, size = run.tracks.view[run.keep], np.array([view.size for view in run.views])
+    cells = cell_numbers(run.tracks.xy[run.keep], size[view]) + view * CELLS**2
+    return np.bincount(np.unique(cells) // CELLS**2, minlength=len(size)) / CELLS**2
+
+
+def rmse_by_view(residuals: Array, view: IntArray, num_views: int) -> Array:
+    """RMS of each view (N,) [px]: sqrt(mean(dcol^2 + drow^2)) over those residuals (K, 2) that are not NaN."""
+    use = np.isfinite(residuals).all(axis=1)
+    squares = np.bincount(view[use], (residuals[use] ** 2).sum(axis=1), minlength=num_views)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(squares / np.bincount(view[use], minlength=num_views)))
+
+
+def cell_numbers(xy: Array, size: Sequence[int] | IntArray) -> IntArray:
+    """Which of the `CELLS` x `CELLS` cells of an image, or each of its own (n, 2), points (n, 2) [px] lie in."""
+    col, row = ((xy + 0.5) / np.asarray(size) * CELLS).astype(np.int64).clip(0, CELLS - 1).T
+    number: IntArray = row * CELLS + col
+    return number
+
+
+def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntry:
+    """The correction of a view, at the ground point (3,) in the middle of its image."""
+    whole, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
+    sensor, spline = (whole.sensor, whole.correction) if isinstance(whole, Splined) else (whole, None)
+    assert isinstance(sensor, Corrected | ImageCorrected)
+    correction, covariance = sensor.correction, adjustment.covariance.view(i)
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    common = (model, adjustment.params[i].tolist(), sigma)
+    if not isinstance(correction, Correction):
+        shift, slope = correction.shift.tolist(), correction.slope.tolist()
+        return CorrectionEntry(*common, None, None, shift_px=shift, slope=slope)
+    assert isinstance(sensor, Corrected)
+    moved, uncertain = shift_in_image(sensor, covariance, model, middle)
+    return CorrectionEntry(
+        *common,
+        moved.tolist(),
+        uncertain.tolist(),
+        rotation_urad=(correction.rotation * 1e6).tolist(),
+        angle_urad=float(np.linalg.norm(correction.rotation)) * 1e6,
+        translation_m=correction.translation.tolist(),
+        translation_norm_m=float(np.linalg.norm(correction.translation)),
+        drift_urad=(correction.drift * 1e6).tolist(),
+        **_in_image(spline),
+    )
+
+
+def _in_image(spline: RowSpline | None) -> dict[str, Any]:
+    """What follows the correction in the image."""
+    if spline is None:
+        return {}
+    found: dict[str, Any] = {}
+    if len(spline.coeffs):
+        rows = spline.row_offset + spline.row_scale * np.linspace(-1, 1, _ROWS)
+        along = replace(spline, edges=np.zeros(0), steps=np.zeros((0, 2))).at(np.column_stack([rows, rows]))
+        found |= {"jitter_px": _size(along), "jitter_rows": spline.spacing}
+    if len(spline.steps):
+        found |= {"detector_px": _size(spline.steps), "detectors": tuple((spline.edges + 0.5).tolist())}
+    return found
+
+
+def _size(displacement: Array) -> float:
+    return float(np.sqrt((displacement**2).sum(axis=-1).mean()))
+
+
+def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array]:
+    """How far P_BA moves a ground point (3,) near the middle of the image, and the standard deviation of that.
+
+    Parameters
+    ----------
+    model : Corrected
+        P_BA.
+    covariance : (q, q)
+        Of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the middle row.
+    unknowns : str
+        "rotation", "translation" or "rotation+translation".
+    ground : (3,)
+        lon, lat [deg], alt [m].
+
+    Returns
+    -------
+    shift, sigma : (2,)
+        col, row [px].
+    """
+    ecef = ecef_from_ground(ground)
+    image, _, by_rotation, by_translation = model.project_ecef(ecef)
+    distance = np.linalg.norm(ecef - model.correction.center)
+    parts = {"rotation": by_rotation / distance, "translation": by_translation}
+    jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
+    q = jacobian.shape[1]
+    variance = np.einsum("ij,jk,ik->i", jacobian, covariance[:q, :q], jacobian)
+    return image - model.sensor.project(ground), np.sqrt(np.maximum(variance, 0.0))
