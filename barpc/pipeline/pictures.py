@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
-from contextlib import ExitStack
-from typing import Any
+from contextlib import ExitStack, suppress
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -40,8 +41,7 @@ def pictures(run: Run, band: int) -> str:
             continue
         if look is not None:
             looks[view.name] = _text(look)
-    ties = [tie for kind, track in _chosen(run) if (tie := _tie(run, track, kind, band)) is not None]
-    return json.dumps({"quicklooks": looks, "ties": ties})
+    return json.dumps({"quicklooks": looks, "ties": _ties(run, band)})
 
 
 def _text(pixels: Pixels) -> str:
@@ -80,38 +80,54 @@ def _chosen(run: Run) -> list[tuple[str, int]]:
     return [("worst", track) for track in first] + [("random", track) for track in sorted(others)]
 
 
-def _tie(run: Run, track: int, kind: str, band: int) -> dict[str, Any] | None:
-    """The patch of one image, and that of another brought over by its cameras before and after."""
+class _Tie(NamedTuple):
+    """A tie point in two of its images, the better one first."""
+
+    kind: str
+    views: tuple[int, int]
+    rows: tuple[int, int]  # of the tracks
+
+
+def _pair(run: Run, kind: str, track: int) -> _Tie:
     rows = np.flatnonzero((run.tracks.point == track) & run.keep)
     norm = np.hypot(*(run.ties_after or run.ties_before).residuals[rows].T)
-    pair = [int(rows[np.argmin(norm)]), int(rows[np.argmax(norm)])]
-    a, b = (int(run.tracks.view[row]) for row in pair)
-    if a == b or any(isinstance(run.views[k].path, Remote) or not run.views[k].path for k in (a, b)):
-        return None
-    xy = run.tracks.xy[pair]
-    cameras = [(s[a], s[b]) for s in ([run.before] if run.after is None else [run.before, run.after])]
-    alt = float(run.ground[track, 2])
-    seen = [epipolar_offset(*two, xy[:1], xy[1:], alt, steps=2) for two in cameras]
-    try:
-        with ExitStack() as stack:
-            images = [stack.enter_context(open_raster(run.views[k].path)) for k in (a, b)]
-            corner = np.rint(xy[0])
-            patches = [_patch(images[0], band, _grid() + corner)]
-            for two, (_, alts) in zip(cameras, seen, strict=True):
-                patches.append(_patch(images[1], band, _brought(*two, corner, alts[0])))
-    except ImageError:
-        return None
-    shown = [_text(_stretched(patch)) for patch in patches if patch is not None]
-    if len(shown) < len(patches):
-        return None
-    offsets = [float(offset[0]) for offset, _ in seen]
-    return {
-        "kind": kind,
-        "a": run.views[a].name,
-        "b": run.views[b].name,
-        "offset_px": offsets,
-        "patches": shown,
-    }
+    first, last = int(rows[np.argmin(norm)]), int(rows[np.argmax(norm)])
+    return _Tie(kind, (int(run.tracks.view[first]), int(run.tracks.view[last])), (first, last))
+
+
+def _ties(run: Run, band: int) -> list[dict[str, Any]]:
+    """Tie points in two images each: a patch of one, and that of the other brought over by cameras before and after.
+
+    Cameras are asked once a pair of images, and images are opened once.
+    """
+    chosen = [_pair(run, kind, track) for kind, track in _chosen(run)]
+    shown: dict[_Tie, dict[str, Any]] = {}
+    with ExitStack() as stack:
+        opened = cache(lambda view: stack.enter_context(open_raster(run.views[view].path)))
+        for a, b in sorted({tie.views for tie in chosen}):
+            if a == b or any(isinstance(run.views[k].path, Remote) or not run.views[k].path for k in (a, b)):
+                continue
+            ties = [tie for tie in chosen if tie.views == (a, b)]
+            xy = run.tracks.xy[np.array([tie.rows for tie in ties])]
+            alt = run.ground[run.tracks.point[[tie.rows[0] for tie in ties]], 2]
+            cameras = [(s[a], s[b]) for s in (run.before, run.after) if s is not None]
+            seen = [epipolar_offset(*two, xy[:, 0], xy[:, 1], alt, steps=2) for two in cameras]
+            corners = np.rint(xy[:, 0])
+            there = [_brought(*two, corners, alts) for two, (_, alts) in zip(cameras, seen, strict=True)]
+            for n, tie in enumerate(ties):
+                with suppress(ImageError):
+                    patches = [_patch(opened(a), band, _grid() + corners[n])]
+                    patches += [_patch(opened(b), band, places[n]) for places in there]
+                    texts = [_text(_stretched(patch)) for patch in patches if patch is not None]
+                    if len(texts) == len(patches):
+                        shown[tie] = {
+                            "kind": tie.kind,
+                            "a": run.views[a].name,
+                            "b": run.views[b].name,
+                            "offset_px": [float(offset[n]) for offset, _ in seen],
+                            "patches": texts,
+                        }
+    return [shown[tie] for tie in chosen if tie in shown]
 
 
 def _grid() -> Array:
@@ -119,12 +135,13 @@ def _grid() -> Array:
     return np.stack(np.meshgrid(step, step), axis=-1)
 
 
-def _brought(a: SensorModel, b: SensorModel, corner: Array, alt: float) -> Array:
-    """Where the pixels of A's patch lie in B (S, S, 2), on level ground."""
-    corners = corner + HALF * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    there = b.project(a.localize(corners, np.full(3, alt)))
-    slopes = (there[1:] - there[0]) / HALF
-    return np.asarray(there[0] + _grid() @ slopes)
+def _brought(a: SensorModel, b: SensorModel, corners: Array, alts: Array) -> Array:
+    """Where the pixels of patches of A about corners (N, 2) lie in B (N, S, S, 2), on level ground at alts (N,)."""
+    three = corners[:, None] + HALF * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    ground = a.localize(three.reshape(-1, 2), np.repeat(alts, 3))
+    there = b.project(ground).reshape(-1, 3, 2)
+    slopes = (there[:, 1:] - there[:, :1]) / HALF
+    return np.asarray(there[:, :1, None] + np.einsum("rcs,nsk->nrck", _grid(), slopes))
 
 
 def _patch(image: Any, band: int, places: Array) -> Array | None:
