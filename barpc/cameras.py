@@ -46,6 +46,10 @@ class Camera:
     notes: tuple[str, ...] = ()
     """What the user should know."""
 
+    def __repr__(self) -> str:
+        place = self.path if len(str(self.path)) <= 50 else self.path.name
+        return f"Camera({self.format} in {place}, size {self.size}, {self.model})"
+
     @property
     def rpc(self) -> RPC:
         """The model where it is an RPC; InputError where it is not."""

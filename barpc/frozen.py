@@ -21,10 +21,10 @@ from barpc.sidefile import ARRAYS, Kind, opened
 
 
 class Frozen:
-    """Base of frozen dataclasses (declared with ``eq=False``) that hold arrays and plain values.
+    """Base of frozen dataclasses (declared with ``eq=False, repr=False``) that hold arrays and plain values.
 
     Arrays are copies of their own and read-only, after unpickling too; equality and hash go by the content of the
-    fields that are given to the constructor.
+    fields that are given to the constructor; one line is printed.
     """
 
     def __post_init__(self) -> None:
@@ -62,6 +62,13 @@ class Frozen:
     def _given(self) -> list[str]:
         return [field.name for field in fields(self) if field.init]  # type: ignore[arg-type]  # children are dataclasses
 
+    def _told(self) -> str:
+        """What is printed of it."""
+        return ", ".join(f"{name}={_short(getattr(self, name))}" for name in self._given())
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._told()})"
+
     def _content(self) -> tuple[object, ...]:
         return tuple(_plain(getattr(self, name)) for name in self._given())
 
@@ -81,6 +88,13 @@ def _plain(value: object) -> object:
     if not isinstance(value, np.ndarray):
         return value
     return value.shape, (value + 0.0 if value.dtype.kind == "f" else value).tobytes()
+
+
+def _short(value: object) -> str:
+    """A value in a few words: of an array with more than three numbers its shape."""
+    if isinstance(value, np.ndarray) and value.size > 3:
+        return f"{' x '.join(map(str, value.shape))} numbers"
+    return np.array2string(value, precision=6) if isinstance(value, np.ndarray) else repr(value)
 
 
 # --- values as named arrays -------------------------------------------------------------------------------

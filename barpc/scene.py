@@ -25,7 +25,7 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class View(Frozen):
     """One image and its camera.
 
@@ -57,8 +57,13 @@ class View(Frozen):
         """The middle of its altitudes [m]."""
         return sum(self.alt_range) / 2.0
 
+    def _told(self) -> str:
+        (width, height), (low, high) = self.size, self.alt_range
+        what = f"{self.name!r}, {width} x {height} px, {type(self.sensor).__name__} for {low:g} to {high:g} m"
+        return f"{what}, {self.date}" if self.date else what
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Tracks(Frozen):
     """Tie points over the views, one row an observation.
 
@@ -89,6 +94,9 @@ class Tracks(Frozen):
     def __len__(self) -> int:
         return len(self.view)
 
+    def _told(self) -> str:
+        return f"{self.num_points} tie points, {_seen(self.view, self.sigma)}"
+
     @property
     def num_points(self) -> int:
         """Number of tracks P."""
@@ -102,7 +110,7 @@ class Tracks(Frozen):
         return Tracks(self.view[keep], point, self.xy[keep], self.sigma[keep])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GroundPoints(Frozen):
     """Points of known position (GCPs or check points), and where they are seen.
 
@@ -143,6 +151,9 @@ class GroundPoints(Frozen):
         if m and (point.min() < 0 or point.max() >= g):
             raise InputError("ground points: an observation names a point that does not exist")
 
+    def _told(self) -> str:
+        return f"{len(self.names)} points, {_seen(self.view, self.xy_sigma)}"
+
     @classmethod
     def none(cls) -> GroundPoints:
         """No points."""
@@ -164,7 +175,7 @@ class GroundPoints(Frozen):
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Reference(Frozen):
     """Control of an orthoimage and a terrain: many points that share the errors of both.
 
@@ -183,6 +194,13 @@ class Reference(Frozen):
         if not (self._array("bias", (3,)) > 0).all():
             raise InputError("reference: standard deviations must be positive")
         self._array("offset", (None, 2), finite=False)
+
+
+def _seen(view: IntArray, sigma: Array) -> str:
+    """Observations in a few words."""
+    if not len(view):
+        return "no observations"
+    return f"{len(view)} observations in {len(np.unique(view))} views, to {np.median(sigma):.2g} px"
 
 
 def middle_altitude(views: Sequence[View]) -> float:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import copy
 import pickle
 from dataclasses import FrozenInstanceError, fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from barpc.cameras import Camera
 from barpc.errors import FitError, InputError, RpcError
-from barpc.fit import Normalization
+from barpc.fit import Normalization, fit_rpc
 from barpc.frozen import Frozen
 from barpc.scene import GroundPoints, Tracks, View
-from barpc.sensor.corrected import ImageAffine
+from barpc.sensor.corrected import Corrected, Correction, ImageAffine
 from barpc.sensor.curve import Curve
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.rpc import RPC
@@ -76,6 +78,49 @@ def test_copies_pickles_and_replacements_are_equal_and_stay_read_only(make):
                 array[...] = 0
             with pytest.raises(FrozenInstanceError):
                 setattr(twin, name, array)
+
+
+def test_one_line_is_printed_with_figures_and_no_long_array(make):
+    for value in (make(), replace(make())):
+        said = repr(value)
+        assert said.startswith(f"{type(value).__name__}(")
+        assert 20 < len(said) < 150
+        assert not {"array", "\n", "Array"} & {*said, *said.split("(")}
+
+
+def test_what_is_printed_is_what_it_holds():
+    """Figures of each are told by eye, from the values given."""
+    rpc = RPC(
+        COEFFS,
+        np.array([5.4, 43.3, 250.0]),
+        np.array([0.1, -0.2, 300.0]),
+        np.full(2, 499.5),
+        np.full(2, 500.0),
+    )
+    box = "RPC(lon 5.3000 to 5.5000, lat 43.1000 to 43.5000, -50 to 550 m, col -0.5 to 999.5, row -0.5 to 999.5)"
+    assert repr(rpc) == box
+    assert (
+        repr(View("left", "", (20, 10), rpc, (-50.0, 550.0)))
+        == "View('left', 20 x 10 px, RPC for -50 to 550 m)"
+    )
+    assert repr(replace(MAKE["View"](), date="2013-04-17")).endswith("m, 2013-04-17)")
+    sigmas = np.array([0.1, 0.1, 0.3, 0.5, 0.7])
+    tracks = Tracks(np.array([0, 1, 3, 0, 1]), np.array([0, 0, 0, 1, 1]), np.ones((5, 2)), sigmas)
+    assert repr(tracks) == "Tracks(2 tie points, 5 observations in 3 views, to 0.3 px)"
+    assert repr(GroundPoints.none()) == "GroundPoints(0 points, no observations)"
+    correction = Correction(
+        np.array([3e-6, 0, 4e-6]), np.array([0, -2.0, 0]), np.full(3, 6e6), np.eye(3)[:1] * 1e-7
+    )
+    assert repr(Corrected(rpc, correction)) == (
+        f"Corrected(sensor={box}, correction=Correction(rotation 5 urad, translation 2 m, drift 0.1 urad))"
+    )
+    camera = Camera(rpc, Path("left.tif"), "tag", (20, 10), (-50.0, 550.0))
+    assert repr(camera) == f"Camera(tag in left.tif, size (20, 10), {box})"
+    fit = fit_rpc(rpc, (1000, 1000), (-50.0, 550.0))
+    worst = f"{fit.max_ckp.max():.2g} px at {fit.num_ckp} check points"
+    assert repr(fit) == f"RpcFit({fit.method}, at most {worst}, {fit.rpc})"
+    pushbroom = repr(fly(np.array([5.4, 43.3, 200.0]), Look(0.0, altitude=500e3), (300, 200), 0.5))
+    assert 495 < float(pushbroom.partition("(")[2].split()[0]) < 505
 
 
 def test_an_array_that_is_changed_afterwards_changes_no_value():

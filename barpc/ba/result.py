@@ -128,6 +128,10 @@ class Adjustment:
     seconds: float
     options: AdjustOptions = field(repr=False)
 
+    def __repr__(self) -> str:
+        used = f"{np.count_nonzero(self.inlier)} of {len(self.inlier)} observations"
+        return f"Adjustment({len(self.names)} views, {len(self.points)} tie points, {used}: {self.status})"
+
     @property
     def splines(self) -> tuple[RowSpline | None, ...]:
         """What every view's correction is followed by in the image; None: nothing."""

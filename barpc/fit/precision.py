@@ -19,7 +19,7 @@ ALTITUDE_FLOOR = 50.0
 """Smallest altitude half range [m] that a model is sampled over, and smallest altitude scale of an RPC."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Normalization(Frozen):
     """The offsets and scales of an RPC.
 

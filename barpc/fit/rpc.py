@@ -82,6 +82,9 @@ class RpcFit:
     method: str
     localisation: Localisation | None = None
 
+    def __repr__(self) -> str:
+        return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"
+
     def summary(self) -> dict[str, Any]:
         """The certificate as plain numbers and lists, col before row, lengths in px."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}

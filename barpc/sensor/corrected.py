@@ -86,7 +86,7 @@ def _by_view(matrices: Array, rows: Array, bounds: IntArray) -> Array:
     return out
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Correction(Frozen):
     """Rotation and translation of one view about its camera centre.
 
@@ -114,6 +114,11 @@ class Correction(Frozen):
         self._array("drift", (None, 3), RpcError)
         if not (np.isfinite(self.row_offset) and np.isfinite(self.row_scale) and self.row_scale != 0):
             raise RpcError(f"correction rows: offset {self.row_offset}, scale {self.row_scale}")
+
+    def _told(self) -> str:
+        turn, move, *drift = (np.linalg.norm(v) for v in (self.rotation, self.translation, *self.drift))
+        bent = "".join(f", drift {1e6 * d:.3g} urad" for d in drift)
+        return f"rotation {1e6 * turn:.3g} urad, translation {move:.3g} m{bent}"
 
     def motion(self, ecef: Array, row: Array | None = None) -> Motion:
         """The motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
@@ -220,7 +225,7 @@ class Corrected:
         return ground
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ImageAffine(Frozen):
     """image + shift + slope @ image."""
 

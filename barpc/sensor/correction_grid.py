@@ -18,7 +18,7 @@ _STEPS = 12  # displacements change by thousandths of a pixel a pixel: each step
 _SETTLED = 1e-9  # px
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CorrectionGrid(Frozen):
     """Displacements (dcol, drow) over an image, linear between the nodes and constant beyond them.
 

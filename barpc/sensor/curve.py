@@ -29,7 +29,7 @@ _ROUNDS = 5  # of estimating them: they settle in three
 _GAIN = 1.5  # a higher degree must lower the residual across the track by this factor
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Curve(Frozen):
     """A piecewise polynomial of time with values in three dimensions."""
 

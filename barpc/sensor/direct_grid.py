@@ -39,7 +39,7 @@ _TRIED = 1000  # cells
 _VALUE, _BY_COL, _BY_ROW, _BY_ALT = (0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DirectGrid(Frozen):
     """A camera given by the ground points of a grid of image points: itself a `SensorModel`.
 

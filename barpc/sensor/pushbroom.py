@@ -99,7 +99,7 @@ def _drag(sight: Array, velocity: Array) -> Array:
 STRAIGHT = Light()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Pushbroom(Frozen):
     """A rigorous pushbroom camera: itself a `SensorModel`.
 
@@ -167,6 +167,14 @@ class Pushbroom(Frozen):
         """First and last time that both curves are believed for [s]."""
         (a, b), (c, d) = self.orbit.span, self.attitude.span
         return max(a, c), min(b, d)
+
+    def _told(self) -> str:
+        start, end = self._span
+        height = ground_from_ecef(self.position((np.mean(self._span) - self.first_line) / self.line_period))[
+            2
+        ]
+        period = f"{1e3 * self.line_period:.6g} ms a row"
+        return f"{height / 1e3:.1f} km high, {period}, orbit and attitude for {end - start:.3g} s"
 
     def time(self, row: npt.ArrayLike) -> Array:
         """Time [s] of rows (...) [px]."""

@@ -18,7 +18,7 @@ from barpc.sensor.rational import CHUNK, REACH, BoolArray, Rational, monomials
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RPC(Frozen):
     """A rational polynomial camera: itself a `SensorModel`.
 
@@ -64,6 +64,18 @@ class RPC(Frozen):
             if held is not None and not held[1::2].any(axis=1).all():
                 raise RpcError(f"RPC {name}: a denominator is zero everywhere")
         self._keep("_map", Rational(self.coeffs, _ACCURACY / np.abs(self.image_scale)))
+
+    def _told(self) -> str:
+        offset = [*self.ground_offset, *self.image_offset]
+        scale = np.abs([*self.ground_scale, *self.image_scale])
+        words = (
+            "lon {:.4f} to {:.4f}",
+            "lat {:.4f} to {:.4f}",
+            "{:g} to {:g} m",
+            "col {:g} to {:g}",
+            "row {:g} to {:g}",
+        )
+        return ", ".join(word.format(o - s, o + s) for word, o, s in zip(words, offset, scale, strict=True))
 
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
         """Normalised longitude, latitude, altitude (3, N), -1 to 1 in the RPC's box, of ground points (N, 3)."""

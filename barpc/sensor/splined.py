@@ -46,7 +46,7 @@ def bsplines(u: Array, count: int) -> Array:
     return basis
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RowSpline(Frozen):
     """A displacement of image points: where a point is seen, less where a model without it projects it.
 

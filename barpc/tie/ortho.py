@@ -28,7 +28,7 @@ _NODE = 8  # px between exact projections; straight lines between them
 _KNOWN = 0.99  # of what a pixel is made of must be valid
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Patch(Frozen):
     """A grid on the ground, rows to the south.
 

@@ -339,3 +339,8 @@ def test_a_result_prints_its_counts(run: Run) -> None:
     assert len(repr(found)) < 150
     assert repr(found).startswith(f"AdjustResult(adjust: 3 views, {found.tracks.num_points} tie points, ")
     assert found.summary["status"] in repr(found)
+    used = int(found.adjustment.inlier.sum())
+    said = f"Adjustment(3 views, {found.tracks.num_points} tie points, {used} of {len(found.tracks)} observations: "
+    assert repr(found.adjustment).startswith(said)
+    assert len(repr(found.adjustment)) < 250
+    assert repr(found.record) == f"Summary(adjust of 3 views, {found.record.status}: {found.record.headline})"

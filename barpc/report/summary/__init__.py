@@ -127,6 +127,9 @@ class Summary(Record):
     versions: Mapping[str, str] = said("Versions of Python and packages")
     reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
 
+    def __repr__(self) -> str:
+        return f"Summary({self.kind} of {len(self.views)} views, {self.status}: {self.headline})"
+
     @property
     def adjusted(self) -> bool:
         """Whether cameras were adjusted."""

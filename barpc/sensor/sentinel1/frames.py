@@ -26,7 +26,7 @@ _SPREAD = 1e-5  # s: what lines and azimuth times of a grid may scatter
 _ZENITH = (2.41, -1.0 / 3411.0, 1.0 / 8.55e7)  # m, per m, per m^2 of altitude
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SlantFrame(Frozen):
     """The frame of an SLC: columns at a constant interval of slant range time."""
 
@@ -47,7 +47,7 @@ class SlantFrame(Frozen):
         return np.stack([image[1] * self.interval, image[0] / self.sampling_rate + self.first_range_time])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GroundFrame(Frozen):
     """The frame of a GRD: columns at a constant interval of ground range.
 

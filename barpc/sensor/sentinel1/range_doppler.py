@@ -54,7 +54,7 @@ _SLACK = 10.0  # s: how far beyond the orbit the search for zero Doppler may wan
 _SETTLED = 1e-5  # s: quadratic convergence leaves less than 1e-12 s after a step so small
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RangeDoppler(Frozen):
     """A Sentinel-1 image: itself a `SensorModel`.
 
@@ -83,6 +83,11 @@ class RangeDoppler(Frozen):
             raise RpcError(f"Range-Doppler model: size {self.size}, altitudes {self.alt_range}")
         if self.look not in ("right", "left"):
             raise RpcError(f"Range-Doppler model: look {self.look!r}, expected 'right' or 'left'")
+
+    def _told(self) -> str:
+        (width, height), (low, high) = self.size, self.alt_range
+        start = np.datetime_as_string(self.epoch, "s")
+        return f"{width} x {height} px from {start}, looks {self.look}, for {low:g} to {high:g} m"
 
     @classmethod
     def from_annotation(

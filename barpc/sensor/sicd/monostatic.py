@@ -28,7 +28,7 @@ _STEP = 1.0  # m: central differences over so much are exact to 1e-9
 _BEYOND = 1.0  # sides of the image around it that its polynomials are believed for
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Monostatic(Frozen):
     """A SICD image: itself a `SensorModel`.
 
