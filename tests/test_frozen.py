@@ -116,7 +116,7 @@ def test_what_is_printed_is_what_it_holds():
     )
     camera = Camera(rpc, Path("left.tif"), "tag", (20, 10), (-50.0, 550.0))
     assert repr(camera) == f"Camera(tag in left.tif, size (20, 10), {box})"
-    fit = fit_rpc(rpc, (1000, 1000), (-50.0, 550.0))
+    fit = fit_rpc(MAKE["Pushbroom"](), (300, 200), (0.0, 500.0))
     worst = f"{fit.max_ckp.max():.2g} px at {fit.num_ckp} check points"
     assert repr(fit) == f"RpcFit({fit.method}, at most {worst}, {fit.rpc})"
     pushbroom = repr(fly(np.array([5.4, 43.3, 200.0]), Look(0.0, altitude=500e3), (300, 200), 0.5))

@@ -7,7 +7,7 @@ import json
 import platform
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -95,13 +95,66 @@ def info(
     return 0
 
 
+_METHODS = {
+    "line": "where the rays of an image line meet",
+    "stated": "by its orbit",
+    "nominal": "assumed: the rays of an image line meet nowhere that an orbit could be",
+}
+
+
 def _print(images: Sequence[str], reports: Sequence[Mapping[str, Any]]) -> None:
     for image, report in zip(images, reports, strict=True):
         echo(image)
-        for key, value in report.items():
-            for line in value if key == "pairs" else [value]:
-                if key != "footprint":
-                    echo(f"  {key.replace('_', ' ')}: {_text(line)}")
+        for label, line in _lines(report):
+            echo(f"  {label:<13}{line}")
+
+
+def _lines(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """What is told of a camera in words: label and sentence of each line."""
+    is_rpc = "domain" in report
+    yield "camera", f"RPC ({report['rpc'].replace(' in ', ') in ', 1)}" if is_rpc else report["rpc"]
+    yield from (("note", note) for note in report["notes"])
+    if "size_px" not in report:
+        yield "image", "its size is not known; with FILE,size=WIDTH:HEIGHT angles and places are told"
+    else:
+        yield "image", "{} x {} px; (0, 0) is the centre of the first pixel".format(*report["size_px"])
+    yield "altitudes", "{:g} to {:g} m above the ellipsoid".format(*report["altitude_range_m"])
+    if is_rpc:
+        yield from _lines_of_rpc(report)
+    if "problem" in report:
+        yield "problem", report["problem"]
+    elif "size_px" in report:
+        yield from _lines_of_geometry(report)
+    for pair in report.get("pairs", ()):
+        angle = "with {with}: {convergence_deg:.2f} deg between the rays, B/H {b_over_h:.3f}"
+        yield "pair", angle.format(**pair)
+
+
+def _lines_of_rpc(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    yield (
+        "made for",
+        "lon {0[0]:.5f} to {0[1]:.5f}, lat {1[0]:.5f} to {1[1]:.5f} deg".format(*report["domain"].values()),
+    )
+    stated = {"common to the image": report["err_bias_m"], "of each point": report["err_rand_m"]}
+    known = [f"{value:g} m {what}" for what, value in stated.items() if value is not None]
+    yield "accuracy", ", ".join(known) or "not stated"
+    least = report["smallest_denominator"]
+    pole = "0 would be a pole" if least > 0 else "it may have a pole in or near these bounds"
+    yield "denominators", f"at least {least:.3g} of what they are in the middle: {pole}"
+
+
+def _lines_of_geometry(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    yield (
+        "centre",
+        "lon {:.6f}, lat {:.6f} deg".format(*report["center_deg"]) + f" at {report['center_alt_m']:g} m",
+    )
+    yield "pixel", "{col:.3f} m a column, {row:.3f} m a row on the ground".format(**report["gsd_m"])
+    yield (
+        "looks",
+        "{incidence_deg:.2f} deg off the vertical, from {azimuth_deg:.2f} deg (north is 0)".format(**report),
+    )
+    stand = report["camera_altitude_m"]
+    yield "sensor", f"{stand['value'] / 1e3:.1f} km high, {_METHODS[stand['method']]}"
 
 
 def _altitude(image: str, camera: Camera, alt: float | None, terrain: Dem | None) -> float:
@@ -181,7 +234,7 @@ def _geometry(
     model = camera.model
     middle = (np.array(size) - 1) / 2
     center = model.localize(middle, np.asarray(alt))
-    report: dict[str, Any] = {"size_px": list(size), "center_deg": center[:2].tolist()}
+    report: dict[str, Any] = {"size_px": list(size), "center_deg": center[:2].tolist(), "center_alt_m": alt}
     if not np.isfinite(center).all():
         return report | {"problem": "no ground point at the image's centre"}
     incidence, azimuth = geometry.view_angles(model, center if at is None else np.array(at))
@@ -194,14 +247,6 @@ def _geometry(
         "camera_altitude_m": {"value": stand.altitude, "method": stand.method},
         "footprint": polygon(geometry.footprint(model, size, alt)),
     }
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {_text(v)}" for key, v in value.items())
-    if isinstance(value, list):
-        return " .. ".join(map(_text, value)) or "none"
-    return "unknown" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 # --- the installation -------------------------------------------------------------------------------------

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import logging
+import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -150,7 +152,8 @@ def test_info_tells_the_angle_between_several_images(image, other, capsys):
     assert pair["b_over_h"] == pytest.approx(float(base_to_height(read_rpc(image), read_rpc(other), place)))
     assert 1 < pair["convergence_deg"] < 60
     assert run("info", image, other) == 0
-    assert "pairs: with other, convergence_deg " in capsys.readouterr().out
+    text = f"pair         with other: {pair['convergence_deg']:.2f} deg between the rays, B/H {pair['b_over_h']:.3f}\n"
+    assert capsys.readouterr().out.count(text) == 1
     assert run("info", image, "--at", 5.5, 43.3, 100, "--json") == 0
     (elsewhere,) = json.loads(capsys.readouterr().out)
     assert elsewhere["incidence_deg"] != first["incidence_deg"]
@@ -260,7 +263,37 @@ def test_info_says_where_the_rpc_comes_from_and_what_was_passed_over(image, caps
     assert 0.9 < report["smallest_denominator"] <= 1.0
     assert 0 < report["incidence_deg"] < 60
     assert run("info", image) == 0
-    assert "incidence deg" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    (lon_min, lon_max), (lat_min, lat_max) = report["domain"]["lon_deg"], report["domain"]["lat_deg"]
+    low, high = report["altitude_range_m"]
+    gsd, stand, least = report["gsd_m"], report["camera_altitude_m"]["value"], report["smallest_denominator"]
+    (lon, lat), angle, side = report["center_deg"], report["incidence_deg"], report["azimuth_deg"]
+    assert told.splitlines()[1:] == [
+        f"  camera       RPC (rpb) in {image.with_suffix('.RPB')}",
+        "  note         not used: the image's own RPC",
+        "  image        600 x 400 px; (0, 0) is the centre of the first pixel",
+        f"  altitudes    {low:g} to {high:g} m above the ellipsoid",
+        f"  made for     lon {lon_min:.5f} to {lon_max:.5f}, lat {lat_min:.5f} to {lat_max:.5f} deg",
+        "  accuracy     3.1 m common to the image, 0.7 m of each point",
+        f"  denominators at least {least:.3g} of what they are in the middle: 0 would be a pole",
+        f"  centre       lon {lon:.6f}, lat {lat:.6f} deg at {(low + high) / 2:g} m",
+        f"  pixel        {gsd['col']:.3f} m a column, {gsd['row']:.3f} m a row on the ground",
+        f"  looks        {angle:.2f} deg off the vertical, from {side:.2f} deg (north is 0)",
+        f"  sensor       {stand / 1e3:.1f} km high, assumed: the rays of an image line meet nowhere that an orbit could be",
+    ]
+
+
+def test_info_says_in_words_what_is_not_known_of_a_camera(tmp_path, capsys):
+    rpc = make_rpc()
+    coeffs = rpc.coeffs.copy()
+    coeffs[1, 1] = 2.0  # the denominator of the column falls through 0 to the west
+    write_rpc(replace(rpc, coeffs=coeffs, err_bias=None, err_rand=None), tmp_path / "a.RPB")
+    assert run("info", tmp_path / "a.RPB") == 0
+    told = capsys.readouterr().out
+    assert "  image        its size is not known; with FILE,size=WIDTH:HEIGHT angles" in told
+    assert "  accuracy     not stated\n" in told
+    assert re.search(r"  denominators at least -\d\.\d+ of .*: it may have a pole", told)
+    assert "centre of the first" not in told
 
 
 @pytest.mark.parametrize("name", ["b_RPC.TXT", "b.RPB", "b.geom", "b.XML", "b.json", "b.vrt", "b.tif"])
