@@ -1,7 +1,7 @@
-"""Write docs/options.md from the declarations of the options and the verbs' flags.
+"""Write docs/options.md and docs/man/barpc.1 from the declarations of the options and the verbs' flags.
 
-python docs/generate_options.py            # writes it
-python docs/generate_options.py --print    # prints it
+python docs/generate_options.py            # writes both
+python docs/generate_options.py --print    # prints the page of options
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from barpc.cli.options import ADJUSTMENT, RUN, TIE, flag_name
 from barpc.options import AdjustOptions, FitOptions, Options, RunOptions, TieOptions, declared, wanted
 
 PAGE = Path(__file__).with_name("options.md")
+MANUAL = Path(__file__).parent / "man" / "barpc.1"
 TABLES = {"": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions}
 """Table of an options file -> the record it fills; "" is the file's top level."""
 
@@ -83,22 +84,25 @@ def option_table(name: str, record: type[Options], flags: dict[str, str]) -> lis
     return lines
 
 
+def parts(command: click.Command, name: str) -> tuple[str, str, str, list[tuple[str, str]]]:
+    """A command in four parts: its usage, its first words, its examples, its flags with their help."""
+    context = click.Context(command, info_name=name, terminal_width=100)
+    usage = " ".join([name, *command.collect_usage_pieces(context)])
+    first, *examples = command.help.replace("\b", "\\b").split("\\b")
+    text = inspect.cleandoc("\n".join(examples[0].strip("\n").splitlines()[1:])).strip() if examples else ""
+    records = [p.get_help_record(context) for p in command.params if isinstance(p, click.Option)]
+    return usage, " ".join(first.split()), text, [record for record in records if record is not None]
+
+
 def verb_section(name: str) -> list[str]:
     """A verb: its usage, its first words and its flags."""
-    command = cli.get_command(click.Context(cli), name)
-    context = click.Context(command, info_name=f"barpc {name}", terminal_width=100)
-    usage = " ".join(command.collect_usage_pieces(context))
-    first = command.help.replace("\b", "\\b").split("\\b")[0]
-    lines = ["", f"### barpc {name}", "", f"`barpc {name} {usage}`", "", " ".join(first.split())]
-    examples = command.help.replace("\b", "\\b").split("\\b")[1:]
+    usage, first, examples, flags = parts(cli.get_command(click.Context(cli), name), f"barpc {name}")
+    lines = ["", f"### barpc {name}", "", f"`{usage}`", "", first]
     if examples:
-        text = inspect.cleandoc("\n".join(examples[0].strip("\n").splitlines()[1:])).strip()
-        lines += ["", "```", text, "```"]
-    records = [p.get_help_record(context) for p in command.params if isinstance(p, click.Option)]
-    shown = [record for record in records if record is not None]
-    if shown:
+        lines += ["", "```", examples, "```"]
+    if flags:
         lines += ["", row("flag", "meaning"), row("---", "---")]
-        lines += [row(f"`{names}`", help_text(text)) for names, text in shown]
+        lines += [row(f"`{names}`", help_text(text)) for names, text in flags]
     return lines
 
 
@@ -119,6 +123,34 @@ def page() -> str:
     return "\n".join(lines) + "\n"
 
 
+def roff(text: str) -> str:
+    """Plain text as a line of a manual page: a dash is one to be typed, a dot in front is no macro."""
+    text = re.sub(r"\s+", " ", text).replace("\\", "\\e").replace("-", "\\-")
+    return "\\&" + text if text.startswith((".", "'")) else text
+
+
+def man_section(command: click.Command, name: str) -> list[str]:
+    """A command of the manual page: its words, flags and examples."""
+    usage, first, examples, flags = parts(command, name)
+    lines = [".nf", roff(usage), ".fi", ".PP", roff(first)]
+    for names, text in flags:
+        lines += [".TP", f".B {roff(names)}", roff(text)]
+    if examples:
+        lines += [".PP", ".nf", *map(roff, examples.splitlines()), ".fi"]
+    return lines
+
+
+def manual() -> str:
+    """The manual page, with the man macros of roff."""
+    lines = ['.TH BARPC 1 "" barpc "User Commands"', ".SH NAME"]
+    lines += [roff("barpc - bundle adjustment of satellite images with RPC cameras"), ".SH SYNOPSIS"]
+    lines += man_section(cli, "barpc")
+    for name, told in COMMANDS.items():
+        lines += [f".SH BARPC {name.upper()}", roff(told), ".PP"]
+        lines += man_section(cli.get_command(click.Context(cli), name), f"barpc {name}")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     """Write or print the page."""
     parser = argparse.ArgumentParser(
@@ -129,6 +161,7 @@ def main() -> None:
         print(page(), end="")
     else:
         PAGE.write_text(page(), encoding="utf-8")
+        MANUAL.write_text(manual(), encoding="utf-8")
 
 
 if __name__ == "__main__":

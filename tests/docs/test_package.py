@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tarfile
@@ -34,7 +35,7 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_the_wheel_holds_the_whole_package_and_no_tests_or_samples(archives):
     with zipfile.ZipFile(archives[0]) as wheel:
         names = set(wheel.namelist())
-    packaged = {name for name in names if ".dist-info/" not in name}
+    packaged = {name for name in names if ".dist-info/" not in name and ".data/" not in name}
     expected = {
         str(path.relative_to(ROOT))
         for path in (ROOT / "barpc").rglob("*")
@@ -43,6 +44,8 @@ def test_the_wheel_holds_the_whole_package_and_no_tests_or_samples(archives):
     assert packaged == expected
     assert {"barpc/py.typed", "barpc/report/template.html.j2"} <= packaged
     assert sum(1 for name in names if name.endswith("licenses/LICENSE")) == 1
+    manual = f"barpc-{barpc.__version__}.data/data/share/man/man1/barpc.1"
+    assert [name for name in names if ".data/" in name] == [manual]
 
 
 def test_the_wheel_says_what_it_is(archives):
@@ -61,6 +64,26 @@ def test_the_wheel_says_what_it_is(archives):
     assert needed == {r.split(">")[0] for r in declared}
 
 
+def test_what_an_index_shows_has_no_link_into_the_repository_and_all_the_words(archives):
+    with zipfile.ZipFile(archives[0]) as wheel:
+        name = next(name for name in wheel.namelist() if name.endswith("METADATA"))
+        said = Parser().parsestr(wheel.read(name).decode())
+    assert said["Description-Content-Type"] == "text/markdown"
+    text, readme = said.get_payload(), (ROOT / "README.md").read_text(encoding="utf-8")
+    assert re.findall(r"\]\((?!https:)", readme)
+    assert not re.findall(r"\]\((?!https:)|<img", text)
+    for fence in re.findall(r"```.*?```", readme, re.DOTALL):
+        assert fence in text
+    assert "quick start · concepts · recipes" in text
+
+
+def test_an_index_takes_the_archives(archives):
+    pytest.importorskip("twine")
+    command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, archives)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
 def test_the_source_archive_holds_what_it_takes_to_test_and_to_build_the_manual(archives):
     with tarfile.open(archives[1]) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
@@ -68,7 +91,11 @@ def test_the_source_archive_holds_what_it_takes_to_test_and_to_build_the_manual(
         assert name in names, name
     for name in ("tests/conftest.py", "data_samples/view_00.tif", "docs/index.md", "benchmarks/kernels.py"):
         assert name in names, name
+    for name in ("recipe/recipe.yaml", "Dockerfile", "docs/man/barpc.1", "notebooks/first_run.ipynb"):
+        assert name in names, name
     assert not [name for name in names if "__pycache__" in name]
+    rasters = {name for name in names if name.lower().endswith((".tif", ".ntf", ".hgt", ".jp2", ".gtx"))}
+    assert {name.rpartition("/")[0] for name in rasters} == {"data_samples"}
     assert archives[1].stat().st_size < 10e6
 
 
