@@ -23,6 +23,7 @@ pytestmark = pytest.mark.slow
 def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The wheel and the source archive, built by the backend that pip uses."""
     pytest.importorskip("hatchling")
+    pytest.importorskip("hatch_fancy_pypi_readme")
     out = tmp_path_factory.mktemp("dist")
     code = "from hatchling import build; print(build.build_wheel({0!r})); print(build.build_sdist({0!r}))"
     command = [sys.executable, "-c", code.format(str(out))]
@@ -74,7 +75,7 @@ def test_what_an_index_shows_has_no_link_into_the_repository_and_all_the_words(a
     assert not re.findall(r"\]\((?!https:)|<img", text)
     for fence in re.findall(r"```.*?```", readme, re.DOTALL):
         assert fence in text
-    assert "quick start · concepts · recipes" in text
+    assert "quick start · two notebooks · concepts · recipes" in text
 
 
 def test_an_index_takes_the_archives(archives):

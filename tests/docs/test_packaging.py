@@ -1,4 +1,4 @@
-"""What hands barpc to others beside pip - manual page, conda recipe, image of a container - says what the project says."""
+"""What hands barpc to others beside pip - manual page, conda recipe, container - says what the project says."""
 
 from __future__ import annotations
 
@@ -87,8 +87,14 @@ def test_the_recipe_is_one_that_a_builder_of_conda_packages_understands():
 
 def test_the_container_copies_what_the_wheel_is_made_of_and_is_named_by_the_version():
     text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    assert set(re.findall(r"barpc:(\d\S+)", (DOCS / "quickstart.md").read_text(encoding="utf-8"))) == {
+        barpc.__version__
+    }
     assert set(re.findall(r"barpc:(\S+)", text)) == {barpc.__version__}
-    assert re.findall(r"^(?:USER|ENTRYPOINT) .*$", text, re.MULTILINE) == ["USER 1000", 'ENTRYPOINT ["barpc"]']
+    assert re.findall(r"^(?:USER|ENTRYPOINT) .*$", text, re.MULTILINE) == [
+        "USER 1000",
+        'ENTRYPOINT ["barpc"]',
+    ]
     let_in = {line[1:] for line in (ROOT / ".dockerignore").read_text().split() if line.startswith("!")}
     wheel = project()["tool"]["hatch"]["build"]["targets"]["wheel"]
     used = {*wheel["packages"], *wheel["shared-data"], "pyproject.toml", "README.md", "LICENSE"}
