@@ -98,7 +98,7 @@ def info(
 _METHODS = {
     "line": "where the rays of an image line meet",
     "stated": "by its orbit",
-    "nominal": "assumed: the rays of an image line meet nowhere that an orbit could be",
+    "nominal": "assumed: the rays of an image line meet in no orbit",
 }
 
 

@@ -279,7 +279,7 @@ def test_info_says_where_the_rpc_comes_from_and_what_was_passed_over(image, caps
         f"  centre       lon {lon:.6f}, lat {lat:.6f} deg at {(low + high) / 2:g} m",
         f"  pixel        {gsd['col']:.3f} m a column, {gsd['row']:.3f} m a row on the ground",
         f"  looks        {angle:.2f} deg off the vertical, from {side:.2f} deg (north is 0)",
-        f"  sensor       {stand / 1e3:.1f} km high, assumed: the rays of an image line meet nowhere that an orbit could be",
+        f"  sensor       {stand / 1e3:.1f} km high, assumed: the rays of an image line meet in no orbit",
     ]
 
 

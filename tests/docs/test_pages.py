@@ -167,9 +167,13 @@ def test_the_citation_file_names_the_paper_and_the_licence_of_the_package():
         assert f"family-names: {author}" in text
 
 
+OTHER = "README.md", "template.md.j2"
+"""What is in changelog.d beside fragments."""
+
+
 def test_changelog_fragments_have_a_type_that_the_changelog_knows():
     configuration = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     types = set(re.findall(r'^directory = "(\w+)"$', configuration, re.MULTILINE))
-    for path in (ROOT / "changelog.d").iterdir():
+    for path in {*(ROOT / "changelog.d").iterdir()} - {ROOT / "changelog.d" / name for name in OTHER}:
         assert re.fullmatch(r"[\w-]+\.(\w+)\.md", path.name), path.name
         assert path.name.split(".")[1] in types, path.name
