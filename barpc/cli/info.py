@@ -118,7 +118,7 @@ def _lines(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "image", "its size is not known; with FILE,size=WIDTH:HEIGHT angles and places are told"
     else:
         yield "image", "{} x {} px; (0, 0) is the centre of the first pixel".format(*report["size_px"])
-    yield "altitudes", "{:g} to {:g} m above the ellipsoid".format(*report["altitude_range_m"])
+    yield "altitudes", "{:.5g} to {:.5g} m above the ellipsoid".format(*report["altitude_range_m"])
     if is_rpc:
         yield from _lines_of_rpc(report)
     if "problem" in report:
@@ -136,7 +136,7 @@ def _lines_of_rpc(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         "lon {0[0]:.5f} to {0[1]:.5f}, lat {1[0]:.5f} to {1[1]:.5f} deg".format(*report["domain"].values()),
     )
     stated = {"common to the image": report["err_bias_m"], "of each point": report["err_rand_m"]}
-    known = [f"{value:g} m {what}" for what, value in stated.items() if value is not None]
+    known = [f"{value:.3g} m {what}" for what, value in stated.items() if value is not None]
     yield "accuracy", ", ".join(known) or "not stated"
     least = report["smallest_denominator"]
     pole = "0 would be a pole" if least > 0 else "it may have a pole in or near these bounds"
@@ -146,7 +146,7 @@ def _lines_of_rpc(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 def _lines_of_geometry(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield (
         "centre",
-        "lon {:.6f}, lat {:.6f} deg".format(*report["center_deg"]) + f" at {report['center_alt_m']:g} m",
+        "lon {:.6f}, lat {:.6f} deg".format(*report["center_deg"]) + f" at {report['center_alt_m']:.5g} m",
     )
     yield "pixel", "{col:.3f} m a column, {row:.3f} m a row on the ground".format(**report["gsd_m"])
     yield (
