@@ -204,6 +204,24 @@ def _open_sentinel1(path: Place, pol: str | None = None, **choices: Any) -> Came
     return Camera(model, path, "sentinel-1", model.size, model.alt_range)
 
 
+def _is_terrasar(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
+    """A product folder, or its annotation."""
+    if not (path.is_dir() and isinstance(path, Path)):
+        return b"<level1Product" in head
+    from barpc.sensor.terrasar import find_annotation
+
+    return find_annotation(path) is not None
+
+
+def _open_terrasar(path: Place) -> Camera:
+    from barpc.sensor.terrasar import open_terrasar
+
+    if not isinstance(path, Path):
+        raise ImageError(f"{path}: a radar product is read from disk only")
+    model = open_terrasar(path)
+    return Camera(model, path, "terrasar-x", model.size, model.alt_range)
+
+
 def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
     """The XML of a SICD image, or a NITF that holds it."""
     if b"<SICD" in head or not head.startswith(b"NITF02.10") or not isinstance(path, Path):
@@ -314,5 +332,6 @@ OPENERS: dict[str, Opener] = {
             "bistatic": {"annotated": "annotated", "full": "full"}.__getitem__,
         },
     ),
+    "terrasar-x": Opener(_is_terrasar, _open_terrasar),
 }
 """Kind -> how it is told from others and opened. The last row that knows a file has it; the first takes any."""
