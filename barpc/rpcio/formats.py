@@ -40,7 +40,7 @@ def _has(*patterns: str) -> Callable[[str], bool]:
 
 
 _BESIDE = "gdal, beside an image"
-_TXT = _has(r"(?im)^[ \t]*+LINE_NUM_COEFF_1[ \t]*+[:=]")
+_TXT = _has(r"(?im)^[ \t]*+LINE_NUM_COEFF(_1)?[ \t]*+[:=](?(1)|[ \t]*+[-+.\d])")
 _RPB = _has(r"(?i)lineNumCoef\s*+=")
 _GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
 _MAXAR = _has(r"<(\w+:)?LINENUMCOEF")

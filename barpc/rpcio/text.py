@@ -60,10 +60,15 @@ def _numbered(fields: Fields, separator: str, indices: Sequence[str]) -> list[st
 
 
 def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
-    """``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT)."""
-    found = ((key.upper(), value) for key, value in _pairs(text))
-    known = ((k, v) for k, v in found if k in SINGLE or k.rpartition("_")[0] in LISTS)
-    pairs = [(key, number(value, name, key)) for key, value in known]
+    """``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT).
+
+    Coefficients are numbered or, as GDAL shows them, twenty in a line.
+    """
+    found = [(key.upper(), value) for key, value in _pairs(text)]
+    pairs = [(k, number(v, name, k)) for k, v in found if k in SINGLE or k.rpartition("_")[0] in LISTS]
+    pairs += [
+        (f"{k}_{i}", value) for k, v in found if k in LISTS for i, value in enumerate(numbers(v, name, k), 1)
+    ]
     return rpc_from_fields(collect_numbered(pairs, name), name, options)
 
 

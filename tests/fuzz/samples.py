@@ -46,11 +46,13 @@ from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.sentinel1 import open_product
 from barpc.sensor.sicd import open_sicd
+from barpc.sensor.terrasar import open_terrasar
 from barpc.tie.pairs import read_area
 from barpc.workspace import Workspace
 from tests.pointio.test_foreign import binary, colmap
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
+from tests.sensor import terrasar_files
 from tests.sensor.linescan_files import Flight, dimap, isd
 from tests.sensor.radar_documents import document, nitf
 from tests.sensor.s1_product import Product
@@ -387,6 +389,33 @@ def _sicd_nitf() -> bytes:
         return nitf(document("PFA"), Path(folder) / "image.ntf").read_bytes()
 
 
+def _use_terrasar(path: Path) -> object:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        radar = open_terrasar(path)
+        return radar.project(radar.localize(np.array([[100.0, 20.0]]), np.array([100.0])))
+
+
+def _use_georef(path: Path) -> object:
+    return _use_terrasar(path.parents[1] / terrasar_files.NAME)
+
+
+@cache
+def _terrasar() -> tuple[bytes, bytes]:
+    product = terrasar_files.Terrasar()
+    return product.main().encode(), product.georef().encode()
+
+
+def _beside_georef(folder: Path) -> None:
+    (folder / "ANNOTATION").mkdir()
+    (folder / terrasar_files.NAME).write_bytes(_terrasar()[0])
+
+
+def _beside_main(folder: Path) -> None:
+    _beside_georef(folder)
+    (folder / "ANNOTATION" / "GEOREF.xml").write_bytes(_terrasar()[1])
+
+
 # --- physical models --------------------------------------------------------------------------------------
 
 _FLIGHT = Flight(size=(200, 1500))
@@ -570,6 +599,17 @@ SAMPLES: dict[str, Sample] = {
     ),
     "sicd": Sample("image.xml", _use_sicd, lambda: document("INCA").encode(), (mutate_xml,), share=0.2),
     "sicd nitf": Sample("image.ntf", _use_sicd, _sicd_nitf, (), share=0.2),
+    "terrasar": Sample(
+        terrasar_files.NAME, _use_terrasar, lambda: _terrasar()[0], (mutate_xml,), _beside_main, share=0.2
+    ),
+    "georef": Sample(
+        "ANNOTATION/GEOREF.xml",
+        _use_georef,
+        lambda: _terrasar()[1],
+        (mutate_xml,),
+        _beside_georef,
+        share=0.2,
+    ),
     "isd": Sample("image.XML", _use_linescan, lambda: isd(_FLIGHT)[0].encode(), (mutate_xml,)),
     "dimap model": Sample("DIM_image.XML", _use_linescan, lambda: dimap(_FLIGHT)[0].encode(), (mutate_xml,)),
     "product zip": Sample("S1A.zip", _use_product, _safe, (), share=0.2),

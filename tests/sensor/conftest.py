@@ -19,9 +19,11 @@ from barpc.sensor.pushbroom import Light, Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sicd import open_sicd
 from barpc.sensor.splined import RowSpline, Splined
+from barpc.sensor.terrasar import open_terrasar
 from barpc.simulate.orbit import Look, fly
 from tests.sensor.radar_documents import document
 from tests.sensor.s1_product import Product
+from tests.sensor.terrasar_files import Terrasar
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,12 @@ def _sicd(kind: str, lon: float = 5.4, **said: object) -> Case:
     return Case(model, model.size, model.alt_range)
 
 
+def _terrasar(lon: float) -> Case:
+    with TemporaryDirectory() as folder:
+        model = open_terrasar(Terrasar("left", orbit=Product(lon=lon + 4.4)).write(Path(folder)))
+    return Case(model, model.size, model.alt_range)
+
+
 def _grid(lon: float) -> DirectGrid:
     cols, rows, alts = (
         np.arange(-500.0, 21000, 1000),
@@ -141,6 +149,7 @@ MODELS: dict[str, Callable[[], Case]] = {
     "range-doppler": lambda: _range_doppler(5.4),
     "range-doppler across the antimeridian": lambda: _range_doppler(180.0),
     "corrected range-doppler": _corrected_range_doppler,
+    "terrasar-x to the left, across the antimeridian": lambda: _terrasar(180.0),
     "sicd, polar format": lambda: _sicd("PFA"),
     "sicd, zero doppler, to the left": lambda: _sicd("INCA", side="L"),
     "sicd, ground plane across the antimeridian": lambda: _sicd("PLANE", lon=180.0),

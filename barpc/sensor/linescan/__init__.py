@@ -34,7 +34,7 @@ def read_linescan(
     path : Path, Maxar's image support data or Airbus' ``DIM_*.XML``
     band : str, optional, the band whose detector is taken, where they have detectors of their own
     aberration, refraction : bool, optional
-        What bends the line of sight (`Light`); None: both for Maxar, none for DIMAP, as their attitudes ask for it.
+        What bends the line of sight (`Light`); None: both for Maxar, what the settings of a DIMAP say for Airbus.
 
     Raises
     ------
@@ -49,8 +49,9 @@ def read_linescan(
             f"{path}: no physical camera model; its root is <{root.element.tag}>, expected one of {known}"
         )
     found: Linescan = vendor.read(root, band)
+    usual: Light = vendor.light(root)
     light = Light(
-        vendor.LIGHT.aberration if aberration is None else aberration,
-        vendor.LIGHT.refraction if refraction is None else refraction,
+        usual.aberration if aberration is None else aberration,
+        usual.refraction if refraction is None else refraction,
     )
     return replace(found, model=replace(found.model, light=light), kind=vendor.KIND)

@@ -19,16 +19,22 @@ from barpc.geodesy import Array
 from barpc.sensor.curve import EXTRAPOLATION
 from barpc.sensor.document import Fields, seconds
 from barpc.sensor.linescan.samples import Detector, Linescan, Samples, build
-from barpc.sensor.pushbroom import STRAIGHT
+from barpc.sensor.pushbroom import Light
 
 ROOT, KIND = "Dimap_Document", "dimap physical model"
-LIGHT = STRAIGHT  # the attitude is the one that lets the straight line of sight meet the ground
 
 _MOST = 1_000_000  # rows or columns
 _UNITS = (1.0, 1e-3, 1e-6)  # s: that LINE_PERIOD may be in
 _AGREE = 0.01  # relative: by how much LINE_PERIOD may miss what START and END say
 _DAY = 86400.0  # s: OFFSET counts from midnight
 _STEP = 0.05  # s: at which a polynomial attitude is sampled
+
+
+def light(root: Fields) -> Light:
+    """What the product's settings say that its model allows for: nothing (Pleiades), refraction (Neo)."""
+    stated = "Processing_Information/Product_Settings/Geometric_Settings/{}_SETTING"
+    said = (root.element.findtext(stated.format(w), "") for w in ("LIGHT_SPEED", "ATMOSPHERIC_REFRACTION"))
+    return Light(*(text.strip().lower() == "true" for text in said))
 
 
 def read(root: Fields, band: str | None = None) -> Linescan:

@@ -22,11 +22,15 @@ from barpc.sensor.linescan.samples import Detector, Linescan, Samples, build, un
 from barpc.sensor.pushbroom import Light
 
 ROOT, KIND = "isd", "maxar physical model"
-LIGHT = Light(aberration=True, refraction=True)  # star trackers tell where the body points, not what it sees
 
 _MOST = 1_000_000  # rows or columns
 _STRAIGHT = 0.01  # rows by which line times may leave a straight line
 _TABLES = {"EPH": (13, 7), "ATT": (15, 5)}  # numbers of a row: with covariances, without
+
+
+def light(_root: Fields) -> Light:
+    """Both: star trackers tell where the body points, not what it sees."""
+    return Light(aberration=True, refraction=True)
 
 
 def read(root: Fields, band: str | None = None) -> Linescan:

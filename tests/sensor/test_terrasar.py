@@ -1,0 +1,154 @@
+"""TerraSAR-X: the model of an annotation against zero Doppler found by bracketing, and what is refused."""
+
+from __future__ import annotations
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+from barpc.cameras import open_camera
+from barpc.errors import BarpcError, BarpcWarning, InputError, RpcFormatError
+from barpc.fit import fit_rpc
+from barpc.sensor.terrasar import open_terrasar
+from tests.sensor.terrasar_files import INTERVAL, NAME, SIZE, SPACING, START, Terrasar
+
+
+@pytest.mark.parametrize("look", ["right", "left"])
+def test_points_are_seen_at_their_zero_doppler_and_range_times_with_their_delays(tmp_path, look):
+    product = Terrasar(look)
+    model = open_terrasar(product.write(tmp_path))
+    ground = product.ground()
+    truth = product.image(ground)
+    np.testing.assert_allclose(model.project(ground), truth, rtol=0, atol=2e-3)  # velocities in mm/s
+    there = model.localize(truth, ground[:, 2])
+    np.testing.assert_allclose(model.project(there), truth, rtol=0, atol=1e-6)
+    assert model.size == SIZE
+    assert model.alt_range == (103 - 200, 899 + 500)
+    assert model.look == look
+
+
+def test_without_its_delays_a_product_is_off_by_them_and_says_so(tmp_path):
+    product = Terrasar()
+    path = product.write(tmp_path)
+    (tmp_path / "ANNOTATION" / "GEOREF.xml").unlink()
+    with pytest.warns(BarpcWarning, match="no ANNOTATION/GEOREF.xml"):
+        model = open_terrasar(path)
+    off = model.project(product.ground()) - product.image(product.ground())
+    wanted = -np.array(product.late) / (SPACING, INTERVAL)  # col 1.6 px to the left, row 0.7 px down
+    np.testing.assert_allclose(off, np.tile(wanted, (len(off), 1)), rtol=0, atol=2e-3)
+    assert model.alt_range == (-550.0, 1450.0)
+
+
+def test_a_folder_is_opened_as_its_annotation_and_an_rpc_follows(tmp_path):
+    path = Terrasar().write(tmp_path)
+    cameras = [open_camera(tmp_path), open_camera(path)]
+    assert [c.format for c in cameras] == ["terrasar-x", "terrasar-x"]
+    assert cameras[0].model == cameras[1].model
+    assert cameras[0].size == SIZE
+    fit = fit_rpc(cameras[0].model, SIZE, cameras[0].alt_range)
+    assert fit.max_ckp.max() < 1e-3
+    (tmp_path / NAME.replace("TSX1", "TDX1")).write_bytes(path.read_bytes())
+    with pytest.raises(RpcFormatError, match="no Sentinel-1 annotation"):  # two: not one product
+        open_camera(tmp_path)
+
+
+def test_the_product_s_own_grid_is_a_witness(tmp_path):
+    path = Terrasar().write(tmp_path)
+    georef = tmp_path / "ANNOTATION" / "GEOREF.xml"
+    text = georef.read_text()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        open_terrasar(path)
+    georef.write_text(re.sub(r"<t>([^<]*)</t>", lambda m: f"<t>{float(m[1]) + 6 * INTERVAL}</t>", text))
+    with pytest.warns(BarpcWarning, match=r"off by 0\.0 columns, 6\.0 rows"):
+        open_terrasar(path)
+    georef.write_text(
+        re.sub(r"<tau>([^<]*)</tau>", lambda m: f"<tau>{float(m[1]) - 7 * SPACING}</tau>", text)
+    )
+    with pytest.warns(BarpcWarning, match=r"off by 7\.0 columns, 0\.0 rows"):
+        open_terrasar(path)
+
+
+NOT_READ = {
+    "a ground range product": (">SLANTRANGE<", ">GROUNDRANGE<", "GROUNDRANGE projection.*SSC"),
+    "a map": (">SLANTRANGE<", ">MAP<", "MAP projection"),
+    "ScanSAR": (">SM<", ">SC<", "mode SC, read are SM"),
+    "bistatic": ('fileName="TSX1_SAR__SSC______SM', 'fileName="TSX1_SAR__SSC_BRX2_SM', "another satellite"),
+    "squinted": (">ZERODOPPLER<", ">ACQUISITION<", "imageCoordinateType is ACQUISITION"),
+    "far range first": (">EARLYAZNEARRG<", ">EARLYAZFARRG<", "imageDataStartWith is EARLYAZFARRG"),
+}
+LIES = {
+    "another look": (">RIGHT<", ">DOWN<", "lookDirection is 'DOWN'"),
+    "a row less": (
+        f"<numberOfRows>{SIZE[1]}",
+        "<numberOfRows>19997",
+        "19997 rows every 0.00026 s do not last",
+    ),
+    "columns of another length": (f">{SPACING!r}<", ">8.1e-09<", "12000 columns every 8.1e-09 s do not last"),
+    "an inertial orbit": (">WGS84<", ">ICRF<", "state vectors in ICRF"),
+    "no orbit": ("stateVec", "stateVek", "orbit: 0 state vectors"),
+    "an orbit of another time": ("T15:1[123]:", "T16:11:", "orbit: .*state vectors"),
+    "no number": ("<sceneAverageHeight>4.5E", "<sceneAverageHeight>high", "sceneAverageHeight is not a list"),
+    "no TerraSAR-X": ("level1Product", "level1Produce", "no TerraSAR-X annotation"),
+}
+
+
+@pytest.mark.parametrize("lie", [*NOT_READ, *LIES])
+def test_what_is_not_read_or_lies_is_said_in_one_line(tmp_path, lie):
+    path = Terrasar().write(tmp_path)
+    old, new, words = {**NOT_READ, **LIES}[lie]
+    text = re.sub(old, new, path.read_text())
+    assert text != path.read_text()
+    path.write_text(text)
+    with pytest.raises(InputError if lie in NOT_READ else RpcFormatError, match=words) as told:
+        open_terrasar(path)
+    assert "\n" not in str(told.value)
+    assert NAME in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("gridPoint", "gridpoint", "no gridPoint"),
+        ("-0.00018<", "-0.18<", "azimuthShift is -0.18 s"),
+        (r"<lat>[^<]*<", "<lat>north<", "lat is not a list"),
+        ("<referencePoint>[^<]*<", "<referencePoint><", "no referencePoint"),
+    ],
+)
+def test_a_georef_that_lies_is_said_in_one_line(tmp_path, old, new, words):
+    path = Terrasar().write(tmp_path)
+    georef = tmp_path / "ANNOTATION" / "GEOREF.xml"
+    text = re.sub(old, new, georef.read_text())
+    assert text != georef.read_text()
+    georef.write_text(text)
+    with pytest.raises(RpcFormatError, match=f"GEOREF.xml: .*{words}"):
+        open_terrasar(path)
+
+
+def test_damage_anywhere_is_one_line(tmp_path):
+    path, rng = Terrasar().write(tmp_path), np.random.default_rng(6)
+    files = [path, tmp_path / "ANNOTATION" / "GEOREF.xml"]
+    whole = [file.read_bytes() for file in files]
+    for k in range(60):
+        for file, data in zip(files, whole, strict=True):
+            file.write_bytes(data)
+        damaged = bytearray(whole[k % 2])
+        for at in rng.integers(60, len(damaged), 3):
+            damaged[at] = rng.choice(list(b"<>0x-e.9 /"))
+        files[k % 2].write_bytes(damaged[: rng.integers(1, len(damaged)) if k % 7 == 0 else None])
+        said = ""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                open_terrasar(path)
+            except BarpcError as error:
+                said = str(error)
+        assert "\n" not in said
+
+
+def test_times_of_the_frame_begin_with_the_first_row(tmp_path):
+    model = open_terrasar(Terrasar().write(tmp_path))
+    late = (model.epoch - np.datetime64("2021-02-16T15:12:07.524369", "ns")) / np.timedelta64(1, "ns")
+    assert late == pytest.approx((START + 1.8e-4) * 1e9, abs=1)
