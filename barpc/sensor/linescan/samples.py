@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import factorial
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from barpc.errors import RpcError, RpcFormatError
 from barpc.geodesy import Array, ecef_from_ground
@@ -16,6 +18,9 @@ _BEYOND = 2.0  # steps that an image may reach beyond the samples
 _FASTEST = 0.3  # rad/s: no imaging satellite turns so fast
 _UNIT = 1e-3  # by which the length of a quaternion may miss 1
 _RADII = (6.5e6, 8e6)  # m from the Earth's centre
+_ORBIT, _RATE = 7e6, 1.2e-3  # m, rad/s: radius and turn of an orbit: of its Taylor series in time
+_DEGREES, _EXACT = range(2, 7), 1e-5  # m: the first degree whose next term is smaller is taken
+_SCATTER = 0.01  # m, RMS: samples farther from the polynomial are not noise
 _OFF = 700.0  # m/s: by more than the Earth's rotation no stated velocity differs from that of the positions
 
 
@@ -64,7 +69,7 @@ def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | Non
     try:
         mount, attitude = attitude_through(samples.ticks, samples.quaternions)
         model = Pushbroom(
-            Curve.through(samples.times, samples.positions),
+            _track(samples.times, samples.positions),
             attitude,
             mount,
             detector.look,
@@ -83,6 +88,26 @@ def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | Non
         far = float(np.linalg.norm(ecef_from_ground(middle) - place))
         model = replace(model, accuracy=(sigma[0] * far, sigma[1]))
     return Linescan(model, detector.size)
+
+
+def _track(times: Array, positions: Array) -> Curve:
+    """Where the camera is: a polynomial that any orbit follows for so long, or through all samples if these do not.
+
+    Dense samples scatter by millimetres, which a curve through them all carries beyond the first by centimetres.
+    """
+    half = 0.5 * (times[-1] - times[0])
+    degree = next((d for d in _DEGREES if _ORBIT * (_RATE * half) ** (d + 1) < _EXACT * factorial(d + 1)), 0)
+    if not degree or len(times) <= degree + 1:
+        return Curve.through(times, positions)
+    since = times - times[0]
+    parts = [Polynomial.fit(since, axis, degree) for axis in positions.T]
+    left = positions.T - [part(since) for part in parts]
+    if not np.sqrt((left**2).mean()) <= _SCATTER:
+        return Curve.through(times, positions)
+    coeffs = [part.convert().coef for part in parts]
+    return Curve.polynomial(
+        np.stack([np.pad(c, (0, degree + 1 - len(c))) for c in coeffs], 1), times[0], times[-1]
+    )
 
 
 def unit(quaternions: Array, name: str) -> Array:
