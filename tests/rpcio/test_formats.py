@@ -245,7 +245,19 @@ def _units(text: str) -> str:
     )
 
 
+def _in_lines(text: str) -> str:
+    """Twenty coefficients in a line, as GDAL shows them."""
+    keys = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
+    lists = [f"  {key}={' '.join(re.findall(rf'(?m)^{key}_[0-9]+: (.*)$', text))}" for key in keys]
+    return "\n".join([*(line for line in text.splitlines() if "COEFF" not in line), *lists])
+
+
 CONSTELLATIONS = {
+    "GDAL's own listing: coefficients in lines": ("txt", _in_lines),
+    "GF: .rpb without semicolons, signs behind tabs": (
+        "rpb",
+        lambda t: re.sub(r"= (\d)", r"= \t+\1", t).replace(";", ""),
+    ),
     "BlackSky, Satellogic: _rpc.txt in any order": ("txt", lambda t: "\n".join(sorted(t.splitlines()))),
     "KOMPSAT, ZY-3, Jilin-1: signs and units": ("txt", lambda t: _units(_signed(t))),
     "GF-7, SuperView: .rpb with CRLF and tabs": (

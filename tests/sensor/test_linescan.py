@@ -19,7 +19,7 @@ from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.pushbroom import STRAIGHT, Light
-from tests.sensor.linescan_files import Flight, dimap, inertial_sight, isd, stamp
+from tests.sensor.linescan_files import START, Flight, dimap, inertial_sight, isd, stamp
 
 FLIGHT = Flight()
 IMAGE = np.array(
@@ -132,9 +132,9 @@ def test_stated_covariances_are_the_priors_of_the_view(tmp_path):
     np.testing.assert_array_equal(prior_sigmas((silent,), AdjustOptions(), 0), np.full((1, 6), 7.5))
 
 
-# What the files of two satellites say, against their RPC over five altitudes: mean and spread [px]. That RPC was
-# fitted with strong damping, of WV03 without aberration and refraction and of WV01 with both, and an attitude that
-# swings is beyond any RPC: the spread is the fit's. The mean is the model's.
+# What the files of two satellites say, against their RPC over five altitudes: mean and spread [px]. Both were put
+# together from tiles by other software, which fitted the RPC anew with strong damping, of WV03 without aberration and
+# refraction and of WV01 with both: the spread is that fit's. The mean is the model's.
 @pytest.mark.parametrize(
     ("name", "bent", "mean", "spread"),
     [
@@ -160,6 +160,37 @@ def test_the_model_is_that_of_the_rpc_in_the_same_file(shared_data, name, bent, 
     assert np.hypot(*other.mean(axis=0)) > 20
 
 
+# Corners that the vendor computed: (lon, lat, alt, col, row) of the first tile of the WV01 image.
+_CORNERS = np.array(
+    [[50.59096874, -77.01128208, 3431.44, 0, 0], [49.81876988, -77.01468990, 3468.26, 35179, 0]],
+)
+
+
+@pytest.mark.parametrize(
+    ("aberration", "refraction", "low", "high"),
+    [(True, True, 0.0, 0.06), (True, False, 1.0, 1.2), (False, True, 18, 19), (False, False, 19, 20)],
+)
+def test_the_vendor_s_own_corners_lie_where_bent_light_has_them(
+    shared_data, aberration, refraction, low, high
+):
+    path = shared_data / "physical_maxar" / "10200100A1865800.r100.xml"
+    model = read_linescan(path, aberration=aberration, refraction=refraction).model
+    off = np.abs(model.project(_CORNERS[:, :3]) - _CORNERS[:, 3:])
+    assert low <= off.max() <= high
+
+
+@pytest.mark.parametrize(("aberration", "low", "high"), [(True, 0.0, 0.02), (False, 25, 40)])
+def test_a_vendor_s_corner_of_unknown_height_lies_on_the_line_of_sight_with_aberration(
+    shared_data, aberration, low, high
+):
+    path = shared_data / "physical_maxar" / "1040010074793300.xml"
+    model = read_linescan(path, aberration=aberration).model
+    corner = np.array([[-156.8255209, 71.3953744, alt] for alt in (0.0, 10.0)])  # of pixel (0, 0)
+    (off, _), along = model.project(corner), np.diff(model.project(corner), axis=0)[0]
+    across = abs(off[0] * along[1] - off[1] * along[0]) / np.hypot(*along)
+    assert low <= across <= high
+
+
 def test_a_fit_to_an_attitude_that_swings_says_why_it_fails(tmp_path):
     model = read(tmp_path, isd(Flight(swing=2e-5))[0]).model
     with pytest.raises(FitError, match="attitude may swing within the image"):
@@ -183,6 +214,59 @@ def test_a_dimap_means_what_its_parts_say(tmp_path, poly, unit):
     assert found.model.line_period == pytest.approx(flight.period, rel=1e-12)
     assert misses(found.model, truth) < 2e-3
     assert misses(replace(found.model, look_origin=found.model.look_origin - 1), truth) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("speed", "air", "light"),
+    [
+        ("false", "true", Light(refraction=True)),  # as a Pleiades Neo product says
+        ("true", "false", Light(aberration=True)),
+        ("false", "false", STRAIGHT),
+    ],
+)
+def test_a_dimap_says_what_bends_its_light(tmp_path, speed, air, light):
+    text, _ = dimap(FLIGHT, poly=False)
+    said = (
+        f"<LIGHT_SPEED_SETTING>{speed}</LIGHT_SPEED_SETTING>"
+        f"<ATMOSPHERIC_REFRACTION_SETTING>{air}</ATMOSPHERIC_REFRACTION_SETTING>"
+    )
+    part = "<Processing_Information><Product_Settings><Geometric_Settings>{}</Geometric_Settings></Product_Settings>"
+    text = text.replace("<Raster_Data>", part.format(said) + "</Processing_Information><Raster_Data>")
+    assert read(tmp_path, text).model.light == light
+    assert read(tmp_path, text, aberration=False, refraction=False).model.light == STRAIGHT
+
+
+def _shaken(text, noise, first=2):
+    """The document with noise [m] on its positions, and without those before the `first`."""
+    rng = np.random.default_rng(8)
+    points = re.findall(r"<Point>.*?</Point>", text)
+    for k, point in enumerate(points):
+        place = [float(v) for v in re.search(r"<LOCATION_XYZ>(.*?)<", point)[1].split()]
+        moved = " ".join(repr(float(v)) for v in place + rng.normal(0, noise, 3))
+        new = re.sub(r"<LOCATION_XYZ>.*?<", f"<LOCATION_XYZ>{moved}<", point)
+        text = text.replace(point, new if k >= first else "")
+    return text
+
+
+def test_dense_positions_scatter_about_an_orbit(tmp_path):
+    text, truth = dimap(Flight(swing=0.0), poly=False)
+    clean = read(tmp_path, text).model
+    model = read(tmp_path, _shaken(text, 0.003, first=3)).model  # the first sample is one step behind row 0
+    rows = np.linspace(0, 19999, 50)
+    off = np.linalg.norm(model.position(rows) - clean.position(rows), axis=-1)
+    assert 1e-4 < off.max() < 0.006
+    assert misses(model, truth) < 0.02
+
+
+def test_positions_that_no_orbit_follows_are_taken_as_they_are(tmp_path):
+    text = _shaken(dimap(FLIGHT, poly=False)[0], 0.1)
+    model = read(tmp_path, text).model
+    points = re.findall(r"<TIME>(\S+?)Z</TIME><LOCATION_XYZ>(.*?)<", text)
+    assert len(points) > 30
+    for stated, place in points[3:-3:5]:
+        time = (np.datetime64(stated, "ns") - START) / np.timedelta64(1, "ns") * 1e-9
+        at = model.position(time / model.line_period)
+        np.testing.assert_allclose(at, [float(v) for v in place.split()], rtol=0, atol=1e-5)
 
 
 def test_commas_may_stand_between_coordinates(tmp_path):
