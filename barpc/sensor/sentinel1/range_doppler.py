@@ -56,7 +56,7 @@ _SETTLED = 1e-5  # s: quadratic convergence leaves less than 1e-12 s after a ste
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RangeDoppler(Frozen):
-    """A Sentinel-1 image: itself a `SensorModel`.
+    """A radar image in zero-Doppler geometry (Sentinel-1, TerraSAR-X): itself a `SensorModel`.
 
     Parameters
     ----------
