@@ -27,6 +27,7 @@ from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor import SensorModel
 from tests.rpcio.conftest import make_rpc, write_image
 from tests.sensor.conftest import MODELS
+from tests.sensor.terrasar_files import Terrasar
 
 SAMPLES = sorted((Path(__file__).parents[1] / "data_samples").glob("*.tif"))
 
@@ -159,7 +160,8 @@ def _nodes(grid):
 def test_a_radar_product_and_a_vendor_s_grid_go_through_the_verbs(shared_data, tmp_path, capsys):
     radar = sorted((shared_data / "sar").glob("s1a-iw1-slc-vv-20210216*.xml"))[0]
     grid = shared_data / "physical" / "GRID_P1BP--2017092838284574CP.tif"
-    for source, kind in ((radar, "sentinel-1"), (grid, "grid")):
+    folder = Terrasar().write(tmp_path).parent
+    for source, kind in ((radar, "sentinel-1"), (grid, "grid"), (folder, "terrasar-x")):
         camera = open_camera(source)
         assert camera.format == kind
         middle = (np.array(camera.extent) - 1) / 2

@@ -61,6 +61,10 @@ def _files(name: str) -> list[str]:
             str(path / one) for one in inside if one.lower().endswith(_ENDS) and _is_raster(path / one)
         ]
         if not rasters:
+            from barpc.sensor.terrasar import find_annotation
+
+            if find_annotation(path):
+                return [name]
             raise InputError(f"{name}: a folder without images ({', '.join(_ENDS)})")
         return rasters
     if os.path.lexists(name):
