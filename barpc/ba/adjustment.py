@@ -22,7 +22,7 @@ from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Outcome, Rounds, revived
-from barpc.ba.snooping import ControlTest, control_test
+from barpc.ba.snooping import MOST_TESTED, ControlTest, control_test, image_test
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
 from barpc.ba.unknowns import make_unknowns
@@ -358,6 +358,7 @@ def _adjustment(
         for inside, outside in ((found.before, found.start), (outcome.residual, found.after))
     )
     gauge, shares = _place(found, block, covariance)
+    w = block.in_order(_control_w(found, block, covariance))
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
     return Adjustment(
         names=block.names,
@@ -389,10 +390,26 @@ def _adjustment(
         gcp_inlier=inlier[known],
         reference_inlier=inlier[known.stop :],
         control=found.tested,
+        gcp_w=w[known],
+        reference_w=w[known.stop :],
         gcp_residuals=enu_offsets(final.points[block.num_tracks : block.num_known], block.gcps.lonlatalt),
         seconds=time.process_time() - start,
         options=options,
     )
+
+
+def _control_w(found: _Solution, block: Block, covariance: Covariance) -> Array:
+    """Baarda's w (K,) of the observations of known points; NaN for all others, and those that do not count."""
+    outcome, w = found.outcome, np.full(len(block.point), np.nan)
+    held = outcome.problem.point_prior
+    is_held = outcome.inlier & (False if held is None else np.isin(block.point, held.index))
+    of_gcps = np.flatnonzero(is_held & (block.point >= block.num_tracks) & (block.point < block.num_known))
+    others = np.flatnonzero(is_held & (block.point >= block.num_known))
+    rows = np.union1d(of_gcps, others[:: -(-len(others) // MOST_TESTED)] if len(others) else others)
+    if len(rows):
+        at_end = (found.final, outcome.residual, outcome.weight)
+        w[rows] = image_test(covariance, outcome.problem, *at_end, rows)
+    return w
 
 
 def _place(found: _Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:

@@ -83,6 +83,9 @@ class Adjustment:
         Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
     control : ControlTest or None
         Ground control points against each other and the cameras.
+    gcp_w, reference_w : (M,), (R,)
+        Baarda's w of the observations of GCPs and of a reference's points (`barpc.ba.snooping.image_test`); NaN for
+        those that do not count, and of a large reference for all but every n-th.
     gcp_inlier : (M,)
         Observations of GCPs that were kept.
     reference_inlier : (M,)
@@ -122,6 +125,8 @@ class Adjustment:
     terrain: TerrainTest | None
     left_out: tuple[str, ...]
     control: ControlTest | None
+    gcp_w: Array
+    reference_w: Array
     gcp_inlier: BoolArray
     reference_inlier: BoolArray
     gcp_residuals: Array

@@ -4,6 +4,8 @@ A control point that is used pulls its own residual towards zero, the more the l
 covariance stated of its place and Q_x that of the adjusted point, the residual v = adjusted - given has the covariance
 Q_v = Q_l - Q_x, and what all the others predict of it is off by Q_l Q_v^-1 v: leave-one-out without leaving one out.
 All together they are tested by the sum of v^T Q_l^-1 v over the points: errors that are no one's alone show there.
+
+Where they are seen is tested, too: every residual in an image over its own standard deviation, Baarda's w.
 """
 
 from __future__ import annotations
@@ -11,12 +13,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as la
 from scipy.special import chdtri
 
 from barpc.ba.covariance import Covariance
 from barpc.ba.heldout import enu_offsets
+from barpc.ba.normal import solve_transposed
+from barpc.ba.problem import Problem
+from barpc.ba.solve import State
 from barpc.geodesy import Array, enu_basis
-from barpc.scene import BoolArray, GroundPoints
+from barpc.scene import BoolArray, GroundPoints, IntArray
 
 CRITICAL = 4.0
 """A normalised residual that is larger is no chance: 6e-5 for a component, a thousandth for five points."""
@@ -24,6 +30,8 @@ _PART = 3  # of so many points one may be wrong, or the stated accuracies are
 _LEAST = 1e-6  # redundancy of a direction that nothing else tells about: along the ray of a point seen once
 CHECKED = 0.1  # redundancy of a point that something beside the cameras' priors tells about
 _CHANCE = 1e-3  # that points which are as good as stated scatter by more
+MOST_TESTED = 2000
+"""Observations of a reference that are tested in the images: of more, every n-th."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,3 +139,54 @@ def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[floa
         return np.nan, True
     squares = float((whitened[used & (redundancy > 0)] ** 2).sum())
     return float(np.sqrt(squares / freedom)), bool(squares <= chdtri(freedom, _CHANCE))
+
+
+def image_test(
+    covariance: Covariance, problem: Problem, state: State, residual: Array, weight: Array, rows: IntArray
+) -> Array:
+    """Baarda's w (n,) of observations in the images: the larger of |col| and |row| over its standard deviation.
+
+    A whitened residual has the covariance 1 - J C J^T, C that of camera and point together. NaN: nothing checks it.
+
+    Parameters
+    ----------
+    covariance : Covariance
+        Of the solution.
+    problem, state, weight : as solved last, and 1 / sigma of every observation (K,)
+    residual : (2, K)
+        Projected - observed [px].
+    rows : (n,)
+        Observations to test, ascending: of those that count, at known points.
+    """
+    structure, reduced, q = problem.structure, covariance.reduced, covariance.num_unknowns
+    bounds = np.searchsorted(structure.view[rows], np.arange(structure.num_views + 1))
+    ecef = structure.of_points(state.points)[:, rows]
+    seen = problem.cameras.seeing(problem.xy[:, rows]).project(state.params, ecef, bounds)
+    by_point, by_unknown = (part.transpose(2, 0, 1) for part in (seen.by_point, seen.by_unknown))
+    lower = reduced.lower[:, structure.point[rows]]
+    inverse = solve_transposed(lower, np.eye(3)[..., None]).transpose(2, 0, 1)  # L^-T
+    place = {} if reduced.common is None else {int(p): n for n, p in enumerate(reduced.common.index)}
+    left = np.empty((len(rows), 2))
+    for n, k in enumerate(rows.tolist()):
+        p = int(structure.point[k])
+        together = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
+        own = weight[k] * by_point[n] @ inverse[n]
+        moves = -own @ reduced.cross[together]
+        moves[together == k] += weight[k] * by_unknown[n]
+        known = np.eye(2) - own @ own.T
+        if p in place:
+            assert reduced.common is not None
+            shared = (
+                own @ la.solve_triangular(reduced.common.upper, reduced.common.cross[place[p]].T, trans="T").T
+            )
+            whole = shared @ reduced.common.by_camera
+            for view, move in zip(structure.view[together].tolist(), moves, strict=True):
+                whole[:, view * q : (view + 1) * q] += move
+            known -= shared @ shared.T + whole @ covariance.solve(whole.T)
+        else:
+            flat = moves.transpose(1, 0, 2).reshape(2, -1)
+            known -= flat @ covariance.joint(structure.view[together]) @ flat.T
+        left[n] = np.diag(known)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        w = np.abs(residual[:, rows].T * weight[rows, None]) / np.sqrt(np.where(left > _LEAST, left, np.nan))
+    return np.asarray(np.fmax(*w.T))

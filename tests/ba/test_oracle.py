@@ -17,6 +17,7 @@ from barpc.ba.datum import datum_shares
 from barpc.ba.gauge import MOTIONS, _modes, gauge_report
 from barpc.ba.ground import Heights, convergence_angles, ground_control
 from barpc.ba.problem import Problem
+from barpc.ba.snooping import image_test
 from barpc.ba.solve import Minimum, State, _Compressed, camera_step, gauss_newton
 from barpc.ba.weights import Observations
 from barpc.scene import GroundPoints
@@ -256,6 +257,25 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole(case):
         _assert_close(found, inverse[np.ix_(place, place)], 1e-4)
     pair = np.r_[q : 2 * q, 3 * q : 4 * q]
     _assert_close(covariance.joint(np.array([1, 3])), inverse[np.ix_(pair, pair)], 1e-4)
+
+
+def test_a_residual_in_an_image_is_taken_in_units_of_its_own_deviation(case):
+    """Baarda's w against 1 - J (J^T J)^-1 J^T of the whole differenced problem; heights that share errors, too."""
+    matrix, _, _ = case.dense
+    jacobian = case.plain.jacobian(case.params, case.points)
+    structure = case.problem.structure
+    rows = np.flatnonzero(np.isin(structure.point, [2, 5, 6, 10, 11]))
+    assert (np.bincount(structure.point[rows])[[2, 10]] > 1).all()
+    residual = case.problem.residuals(case.params, case.points)
+    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    found = image_test(covariance, case.problem, _state(case), residual, case.weight, rows)
+    left = 1.0 - np.einsum("ki,ij,kj->k", jacobian, np.linalg.inv(matrix), jacobian)
+    whitened = case.plain.residual(case.params, case.points)
+    places = 2 * rows[:, None] + [0, 1]
+    assert (left[places] < 0.99).any()  # or all would be residuals over what is stated
+    np.testing.assert_allclose(
+        found, (np.abs(whitened[places]) / np.sqrt(left[places])).max(axis=1), rtol=1e-4
+    )
 
 
 def test_modes_are_the_principal_axes_the_weakest_first_and_upright():
