@@ -8,6 +8,7 @@ they say how unlike two places may look for a wanted share of them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -84,6 +85,13 @@ class PairReport:
     matcher: str = "guided"  # that found the matches
     loosened: bool = False  # whether with loosened thresholds, in a second attempt
     reason: str = ""  # why the pair was tried
+    beaten: tuple[str, ...] = ()
+    """Attempts that found fewer: matcher, whether loosened, verified matches of those wanted, as "guided 12 of 100"."""
+
+    @property
+    def means(self) -> str:
+        """What found the matches, and whether with loosened thresholds."""
+        return self.matcher + ", loosened" * self.loosened
 
 
 def match_pair(
@@ -112,15 +120,28 @@ def match_pair(
 
 
 def enough(report: PairReport) -> bool:
-    """Whether a pair has matches enough not to be tried again: fewer where little is in common."""
+    """Whether a pair has matches enough not to be tried again."""
+    return report.status == "ok" and report.verified >= _wanted(report)
+
+
+def _wanted(report: PairReport) -> int:
+    """So many matches a pair is to have: fewer where little is in common."""
     common = report.overlap * min(report.keypoints)
-    least = min(THIN, max(FEW, SHARE * common)) if common > 0 else THIN
-    return report.status == "ok" and report.verified >= least
+    return math.ceil(min(THIN, max(FEW, SHARE * common))) if common > 0 else THIN
 
 
 def _better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
     """The attempt with most verified matches, of those that count; the earlier one of equals."""
-    return max(attempts, key=lambda attempt: attempt[1].verified if attempt[1].status == "ok" else -1)
+    best = max(attempts, key=lambda attempt: attempt[1].verified if attempt[1].status == "ok" else -1)
+    beaten = tuple(
+        text
+        for _, report in attempts
+        for text in (
+            *report.beaten,
+            *([] if report is best[1] else [f"{report.means} {report.verified} of {_wanted(report)}"]),
+        )
+    )
+    return best[0], replace(best[1], beaten=beaten)
 
 
 def _attempt(

@@ -118,9 +118,10 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
         report = reports.get(names)
         entry = PairEntry(*names, len(ties.a), angle, base, height, first, last, None)
         if report is not None:
-            tied = report.matcher + ", loosened" * report.loosened
             share, noise = report.control_share, report.spread
-            entry = replace(entry, matching=plain(report), tied_by=tied, decoy_share=share, noise_px=noise)
+            entry = replace(
+                entry, matching=plain(report), tied_by=report.means, decoy_share=share, noise_px=noise
+            )
             entry = replace(entry, chosen_by=report.reason)
         entries.append(entry)
     return tuple(entries)
