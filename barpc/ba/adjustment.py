@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Outcome, Rounds, revived
+from barpc.ba.smooth import SmoothTest
 from barpc.ba.snooping import MOST_TESTED, ControlTest, control_test, image_test
 from barpc.ba.solve import State
 from barpc.ba.structure import Structure, make_structure
@@ -117,6 +118,8 @@ class _Solution:
     start: HeldOut  # what the tracks that took no part say before
     after: HeldOut  # and after
     tested: ControlTest | None  # control points against the rest
+    # "drift", "jitter" -> what was smooth before another degree was taken, splines or steps followed
+    asked: Mapping[str, SmoothTest] = field(default_factory=dict)
 
     @property
     def final(self) -> State:
@@ -212,7 +215,7 @@ def _followed(found: _Solution, block: Block, outer: Block, options: AdjustOptio
                 tried = _with_waves(tried, block, outer, options, Waves(count, edges))
         better = given or (asked and best is found) or is_better(tried.after, best.after, outer)
         best, misses = (tried, 0) if better else (best, misses + 1)
-    return best
+    return best if best is found else replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
 
 
 def _given_edges(block: Block, options: AdjustOptions) -> Array:
@@ -286,14 +289,15 @@ def _solve(
         again = Rounds(problem, block, state, options, heights, agree).run()
         if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
-    drift = problem.cameras.unknowns.drift
+    drift, asked = problem.cameras.unknowns.drift, dict[str, SmoothTest]()
     if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
         bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
         ended, weight = outcome.minimum.state, block.use / block.sigma
         there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
+        asked = {"drift": outcome.smooth}
         problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
-    first = _Solution(problem, state, before, heights, outcome, start, start, None)
+    first = _Solution(problem, state, before, heights, outcome, start, start, None, asked)
     return _ended(first, problem, block, outer, options, outcome)
 
 
@@ -382,6 +386,7 @@ def _adjustment(
         datum=shares,
         prior=outcome.prior,
         smooth=outcome.smooth,
+        asked=found.asked,
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],

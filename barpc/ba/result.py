@@ -70,6 +70,8 @@ class Adjustment:
         How the corrections compare with the priors given, and what the priors became.
     smooth : SmoothTest
         What is smooth in the residuals that are left.
+    asked : mapping
+        "drift" or "jitter" -> what was smooth before a degree was added, or splines or steps were followed, for that.
     in_space_rms : float or None
         Where the data chose an affine in the image: what rotations, translations and drifts leave of the tracks
         that took no part [px].
@@ -119,6 +121,7 @@ class Adjustment:
     datum: Mapping[str, Array]
     prior: PriorTest
     smooth: SmoothTest
+    asked: Mapping[str, SmoothTest]
     in_space_rms: float | None
     two_groups: tuple[TwoGroups, ...]
     held: BoolArray

@@ -34,6 +34,15 @@ class PairTies:
     b: IntArray
 
 
+@dataclass(frozen=True)
+class ControlResidual:
+    """A residual of a known point in an image: view, name of the point, Baarda's w."""
+
+    view: int
+    point: str
+    w: float
+
+
 @dataclass(frozen=True, eq=False)
 class Run:
     """Everything that a run found out.
@@ -83,6 +92,21 @@ class Run:
     def held_out(self) -> BoolArray:
         """The observations (K,) that took no part in the adjustment, to be measured on."""
         return np.zeros(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.held_out
+
+    @cached_property
+    def control_tests(self) -> list[ControlResidual]:
+        """The residuals of control and of a reference's points in the images that could be tested."""
+        if self.adjustment is None:
+            return []
+        reference = None if self.reference is None else self.reference.control
+        of_reference = None if reference is None else reference.points
+        tested = ((self.gcps, self.adjustment.gcp_w), (of_reference, self.adjustment.reference_w))
+        return [
+            ControlResidual(int(points.view[k]), points.names[points.point[k]], float(w[k]))
+            for points, w in tested
+            if points is not None
+            for k in np.flatnonzero(np.isfinite(w)).tolist()
+        ]
 
     @cached_property
     def number(self) -> dict[str, int]:

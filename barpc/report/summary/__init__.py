@@ -19,16 +19,19 @@ from barpc.report.run import Run
 from barpc.report.summary.ground import (
     GCPS,
     CheckPointEntry,
+    ControlTestEntry,
     GcpEntry,
     KnownPoint,
     ReferenceEntry,
     ReferenceViewEntry,
     SeenEntry,
     measure_check_points,
+    measure_control,
     measure_gcps,
     measure_reference,
-)  # fmt: skip
+)
 from barpc.report.summary.pairs import OffsetEntry, PairEntry, measure_pairs
+from barpc.report.summary.place import EllipseEntry, shift_in_image
 from barpc.report.summary.scene import (
     DATUM,
     DatumEntry,
@@ -47,16 +50,15 @@ from barpc.report.summary.views import (
     ViewEntry,
     cell_numbers,
     measure_views,
-    shift_in_image,
-)  # fmt: skip
+)
 from barpc.report.summary.words import ABOVE, STATUS_WORDS, Count, largest, listed, median, metres
 
 __all__ = [
-    "CELLS", "DATUM", "GCPS", "SCHEMA", "STATUS_WORDS", "CenterEntry", "CheckPointEntry", "CorrectionEntry",
-    "DatumEntry", "DemEntry", "FitEntry", "GcpEntry", "KnownPoint", "LeftOutEntry", "ModeEntry", "OffsetEntry",
-    "PairEntry", "ReferenceEntry", "ReferenceViewEntry", "SceneEntry", "SeenEntry", "SourceEntry", "StageEntry",
-    "Summary", "TablesEntry", "TracksEntry", "ViewEntry", "cell_numbers", "largest", "listed", "measure", "median",
-    "metres", "mode_in_words", "published_schema", "shift_in_image",
+    "CELLS", "DATUM", "GCPS", "SCHEMA", "STATUS_WORDS", "CenterEntry", "CheckPointEntry", "ControlTestEntry",
+    "CorrectionEntry", "DatumEntry", "DemEntry", "EllipseEntry", "FitEntry", "GcpEntry", "KnownPoint", "LeftOutEntry",
+    "ModeEntry", "OffsetEntry", "PairEntry", "ReferenceEntry", "ReferenceViewEntry", "SceneEntry", "SeenEntry",
+    "SourceEntry", "StageEntry", "Summary", "TablesEntry", "TracksEntry", "ViewEntry", "cell_numbers", "largest",
+    "listed", "measure", "median", "metres", "mode_in_words", "published_schema", "shift_in_image",
 ]  # fmt: skip
 
 SCHEMA = 2  # Version of summary.json
@@ -125,6 +127,9 @@ class Summary(Record):
         "Options of the run"
     )
     versions: Mapping[str, str] = said("Versions of Python and packages")
+    control_test: ControlTestEntry | None = said(
+        "The residuals of control in the images, each tested; null without control", default=None
+    )
     reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
 
     def __repr__(self) -> str:
@@ -173,6 +178,7 @@ def measure(run: Run) -> Summary:
         tables=TablesEntry(usable, written, complete=written == usable),
         scene=None if run.adjustment is None else measure_scene(run.adjustment),
         gcps=measure_gcps(run),
+        control_test=measure_control(run),
         check_points=measure_check_points(run),
         reference=measure_reference(run),
         stages=tuple(StageEntry.read(stage) for stage in run.stages),

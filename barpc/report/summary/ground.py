@@ -6,14 +6,16 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from scipy.special import ndtr
 
 from barpc.ba import check_residuals
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report.records import Column, Number, Record, said
-from barpc.report.run import Run
+from barpc.report.run import ControlResidual, Run
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector
 from barpc.scene import IntArray
 
+CRITICAL = 3.29  # standard deviations: of a thousand coordinates chance puts one beyond
 MAX_GCPS = 20  # GCPs that the terminal shows; summary and page have all
 GCPS = "Ground control: what all the others say of a point minus its given place"
 
@@ -34,7 +36,7 @@ class GcpEntry(KnownPoint):
     """A ground control point."""
 
     OWN: ClassVar = {"GCP": Column("GCP", lambda point: point.name)}
-    PAGE: ClassVar = "GCP status residual_enu_m residual_px w sigma_m"
+    PAGE: ClassVar = "GCP status residual_enu_m residual_px w image_w image_w_view sigma_m"
     TERMINAL: ClassVar = "GCP status residual_enu_m residual_px w"
 
     sigma_m: tuple[float, float, float] = said("Stated", "m", "sigma east, north, up", ".2g")
@@ -59,11 +61,32 @@ class GcpEntry(KnownPoint):
         "The residual in the images that show it, RMS", "px", "in images", ".2f", default=None
     )
 
+    image_w: Number = said(
+        "Largest of its residuals in the images over its own standard deviation (Baarda's w)",
+        "",
+        "w in images",
+        ".1f",
+        default=None,
+    )
+    image_w_view: str | None = said("View that it is in", head="largest in", default=None)
+
     @classmethod
     def worst(cls, points: Sequence[GcpEntry]) -> list[GcpEntry]:
         """At most `MAX_GCPS` points, in their order: those that are not used, and of the others the largest w."""
         order = sorted(points, key=lambda point: (point.used, -(point.w or 0.0)))[:MAX_GCPS]
         return [point for point in points if any(point is one for one in order)]
+
+
+class ControlTestEntry(Record):
+    """The residuals of ground control, a reference's points too, in the images, each in units of its own deviation."""
+
+    num: Count = said("Observations tested")
+    critical: float = said("What chance exceeds once in a thousand coordinates")
+    num_beyond: Count = said("Observations beyond that in a coordinate")
+    expected: float = said("As many chance alone would put beyond it")
+    largest_w: Number = said("The largest (Baarda's w)")
+    image: str = said("The view that it is in")
+    point: str = said("The point that it is of")
 
 
 class ReferenceViewEntry(Record):
@@ -140,7 +163,7 @@ def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
         return ()
     tested = None if run.adjustment is None else run.adjustment.control
     left = np.full_like(points.sigma, np.nan) if tested is None else tested.residual
-    entries = []
+    entries, tests = [], run.control_tests
     seen = _grouped(points.point, len(points.names))
     places, sigmas = points.lonlatalt.tolist(), points.sigma.tolist()
     for g, (name, (lon, lat, alt), sigma) in enumerate(zip(points.names, places, sigmas, strict=True)):
@@ -160,9 +183,29 @@ def measure_gcps(run: Run) -> tuple[GcpEntry, ...]:
                 w=None if tested is None else tested.w[g],
                 redundancy=None if tested is None else tested.redundancy[g],
                 residual_px=_in_images(run, points.lonlatalt[g], points.view[seen[g]], left[g]),
+                **_worst_in_images(run, [test for test in tests if test.point == name]),
             )
         )
     return tuple(entries)
+
+
+def _worst_in_images(run: Run, tests: Sequence[ControlResidual]) -> dict[str, Any]:
+    if not tests:
+        return {}
+    worst = max(tests, key=lambda test: test.w)
+    return {"image_w": worst.w, "image_w_view": run.views[worst.view].name}
+
+
+def measure_control(run: Run) -> ControlTestEntry | None:
+    """Every residual of control in the images in units of its own deviation; None without any."""
+    tests = run.control_tests
+    if not tests:
+        return None
+    worst, count = max(tests, key=lambda test: test.w), len(tests)
+    beyond = sum(test.w > CRITICAL for test in tests)
+    chance = 1.0 - (1.0 - 2.0 * ndtr(-CRITICAL)) ** 2
+    name = run.views[worst.view].name
+    return ControlTestEntry(count, CRITICAL, beyond, float(chance * count), worst.w, name, worst.point)
 
 
 def _grouped(index: IntArray, num: int) -> list[IntArray]:

@@ -13,6 +13,7 @@ from barpc.ba.gauge import MOTIONS, Mode
 from barpc.report.records import Column, Number, Record, said
 from barpc.report.summary.words import Count, Vector, metres, percent_of
 
+_LEVEL = 1e-4  # probability of the F test below which something is called smooth
 _MODE_WORDS = {
     "east": "the whole scene may lie {0} farther east or west",
     "north": "the whole scene may lie {0} farther north or south",
@@ -80,6 +81,16 @@ class DemEntry(Record):
     spread_m: Number = said("1.4826 times the median absolute deviation of these", "m")
 
 
+class AskedEntry(Record):
+    """What was left in the image with most of it, before more was solved for."""
+
+    image: str = said("View")
+    smooth_px: Number = said("RMS of what was smooth in its residuals, less noise", "px")
+    smooth_p: Number = said("Probability that noise alone leaves as much (F test)")
+    shared_px: Number = said("Error that an observation shared with its neighbour", "px")
+    num_images: Count = said("Views in which the F test's probability was below 1e-4")
+
+
 class SceneEntry(Record):
     """The block as a whole."""
 
@@ -106,6 +117,12 @@ class SceneEntry(Record):
     )
     num_held_out: Count = said("Observations that took no part, to be measured on", default=0)
     model: str = said("Unknowns of each view that were solved for", default="")
+    drift_asked: AskedEntry | None = said(
+        "What a drift of one degree less left, where one was added", default=None
+    )
+    jitter_asked: AskedEntry | None = said(
+        "What was left without splines and steps, where these follow", default=None
+    )
     in_space_px: Number = said(
         "Where an affine in the image was chosen: what a rotation and translation leave of the same tie points",
         "px",
@@ -140,6 +157,8 @@ def measure_scene(adjustment: Adjustment) -> SceneEntry:
         num_held_out=int(np.count_nonzero(adjustment.held_out)),
         model=adjustment.cameras.unknowns.model,
         in_space_px=adjustment.in_space_rms,
+        drift_asked=_asked(adjustment, "drift"),
+        jitter_asked=_asked(adjustment, "jitter"),
         drift_degree=adjustment.cameras.unknowns.drift,
         drift_sigma_m=tuple(prior.drift_sigma),
         prior_ratio=prior.ratio,
@@ -148,6 +167,16 @@ def measure_scene(adjustment: Adjustment) -> SceneEntry:
         gcp_residuals_enu_m=adjustment.gcp_residuals.tolist(),
         solver=adjustment.status,
     )
+
+
+def _asked(adjustment: Adjustment, what: str) -> AskedEntry | None:
+    test = adjustment.asked.get(what)
+    if test is None:
+        return None
+    found = test.significance < _LEVEL
+    i = int(np.argmax(np.maximum(np.where(found, test.rms, 0.0), test.shared)))
+    rms, significance, shared = (float(values[i]) for values in (test.rms, test.significance, test.shared))
+    return AskedEntry(adjustment.names[i], rms, significance, shared, int(found.sum()))
 
 
 def mode_in_words(mode: Mode) -> str:

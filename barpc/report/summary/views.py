@@ -11,9 +11,10 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.fit import RpcFit
-from barpc.geodesy import Array, ecef_from_ground
+from barpc.geodesy import Array
 from barpc.report.records import Cell, Column, Number, Record, said, value_of
-from barpc.report.run import Run
+from barpc.report.run import ControlResidual, Run
+from barpc.report.summary.place import EllipseEntry, ellipse, shift_in_image, stated_ce90
 from barpc.report.summary.words import (
     ABOVE,
     STATUS_WORDS,
@@ -64,6 +65,10 @@ class CorrectionEntry(Record):
     jitter_px: Number = said("RMS over the rows of the spline that follows in the image", "px", default=None)
     jitter_rows: Number = said("Rows between its knots", "px", default=None)
     detector_px: Number = said("RMS of the steps between detectors", "px", default=None)
+    ellipse: EllipseEntry | None = said(
+        "How well it tells where the middle of its image is, the scene's own uncertain place in it",
+        default=None,
+    )
     detectors: tuple[float, ...] | None = said("Columns where another detector begins", "px", default=None)
 
 
@@ -138,6 +143,11 @@ class ViewEntry(Record):
     CORRECTIONS: ClassVar = (
         "name moves correction.angle_urad correction.translation_norm_m kilometres camera_center.method"
     )
+    PLACES: ClassVar = (
+        "name correction.ellipse.major_m correction.ellipse.minor_m correction.ellipse.azimuth_deg "
+        "correction.ellipse.ce90_m stated_ce90_m"
+    )
+    CONTROL: ClassVar = "name control_w control_w_point"
     FITS: ClassVar = (
         "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fitted fit.num_check_points fit.method"
     )
@@ -181,6 +191,25 @@ class ViewEntry(Record):
         ".3f",
         default=None,
     )
+    stated_ce90_m: Number = said(
+        "CE90 of the camera as delivered, of the accuracies along an axis that its metadata state",
+        "m",
+        "CE90 stated",
+        ".1f",
+        default=None,
+    )
+    smooth_p: Number = said("Probability that noise alone leaves as much as smooth_px (F test)", default=None)
+    shared_px: Number = said(
+        "Error that an observation shares with its neighbour in the row or column", "px", default=None
+    )
+    control_w: Number = said(
+        "Largest residual of its control in the image over its own standard deviation (Baarda's w)",
+        "",
+        "w",
+        ".1f",
+        default=None,
+    )
+    control_w_point: str | None = said("Control point that it is of", head="largest at", default=None)
     date: str | None = said("Day it was taken, where its metadata say so", default=None)
 
 
@@ -207,6 +236,9 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
     covered, middle = _coverage(run), _middles(run)
     incidence, azimuth = view_angles(Several(run.before, np.arange(num)), middle)
     pixel = ground_sample_distance(Several(run.before, np.arange(num)), middle)[1]
+    tests: dict[int, ControlResidual] = {}
+    for test in sorted(run.control_tests, key=lambda test: test.w):
+        tests[test.view] = test
     entries = []
     for i, view in enumerate(run.views):
         entry = ViewEntry(
@@ -232,11 +264,19 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             fit=_fit_entry(run.fits[i]) if run.fits else None,
             outputs=dict(run.written[i]) if run.written else {},
             date=view.date or None,
+            stated_ce90_m=stated_ce90(view),
+            **_control(tests.get(i)),
+            smooth_p=None if adjustment is None else adjustment.smooth.significance[i],
+            shared_px=None if adjustment is None else adjustment.smooth.shared[i],
             status="adjusted",
             advice="",
         )
         entries.append(entry)
     return tuple(entries)
+
+
+def _control(worst: ControlResidual | None) -> dict[str, Any]:
+    return {} if worst is None else {"control_w": worst.w, "control_w_point": worst.point}
 
 
 def _middles(run: Run) -> Array:
@@ -280,6 +320,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
         return CorrectionEntry(*common, None, None, shift_px=shift, slope=slope)
     assert isinstance(sensor, Corrected)
     moved, uncertain = shift_in_image(sensor, covariance, model, middle)
+    place = ellipse(sensor, covariance, model, middle)
     return CorrectionEntry(
         *common,
         moved.tolist(),
@@ -289,6 +330,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
         translation_m=correction.translation.tolist(),
         translation_norm_m=float(np.linalg.norm(correction.translation)),
         drift_urad=(correction.drift * 1e6).tolist(),
+        ellipse=place,
         **_in_image(spline),
     )
 
@@ -309,32 +351,3 @@ def _in_image(spline: RowSpline | None) -> dict[str, Any]:
 
 def _size(displacement: Array) -> float:
     return float(np.sqrt((displacement**2).sum(axis=-1).mean()))
-
-
-def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array]:
-    """How far P_BA moves a ground point (3,) near the middle of the image, and the standard deviation of that.
-
-    Parameters
-    ----------
-    model : Corrected
-        P_BA.
-    covariance : (q, q)
-        Of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the middle row.
-    unknowns : str
-        "rotation", "translation" or "rotation+translation".
-    ground : (3,)
-        lon, lat [deg], alt [m].
-
-    Returns
-    -------
-    shift, sigma : (2,)
-        col, row [px].
-    """
-    ecef = ecef_from_ground(ground)
-    image, _, by_rotation, by_translation = model.project_ecef(ecef)
-    distance = np.linalg.norm(ecef - model.correction.center)
-    parts = {"rotation": by_rotation / distance, "translation": by_translation}
-    jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
-    q = jacobian.shape[1]
-    variance = np.einsum("ij,jk,ik->i", jacobian, covariance[:q, :q], jacobian)
-    return image - model.sensor.project(ground), np.sqrt(np.maximum(variance, 0.0))

@@ -1,0 +1,109 @@
+"""Where a camera puts the middle of its image: how far that moved, and how well it is known."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from scipy.special import erf
+
+from barpc.ba.priors import USABLE_ACCURACY
+from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.report.records import Number, Record, said
+from barpc.scene import View
+from barpc.sensor.corrected import Corrected
+from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.rpc import RPC
+
+
+class EllipseEntry(Record):
+    """How well a camera tells where a ground point in the middle of its image is, its altitude given."""
+
+    major_m: Number = said("Larger semi-axis of the one-sigma ellipse", "m", "semi-axis", ".2f")
+    minor_m: Number = said("Smaller semi-axis", "m", "other", ".2f")
+    azimuth_deg: Number = said("Direction of the larger one, clockwise from north", "deg", "azimuth", ".0f")
+    ce90_m: Number = said("Radius of the circle that holds 90 %", "m", "CE90", ".2f")
+
+
+def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> tuple[Array, Array]:
+    """How far P_BA moves a ground point (3,) near the middle of the image, and the standard deviation of that.
+
+    Parameters
+    ----------
+    model : Corrected
+        P_BA.
+    covariance : (q, q)
+        Of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the middle row.
+    unknowns : str
+        "rotation", "translation" or "rotation+translation".
+    ground : (3,)
+        lon, lat [deg], alt [m].
+
+    Returns
+    -------
+    shift, sigma : (2,)
+        col, row [px].
+    """
+    image, variance, _ = _in_image(model, covariance, unknowns, ground)
+    return image - model.sensor.project(ground), np.sqrt(np.maximum(np.diag(variance), 0.0))
+
+
+def ellipse(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> EllipseEntry:
+    """The standard error ellipse of the place on the ground where P_BA sees a pixel; arguments of `shift_in_image`."""
+    _, variance, by_point = _in_image(model, covariance, unknowns, ground)
+    seen = np.linalg.inv(by_point @ enu_basis(ground)[:2].T)  # east, north by col, row at one altitude
+    values, axes = np.linalg.eigh(seen @ variance @ seen.T)
+    minor, major = np.sqrt(np.maximum(values, 0.0)).tolist()
+    azimuth = float(np.degrees(np.arctan2(axes[0, 1], axes[1, 1]))) % 180.0
+    return EllipseEntry(major, minor, azimuth, ce90(major, minor))
+
+
+def _in_image(
+    model: Corrected, covariance: Array, unknowns: str, ground: Array
+) -> tuple[Array, Array, Array]:
+    """Image (2,) of a ground point, the covariance (2, 2) of that [px^2], its derivative (2, 3) by the point [px/m]."""
+    ecef = ecef_from_ground(ground)
+    image, by_point, by_rotation, by_translation = model.project_ecef(ecef)
+    distance = np.linalg.norm(ecef - model.correction.center)
+    parts = {"rotation": by_rotation / distance, "translation": by_translation}
+    jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
+    q = jacobian.shape[1]
+    return image, jacobian @ covariance[:q, :q] @ jacobian.T, by_point
+
+
+def stated_ce90(view: View) -> float | None:
+    """CE90 [m] of a camera as delivered, of the accuracies per axis that it states."""
+    sensor, sigma = view.sensor, None
+    if isinstance(sensor, Pushbroom) and sensor.accuracy is not None:
+        sigma = float(np.hypot(*sensor.accuracy))
+    elif isinstance(sensor, RPC) and sensor.err_bias is not None and sensor.err_bias > USABLE_ACCURACY:
+        sigma = float(np.hypot(sensor.err_bias, sensor.err_rand or 0.0))
+    return None if sigma is None else ce90(sigma, sigma)
+
+
+def ce90(major: float, minor: float) -> float:
+    """Radius of the circle that holds 90 % of a normal distribution with such standard deviations along its axes.
+
+    Examples
+    --------
+    >>> [round(ce90(1.0, minor), 3) for minor in (1.0, 0.5, 0.0)]
+    [2.146, 1.737, 1.645]
+    """
+    ratio, radius = _radii()
+    return major * float(np.interp(minor / major if major else 1.0, ratio, radius))
+
+
+@cache
+def _radii() -> tuple[Array, Array]:
+    """The radius for a larger axis of one, by the smaller one: the integral over x of what y holds, bisected."""
+    ratio = np.linspace(0.0, 1.0, 101)
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    low, high = np.full(len(ratio), 1.6), np.full(len(ratio), 2.2)
+    for _ in range(40):
+        radius = 0.5 * (low + high)
+        x, rest = radius[:, None] * np.sin(0.5 * np.pi * nodes), np.cos(0.5 * np.pi * nodes)
+        with np.errstate(divide="ignore"):
+            held = erf(radius[:, None] * rest / (np.sqrt(2.0) * ratio[:, None]))
+        density = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi) * held * radius[:, None] * rest * 0.5 * np.pi
+        low, high = np.where(density @ weights < 0.9, (radius, high), (low, radius))
+    return ratio, radius
