@@ -18,13 +18,14 @@ from barpc.report.charts import (
     evenly,
     label,
     line,
+    number,
     path,
     round_ticks,
     sheet,
     tag,
     titled,
 )
-from barpc.report.summary import CELLS, CheckPointEntry, GcpEntry, ViewEntry, cell_numbers
+from barpc.report.summary import CELLS, CheckPointEntry, GcpEntry, ViewEntry, cell_numbers, metres
 from barpc.report.tables import Observations, RunFiles
 
 _MOST_LINKS = 1500
@@ -34,6 +35,9 @@ _AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 _MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
+_LARGEST = 34.0  # units of a semi-axis
+_TIMES = [n * 10.0**power for power in range(7, -7, -1) for n in (5, 2, 1)]
+_CIRCULAR = 2.146  # CE90 where both axes are one
 _REACH = 12.0  # units of a long residual
 
 Link = tuple[Sequence[float] | Array, Sequence[float] | Array, int, str]
@@ -86,8 +90,8 @@ def _plane_of(lonlat: Array) -> Plane:
     return Plane(lon, lat, per_degree * scale, float(extent[1] * scale) + 2 * _MARGIN + 24, scale)
 
 
-def ground_map(files: RunFiles) -> str:
-    """Footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
+def ground_map(files: RunFiles) -> tuple[str, str]:
+    """Footprints, pairs, tie points, GCPs and ellipses on a graticule with a scale bar; what the ellipses say."""
     summary = files.summary
     rings = [ring for outline in files.outlines for ring in outline]
     points_of: dict[str, Sequence[Known]] = {"gcps": summary.gcps, "check_points": summary.check_points}
@@ -104,6 +108,8 @@ def ground_map(files: RunFiles) -> str:
         shape = "".join(path(plane(ring[:-1]), f"outline {view.status}", closed=True) for ring in outline)
         parts.append(titled(shape, f"{view.name}: {view.num_observations} tie points", data_v=k))
     stacks = _stacks(plane, files.outlines)
+    drawn, words = _ellipses(plane, stacks, summary.views)
+    parts += drawn
     parts += _pair_lines(stacks, files)
     if len(stacks) <= 100:
         parts += _stack_names(stacks)
@@ -116,7 +122,7 @@ def ground_map(files: RunFiles) -> str:
         f"{len(summary.views)} outlines, {len(summary.pairs)} pairs, {len(known['gcps'])} GCPs, "
         f"{len(known['check_points'])} check points."
     )
-    return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees])
+    return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees]), words
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +156,42 @@ def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
         else:
             stacks[near].views.append(k)
     return stacks
+
+
+def _ellipses(plane: Plane, stacks: Sequence[Stack], views: Sequence[ViewEntry]) -> tuple[list[str], str]:
+    """Of each stack the largest error ellipse, and as circles what is stated of that image; what they say, in words."""
+    found = []
+    for stack in stacks:
+        known = [(view.correction.ellipse, view) for k in stack.views if (view := views[k]).correction]
+        shown = [(e.ce90_m or 0.0, e, view) for e, view in known if e is not None and e.major_m is not None]
+        if shown:
+            _, e, view = max(shown, key=itemgetter(0))
+            found.append((stack.place, e, view))
+    sizes = [max(e.major_m or 0.0, (view.stated_ce90_m or 0.0) / _CIRCULAR) for _, e, view in found]
+    if not found or not max(sizes) > 0:
+        return [], ""
+    times = next(t for t in _TIMES if t * max(sizes) * plane.scale <= _LARGEST)
+    parts = []
+    for (x, y), e, view in found[:MAX_DRAWN]:
+        stated = view.stated_ce90_m
+        rx, ry = (times * plane.scale * (axis or 0.0) for axis in (e.major_m, e.minor_m))
+        turn = f"rotate({(e.azimuth_deg or 0.0) - 90:.1f} {number(x)} {number(y)})"
+        shapes = [tag("ellipse", cx=x, cy=y, rx=rx, ry=ry, transform=turn, class_="ellipse")]
+        if stated is not None:
+            radius = times * plane.scale * stated / _CIRCULAR
+            shapes.append(tag("circle", cx=x, cy=y, r=radius, class_="ellipse stated"))
+        words = f"{view.name}: {metres(e.major_m or 0.0)} by {metres(e.minor_m or 0.0)}, CE90 {metres(e.ce90_m or 0.0)}"
+        parts.append(
+            titled("".join(shapes), words + ("" if stated is None else f", stated {metres(stated)}"))
+        )
+    dashed = "; dashed circles: as stated with the cameras delivered" * any(
+        v.stated_ce90_m for *_, v in found
+    )
+    drawn = f"{times:g} times as large" if times != 1 else "to scale"
+    return (
+        parts,
+        f" Ellipses: one sigma of where the middle of an image is on the ground, drawn {drawn}{dashed}.",
+    )
 
 
 def _stack_names(stacks: Sequence[Stack]) -> list[str]:

@@ -20,6 +20,7 @@ from barpc.geodesy import Array
 from barpc.report import charts
 from barpc.report.charts import MAX_ROWS, numbered
 from barpc.report.compare import flat_options
+from barpc.report.decisions import decisions, second_attempts
 from barpc.report.maps import ground_map, residual_panels
 from barpc.report.matrix import facts, pair_matrix
 from barpc.report.records import Cell, Table, cell_of, table
@@ -116,9 +117,9 @@ Pictures = Sequence[tuple[str, str]]  # SVG texts with their captions
 class Section:
     """A question and its answer, with what shows it.
 
-    `panels`: small maps; `folds`: words and more of them that open on demand; `bars`: words, a value as text and a
-    length in percent; `ties`: patches of tie points; `half`: half the width of
-    a desk's screen is enough.
+    `points`: sentences; `panels`: small maps; `folds`: words and more of them that open on demand; `bars`: words, a
+    value as text and a length in percent; `ties`: patches of tie points; `half`: half the width of a desk's screen is
+    enough.
     """
 
     key: str
@@ -127,6 +128,7 @@ class Section:
     charts: Pictures = ()
     panels: Pictures = ()
     folds: Sequence[tuple[str, Pictures]] = ()
+    points: Sequence[str] = ()
     bars: Sequence[tuple[str, str, float]] = ()
     tables: Sequence[Table] = ()
     ties: Sequence[TiePatches] = ()
@@ -155,7 +157,8 @@ def _map(files: RunFiles) -> Section | None:
         )
         if files.summary.gcps or files.summary.check_points:
             caption += " Triangles are GCPs, those on their tip check points."
-        shown.append((ground_map(files), caption))
+        drawn, words = ground_map(files)
+        shown.append((drawn, caption + words))
     if shown and len(views) > charts.MAX_DRAWN:
         more = f"At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, evenly taken, and no matrix"
         shown[0] = (shown[0][0], f"{shown[0][1]} {more}; all are in footprints.geojson and pairs.csv.")
@@ -305,7 +308,29 @@ def _corrections(files: RunFiles) -> Section | None:
     chart = (charts.corrections(views), _which(views, "images", "shift"))
     caption = "Corrections: shift in the middle of the image ± one sigma, size of rotation and translation"
     found = table("corrections", caption, views, ViewEntry, ViewEntry.CORRECTIONS, folded=True)
-    return Section("moves", "What was changed in each camera?", answer, [chart], tables=[found], half=True)
+    tables = [found]
+    if any(view.correction and view.correction.ellipse for view in views):
+        caption = "Place on the ground of the middle of each image, its altitude given: one-sigma ellipse, CE90, and"
+        caption += " CE90 as stated with the camera as delivered"
+        tables.append(table("places", caption, views, ViewEntry, ViewEntry.PLACES, folded=True))
+    return Section("moves", "What was changed in each camera?", answer, [chart], tables=tables, half=True)
+
+
+def _decisions(files: RunFiles) -> Section | None:
+    summary, views = files.summary, files.summary.views
+    points = decisions(summary)
+    if not points:
+        return None
+    tables = []
+    if summary.adjusted:
+        caption = (
+            "What was decided by of each image: its prior widened, what was cut, what is left that is smooth"
+        )
+        tables.append(table("decided", caption, views, ViewEntry, ViewEntry.DECISIONS, folded=True))
+    again = second_attempts(summary.pairs)
+    tables += [again] if again else []
+    answer = "Figures that the run decided by; what was asked for by an option is said to be."
+    return Section("decisions", "What was decided, and why?", answer, points=points, tables=tables)
 
 
 def _gauge(files: RunFiles) -> Section | None:
@@ -326,6 +351,9 @@ def _gauge(files: RunFiles) -> Section | None:
         else []
     )
     tables += [table("gcps", GCPS, gcps, GcpEntry, GcpEntry.PAGE)] if gcps else []
+    if tested := [view for view in files.summary.views if view.control_w is not None]:
+        caption = "Control in each image: the largest residual in units of its own deviation (Baarda's w)"
+        tables.append(table("control", caption, tested, ViewEntry, ViewEntry.CONTROL, folded=True))
     if (reference := files.summary.reference) is not None:
         caption = "Reference: what it says of each camera as delivered"
         tables.append(
@@ -410,6 +438,6 @@ def _run(files: RunFiles) -> Section:
 
 
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
-    _images, _map, _errors, _randomness, _ties, _pairs, _corrections, _gauge, _check_points, _files, _run,
+    _images, _map, _errors, _randomness, _ties, _pairs, _corrections, _gauge, _decisions, _check_points, _files, _run,
 )  # fmt: skip
 """In the order of the page; a section that has nothing to show is None."""

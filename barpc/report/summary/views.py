@@ -62,9 +62,11 @@ class CorrectionEntry(Record):
     translation_m: Vector | None = said("Translation T, ECEF", "m", default=None)
     translation_norm_m: Number = said("Its length", "m", "translation", ".2f", default=None)
     drift_urad: tuple[Vector, ...] | None = said("Drift, for each power of the row", "urad", default=None)
-    jitter_px: Number = said("RMS over the rows of the spline that follows in the image", "px", default=None)
+    jitter_px: Number = said(
+        "RMS over the rows of the spline that follows in the image", "px", "jitter", ".2f", default=None
+    )
     jitter_rows: Number = said("Rows between its knots", "px", default=None)
-    detector_px: Number = said("RMS of the steps between detectors", "px", default=None)
+    detector_px: Number = said("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
     ellipse: EllipseEntry | None = said(
         "How well it tells where the middle of its image is, the scene's own uncertain place in it",
         default=None,
@@ -147,6 +149,10 @@ class ViewEntry(Record):
         "name correction.ellipse.major_m correction.ellipse.minor_m correction.ellipse.azimuth_deg "
         "correction.ellipse.ce90_m stated_ce90_m"
     )
+    DECISIONS: ClassVar = (
+        "name prior_scale num_rejected rejected smooth_px smooth_p shared_px correction.jitter_px "
+        "correction.detector_px"
+    )
     CONTROL: ClassVar = "name control_w control_w_point"
     FITS: ClassVar = (
         "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fitted fit.num_check_points fit.method"
@@ -164,15 +170,17 @@ class ViewEntry(Record):
     )
     azimuth_deg: Number = said("Direction to the sensor, clockwise from north", "deg")
     num_observations: Count = said("Tie-point observations that count", head="tie points")
-    num_rejected: Count = said("Observations that the adjustment cut as wrong")
+    num_rejected: Count = said("Observations that the adjustment cut as wrong", head="cut")
     num_gcps: Count = said("Observations of ground control points")
     tie_coverage: Share = said("Share of the cells of an 8 x 8 grid that hold a tie point")
     rmse_before: Number = said("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
     rmse_after: Number = said(
         "The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True
     )
-    smooth_px: Number = said("RMS of what is smooth in the residuals left, less noise", "px")
-    prior_scale: Number = said("By how much the camera's stated standard deviations were widened")
+    smooth_px: Number = said("RMS of what is smooth in the residuals left, less noise", "px", "smooth", ".3f")
+    prior_scale: Number = said(
+        "By how much the camera's stated standard deviations were widened", "", "widened", ".1f"
+    )
     correction: CorrectionEntry | None = said("The correction; null for a check")
     camera_center: CenterEntry | None = said("Centre about which the camera was turned")
     fit: FitEntry | None = said("Certificate of the refitted RPC; null where none was fitted")
@@ -198,9 +206,19 @@ class ViewEntry(Record):
         ".1f",
         default=None,
     )
-    smooth_p: Number = said("Probability that noise alone leaves as much as smooth_px (F test)", default=None)
+    smooth_p: Number = said(
+        "Probability that noise alone leaves as much as smooth_px (F test)",
+        "",
+        "F test p",
+        ".0e",
+        default=None,
+    )
     shared_px: Number = said(
-        "Error that an observation shares with its neighbour in the row or column", "px", default=None
+        "Error that an observation shares with its neighbour in the row or column",
+        "px",
+        "shared",
+        ".3f",
+        default=None,
     )
     control_w: Number = said(
         "Largest residual of its control in the image over its own standard deviation (Baarda's w)",
