@@ -1,0 +1,194 @@
+"""The sentences that say what was decided: there when they are true, another one when they are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from barpc.options import AUTO
+from barpc.report.decisions import control_sentence, decisions, second_attempts
+from barpc.report.summary import AskedEntry, ControlTestEntry, PairEntry, Summary
+
+
+def said(summary: Summary, **scene: Any) -> str:
+    return "\n".join(decisions(replace(summary, scene=replace(summary.scene, **scene)) if scene else summary))
+
+
+def with_views(summary: Summary, *changes: dict[str, Any]) -> Summary:
+    """The first views changed; parts of a correction by names that it has."""
+    views = list(summary.views)
+    for k, change in enumerate(changes):
+        own = {key: value for key, value in change.items() if hasattr(views[k], key)}
+        rest = {key: value for key, value in change.items() if key not in own}
+        views[k] = replace(views[k], **own, correction=replace(views[k].correction, **rest))
+    return replace(summary, views=tuple(views))
+
+
+def asked(summary: Summary, **adjust: Any) -> Summary:
+    return replace(summary, options={**summary.options, "adjust": {**summary.options["adjust"], **adjust}})
+
+
+@pytest.fixture
+def record(block_run) -> Summary:
+    return block_run.record
+
+
+def matched(record: Summary, **fields: Any) -> Summary:
+    """All pairs tied by keypoints, the first one otherwise."""
+    pairs = [replace(pair, tied_by="guided", decoy_share=0.004, matching={}) for pair in record.pairs]
+    return replace(record, pairs=(replace(pairs[0], **fields), *pairs[1:]))
+
+
+def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
+    assert "nothing was matched" in said(record)
+    count = len(record.pairs)
+    plain = said(matched(record))
+    assert f"Of {count} pairs {count} by guided" in plain
+    assert "nothing was matched" not in plain
+    assert "tried again" not in plain
+    assert second_attempts(matched(record).pairs) is None
+    how = {"verified": 240, "beaten": ["guided 12 of 100", "guided, loosened 20 of 100"]}
+    other = matched(record, tied_by="structure", decoy_share=0.03, matching=how, chosen_by="same date")
+    text = said(other)
+    assert f"Of {count} pairs {count - 1} by guided, 1 by structure" in text
+    assert "1 was tried again" in text
+    first = record.pairs[0]
+    assert f"at most 3 % of a pair's matches are false ({first.a} - {first.b})" in text
+    assert "Why these pairs were tried: 1 same date." in text
+    table = second_attempts(other.pairs)
+    assert [cell.text for cell in table.rows[0]] == [
+        f"{first.a} - {first.b}", "structure", "240", "guided 12 of 100; guided, loosened 20 of 100",
+    ]  # fmt: skip
+    assert len(table.rows) == 1
+
+
+def test_the_matcher_is_said_to_be_asked_for(record):
+    tie = {**record.options["tie"], "matcher": "structure"}
+    assert "the matcher asked for is structure" in said(
+        replace(matched(record), options={**record.options, "tie": tie})
+    )
+
+
+def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
+    given = AskedEntry(image="B", smooth_px=0.31, smooth_p=3e-12, shared_px=0.12, num_images=3)
+    assert record.options["adjust"]["drift"] is None
+    plain = said(record, drift_degree=1, drift_sigma_m=(0.12,))
+    assert (
+        "with degree 1 (standard deviation at the first and last row: 12.0 cm): no F test asked for more"
+        in plain
+    )
+    more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_asked=given)
+    assert (
+        "with degree 2 (standard deviation at the first and last row: 12.0 cm, 30.0 cm): degree 1 left "
+        in more
+    )
+    assert "0.31 px that was smooth in B (F test: p = 3e-12; below 1e-4 in 3 images)" in more
+    assert "and neighbours shared 0.12 px" in more
+    assert "no F test" not in more
+    surely = said(record, drift_degree=2, drift_asked=replace(given, smooth_p=0.0, shared_px=0.0))
+    assert "p < 1e-16" in surely
+    assert "neighbours shared" not in surely
+    assert "as those of the earlier run do" in said(record, drift_degree=1, drift_sigma_m=(None,))
+    assert "No drift was solved for" in said(record, drift_degree=0, drift_sigma_m=())
+    text = said(asked(record, drift=2), drift_degree=2)
+    assert "A drift of degree 2 was asked for." in text
+    assert "F test asked" not in text
+
+
+def test_jitter_is_followed_looked_for_or_not_looked_for(record):
+    calm = with_views(record, *[{"shared_px": 0.0, "smooth_px": 0.0, "smooth_p": 0.5}] * 9)
+    assert record.options["adjust"]["jitter"] == AUTO
+    small = with_views(calm, {}, {"shared_px": 0.02})
+    name = record.views[1].name
+    assert f"share 0.020 px with their neighbours at most ({name}); 0.03 px would be looked at" in said(small)
+    large = said(with_views(calm, {}, {"shared_px": 0.2}))
+    assert f"share 0.200 px with their neighbours at most ({name}); splines met" in large
+    assert "would be looked at" not in large
+    smooth = {"smooth_px": 0.4, "smooth_p": 1e-9}
+    assert "share 0.400 px" in said(with_views(calm, smooth))
+    assert "share 0.000 px" in said(with_views(calm, {**smooth, "smooth_p": 0.2}))  # that is noise
+    before = AskedEntry(image="B", smooth_px=0.5, smooth_p=1e-9, shared_px=0.0, num_images=2)
+    waving = with_views(
+        calm, {"jitter_px": 0.1, "jitter_rows": 500.0}, {"jitter_px": 0.3, "jitter_rows": 500.0}
+    )
+    text = said(waving, jitter_asked=before)
+    assert (
+        f"Splines with a knot every 500 rows follow jitter in 2 images, up to 0.30 px RMS ({name}): without"
+        in text
+    )
+    assert "there was 0.50 px that was smooth in B (F test: p = 1e-09; below 1e-4 in 2 images)" in text
+    assert "No jitter" not in text
+    steps = said(with_views(calm, {"detectors": (100.0, 200.0), "detector_px": 0.1}))
+    assert "Detectors begin at up to 2 columns of 1 images." in steps
+    assert "Jitter was not looked for, as asked." in said(asked(calm, jitter="off"))
+    assert "Jitter was not" not in said(asked(waving, jitter="off"))
+
+
+def test_priors_hold_or_were_widened(record):
+    held = with_views(record, *[{"prior_scale": 1.0}] * 9)
+    assert (
+        "Squared corrections are 0.7 times what the accuracies stated let expect: none was widened."
+        in said(held, prior_ratio=0.7)
+    )
+    text = said(with_views(held, {"prior_scale": 1.5}, {"prior_scale": 3.2}), prior_ratio=9.0)
+    assert f"those of 2 images were widened, 3.2 times at most ({record.views[1].name})" in text
+    assert "none was widened" not in text
+    assert "Squared corrections" not in said(held, prior_ratio=None)
+
+
+def test_the_model_in_the_image_is_said_to_be_better(record):
+    assert "Each camera is corrected by rotation+translation." in said(record)
+    views = with_views(record, *[{"held_out_px": 0.05}] * 8, {"held_out_px": 0.08})
+    text = said(views, in_space_px=0.4)
+    assert "Rotations and translations leave 0.400 px of tie points that took no part, an affine" in text
+    assert "at most 0.080 px, which was taken" in text
+    assert "Each camera is" not in text
+
+
+def test_what_was_cut_and_kept_out_is_counted(record):
+    none = with_views(record, *[{"num_rejected": 0, "num_observations": 100}] * 9)
+    assert "No observation of a tie point was cut." in said(none)
+    text = said(with_views(none, {}, {"num_rejected": 100}), num_held_out=70)
+    most = f"the most in {record.views[1].name}: 50.0 %"
+    assert f"100 of 1000 observations of tie points (10.0 %) were cut as wrong, {most}." in text
+    assert "70 more took no part" in text
+    assert "No observation" not in text
+    assert "took no part, so" not in said(none, num_held_out=0)
+
+
+def test_control_that_is_contradicted_is_named(record):
+    assert "6 of 6 GCPs that are seen hold the block." in said(record)
+    wrong = (replace(record.gcps[0], status="rejected", used=False), *record.gcps[1:5])
+    unseen = replace(record.gcps[5], status="not seen", images=(), used=False)
+    text = said(replace(record, gcps=(*wrong, unseen)))
+    assert f"4 of 5 GCPs that are seen hold the block; the rest contradicts {record.gcps[0].name}." in text
+    assert "GCPs" not in said(replace(record, gcps=()))
+
+
+def test_the_test_of_control_says_who_exceeds_and_what_chance_does(record):
+    test = ControlTestEntry(200, 3.29, 0, 0.4, 2.5, "B", "P3")
+    found = control_sentence(replace(record, control_test=test))
+    assert found.startswith(
+        "None of 200 residuals of control in the images exceeds 3.29 times its own standard deviation"
+    )
+    assert "(the largest: w = 2.5, P3 in B)" in found
+    one = control_sentence(replace(record, control_test=replace(test, num_beyond=1, largest_w=4.6)))
+    assert one.startswith("1 of 200 residuals of control in the images exceeds")
+    assert "where chance puts 0.4 (the largest: w = 4.6, P3 in B)." in one
+    two = control_sentence(replace(record, control_test=replace(test, num_beyond=2, expected=0.01)))
+    assert two.startswith("2 of 200 residuals of control in the images exceed 3.29")
+    assert "chance puts none" in two
+    assert control_sentence(replace(record, control_test=None)) == ""
+
+
+def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
+    assert decisions(check_run.record) == ["Tie points were taken as given: nothing was matched."]
+    bare = replace(
+        record.scene, drift_asked=None, jitter_asked=None, prior_ratio=None, model="", num_held_out=0
+    )
+    older = with_views(record, *[{"shared_px": None, "smooth_p": None, "num_rejected": 0}] * 9)
+    found = decisions(replace(older, scene=bare, options=None, control_test=None, gcps=(), pairs=()))
+    assert [line.split()[0] for line in found] == ["Rotations", "No"]
+    assert isinstance(record.pairs[0], PairEntry)

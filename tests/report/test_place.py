@@ -1,0 +1,119 @@
+"""How well a camera tells where a point on the ground is: against cameras drawn at random."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.geodesy import metres_per_unit
+from barpc.report import Run, maps
+from barpc.report.summary.place import ce90, ellipse, stated_ce90
+from barpc.report.tables import read_tables
+from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.rpc import RPC
+
+
+@pytest.mark.parametrize("minor", [1.0, 0.8, 0.5, 0.21, 0.05, 0.0])
+def test_nine_of_ten_points_lie_within_ce90(minor):
+    points = np.random.default_rng(3).normal(size=(400_000, 2)) * [2.0, 2.0 * minor]
+    assert np.mean(np.hypot(*points.T) < ce90(2.0, 2.0 * minor)) == pytest.approx(0.9, abs=0.0015)
+    assert ce90(0.0, 0.0) == 0.0
+
+
+@pytest.mark.parametrize("model", ["rotation+translation", "rotation", "translation"])
+def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, model):
+    run = block_run.run
+    adjustment = adjust_tracks(run.views, run.tracks, AdjustOptions(model=model, drift=0))
+    sensor, covariance = adjustment.sensors[2], adjustment.covariance.view(2)
+    pixel = (np.array(run.views[2].size) - 1) / 2
+    middle = sensor.sensor.localize(pixel, np.array(run.altitude))
+    found = ellipse(sensor, covariance, model, middle)
+    at = sensor.localize(pixel, np.array(run.altitude))
+    distance = adjustment.cameras.unknowns.distance[2]
+    drawn = np.random.default_rng(1).multivariate_normal(np.zeros(len(covariance)), covariance, 3000)
+    places = []
+    for step in drawn:
+        parts = dict(zip(model.split("+"), step.reshape(-1, 3), strict=True))
+        turned = sensor.correction.rotation + parts.get("rotation", np.zeros(3)) / distance
+        moved = sensor.correction.translation + parts.get("translation", np.zeros(3))
+        changed = replace(sensor, correction=replace(sensor.correction, rotation=turned, translation=moved))
+        places.append(changed.localize(pixel, np.array(run.altitude)))
+    east_north = ((np.array(places) - at) * metres_per_unit(at))[:, :2]
+    values, axes = np.linalg.eigh(np.cov(east_north.T))
+    assert [found.minor_m, found.major_m] == pytest.approx(np.sqrt(values), rel=0.06)
+    assert np.mean(np.hypot(*east_north.T) < found.ce90_m) == pytest.approx(0.9, abs=0.02)
+    if found.major_m > 1.2 * found.minor_m:
+        azimuth = np.degrees(np.arctan2(*axes[:, 1]))
+        assert abs((found.azimuth_deg - azimuth + 90) % 180 - 90) < 12
+
+
+def test_what_is_stated_is_taken_from_where_the_priors_take_it(block_run):
+    view = block_run.run.views[0]
+    assert isinstance(view.sensor, RPC)
+    per_axis = 2.1460  # CE90 of one sigma along each axis
+
+    def stated(**accuracy):
+        return stated_ce90(replace(view, sensor=replace(view.sensor, **accuracy)))
+
+    assert stated(err_bias=3.0, err_rand=4.0) == pytest.approx(per_axis * 5.0, rel=1e-4)
+    assert stated(err_bias=3.0, err_rand=None) == pytest.approx(per_axis * 3.0, rel=1e-4)
+    assert stated(err_bias=None, err_rand=4.0) is None
+    assert stated(err_bias=0.05, err_rand=0.1) is None  # of a fit, in pixels
+    physical = Pushbroom.__new__(Pushbroom)
+    object.__setattr__(physical, "accuracy", (3.0, 4.0))
+    assert stated_ce90(replace(view, sensor=physical)) == pytest.approx(per_axis * 5.0, rel=1e-4)
+
+
+def files_of(finished, **change):
+    views = tuple(replace(view, **change) for view in finished.record.views)
+    return read_tables(replace(finished.record, views=views), finished.folder)
+
+
+def test_the_map_draws_them_to_a_scale_that_it_says(block_run):
+    svg, words = maps.ground_map(files_of(block_run))
+    times = float(re.search(r"drawn (\d+) times as large", words)[1])
+    assert "dashed" not in words
+    shapes = re.findall(
+        r"<title>([^<]*)</title><ellipse [^>]*rx=\"([\d.]+)\" ry=\"([\d.]+)\" transform=\"rotate\(([-\d.]+)",
+        svg,
+    )
+    assert len(shapes) == 3  # stacks of three views
+    length = float(
+        re.search(r'<rect x="[\d.]+" y="[\d.]+" width="([\d.]+)" height="4" class="scalebar"', svg)[1]
+    )
+    unit = length / 5000.0
+    assert ">5 km<" in svg
+    by_name = {view.name: view.correction.ellipse for view in block_run.record.views}
+    for title, rx, ry, turn in shapes:
+        found = by_name[title.split(":")[0]]
+        assert float(rx) == pytest.approx(found.major_m * times * unit, abs=0.02)
+        assert float(ry) == pytest.approx(found.minor_m * times * unit, abs=0.02)
+        assert float(turn) == pytest.approx(found.azimuth_deg - 90.0, abs=0.06)
+    assert 10 < max(float(rx) for _, rx, _, _ in shapes) <= 34.01
+
+
+def test_what_is_stated_is_drawn_beside_at_the_same_scale(block_run):
+    svg, words = maps.ground_map(files_of(block_run, stated_ce90_m=2.146 * 7.0))
+    assert "dashed circles: as stated" in words
+    times = float(re.search(r"drawn ([\d.]+) times as large", words)[1])
+    radii = [float(r) for r in re.findall(r'r="([\d.]+)" class="ellipse stated"', svg)]
+    largest = max(float(rx) for rx in re.findall(r'rx="([\d.]+)"', svg))
+    expected = max(view.correction.ellipse.major_m for view in block_run.record.views) / 7.0
+    assert len(radii) == 3
+    assert largest / radii[0] == pytest.approx(expected, abs=0.01)
+    assert times > 1
+    assert "stated 15.0 m" in svg
+
+
+def test_without_an_adjustment_in_space_there_are_none(check_run, block_run):
+    assert maps.ground_map(files_of(check_run))[1] == ""
+    run = block_run.run
+    shifted = adjust_tracks(run.views, run.tracks, AdjustOptions(model="shift"))
+    from tests.report.conftest import summarize
+
+    summary = summarize(Run("adjust", run.views, (), run.tracks, adjustment=shifted))
+    assert "ellipse" not in summary["views"][0]["correction"]
