@@ -24,7 +24,8 @@ MAX_DRAWN = 400  # Images, and ground points, on the map and in the matrix
 _NAMES = 128.0  # units kept free for names on the left
 _RIGHT = WIDTH - 12.0
 _BINS = 48
-MAX_DOTS = 1500
+MAX_DOTS = 1500  # tie points on the map
+PAIR_DOTS = 300  # pairs over their angle
 
 
 def tag(name: str, *children: str, **attributes: object) -> str:
@@ -268,9 +269,11 @@ def convergence(pairs: Sequence[PairEntry]) -> str:
     for value in y.ticks:
         parts += [line(44, y(value), _RIGHT, y(value), "grid"), label(40, y(value) + 4, f"{value:g}", "end")]
     parts.append(label(4, 12, "matches", class_="axis"))
-    for pair, angle in evenly(list(zip(pairs, angles, strict=True)), MAX_DOTS):
-        dot = tag("circle", cx=x(angle), cy=y(pair.num_matches), r=4.5, class_="dot after see")
-        parts.append(titled(dot, f"{pair.a} - {pair.b}: {angle:.1f} deg, {pair.num_matches} matches"))
+    dots = []
+    for pair, angle in evenly(list(zip(pairs, angles, strict=True)), PAIR_DOTS):
+        words = tag("title", escape(f"{pair.a} - {pair.b}: {angle:.1f} deg, {pair.num_matches} matches"))
+        dots.append(tag("circle", words, cx=round(x(angle), 1), cy=round(y(pair.num_matches), 1), r=4.5))
+    parts.append(tag("g", *dots, class_="dot after see"))
     described = f"{len(pairs)} pairs, up to {high:.1f} degrees."
     return sheet("angles-chart", "Matches of each pair over its convergence angle", described, 222, parts)
 

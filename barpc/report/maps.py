@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import numpy as np
@@ -25,7 +25,15 @@ from barpc.report.charts import (
     tag,
     titled,
 )
-from barpc.report.summary import CELLS, CheckPointEntry, GcpEntry, ViewEntry, cell_numbers, metres
+from barpc.report.summary import (
+    CELLS,
+    CheckPointEntry,
+    EllipseEntry,
+    GcpEntry,
+    ViewEntry,
+    cell_numbers,
+    metres,
+)
 from barpc.report.tables import Observations, RunFiles
 
 _MOST_LINKS = 1500
@@ -35,6 +43,7 @@ _AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 _MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
+_MANY = 30  # stacks of images: of more there are fewer numbers, and thinner lines
 _LARGEST = 34.0  # units of a semi-axis
 _TIMES = [n * 10.0**power for power in range(7, -7, -1) for n in (5, 2, 1)]
 _CIRCULAR = 2.146  # CE90 where both axes are one
@@ -90,8 +99,8 @@ def _plane_of(lonlat: Array) -> Plane:
     return Plane(lon, lat, per_degree * scale, float(extent[1] * scale) + 2 * _MARGIN + 24, scale)
 
 
-def ground_map(files: RunFiles) -> tuple[str, str]:
-    """Footprints, pairs, tie points, GCPs and ellipses on a graticule with a scale bar; what the ellipses say."""
+def ground_map(files: RunFiles) -> str:
+    """Footprints, pairs by their matches, tie points, GCPs, on a graticule with a scale bar."""
     summary = files.summary
     rings = [ring for outline in files.outlines for ring in outline]
     points_of: dict[str, Sequence[Known]] = {"gcps": summary.gcps, "check_points": summary.check_points}
@@ -102,14 +111,15 @@ def ground_map(files: RunFiles) -> tuple[str, str]:
     plane = _plane_of(np.concatenate([*rings, files.points[:, :2], *known.values()]))
     grid, degrees = _graticule(plane)
     points = plane(files.points[:: max(1, -(-len(files.points) // MAX_DOTS)), :2])
-    parts = [*grid, *(tag("circle", cx=x, cy=y, r=1.1, class_="point") for x, y in points)]
+    parts = [
+        *grid,
+        tag("path", d="".join(f"M{x:.1f} {y:.1f}h0" for x, y in points.tolist()) or "M0 0", class_="point"),
+    ]
     outlines = list(zip(range(len(summary.views)), summary.views, files.outlines, strict=True))
     for k, view, outline in evenly(outlines, MAX_DRAWN):
         shape = "".join(path(plane(ring[:-1]), f"outline {view.status}", closed=True) for ring in outline)
         parts.append(titled(shape, f"{view.name}: {view.num_observations} tie points", data_v=k))
     stacks = _stacks(plane, files.outlines)
-    drawn, words = _ellipses(plane, stacks, summary.views)
-    parts += drawn
     parts += _pair_lines(stacks, files)
     if len(stacks) <= 100:
         parts += _stack_names(stacks)
@@ -122,7 +132,8 @@ def ground_map(files: RunFiles) -> tuple[str, str]:
         f"{len(summary.views)} outlines, {len(summary.pairs)} pairs, {len(known['gcps'])} GCPs, "
         f"{len(known['check_points'])} check points."
     )
-    return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees]), words
+    many = {"class_": "many"} if len(stacks) > _MANY else {}
+    return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees], **many)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,49 +169,63 @@ def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
     return stacks
 
 
-def _ellipses(plane: Plane, stacks: Sequence[Stack], views: Sequence[ViewEntry]) -> tuple[list[str], str]:
-    """Of each stack the largest error ellipse, and as circles what is stated of that image; what they say, in words."""
-    found = []
+def place_map(files: RunFiles) -> tuple[str, str] | None:
+    """Error ellipses, of each stack of images the largest, and circles of what is stated of that; what they say."""
+    views, rings = files.summary.views, [ring for outline in files.outlines for ring in outline]
+    if not rings:
+        return None
+    plane = _plane_of(np.concatenate(rings))
+    stacks, found = _stacks(plane, files.outlines), []
     for stack in stacks:
         known = [(view.correction.ellipse, view) for k in stack.views if (view := views[k]).correction]
         shown = [(e.ce90_m or 0.0, e, view) for e, view in known if e is not None and e.major_m is not None]
         if shown:
-            _, e, view = max(shown, key=itemgetter(0))
-            found.append((stack.place, e, view))
-    sizes = [max(e.major_m or 0.0, (view.stated_ce90_m or 0.0) / _CIRCULAR) for _, e, view in found]
-    if not found or not max(sizes) > 0:
-        return [], ""
-    times = next(t for t in _TIMES if t * max(sizes) * plane.scale <= _LARGEST)
-    parts = []
-    for (x, y), e, view in found[:MAX_DRAWN]:
-        stated = view.stated_ce90_m
-        rx, ry = (times * plane.scale * (axis or 0.0) for axis in (e.major_m, e.minor_m))
-        turn = f"rotate({(e.azimuth_deg or 0.0) - 90:.1f} {number(x)} {number(y)})"
-        shapes = [tag("ellipse", cx=x, cy=y, rx=rx, ry=ry, transform=turn, class_="ellipse")]
-        if stated is not None:
-            radius = times * plane.scale * stated / _CIRCULAR
-            shapes.append(tag("circle", cx=x, cy=y, r=radius, class_="ellipse stated"))
-        words = f"{view.name}: {metres(e.major_m or 0.0)} by {metres(e.minor_m or 0.0)}, CE90 {metres(e.ce90_m or 0.0)}"
-        parts.append(
-            titled("".join(shapes), words + ("" if stated is None else f", stated {metres(stated)}"))
-        )
-    dashed = "; dashed circles: as stated with the cameras delivered" * any(
-        v.stated_ce90_m for *_, v in found
-    )
-    drawn = f"{times:g} times as large" if times != 1 else "to scale"
-    return (
-        parts,
-        f" Ellipses: one sigma of where the middle of an image is on the ground, drawn {drawn}{dashed}.",
-    )
+            found.append((stack.place, *max(shown, key=itemgetter(0))[1:]))
+    largest = max([max(e.major_m or 0.0, _sigma(view) or 0.0) for _, e, view in found], default=0.0)
+    if not largest > 0:
+        return None
+    middles = np.array([place for place, *_ in found])
+    apart = np.sort(np.linalg.norm(middles[:, None] - middles, axis=2), axis=1)[:, 1:2]
+    room = min(_LARGEST, 0.5 * float(np.median(apart))) if len(found) > 1 else 2 * _LARGEST
+    times = next((t for t in _TIMES if t * largest * plane.scale <= room), _TIMES[-1])
+    grid, degrees = _graticule(plane)
+    faint = [path(plane(ring[:-1]), "faint", closed=True) for ring in evenly(rings, MAX_DRAWN)]
+    parts = [_ellipse(place, times * plane.scale, e, view) for place, e, view in evenly(found, MAX_DRAWN)]
+    lifted = [replace(stack, place=stack.place - (0.0, room + 8.0)) for stack in stacks]
+    names = _stack_names(lifted) if len(stacks) <= _MANY else []
+    dashed = "; dashed circles: as stated with the camera delivered" * any(_sigma(view) for *_, view in found)
+    times_words = f"{times:g} times as large" if times != 1 else "to scale"
+    words = f"One sigma of the place on the ground of an image's middle, {times_words} as the map{dashed}."
+    if len(found) < len(views):
+        words += " Of images that lie over each other the one with the largest."
+    body = [*grid, *faint, *parts, *names, *degrees]
+    return sheet("places", "Error ellipses of the images", words, plane.height, body), words
+
+
+def _sigma(view: ViewEntry) -> float | None:
+    """What is stated of a camera, as one sigma along an axis [m]."""
+    return None if view.stated_ce90_m is None else view.stated_ce90_m / _CIRCULAR
+
+
+def _ellipse(place: Array, scale: float, e: EllipseEntry, view: ViewEntry) -> str:
+    (x, y), sigma = place.tolist(), _sigma(view)
+    turn = f"rotate({(e.azimuth_deg or 0.0) - 90:.1f} {number(x)} {number(y)})"
+    rx, ry = scale * (e.major_m or 0.0), scale * (e.minor_m or 0.0)
+    shapes = tag("ellipse", cx=x, cy=y, rx=rx, ry=ry, transform=turn, class_="ellipse")
+    words = f"{view.name}: {metres(e.major_m or 0.0)} by {metres(e.minor_m or 0.0)}, CE90 {metres(e.ce90_m or 0.0)}"
+    if sigma is not None:
+        shapes += tag("circle", cx=x, cy=y, r=scale * sigma, class_="ellipse stated")
+        words += f", stated {metres(view.stated_ce90_m or 0.0)}"
+    return titled(shapes, words)
 
 
 def _stack_names(stacks: Sequence[Stack]) -> list[str]:
     """The numbers of stacks, without those that would stand on others."""
     taken: list[tuple[float, float, float]] = []
-    names = []
+    names, gap = [], 14 if len(stacks) > _MANY else 0
     for stack in stacks:
         (x, y), half = stack.place.tolist(), 3.6 * len(stack.text)
-        if all(abs(x - u) > half + other or abs(y - v) > 14 for u, v, other in taken):
+        if all(abs(x - u) > half + other + gap or abs(y - v) > 14 + gap for u, v, other in taken):
             taken.append((x, y, half))
             names.append(label(x, y + 4, stack.text, "middle", "stack"))
     return names

@@ -21,7 +21,7 @@ from barpc.report import charts
 from barpc.report.charts import MAX_ROWS, numbered
 from barpc.report.compare import flat_options
 from barpc.report.decisions import decisions, second_attempts
-from barpc.report.maps import ground_map, residual_panels
+from barpc.report.maps import ground_map, place_map, residual_panels
 from barpc.report.matrix import facts, pair_matrix
 from barpc.report.records import Cell, Table, cell_of, table
 from barpc.report.summary import (
@@ -157,8 +157,7 @@ def _map(files: RunFiles) -> Section | None:
         )
         if files.summary.gcps or files.summary.check_points:
             caption += " Triangles are GCPs, those on their tip check points."
-        drawn, words = ground_map(files)
-        shown.append((drawn, caption + words))
+        shown.append((ground_map(files), caption))
     if shown and len(views) > charts.MAX_DRAWN:
         more = f"At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, evenly taken, and no matrix"
         shown[0] = (shown[0][0], f"{shown[0][1]} {more}; all are in footprints.geojson and pairs.csv.")
@@ -269,7 +268,7 @@ def _pairs(files: RunFiles) -> Section | None:
     seen = [pair for pair in pairs if None not in (pair.convergence_deg, pair.base_to_height)]
     if seen:
         caption = "One dot a pair. Small angles give weak heights; beyond about 35 degrees images look too different."
-        caption += f" Of {len(seen)} pairs some are left out, evenly." * (len(seen) > charts.MAX_DOTS)
+        caption += f" Of {len(seen)} pairs some are left out, evenly." * (len(seen) > charts.PAIR_DOTS)
         shown.append((charts.convergence(seen), caption))
         answer += _heights(seen)
     caption = "Pairs: distance of matches from the epipolar line, median ± spread (1.4826 MAD)"
@@ -305,7 +304,9 @@ def _corrections(files: RunFiles) -> Section | None:
     )
     if not files.summary.gcps:
         answer += " Most of that is common to all images: the scene's own place, which no tie point can tell."
-    chart = (charts.corrections(views), _which(views, "images", "shift"))
+    shown = [(charts.corrections(views), _which(views, "images", "shift"))]
+    if (drawn := place_map(files)) is not None:
+        shown.append(drawn)
     caption = "Corrections: shift in the middle of the image ± one sigma, size of rotation and translation"
     found = table("corrections", caption, views, ViewEntry, ViewEntry.CORRECTIONS, folded=True)
     tables = [found]
@@ -313,7 +314,7 @@ def _corrections(files: RunFiles) -> Section | None:
         caption = "Place on the ground of the middle of each image, its altitude given: one-sigma ellipse, CE90, and"
         caption += " CE90 as stated with the camera as delivered"
         tables.append(table("places", caption, views, ViewEntry, ViewEntry.PLACES, folded=True))
-    return Section("moves", "What was changed in each camera?", answer, [chart], tables=tables, half=True)
+    return Section("moves", "What was changed in each camera?", answer, shown, tables=tables, half=True)
 
 
 def _decisions(files: RunFiles) -> Section | None:

@@ -74,8 +74,8 @@ def files_of(finished, **change):
 
 
 def test_the_map_draws_them_to_a_scale_that_it_says(block_run):
-    svg, words = maps.ground_map(files_of(block_run))
-    times = float(re.search(r"drawn (\d+) times as large", words)[1])
+    svg, words = maps.place_map(files_of(block_run))
+    times = float(re.search(r"(\d+) times as large as the map", words)[1])
     assert "dashed" not in words
     shapes = re.findall(
         r"<title>([^<]*)</title><ellipse [^>]*rx=\"([\d.]+)\" ry=\"([\d.]+)\" transform=\"rotate\(([-\d.]+)",
@@ -97,9 +97,9 @@ def test_the_map_draws_them_to_a_scale_that_it_says(block_run):
 
 
 def test_what_is_stated_is_drawn_beside_at_the_same_scale(block_run):
-    svg, words = maps.ground_map(files_of(block_run, stated_ce90_m=2.146 * 7.0))
+    svg, words = maps.place_map(files_of(block_run, stated_ce90_m=2.146 * 7.0))
     assert "dashed circles: as stated" in words
-    times = float(re.search(r"drawn ([\d.]+) times as large", words)[1])
+    times = float(re.search(r"([\d.]+) times as large as the map", words)[1])
     radii = [float(r) for r in re.findall(r'r="([\d.]+)" class="ellipse stated"', svg)]
     largest = max(float(rx) for rx in re.findall(r'rx="([\d.]+)"', svg))
     expected = max(view.correction.ellipse.major_m for view in block_run.record.views) / 7.0
@@ -110,7 +110,7 @@ def test_what_is_stated_is_drawn_beside_at_the_same_scale(block_run):
 
 
 def test_without_an_adjustment_in_space_there_are_none(check_run, block_run):
-    assert maps.ground_map(files_of(check_run))[1] == ""
+    assert maps.place_map(files_of(check_run)) is None
     run = block_run.run
     shifted = adjust_tracks(run.views, run.tracks, AdjustOptions(model="shift"))
     from tests.report.conftest import summarize
