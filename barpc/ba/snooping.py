@@ -30,7 +30,7 @@ _PART = 3  # of so many points one may be wrong, or the stated accuracies are
 _LEAST = 1e-6  # redundancy of a direction that nothing else tells about: along the ray of a point seen once
 CHECKED = 0.1  # redundancy of a point that something beside the cameras' priors tells about
 _CHANCE = 1e-3  # that points which are as good as stated scatter by more
-MOST_TESTED = 2000
+MOST_TESTED = 1000
 """Observations of a reference that are tested in the images: of more, every n-th."""
 
 

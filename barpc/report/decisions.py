@@ -77,7 +77,7 @@ def _matching(summary: Summary) -> list[str]:
         return ["Tie points were taken as given: nothing was matched."] * bool(pairs)
     matcher = _option(summary, "tie", "matcher")
     asked = f"; the matcher asked for is {matcher}" if matcher else ""
-    found = [f"Of {len(pairs)} pairs {_counts((pair.tied_by for pair in tied), 'by ')}{asked}."]
+    found = [f"{len(tied)} pairs are tied: {_counts((pair.tied_by for pair in tied), 'by ')}{asked}."]
     if again := sum(bool((pair.matching or {}).get("beaten")) for pair in tied):
         verb = "was" if again == 1 else "were"
         found[0] += f" {again} {verb} tried again, as fewer matches were found than wanted."

@@ -45,14 +45,14 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
     assert "nothing was matched" in said(record)
     count = len(record.pairs)
     plain = said(matched(record))
-    assert f"Of {count} pairs {count} by guided" in plain
+    assert f"{count} pairs are tied: {count} by guided" in plain
     assert "nothing was matched" not in plain
     assert "tried again" not in plain
     assert second_attempts(matched(record).pairs) is None
     how = {"verified": 240, "beaten": ["guided 12 of 100", "guided, loosened 20 of 100"]}
     other = matched(record, tied_by="structure", decoy_share=0.03, matching=how, chosen_by="same date")
     text = said(other)
-    assert f"Of {count} pairs {count - 1} by guided, 1 by structure" in text
+    assert f"{count} pairs are tied: {count - 1} by guided, 1 by structure" in text
     assert "1 was tried again" in text
     first = record.pairs[0]
     assert f"at most 3 % of a pair's matches are false ({first.a} - {first.b})" in text

@@ -28,7 +28,7 @@ from barpc.tie.epipolar import (
 )
 from barpc.tie.features import Share, detect_tile, join
 from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matching import MATCHERS, PairReport, _latest, _Search, enough
+from barpc.tie.matching import MATCHERS, PairReport, _better, _latest, _Search, enough
 from barpc.tie.pairs import Pair
 from barpc.tie.raster import survey, tiles
 from barpc.tie.register import (
@@ -633,6 +633,20 @@ def test_a_pair_is_tried_again_where_it_has_fewer_matches_than_it_should(
     report = PairReport(("v0", "v1"), "ok", keypoints, verified, verified, overlap=overlap)
     assert enough(report) == stands
     assert not enough(replace(report, status="too few matches"))
+
+
+def test_a_report_says_which_attempts_found_fewer_of_how_many_that_were_wanted() -> None:
+    few = PairReport(("v0", "v1"), "ok", (360, 400), 40, 20, overlap=0.5)
+    loose = replace(few, verified=25, loosened=True)
+    many = replace(few, matcher="structure", keypoints=(0, 0), verified=240)
+    first = _better((NO_MATCHES, few), (NO_MATCHES, loose))
+    assert first[1] == replace(loose, beaten=("guided 20 of 54",))
+    assert _better(first, (NO_MATCHES, many))[1] == replace(
+        many, beaten=("guided 20 of 54", "guided, loosened 25 of 54")
+    )
+    none = replace(many, status="too few matches", verified=0)
+    assert _better(first, (NO_MATCHES, none))[1].beaten == ("guided 20 of 54", "structure 0 of 100")
+    assert _better((NO_MATCHES, few))[1].beaten == ()
 
 
 class Scripted:
