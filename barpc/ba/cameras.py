@@ -110,6 +110,26 @@ class Cameras:
         if not unknowns.geometric:
             image, by_point = self._by_ecef(ecef, views, bounds)
             return Projected(*unknowns.in_image(params, index, image, by_point))
+        if views.start in unknowns.radars:
+            found = self._timed(params[views.start], ecef, views.start, wanted)
+        else:
+            found = self._moved(params, index, ecef, views, bounds, wanted, seen)
+        if unknowns.waves is not None and seen is not None:
+            unknowns.add_waves(found.image, found.by_unknown, params, index, seen)
+        return found
+
+    def _moved(
+        self,
+        params: Array,
+        index: IntArray,
+        ecef: Array,
+        views: slice,
+        bounds: IntArray,
+        wanted: Wanted,
+        seen: Array | None,
+    ) -> Projected:
+        """Of cameras that are turned and shifted."""
+        unknowns = self.unknowns
         drift = row = None
         if unknowns.drift:
             assert seen is not None
@@ -120,17 +140,28 @@ class Cameras:
         motion = Motion(ecef, rotation, translation, unknowns.center[views], bounds, drift)
         if wanted == "image":
             none = np.empty((2, 0, len(index)))
-            found = Projected(self._image(motion.ecef, views, bounds), none, none)
-        else:
-            image, by_moved = self._by_ecef(motion.ecef, views, bounds)
-            by_point, by_rotation, by_drift = motion.derivatives(by_moved)
-            by_unknown = by_point[:, :0]
-            if wanted == "unknowns":
-                by_unknown = unknowns.stack(by_rotation, by_drift, by_point, index, row)
-            found = Projected(image, by_point, by_unknown)
-        if unknowns.waves is not None and seen is not None:
-            unknowns.add_waves(found.image, found.by_unknown, params, index, seen)
-        return found
+            return Projected(self._image(motion.ecef, views, bounds), none, none)
+        image, by_moved = self._by_ecef(motion.ecef, views, bounds)
+        by_point, by_rotation, by_drift = motion.derivatives(by_moved)
+        by_unknown = by_point[:, :0]
+        if wanted == "unknowns":
+            by_unknown = unknowns.stack(by_rotation, by_drift, by_point, index, row)
+        return Projected(image, by_point, by_unknown)
+
+    def _timed(self, params: Array, ecef: Array, view: int, wanted: Wanted) -> Projected:
+        """Of a radar whose clocks are corrected."""
+        unknowns = self.unknowns
+        model = unknowns.radars[view].timed(unknowns.timing(params, view))
+        ground, by_ecef = ground_rows_from_ecef(ecef)
+        if wanted == "image":
+            none = np.empty((2, 0, ecef.shape[1]))
+            return Projected(model.project(ground.T).T, none, none)
+        image, by_ground, by_timing, along = model.timing_jacobian(ground.T)
+        by_point = _times(np.moveaxis(by_ground, 0, -1), by_ecef)
+        by_unknown = by_point[:, :0]
+        if wanted == "unknowns":
+            by_unknown = unknowns.stack_timing(np.moveaxis(by_timing, 0, -1), along, view)
+        return Projected(image.T, by_point, by_unknown)
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
         """Uncorrected image points (2, n) without a derivative."""

@@ -16,6 +16,7 @@ from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
+from barpc.sensor.timing import Clocked
 
 DEFAULT_ACCURACY = (
     7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
@@ -110,8 +111,8 @@ def stated_accuracy(view: View) -> float:
 
 
 def _stated(view: View) -> tuple[float, float]:
-    """What a view states for its attitude, as metres on the ground, and for its position [m]."""
-    if isinstance(view.sensor, Pushbroom) and view.sensor.accuracy is not None:
+    """What a view states for its attitude, as metres on the ground, and position, or for its two clocks [m]."""
+    if isinstance(view.sensor, Pushbroom | Clocked) and view.sensor.accuracy is not None:
         attitude, position = view.sensor.accuracy
         return max(attitude, USABLE_ACCURACY), max(position, USABLE_ACCURACY)
     return (stated_accuracy(view),) * 2
@@ -127,15 +128,17 @@ def prior_sigmas(
     stated = np.array([_stated(view) for view in views])
     if off is not None:
         stated = np.fmax(stated, off[:, None])
-    parts = []
+    parts, count = [], len(views)
     given = (("rotation", options.sigma_attitude), ("translation", options.sigma_position))
     for (name, sigma), own in zip(given, stated.T, strict=True):
         if name in options.first_model:
-            one = own if sigma is None else np.full(len(views), sigma)
+            one = own if sigma is None else np.full(count, sigma)
             parts.append(np.tile(one[:, None], (1, 3)))
-    parts += [np.full((len(views), 3), options.sigma_drift or DRIFT_SIGMA)] * drift
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
-        parts.append(np.full((len(views), size), IMAGE_SIGMA))
-    parts.append(np.full((len(views), waves), FIRST_SIGMA))
+        return np.full((count, size), IMAGE_SIGMA)
+    radars = [isinstance(view.sensor, Clocked) for view in views]
+    parts[0][radars, :2] = stated[radars] if options.sigma_position is None else options.sigma_position
+    parts += [np.full((count, 3), options.sigma_drift or DRIFT_SIGMA)] * drift
+    parts.append(np.full((count, waves), FIRST_SIGMA))
     return np.hstack(parts)

@@ -21,6 +21,7 @@ from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.splined import RowSpline, Splined
+from barpc.sensor.timing import Timed, Timing
 
 _SAMPLE = 200  # of a pair's tie points
 
@@ -151,11 +152,11 @@ class Adjustment:
         return tuple(sensor.sensor if isinstance(sensor, Splined) else sensor for sensor in self.sensors)
 
     @property
-    def corrections(self) -> tuple[Correction | ImageAffine, ...]:
+    def corrections(self) -> tuple[Correction | Timing | ImageAffine, ...]:
         """The correction of every view."""
         found = []
         for sensor in self.bases:
-            assert isinstance(sensor, Corrected | ImageCorrected)
+            assert isinstance(sensor, Corrected | Timed | ImageCorrected)
             found.append(sensor.correction)
         return tuple(found)
 

@@ -1,12 +1,14 @@
 """The unknowns of a view: a row of numbers in metres (or pixels), and the correction that it stands for.
 
 Geometric models count a rotation in metres on the ground (angle x distance of the scene), so that every
-unknown moves the image by about one pixel a pixel's size. Image models count pixels at the image's edge.
+unknown moves the image by about one pixel a pixel's size. Image models count pixels at the image's edge. A radar whose
+clocks can be corrected has the first two unknowns of the constants and of every degree of the drift: range and place
+along the flight (azimuth time x speed). The others are nothing to it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +20,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.geometry import camera_center
 from barpc.sensor.splined import Splined
+from barpc.sensor.timing import Clocked, Timed, Timing
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
 """Image models: which of the terms 1, col, row each coordinate's correction has."""
@@ -36,6 +39,7 @@ class Unknowns:
     # (N, 2) where its scene stands, east and north of the middle of all [m]
     place: Array = field(default_factory=lambda: np.zeros((0, 2)))
     waves: Waves | None = None  # what is left in the image
+    radars: Mapping[int, Clocked] = field(default_factory=dict)  # views whose unknowns are those of clocks
 
     @property
     def geometric(self) -> bool:
@@ -52,7 +56,12 @@ class Unknowns:
     @property
     def _in_space(self) -> int:
         """Unknowns of a view that move the camera; those in the image follow."""
-        return 3 * (self.rotates + self.translates + self.drift)
+        return self.constants + 3 * self.drift
+
+    @property
+    def constants(self) -> int:
+        """Of these, the first, which are not of the drift."""
+        return 3 * (self.rotates + self.translates)
 
     @property
     def in_waves(self) -> slice:
@@ -84,11 +93,25 @@ class Unknowns:
 
     def drift_vectors(self, params: Array) -> Array:
         """Rotation vectors (N, D, 3) [rad] that the powers of the normalised row add."""
-        start = 3 * (self.rotates + self.translates)
-        return (
-            params[:, start : self._in_space].reshape(len(params), self.drift, 3)
-            / self.distance[:, None, None]
-        )
+        vectors = params[:, self.constants : self._in_space].reshape(len(params), self.drift, 3)
+        return vectors / self.distance[:, None, None]
+
+    def timing(self, params: Array, view: int) -> Timing:
+        """What the clocks of a radar with the unknowns (q,) are off by."""
+        radar = self.radars[view]
+        drift = params[self.constants : self._in_space].reshape(-1, 3)[:, :2]
+        place = (float(values[radar.azimuth_axis, view]) for values in (self.middle, self.half))
+        return Timing(np.vstack([params[:2], drift]) / [1.0, radar.speed], *place)
+
+    def stack_timing(self, by_timing: Array, along: Array, view: int) -> Array:
+        """Derivatives (2, 2, n) by range [px/m] and azimuth time [px/s] as (2, q, n) by a radar's unknowns."""
+        radar, out = self.radars[view], np.zeros((2, self.size, len(along)))
+        u = (along - self.middle[radar.azimuth_axis, view]) / self.half[radar.azimuth_axis, view]
+        part = by_timing / np.array([[1.0], [radar.speed]])
+        for at in (0, *range(self.constants, self._in_space, 3)):
+            out[:, at : at + 2] = part
+            part = part * u
+        return out
 
     def normalized(self, image: Array, index: IntArray) -> Array:
         """col, row (2, n) [px] -> -1 at the left and the top, 1 at the right and the bottom of their images."""
@@ -161,6 +184,8 @@ class Unknowns:
             for *of_view, row in zip(*vectors, rows, strict=True)
         ]
         found: list[SensorModel] = [Corrected(v.sensor, c) for v, c in zip(views, corrections, strict=True)]
+        for i, radar in self.radars.items():
+            found[i] = Timed(radar, self.timing(params[i], i))
         if self.waves is not None:
             for i, one in enumerate(params[:, self.in_waves]):
                 of_rows = float(self.middle[1, i]), float(self.half[1, i])
@@ -193,7 +218,9 @@ def make_unknowns(
     distance = np.linalg.norm(centers - scene, axis=1)
     middle = scene.mean(axis=0)
     place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
-    return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0, place, waves)
+    sensors = enumerate(view.sensor for view in views) if model not in _IMAGE_TERMS else ()
+    radars = {i: sensor for i, sensor in sensors if isinstance(sensor, Clocked)}
+    return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0, place, waves, radars)
 
 
 def _middle_of_scene(view: View) -> Array:

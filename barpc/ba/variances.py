@@ -110,7 +110,7 @@ class Variances:
     @property
     def constants(self) -> int:
         """Constant unknowns of a view, which come first."""
-        return 3 * (self.unknowns.rotates + self.unknowns.translates) if self.unknowns.geometric else 0
+        return self.unknowns.constants if self.unknowns.geometric else 0
 
     def for_search(self) -> CameraPrior:
         """Priors while outliers are looked for: a drift that was not expected must not look like them."""

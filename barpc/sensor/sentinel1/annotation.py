@@ -33,7 +33,7 @@ class StateVectors:
     time: TimeArray  # (N,): datetime64[ns], UTC
     position: Array  # (N, 3): ECEF [m]
     velocity: Array  # (N, 3): ECEF [m/s]
-    source: str  # where they come from, for messages: "Auxiliary", "Downlink", or the orbit file
+    source: str  # where they come from: "Auxiliary", "Downlink", or the type of the orbit file, "AUX_POEORB"
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,8 @@ def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
             f"{path}: covers {times.min()} to {times.max()}, the image is of {start}; "
             "take the orbit file of that day"
         )
-    return _states([vectors[i] for i in near], "UTC", ("X", "Y", "Z", "VX", "VY", "VZ"), str(path))
+    kind = root.findtext("Earth_Explorer_Header/Fixed_Header/File_Type", "").strip()
+    return _states([vectors[i] for i in near], "UTC", ("X", "Y", "Z", "VX", "VY", "VZ"), kind)
 
 
 def _times(rows: Sequence[Fields], tag: str) -> TimeArray:

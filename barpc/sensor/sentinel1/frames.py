@@ -18,6 +18,7 @@ from barpc.frozen import Frozen
 from barpc.geodesy import SPEED_OF_LIGHT, Array, enu_basis, up
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation
+from barpc.sensor.timing import Timing
 
 _INVERSION_STEPS = 8
 Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`
@@ -121,9 +122,10 @@ class Delays:
 
     atmosphere: bool = False
     bistatic: float | None = None  # b [s]; None for no correction
+    timing: Timing | None = None  # by azimuth time [s]; None for none
 
     def __bool__(self) -> bool:
-        return self.atmosphere or self.bistatic is not None
+        return self.atmosphere or self.bistatic is not None or self.timing is not None
 
     def shift(self, times: Array, ground: Array, sight: Array) -> Array:
         """What is added to times (2, N), of points (N, 3) that see the satellite along unit vectors (3, N) [s]."""
@@ -132,9 +134,13 @@ class Delays:
             out[0] = self.bistatic - 0.5 * times[1]
         if self.atmosphere:
             out[1] = _zenith(ground[:, 2])[0] / (up(ground) * sight).sum(axis=0) * (2.0 / SPEED_OF_LIGHT)
+        if self.timing is not None:
+            out += _as_times(self.timing.at(times[0]))
         return out
 
-    def shift_jacobian(self, by_ground: Array, ground: Array, sight: Array, by_sight: Array) -> Array:
+    def shift_jacobian(
+        self, times: Array, by_ground: Array, ground: Array, sight: Array, by_sight: Array
+    ) -> Array:
         """Derivative of `shift` by (lon, lat, alt) (2, N, 3) [s/deg, s/deg, s/m].
 
         `by_ground` (2, N, 3) is that of the times, `by_sight` (N, 3, 3) that of the sight.
@@ -152,6 +158,8 @@ class Delays:
             out[1] = -(zenith / cosine**2)[:, None] * by_cosine
             out[1, :, 2] += slope / cosine
             out[1] *= 2.0 / SPEED_OF_LIGHT
+        if self.timing is not None:
+            out += _as_times(self.timing.rate(times[0]))[..., None] * by_ground[0]
         return out
 
 
@@ -184,6 +192,11 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
     if annotation.product_type != "SLC":
         raise InputError(f"{annotation.name}: the full bistatic correction is of one SLC swath")
     return annotation.rank * annotation.pulse_interval - constant
+
+
+def _as_times(late: Array) -> Array:
+    """Range [m] and azimuth time [s] (2, N) as azimuth time and two-way range time [s]."""
+    return np.stack([late[1], late[0] * (2.0 / SPEED_OF_LIGHT)])
 
 
 def _zenith(alt: Array) -> tuple[Array, Array]:

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from barpc.sensor.curve import Curve, Orbit, fit_orbit
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import (
     Annotation,
+    StateVectors,
     burst_rows,
     read_annotation,
     read_orbit_file,
@@ -42,11 +43,21 @@ from barpc.sensor.sentinel1.frames import (
     SlantFrame,
     bistatic_constant,
 )
+from barpc.sensor.timing import Timing
 
 CHUNK = 8192  # points worked on at a time
 RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
 NO_DELAYS = Delays()  # pure geometry
+ORBITS = {"AUX_POEORB": 0.05, "AUX_RESORB": 0.1, "AUX_PREORB": 0.4, "Auxiliary": 0.4}
+"""Source of an orbit -> its error [m], RMS in space. Precise and restituted: what is required (Copernicus Sentinel news, 13
+April 2021); predicted: 0.15 to 0.35 m (news, 9 September 2022). An annotation does not tell which of these its own is."""
+ON_BOARD = 2.5
+"""The same of the receiver's own solution [m] (2.43 m: the same news); downlinked, or of no known source."""
+NOT_CORRECTED = (3.5, 4.0)
+"""What the atmosphere adds to the range at the far side of a swath, and the bistatic delay along the flight [m]."""
+CORRECTED = (0.5, 0.5)
+"""What is left of both [m]: ionosphere and water vapour; the Doppler rate at another height than was assumed."""
 
 _GRID_TOLERANCE = 5.0  # px and lines: a grid farther off does not belong to the orbit
 _STEPS = 12  # at most; three are enough near the image
@@ -67,7 +78,10 @@ class RangeDoppler(Frozen):
     alt_range : (low, high), altitudes that the image is used for [m above the ellipsoid]
     look : "right" or "left", side of the track; a point on the other side projects to NaN
     delays : Delays, smooth corrections between geometry and annotated times; none by default
+    accuracy : (float, float) or None, standard deviations of range and of the place along the flight [m]
     """
+
+    azimuth_axis: ClassVar[int] = 1
 
     orbit: Curve
     epoch: np.datetime64
@@ -76,6 +90,7 @@ class RangeDoppler(Frozen):
     alt_range: tuple[float, float]
     look: Literal["right", "left"] = "right"
     delays: Delays = NO_DELAYS
+    accuracy: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -137,6 +152,25 @@ class RangeDoppler(Frozen):
         )
         return ground_range if isinstance(self.frame, GroundFrame) else ""
 
+    @property
+    def speed(self) -> float:
+        """Of the flight, at the image's middle row [m/s]."""
+        _, velocity = self.orbit(np.array([0.5 * self.size[1] * self.frame.interval]))
+        return float(np.linalg.norm(velocity))
+
+    def timed(self, timing: Timing) -> RangeDoppler:
+        """The model with a timing by the row [px] in place of its own."""
+        interval = self.frame.interval
+        timing = replace(timing, offset=timing.offset * interval, scale=timing.scale * interval)
+        return replace(self, delays=replace(self.delays, timing=timing))
+
+    def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
+        """As of `barpc.sensor.timing.Clocked`; rows of pure geometry."""
+        image, by_ground, by_timing, row = pointwise(
+            self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground
+        )
+        return image, by_ground, by_timing, row
+
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
         """Zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of ground points (..., 3).
 
@@ -157,7 +191,7 @@ class RangeDoppler(Frozen):
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
@@ -212,7 +246,8 @@ class RangeDoppler(Frozen):
         image[:, ~np.isfinite(image).all(axis=0)] = np.nan
         return [image.T]
 
-    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
+    def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
+        """What `timing_jacobian` hands out."""
         seen = self._geometry(ecef_from_ground(ground))
         by_ecef = np.stack([seen.time_by_ecef.T, seen.sight.T * (-2.0 / SPEED_OF_LIGHT)])  # (2, N, 3)
         ecef_by_ground = ecef_from_ground_jacobian(ground)
@@ -220,13 +255,14 @@ class RangeDoppler(Frozen):
         times = seen.times
         if self.delays:
             by_sight = seen.sight_by_ecef() @ ecef_by_ground
-            extra = self.delays.shift_jacobian(by_ground, ground, seen.sight, by_sight)
+            extra = self.delays.shift_jacobian(times, by_ground, ground, seen.sight, by_sight)
             times, by_ground = times + self.delays.shift(times, ground, seen.sight), by_ground + extra
         image, by_times = self.frame.image(times)
         jacobian = np.einsum("ijn,jnk->nik", by_times, by_ground)
         bad = ~np.isfinite(image).all(axis=0)
         image[:, bad], jacobian[bad] = np.nan, np.nan
-        return image.T, jacobian
+        by_timing = np.stack([by_times[:, 1] * (2.0 / SPEED_OF_LIGHT), by_times[:, 0]], axis=1)
+        return image.T, jacobian, np.moveaxis(by_timing, -1, 0), seen.times[0] / self.frame.interval
 
     def _localize(self, image: Array, alt: Array) -> Array:
         measured = times = self.frame.times(image)
@@ -285,13 +321,19 @@ def build(
     """The model of swaths side by side, the nearest first; row 0 at `epoch`."""
     nearest = swaths[0]
     alt = np.concatenate([a.grid.ground[:, 2] for a in swaths])
+    states = nearest.states if orbit is None else read_orbit_file(orbit, nearest)
+    left = [
+        CORRECTED[k] if done else NOT_CORRECTED[k] for k, done in enumerate((atmosphere, bistatic == "full"))
+    ]
+    of_orbit = ORBITS.get(states.source, ON_BOARD)
     model = RangeDoppler(
-        orbit=_orbit(nearest, orbit, epoch),
+        orbit=_orbit(nearest, states, epoch),
         epoch=epoch,
         frame=_frame(nearest, epoch),
         size=size,
         alt_range=(float(np.floor(alt.min()) - RELIEF[0]), float(np.ceil(alt.max()) + RELIEF[1])),
         delays=Delays(atmosphere, None if bistatic is None else bistatic_constant(nearest, bistatic)),
+        accuracy=(float(np.hypot(of_orbit, left[0])), float(np.hypot(of_orbit, left[1]))),
     )
     for annotation in swaths:
         worst = np.abs(grid_residuals(annotation, model)).max(axis=0)
@@ -314,8 +356,7 @@ def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
     return np.stack([samples, lines], axis=1)
 
 
-def _orbit(annotation: Annotation, file: Path | None, epoch: np.datetime64) -> Orbit:
-    states = annotation.states if file is None else read_orbit_file(file, annotation)
+def _orbit(annotation: Annotation, states: StateVectors, epoch: np.datetime64) -> Orbit:
     start, stop = (float(seconds(t, epoch)) for t in (annotation.first_line_time, annotation.last_line_time))
     return fit_orbit(seconds(states.time, epoch), states.position, states.velocity, (start, stop))
 

@@ -27,6 +27,7 @@ class Aperture(NamedTuple):
     velocity: Array  # (3, N): [m/s]
     distance: Array  # (N,): R [m]
     rate: Array  # (N,): dR/dt [m/s]
+    time: Array  # (N,): of the centre of the aperture [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class Formation(Frozen, ABC):
         """The apertures of N pixels at x, y (N,) [m]."""
         time: Array = np.asarray(polynomial.polyval2d(x, y, self.time), dtype=np.float64)
         position, velocity = orbit(time)
-        return Aperture(position, velocity, *self._contour(x, y, time, position, velocity, orbit))
+        return Aperture(position, velocity, *self._contour(x, y, time, position, velocity, orbit), time)
 
     @abstractmethod
     def _contour(

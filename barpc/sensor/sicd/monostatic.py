@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Literal
 
@@ -20,6 +20,7 @@ from barpc.geodesy import (
 from barpc.sensor.circle import aside, dot, on_circle
 from barpc.sensor.curve import Curve
 from barpc.sensor.sicd.formation import Aperture, Formation
+from barpc.sensor.timing import Timing
 
 CHUNK = 4096  # points worked on at a time
 _STEPS = 12  # at most; four are enough
@@ -43,6 +44,8 @@ class Monostatic(Frozen):
     size : (width, height) [px]
     alt_range : (low, high), altitudes that the image is used for [m above the ellipsoid]
     look : "right" or "left", side of the track; a point on the other side projects to NaN
+    timing : Timing or None, of the clocks, by y [m]: the antenna is where the orbit had it earlier, the range less
+    accuracy : (float, float) or None, standard deviations of range and of the place along the flight [m]
     """
 
     orbit: Curve
@@ -52,8 +55,11 @@ class Monostatic(Frozen):
     size: tuple[int, int]
     alt_range: tuple[float, float]
     look: Literal["right", "left"] = "right"
+    timing: Timing | None = None
+    accuracy: tuple[float, float] | None = None
 
     advice: ClassVar[str] = ""
+    azimuth_axis: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,7 +76,7 @@ class Monostatic(Frozen):
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Image points (..., 2) [px] and their derivative (..., 2, 3) [px/deg, px/deg, px/m]."""
-        image, jacobian = pointwise(self._jacobian, CHUNK, [(2,), (2, 3)], ground)
+        image, jacobian = pointwise(lambda part: self._derivatives(part)[:2], CHUNK, [(2,), (2, 3)], ground)
         return image, jacobian
 
     def localize(self, image: Array, alt: Array) -> Array:
@@ -86,6 +92,25 @@ class Monostatic(Frozen):
     def to_radar(self, ground: Array) -> Array:
         """Vectors (..., 3) [m], ECEF, from ground points (..., 3) to the antenna that sees them; NaN as `project`."""
         return pointwise(lambda part: [self._to_radar(part)], CHUNK, [(3,)], ground)[0]
+
+    @property
+    def speed(self) -> float:
+        """Of the flight, in the middle of the collection [m/s]."""
+        _, velocity = self.orbit(np.array([np.mean(self.orbit.knots)]))
+        return float(np.linalg.norm(velocity))
+
+    def timed(self, timing: Timing) -> Monostatic:
+        """The model with a timing by the column [px] in place of its own."""
+        pixel, zero = self.spacing[1], self.origin[1]
+        timing = replace(timing, offset=(timing.offset - zero) * pixel, scale=timing.scale * pixel)
+        return replace(self, timing=timing)
+
+    def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
+        """As of `barpc.sensor.timing.Clocked`; columns where the points are seen."""
+        image, by_ground, by_timing, col = pointwise(
+            self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground
+        )
+        return image, by_ground, by_timing, col
 
     @cached_property
     def _middle(self) -> float:
@@ -107,9 +132,19 @@ class Monostatic(Frozen):
         row, col = plane / np.array(self.spacing)[:, None] + np.array(self.origin)[:, None]
         return np.column_stack([col, row])
 
+    def _seen(self, plane: Array) -> Aperture:
+        """What the pixels (2, N) state, as the clocks have it."""
+        seen = self.formation.at(plane[0], plane[1], self.orbit)
+        if self.timing is None:
+            return seen
+        far, late = self.timing.at(plane[1])
+        position, velocity = self.orbit(seen.time - late)
+        distance, time = seen.distance - far, seen.time - late
+        return seen._replace(position=position, velocity=velocity, distance=distance, time=time)
+
     def _miss(self, plane: Array, point: Array) -> tuple[Array, Aperture, Array, Array]:
         """Pixel - point in range and rate (2, N), the aperture, and the point's sight (3, N) and distance (N,)."""
-        seen = self.formation.at(plane[0], plane[1], self.orbit)
+        seen = self._seen(plane)
         sight = seen.position - point
         distance = np.sqrt(dot(sight, sight))
         sight = sight / distance
@@ -143,7 +178,8 @@ class Monostatic(Frozen):
         _, _, sight, distance = self._miss(self._solve(point)[0], point)
         return (sight * distance).T
 
-    def _jacobian(self, ground: Array) -> tuple[Array, Array]:
+    def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
+        """What `timing_jacobian` hands out."""
         point = ecef_from_ground(ground).T
         plane, slope = self._solve(point)
         _, seen, sight, distance = self._miss(plane, point)
@@ -151,14 +187,20 @@ class Monostatic(Frozen):
         by_point = np.stack([sight, (seen.velocity - toward * sight) / distance])  # (2, 3, N)
         moved = -np.stack([_solve(slope, by_point[:, k]) for k in range(3)], axis=1)  # d(x, y)/dX
         by_ground = np.einsum("ikn,nkj->nij", moved, ecef_from_ground_jacobian(ground))
-        jacobian = by_ground / np.array(self.spacing)[:, None]
-        return self._image(plane), jacobian[:, ::-1]
+        acceleration = self.orbit.states(seen.time)[2]
+        turning = dot(acceleration, sight) + (dot(seen.velocity, seen.velocity) - toward**2) / distance
+        zero = np.zeros_like(toward)
+        by_late = np.array([[-zero - 1.0, toward], [zero, turning]])  # of the miss, by range and time
+        by_timing = -np.stack([_solve(slope, by_late[:, k]) for k in range(2)], axis=1)
+        image, pixel = self._image(plane), np.array(self.spacing)[:, None]
+        timing = np.moveaxis(by_timing, -1, 0) / pixel
+        return image, (by_ground / pixel)[:, ::-1], timing[:, ::-1], image[:, 0]
 
     def _localize(self, image: Array, alt: Array) -> list[Array]:
         low, high = self._bounds
         plane = ((image[:, ::-1] - np.array(self.origin)) * np.array(self.spacing)).T
         plane[:, ~((plane > low) & (plane < high)).all(axis=0)] = np.nan
-        seen = self.formation.at(plane[0], plane[1], self.orbit)
+        seen = self._seen(plane)
         ahead = -seen.rate / np.sqrt(dot(seen.velocity, seen.velocity))
         ground, _ = on_circle(seen.position, seen.velocity, seen.distance, alt, self.look == "right", ahead)
         return [ground]
