@@ -461,7 +461,8 @@ def make_problem(
     sigma = prior_sigmas(views, options, drift, off, 0 if waves is None else waves.size)
     on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma), None
     if prior is not None:
-        on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras)
+        radars = [block.names[v] for v in unknowns.radars]
+        on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras, radars)
     joined = None if jointly is None else np.unique(jointly.index // unknowns.size)
     return Problem(
         Cameras(views, unknowns, block.xy),

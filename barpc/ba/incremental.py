@@ -6,7 +6,7 @@ points may observe old views; an observation that the old block has used must no
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,6 +50,8 @@ class BlockPrior:
         Rows B of B^T B that is still to be taken off a sparse matrix: what heights have in common.
     splines, edges : int, (n, C)
         Layout of the unknowns in the image (see `barpc.ba.waves`).
+    radars : tuple of str
+        Those of its views whose unknowns are of a radar's clocks.
     """
 
     names: tuple[str, ...]
@@ -61,6 +63,7 @@ class BlockPrior:
     less: Array | None = None
     splines: int = 0
     edges: Array | None = None
+    radars: tuple[str, ...] = ()
 
     def waves(self, names: tuple[str, ...]) -> Waves | None:
         """The unknowns in the image of views that go on from the block; a new one has no detectors."""
@@ -87,6 +90,7 @@ class BlockPrior:
                 model=self.model,
                 drift=self.drift,
                 splines=self.splines,
+                radars=np.array(self.radars, dtype=np.str_),
                 edges=np.zeros((len(self.names), 0)) if self.edges is None else self.edges,
                 **arrays,
             )
@@ -108,7 +112,8 @@ class BlockPrior:
             less = file["less"] if sparse else None
             splines, edges = int(file.get("splines", 0)), file.get("edges", np.zeros((len(names), 0)))
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
-            prior = cls(names, *known, splines, edges)
+            radars = tuple(str(name) for name in file.get("radars", ()))
+            prior = cls(names, *known, splines, edges, radars)
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
         if not prior._is_whole():
@@ -180,13 +185,21 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
         else reduced.common.by_camera[:, free],
         waves.count if waves else 0,
         waves.edges[views] if waves else None,
+        tuple(adjustment.names[v] for v in adjustment.cameras.unknowns.radars if v in views),
     )
 
 
 def apply_prior(
-    prior: BlockPrior, names: tuple[str, ...], model: str, drift: int, cameras: CameraPrior
+    prior: BlockPrior,
+    names: tuple[str, ...],
+    model: str,
+    drift: int,
+    cameras: CameraPrior,
+    radars: Collection[str] = (),
 ) -> tuple[CameraPrior, JointPrior]:
     """The priors of a run that goes on from an old block: the old views' own ones make way for the joint one.
+
+    `radars` are the views whose unknowns are now those of clocks.
 
     Raises
     ------
@@ -200,6 +213,11 @@ def apply_prior(
     missing = sorted(set(prior.names) - set(names))
     if missing:
         raise InputError(f"views of the earlier block are missing: {', '.join(missing[:10])}")
+    if other := sorted(set(prior.radars) ^ (set(radars) & set(prior.names))):
+        raise InputError(
+            f"the earlier block corrected {', '.join(other[:10])} otherwise, as a radar or not as one: give the same "
+            "camera files"
+        )
     size = prior.params.shape[1]
     if size != cameras.mean.shape[1]:
         raise InputError(f"the earlier block has {size} unknowns a view, not {cameras.mean.shape[1]}")

@@ -308,7 +308,9 @@ def _corrections(files: RunFiles) -> Section | None:
     if (drawn := place_map(files)) is not None:
         shown.append(drawn)
     caption = "Corrections: shift in the middle of the image ± one sigma, size of rotation and translation"
-    found = table("corrections", caption, views, ViewEntry, ViewEntry.CORRECTIONS, folded=True)
+    radars = any(view.correction and view.correction.range_m is not None for view in views)
+    columns = ViewEntry.CORRECTIONS + ViewEntry.CLOCKS * radars
+    found = table("corrections", caption, views, ViewEntry, columns, folded=True)
     tables = [found]
     if any(view.correction and view.correction.ellipse for view in views):
         caption = "Place on the ground of the middle of each image, its altitude given: one-sigma ellipse, CE90, and"

@@ -279,7 +279,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     if prior.drift_sigma and np.isfinite(prior.drift_sigma).all():  # an earlier run's are in its matrix
         sizes = f"{_lengths(prior.drift_sigma)} at the first and last row"
         lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
-    lines += _jitter_lines(views)
+    lines += _jitter_lines(views) + _radar_lines(views)
     if len(run.tracks) or run.gcps is not None:
         lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
     lines += _reference_lines(run)
@@ -330,6 +330,16 @@ def _jitter_lines(views: Sequence[ViewEntry]) -> list[str]:
             f"Detectors begin at up to {_count(most, 'column')} of an image, {size:.2f} px RMS apart."
         )
     return lines
+
+
+def _radar_lines(views: Sequence[ViewEntry]) -> list[str]:
+    """What the clocks of radars were off by."""
+    found = [
+        f"{view.name}: range {one.range_m:+.2f} ± {sigma[0]:.2f} m, azimuth {one.azimuth_ms:+.3f} ± {sigma[1]:.3f} ms"
+        for view in views
+        if (one := view.correction) is not None and (sigma := one.timing_sigma) is not None
+    ]
+    return [f"Radar images are corrected by their clocks: {listed(found, _MOST_NAMED)}."] if found else []
 
 
 def _dem_lines(adjustment: Adjustment) -> list[str]:

@@ -8,12 +8,13 @@ import numpy as np
 from scipy.special import erf
 
 from barpc.ba.priors import USABLE_ACCURACY
-from barpc.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
 from barpc.report.records import Number, Record, said
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
+from barpc.sensor.timing import Timed
 
 
 class EllipseEntry(Record):
@@ -51,7 +52,25 @@ def shift_in_image(model: Corrected, covariance: Array, unknowns: str, ground: A
 def ellipse(model: Corrected, covariance: Array, unknowns: str, ground: Array) -> EllipseEntry:
     """The standard error ellipse of the place on the ground where P_BA sees a pixel; arguments of `shift_in_image`."""
     _, variance, by_point = _in_image(model, covariance, unknowns, ground)
-    seen = np.linalg.inv(by_point @ enu_basis(ground)[:2].T)  # east, north by col, row at one altitude
+    return _drawn(variance, by_point @ enu_basis(ground)[:2].T)
+
+
+def clocks_in_image(model: Timed, covariance: Array, ground: Array) -> tuple[Array, Array, EllipseEntry]:
+    """As `shift_in_image` and `ellipse`, by a radar's clocks.
+
+    `covariance` begins with range and place along the flight [m].
+    """
+    image, by_timing = model.timing_jacobian(ground)
+    by_unknown = by_timing / [1.0, model.sensor.speed]
+    variance = by_unknown @ covariance[:2, :2] @ by_unknown.T
+    by_ground = model.project_jacobian(ground)[1] / metres_per_unit(ground)
+    moved = image - model.sensor.project(ground)
+    return moved, np.sqrt(np.maximum(np.diag(variance), 0.0)), _drawn(variance, by_ground[:, :2])
+
+
+def _drawn(variance: Array, by_level: Array) -> EllipseEntry:
+    """The ellipse of a covariance [px^2] in an image, of its derivative (2, 2) [px/m] by east and north."""
+    seen = np.linalg.inv(by_level)  # at one altitude
     values, axes = np.linalg.eigh(seen @ variance @ seen.T)
     minor, major = np.sqrt(np.maximum(values, 0.0)).tolist()
     azimuth = float(np.degrees(np.arctan2(axes[0, 1], axes[1, 1]))) % 180.0

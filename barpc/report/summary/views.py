@@ -14,7 +14,7 @@ from barpc.fit import RpcFit
 from barpc.geodesy import Array
 from barpc.report.records import Cell, Column, Number, Record, said, value_of
 from barpc.report.run import ControlResidual, Run
-from barpc.report.summary.place import EllipseEntry, ellipse, shift_in_image, stated_ce90
+from barpc.report.summary.place import EllipseEntry, clocks_in_image, ellipse, shift_in_image, stated_ce90
 from barpc.report.summary.words import (
     ABOVE,
     STATUS_WORDS,
@@ -30,6 +30,7 @@ from barpc.scene import IntArray
 from barpc.sensor.corrected import Corrected, Correction, ImageCorrected
 from barpc.sensor.geometry import Several, ground_sample_distance, view_angles
 from barpc.sensor.splined import RowSpline, Splined
+from barpc.sensor.timing import Timed
 
 CELLS = 8  # Cells of an image from left to right and from top to bottom
 _ROWS = 400  # of an image, over which a spline is averaged
@@ -62,6 +63,12 @@ class CorrectionEntry(Record):
     translation_m: Vector | None = said("Translation T, ECEF", "m", default=None)
     translation_norm_m: Number = said("Its length", "m", "translation", ".2f", default=None)
     drift_urad: tuple[Vector, ...] | None = said("Drift, for each power of the row", "urad", default=None)
+    range_m: Number = said("Radar: added to the range", "m", "range", "+.3f", default=None)
+    azimuth_ms: Number = said("Radar: added to the azimuth time", "ms", "azimuth", "+.4f", default=None)
+    timing_sigma: Pixel | None = said("Their posterior standard deviations, m and ms", default=None)
+    timing_slopes: tuple[Pixel, ...] | None = said(
+        "Radar: what is added at the end of the flight over the image, m and ms, for each power", default=None
+    )
     jitter_px: Number = said(
         "RMS over the rows of the spline that follows in the image", "px", "jitter", ".2f", default=None
     )
@@ -154,6 +161,7 @@ class ViewEntry(Record):
         "correction.detector_px"
     )
     CONTROL: ClassVar = "name control_w control_w_point"
+    CLOCKS: ClassVar = " correction.range_m correction.azimuth_ms"
     FITS: ClassVar = (
         "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fitted fit.num_check_points fit.method"
     )
@@ -329,10 +337,26 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
     """The correction of a view, at the ground point (3,) in the middle of its image."""
     whole, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
     sensor, spline = (whole.sensor, whole.correction) if isinstance(whole, Splined) else (whole, None)
-    assert isinstance(sensor, Corrected | ImageCorrected)
-    correction, covariance = sensor.correction, adjustment.covariance.view(i)
+    covariance = adjustment.covariance.view(i)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     common = (model, adjustment.params[i].tolist(), sigma)
+    if isinstance(sensor, Timed):
+        moved, uncertain, place = clocks_in_image(sensor, covariance, middle)
+        known = np.sqrt(np.maximum(np.diag(covariance[:2, :2]), 0.0)) / [1.0, sensor.sensor.speed / 1e3]
+        offset, *slopes = (sensor.correction.coeffs * [1.0, 1e3]).tolist()
+        return CorrectionEntry(
+            *common,
+            moved.tolist(),
+            uncertain.tolist(),
+            range_m=offset[0],
+            azimuth_ms=offset[1],
+            timing_sigma=known.tolist(),
+            timing_slopes=slopes,
+            ellipse=place,
+            **_in_image(spline),
+        )
+    assert isinstance(sensor, Corrected | ImageCorrected)
+    correction = sensor.correction
     if not isinstance(correction, Correction):
         shift, slope = correction.shift.tolist(), correction.slope.tolist()
         return CorrectionEntry(*common, None, None, shift_px=shift, slope=slope)

@@ -50,8 +50,8 @@ RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
 NO_DELAYS = Delays()  # pure geometry
 ORBITS = {"AUX_POEORB": 0.05, "AUX_RESORB": 0.1, "AUX_PREORB": 0.4, "Auxiliary": 0.4}
-"""Source of an orbit -> its error [m], RMS in space. Precise and restituted: what is required (Copernicus Sentinel news, 13
-April 2021); predicted: 0.15 to 0.35 m (news, 9 September 2022). An annotation does not tell which of these its own is."""
+"""Source of an orbit -> its error [m], RMS in space. Precise, restituted: what is required (Copernicus Sentinel news of
+13 April 2021); predicted: 0.15 to 0.35 m (9 September 2022). An annotation does not tell which of these its own is."""
 ON_BOARD = 2.5
 """The same of the receiver's own solution [m] (2.43 m: the same news); downlinked, or of no known source."""
 NOT_CORRECTED = (3.5, 4.0)

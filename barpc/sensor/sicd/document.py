@@ -8,7 +8,7 @@ from typing import BinaryIO, Literal
 import numpy as np
 
 from barpc.errors import InputError, RpcFormatError
-from barpc.geodesy import Array, ground_from_ecef
+from barpc.geodesy import EARTH_RATE, Array, ground_from_ecef
 from barpc.sensor.curve import Curve
 from barpc.sensor.document import Fields
 from barpc.sensor.sicd.formation import Formation, ImagePlane, PolarFormat, RangeAzimuth, ZeroDoppler
@@ -102,6 +102,7 @@ def open_sicd(path: Path) -> Monostatic:
         size=(int(root.positive("ImageData/NumCols")), int(root.positive("ImageData/NumRows"))),
         alt_range=(altitude - RELIEF, altitude + RELIEF),
         look=_look(root),
+        accuracy=_accuracy(root, scp),
     )
     seen = model.project(ground_from_ecef(scp))
     miss = float(np.abs(seen - model.origin[::-1]).max())
@@ -125,6 +126,31 @@ def _look(root: Fields) -> Literal["right", "left"]:
     if side not in ("R", "L"):
         raise RpcFormatError(f"{root.name}: SCPCOA/SideOfTrack is {side[:20]!r}, expected R or L")
     return "right" if side == "R" else "left"
+
+
+def _accuracy(root: Fields, scp: Array) -> tuple[float, float] | None:
+    """Of range and along the flight [m]: those of the centre as a whole, else those of the orbit and of the range."""
+    whole = _error(root, "CompositeSCP//Rg"), _error(root, "CompositeSCP//Az")
+    orbit = np.array([_error(root, f"Components/PosVelErr/P{k}") for k in (1, 2, 3)])
+    frame = root.element.findtext("ErrorStatistics/Components/PosVelErr/Frame", "").strip()
+    if min(whole) > 0 or not (orbit > 0).all() or frame not in ("ECF", "RIC_ECF", "RIC_ECI"):
+        return whole if min(whole) > 0 else None
+    position, velocity = _vector(root, "SCPCOA/ARPPos"), _vector(root, "SCPCOA/ARPVel")
+    directions, basis = np.stack([position - scp, velocity], axis=1), np.eye(3)
+    if frame != "ECF":  # radial, in track, across it
+        turning = np.array([0.0, 0.0, EARTH_RATE * (frame == "RIC_ECI")])
+        across = np.cross(position, velocity + np.cross(turning, position))
+        basis = np.stack([position, np.cross(across, position), across])
+        basis /= np.linalg.norm(basis, axis=1, keepdims=True)
+    parts = orbit[:, None] * (basis @ directions)
+    far, along = np.linalg.norm(parts, axis=0) / np.linalg.norm(directions, axis=0)
+    delays = ("RadarSensor/RangeBias", "TropoError/TropoRangeSlant", "IonoError/IonoRangeVertical")
+    return float(np.linalg.norm([far, *(_error(root, f"Components/{d}") for d in delays)])), float(along)
+
+
+def _error(root: Fields, path: str) -> float:
+    """A standard deviation [m]; 0 where it is not stated."""
+    return max([0.0, *(float(one.numbers(".")[0]) for one in root.all(f"ErrorStatistics/{path}"))])
 
 
 def _orbit(root: Fields) -> Curve:
