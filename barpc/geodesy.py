@@ -56,7 +56,7 @@ def pointwise(
                 given.append(memory[:, : len(given[0])])
             for whole, piece in zip(out, function(*given), strict=True):
                 whole[part] = piece
-    return [whole.reshape(*lead, *shape) for whole, shape in zip(out, shapes, strict=True)]
+    return [whole.reshape((*lead, *shape)) for whole, shape in zip(out, shapes, strict=True)]
 
 
 def ecef_from_ground(ground: npt.ArrayLike) -> Array:
