@@ -1,0 +1,78 @@
+"""A run on a radar image and two optical ones: the radar's clocks are corrected, an RPC is fitted to the result."""
+
+from __future__ import annotations
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from barpc.fit import fit_rpc
+from barpc.options import AdjustOptions, RunOptions
+from barpc.pipeline import adjust
+from barpc.pointio.matches import write_matches
+from barpc.rpcio import read_rpc, write_rpc
+from barpc.scene import Tracks
+from barpc.sensor.sicd import open_sicd
+from barpc.sensor.timing import Timed, Timing
+from barpc.simulate.orbit import Look, fly
+from tests.sensor.radar_documents import SIZE, document
+
+TARGET, ALT = np.array([5.4, 43.3, 120.0]), (-100.0, 400.0)
+STATED = "<ErrorStatistics><CompositeSCP><Rg>3</Rg><Az>3</Az></CompositeSCP></ErrorStatistics></SICD>"
+
+
+def blank(path, size):
+    """An image in which nothing varies: no two such are compared."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        profile = {"driver": "GTiff", "width": size[0], "height": size[1], "count": 1, "dtype": "uint8"}
+        with rasterio.open(path, "w", **profile, compress="deflate") as out:
+            out.write(np.ones((1, size[1], size[0]), dtype=np.uint8))
+    return str(path)
+
+
+def test_a_radar_image_is_adjusted_by_its_clocks_and_said_to_be(tmp_path):
+    pytest.importorskip("jinja2", reason="the page")
+    (tmp_path / "radar.xml").write_text(document("PLANE", squint=0.1).replace("</SICD>", STATED))
+    radar = open_sicd(tmp_path / "radar.xml")
+    truth = [
+        fit_rpc(fly(TARGET, Look(12.0, azimuth), (1200, 1200), 0.5), (1200, 1200), ALT).rpc
+        for azimuth in (10.0, 190.0)
+    ]
+    truth.append(Timed(radar, Timing([[2.5, -4e-4]])))
+    images = [blank(tmp_path / f"{name}.tif", (1200, 1200)) for name in "ab"]
+    for image, rpc in zip(images, truth, strict=False):
+        write_rpc(rpc, image.replace(".tif", "_RPC.TXT"))
+    images.append(f"{blank(tmp_path / 'radar.tif', SIZE)},camera={tmp_path / 'radar.xml'}")
+    rng, count = np.random.default_rng(2), 120
+    ground = TARGET + rng.uniform(-1, 1, (2 * count, 3)) * [1.5e-3, 1.5e-3, 80.0]
+    xy = np.stack([camera.project(ground) for camera in truth], axis=1)
+    ties = xy[:count].reshape(-1, 2) + rng.normal(0, 0.05, (3 * count, 2))
+    index = np.tile(np.arange(3), count), np.repeat(np.arange(count), 3)
+    write_matches(tmp_path / "ties.csv", Tracks(*index, ties, np.full(3 * count, 0.05)), ["a", "b", "radar"])
+    options = RunOptions(
+        matches=str(tmp_path / "ties.csv"), matches_only=True, adjust=AdjustOptions(fixed=("a", "b"))
+    )
+    result = adjust(images, tmp_path / "out", options)
+    told = result.adjustment.corrections[2]
+    fresh = read_rpc(tmp_path / "out" / "radar_RPC.TXT")
+    pixels = rng.uniform(50, np.array(SIZE) - 50, (200, 2))
+    across = result.adjustment.sensors[2].localize(pixels, rng.uniform(*ALT, 200))
+    np.testing.assert_allclose(
+        fresh.project(across), result.adjustment.sensors[2].project(across), rtol=0, atol=1e-3
+    )
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    correction = summary["views"][2]["correction"]
+    assert correction["range_m"] == pytest.approx(told.coeffs[0, 0])
+    assert correction["azimuth_ms"] == pytest.approx(1e3 * told.coeffs[0, 1])
+    assert correction["range_m"] == pytest.approx(2.5, abs=0.05)
+    assert correction["azimuth_ms"] == pytest.approx(-0.4, abs=0.005)
+    assert 0.001 < correction["timing_sigma"][0] < 0.05
+    assert any("radar: range +" in line for line in summary["verdict"])
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "range [m]" in page
+    assert f"{correction['range_m']:+.3f}" in page
