@@ -277,7 +277,8 @@ class AdjustOptions(Options):
     )
     sigma_position: float | None = option(
         None,
-        "Prior standard deviation of the translation along an axis. Without: as for the attitude.",
+        """Prior standard deviation of the translation along an axis; of a radar's range and place along the flight.
+        Without: as for the attitude, or what a radar's orbit and metadata state.""",
         unit="m",
         above=0,
     )

@@ -216,7 +216,7 @@ def apply_prior(
     if other := sorted(set(prior.radars) ^ (set(radars) & set(prior.names))):
         raise InputError(
             f"the earlier block corrected {', '.join(other[:10])} otherwise, as a radar or not as one: give the same "
-            "camera files"
+            "camera files, or adjust all images together"
         )
     size = prior.params.shape[1]
     if size != cameras.mean.shape[1]:
