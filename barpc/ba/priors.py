@@ -16,7 +16,7 @@ from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
-from barpc.sensor.timing import Clocked
+from barpc.sensor.timing import is_clocked
 
 DEFAULT_ACCURACY = (
     7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
@@ -112,8 +112,9 @@ def stated_accuracy(view: View) -> float:
 
 def _stated(view: View) -> tuple[float, float]:
     """What a view states for its attitude, as metres on the ground, and position, or for its two clocks [m]."""
-    if isinstance(view.sensor, Pushbroom | Clocked) and view.sensor.accuracy is not None:
-        attitude, position = view.sensor.accuracy
+    sensor = view.sensor
+    if (isinstance(sensor, Pushbroom) or is_clocked(sensor)) and sensor.accuracy is not None:
+        attitude, position = sensor.accuracy
         return max(attitude, USABLE_ACCURACY), max(position, USABLE_ACCURACY)
     return (stated_accuracy(view),) * 2
 
@@ -137,7 +138,7 @@ def prior_sigmas(
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
         return np.full((count, size), IMAGE_SIGMA)
-    radars = [isinstance(view.sensor, Clocked) for view in views]
+    radars = [is_clocked(view.sensor) for view in views]
     parts[0][radars, :2] = stated[radars] if options.sigma_position is None else options.sigma_position
     parts += [np.full((count, 3), options.sigma_drift or DRIFT_SIGMA)] * drift
     parts.append(np.full((count, waves), FIRST_SIGMA))

@@ -20,7 +20,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, ImageAffine, ImageCorrected
 from barpc.sensor.geometry import camera_center
 from barpc.sensor.splined import Splined
-from barpc.sensor.timing import Clocked, Timed, Timing
+from barpc.sensor.timing import Clocked, Timed, Timing, is_clocked
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
 """Image models: which of the terms 1, col, row each coordinate's correction has."""
@@ -219,7 +219,7 @@ def make_unknowns(
     middle = scene.mean(axis=0)
     place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
     sensors = enumerate(view.sensor for view in views) if model not in _IMAGE_TERMS else ()
-    radars = {i: sensor for i, sensor in sensors if isinstance(sensor, Clocked)}
+    radars = {i: sensor for i, sensor in sensors if is_clocked(sensor)}
     return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0, place, waves, radars)
 
 

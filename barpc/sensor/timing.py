@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, Self, TypeGuard
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -45,7 +45,6 @@ class Timing(Frozen):
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, slopes))
 
 
-@runtime_checkable
 class Clocked(SensorModel, Protocol):
     """A radar model whose clocks can be corrected."""
 
@@ -72,6 +71,11 @@ class Clocked(SensorModel, Protocol):
         d(image)/d(ground) (..., 2, 3), d(image)/d(range, azimuth time) (..., 2, 2) [px/m, px/s], and (...) [px].
         """
         ...
+
+
+def is_clocked(sensor: SensorModel) -> TypeGuard[Clocked]:
+    """Whether a model is a radar whose clocks can be corrected: asking the protocol itself costs 70 us a view."""
+    return hasattr(sensor, "timed")
 
 
 @dataclass(frozen=True)

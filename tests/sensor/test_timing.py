@@ -12,7 +12,7 @@ from barpc.errors import RpcError, RpcFormatError
 from barpc.geodesy import SPEED_OF_LIGHT, ecef_from_ground
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.sensor.sicd import open_sicd
-from barpc.sensor.timing import Clocked, Timed, Timing
+from barpc.sensor.timing import Clocked, Timed, Timing, is_clocked
 from tests.sensor.radar_documents import KINDS, SIZE, document
 from tests.sensor.s1_product import GRD, INTERVAL, SAMPLING, Product
 
@@ -31,7 +31,7 @@ def model_of(kind: str, folder: Path) -> Clocked:
 @pytest.mark.parametrize("kind", MODELS)
 def test_derivatives_by_range_and_azimuth_time_are_central_differences(kind, tmp_path):
     model, rng = model_of(kind, tmp_path), np.random.default_rng(3)
-    assert isinstance(model, Clocked)
+    assert is_clocked(model)
     middle = model.size[model.azimuth_axis] / 2
     timing = Timing([[3.0, 2e-4], [0.4, 1e-5]], middle, middle)
     ground = model.localize(rng.uniform(0.1, 0.9, (20, 2)) * model.size, rng.uniform(0, 300, 20))
@@ -163,6 +163,13 @@ def test_the_accuracy_of_a_sicd_image_is_what_it_states(tmp_path):
     assert stated(whole, folder=tmp_path) == (1.5, 2.5)
     assert stated(whole.replace("<Rg>1.5</Rg>", "<Rg>0</Rg>"), folder=tmp_path) is None
     assert stated(errors_of_orbit("NED", 1.0, 2.0, 3.0), folder=tmp_path) is None
+    nowhere = "<X>0</X><Y>0</Y><Z>0</Z></ARPVel>"
+    text = document("PFA").replace(
+        "</SICD>", f"<ErrorStatistics>{errors_of_orbit('RIC_ECF', 1, 2, 3)}</ErrorStatistics></SICD>"
+    )
+    begin, end = text.index("<ARPVel>") + 8, text.index("</ARPVel>") + 9
+    (tmp_path / "image.xml").write_text(text[:begin] + nowhere + text[end:])
+    assert open_sicd(tmp_path / "image.xml").accuracy is None
     with pytest.raises(RpcFormatError, match="not a list of numbers"):
         stated(whole.replace("1.5", "good"), folder=tmp_path)
 

@@ -137,15 +137,17 @@ def _accuracy(root: Fields, scp: Array) -> tuple[float, float] | None:
         return whole if min(whole) > 0 else None
     position, velocity = _vector(root, "SCPCOA/ARPPos"), _vector(root, "SCPCOA/ARPVel")
     directions, basis = np.stack([position - scp, velocity], axis=1), np.eye(3)
-    if frame != "ECF":  # radial, in track, across it
-        turning = np.array([0.0, 0.0, EARTH_RATE * (frame == "RIC_ECI")])
-        across = np.cross(position, velocity + np.cross(turning, position))
-        basis = np.stack([position, np.cross(across, position), across])
-        basis /= np.linalg.norm(basis, axis=1, keepdims=True)
-    parts = orbit[:, None] * (basis @ directions)
-    far, along = np.linalg.norm(parts, axis=0) / np.linalg.norm(directions, axis=0)
+    with np.errstate(invalid="ignore"):  # of damaged documents
+        if frame != "ECF":  # radial, in track, across it
+            turning = np.array([0.0, 0.0, EARTH_RATE * (frame == "RIC_ECI")])
+            across = np.cross(position, velocity + np.cross(turning, position))
+            basis = np.stack([position, np.cross(across, position), across])
+            basis /= np.linalg.norm(basis, axis=1, keepdims=True)
+        parts = orbit[:, None] * (basis @ directions)
+        far, along = np.linalg.norm(parts, axis=0) / np.linalg.norm(directions, axis=0)
     delays = ("RadarSensor/RangeBias", "TropoError/TropoRangeSlant", "IonoError/IonoRangeVertical")
-    return float(np.linalg.norm([far, *(_error(root, f"Components/{d}") for d in delays)])), float(along)
+    found = float(np.linalg.norm([far, *(_error(root, f"Components/{d}") for d in delays)])), float(along)
+    return found if np.isfinite(found).all() else None
 
 
 def _error(root: Fields, path: str) -> float:
