@@ -279,6 +279,8 @@ def test_a_radar_goes_on_as_a_radar_only(slc: Scene, found: Adjustment, tmp_path
     block_prior(found).save(tmp_path / "prior.npz")
     prior = BlockPrior.load(tmp_path / "prior.npz")
     assert prior.radars == ("radar",)
+    held = adjust_tracks(slc.views, slc.tracks(), AdjustOptions(fixed=("radar",)))
+    assert block_prior(held).radars == ()  # a view that was fixed is not handed on
     again = adjust_tracks(slc.views, slc.tracks(), prior=prior)
     np.testing.assert_allclose(again.corrections[2].coeffs[0], found.corrections[2].coeffs[0], atol=0.05)
     with pytest.raises(InputError, match="corrected radar otherwise, as a radar or not as one"):
