@@ -11,10 +11,12 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.geodesy import metres_per_unit
 from barpc.report import Run, maps
-from barpc.report.summary.place import ce90, ellipse, stated_ce90
+from barpc.report.summary.place import ce90, clocks_in_image, ellipse, stated_ce90
 from barpc.report.tables import read_tables
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
+from barpc.sensor.timing import Timed, Timing
+from tests.sensor.s1_product import Product
 
 
 @pytest.mark.parametrize("minor", [1.0, 0.8, 0.5, 0.21, 0.05, 0.0])
@@ -49,6 +51,26 @@ def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, mod
     if found.major_m > 1.2 * found.minor_m:
         azimuth = np.degrees(np.arctan2(*axes[:, 1]))
         assert abs((found.azimuth_deg - azimuth + 90) % 180 - 90) < 12
+
+
+def test_that_of_a_radar_is_of_clocks_drawn_from_theirs():
+    radar, pixel, alt = Product().model(), np.array([8000.0, 6000.0]), np.array(120.0)
+    timed = Timed(radar, Timing([[3.0, 2e-4]]))
+    covariance = np.array(
+        [[0.5, 0.3, 9.0], [0.3, 1.2, 9.0], [9.0, 9.0, 9.0]]
+    )  # range and along the flight first
+    moved, sigma, found = clocks_in_image(timed, covariance, timed.localize(pixel, alt))
+    drawn = np.random.default_rng(1).multivariate_normal(np.zeros(2), covariance[:2, :2], 3000)
+    clocks = [Timed(radar, Timing([[3.0 + m, 2e-4 + n / radar.speed]])) for m, n in drawn]
+    at = timed.localize(pixel, alt)
+    east_north = ((np.array([one.localize(pixel, alt) for one in clocks]) - at) * metres_per_unit(at))[:, :2]
+    assert [found.minor_m, found.major_m] == pytest.approx(
+        np.sqrt(np.linalg.eigvalsh(np.cov(east_north.T))), rel=0.05
+    )
+    assert np.mean(np.hypot(*east_north.T) < found.ce90_m) == pytest.approx(0.9, abs=0.02)
+    seen = np.array([one.project(at) for one in clocks])
+    assert sigma == pytest.approx(seen.std(axis=0), rel=0.05)
+    assert moved == pytest.approx(pixel - radar.project(at), abs=1e-6)
 
 
 def test_what_is_stated_is_taken_from_where_the_priors_take_it(block_run):
