@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from barpc.report.records import Table, cell_of
+from barpc.report.records import Table, table
 from barpc.report.summary import (
     AskedEntry,
     GcpEntry,
@@ -19,7 +19,7 @@ from barpc.report.summary import (
 )
 
 SHARED = 0.03  # px: what neighbours share and is less is not followed
-_NAMED = 5  # of many images or points
+_NAMED = 5  # of many points
 
 
 def decisions(summary: Summary) -> list[str]:
@@ -38,21 +38,9 @@ def decisions(summary: Summary) -> list[str]:
 
 def second_attempts(pairs: Sequence[PairEntry]) -> Table | None:
     """Pairs that were tried more than once; None without any."""
-    found = [(pair, pair.matching or {}) for pair in pairs]
-    rows = [
-        [
-            cell_of(f"{pair.a} - {pair.b}"),
-            *map(cell_of, (pair.tied_by, how.get("verified"), "; ".join(how["beaten"]))),
-        ]
-        for pair, how in found
-        if how.get("beaten")
-    ]
+    again = [pair for pair in pairs if pair.beaten]
     caption = "Pairs that were tried again, and what found fewer matches than were wanted"
-    return (
-        Table("again", caption, ["pair", "tied by", "matches", "instead of"], rows, folded=True)
-        if rows
-        else None
-    )
+    return table("again", caption, again, PairEntry, PairEntry.AGAIN, folded=True) if again else None
 
 
 def control_sentence(summary: Summary) -> str:
@@ -78,7 +66,7 @@ def _matching(summary: Summary) -> list[str]:
     matcher = _option(summary, "tie", "matcher")
     asked = f"; the matcher asked for is {matcher}" if matcher else ""
     found = [f"{len(tied)} pairs are tied: {_counts((pair.tied_by for pair in tied), 'by ')}{asked}."]
-    if again := sum(bool((pair.matching or {}).get("beaten")) for pair in tied):
+    if again := sum(bool(pair.beaten) for pair in tied):
         verb = "was" if again == 1 else "were"
         found[0] += f" {again} {verb} tried again, as fewer matches were found than wanted."
     shares = [(pair.decoy_share, f"{pair.a} - {pair.b}") for pair in tied if pair.decoy_share is not None]

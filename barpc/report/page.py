@@ -314,7 +314,7 @@ def _corrections(files: RunFiles) -> Section | None:
     tables = [found]
     if any(view.correction and view.correction.ellipse for view in views):
         caption = "Place on the ground of the middle of each image, its altitude given: one-sigma ellipse, CE90, and"
-        caption += " CE90 as stated with the camera as delivered"
+        caption += " CE90 as stated with the camera as delivered (-: nothing is)"
         tables.append(table("places", caption, views, ViewEntry, ViewEntry.PLACES, folded=True))
     return Section("moves", "What was changed in each camera?", answer, shown, tables=tables, half=True)
 

@@ -36,6 +36,8 @@ frame.addEventListener("load", () => {
   heads[points].firstElementChild.click(); found.down = values(points);
   heads[image].firstElementChild.click(); found.names = values(image); found.unsorted = heads[points].getAttribute("aria-sort");
   heads[image].firstElementChild.focus(); found.focus = page.activeElement === heads[image].firstElementChild;
+  const box = table.closest(".scroll"), top = e => e.getBoundingClientRect().top;
+  box.style.maxHeight = "160px"; box.scrollTop = 120; found.scrolled = box.scrollTop; found.sticky = top(heads[0]) - top(box);
   const style = getComputedStyle(page.body); found.colors = [style.color, style.backgroundColor];
   document.body.textContent = JSON.stringify({...found, errors});
 });

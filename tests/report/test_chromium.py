@@ -88,6 +88,8 @@ def test_tables_sort_up_and_down_and_say_so(block_run, tmp_path):
     assert found["names"] == sorted(view["name"] for view in block_run.summary["views"])
     assert (found["sorted"], found["unsorted"]) == ("ascending", "none")
     assert found["focus"]
+    assert found["scrolled"] > 60
+    assert 0 <= found["sticky"] < 3  # the heads stay on top
 
 
 def test_it_is_light_by_day_and_dark_by_night(block_run, tmp_path):

@@ -37,7 +37,7 @@ def record(block_run) -> Summary:
 
 def matched(record: Summary, **fields: Any) -> Summary:
     """All pairs tied by keypoints, the first one otherwise."""
-    pairs = [replace(pair, tied_by="guided", decoy_share=0.004, matching={}) for pair in record.pairs]
+    pairs = [replace(pair, tied_by="guided", decoy_share=0.004, beaten=()) for pair in record.pairs]
     return replace(record, pairs=(replace(pairs[0], **fields), *pairs[1:]))
 
 
@@ -49,8 +49,10 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
     assert "nothing was matched" not in plain
     assert "tried again" not in plain
     assert second_attempts(matched(record).pairs) is None
-    how = {"verified": 240, "beaten": ["guided 12 of 100", "guided, loosened 20 of 100"]}
-    other = matched(record, tied_by="structure", decoy_share=0.03, matching=how, chosen_by="same date")
+    fewer = ("guided 12 of 100", "guided, loosened 20 of 100")
+    other = matched(
+        record, tied_by="structure", decoy_share=0.03, beaten=fewer, num_matches=240, chosen_by="same date"
+    )
     text = said(other)
     assert f"{count} pairs are tied: {count - 1} by guided, 1 by structure" in text
     assert "1 was tried again" in text

@@ -46,12 +46,14 @@ class PairEntry(Record):
     OWN: ClassVar = {
         "pair": Column("pair", lambda pair: f"{pair.a} - {pair.b}"),
         "before": Column("before [px]", lambda pair: _offset_cell(pair.epipolar_before), ".3f"),
+        "beaten": Column("instead of", lambda pair: "; ".join(pair.beaten)),
         "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
     }
     PAGE: ClassVar = (
         "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px "
         "before after"
     )
+    AGAIN: ClassVar = "pair tied_by num_matches beaten"
     TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
     CSV: ClassVar = (
         "a b num_matches convergence_deg base_to_height height_m_per_px epipolar_before.median epipolar_before.spread "
@@ -90,6 +92,9 @@ class PairEntry(Record):
         ".2f",
         default=None,
     )
+    beaten: tuple[str, ...] = said(
+        "Attempts that found fewer: matcher, whether loosened, verified matches of those wanted", default=()
+    )
     chosen_by: str | None = said(
         "Why it was tried: overlap and angle, same date, quick score, connects all, second path, listed, given",
         default=None,
@@ -122,7 +127,7 @@ def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
             entry = replace(
                 entry, matching=plain(report), tied_by=report.means, decoy_share=share, noise_px=noise
             )
-            entry = replace(entry, chosen_by=report.reason)
+            entry = replace(entry, chosen_by=report.reason, beaten=report.beaten)
         entries.append(entry)
     return tuple(entries)
 
