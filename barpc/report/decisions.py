@@ -95,9 +95,10 @@ def _drift(scene: SceneEntry, summary: Summary) -> list[str]:
     if not degree:
         return ["No drift was solved for: nothing rotates, or an earlier run had none."]
     words = f"Rotations change along the rows with degree {degree}"
-    if None in sigmas:
+    known = [sigma for sigma in sigmas if sigma is not None]
+    if len(known) < len(sigmas):
         return [f"{words}, as those of the earlier run do."]
-    sizes = f"standard deviation at the first and last row: {', '.join(map(metres, sigmas))}"
+    sizes = f"standard deviation at the first and last row: {', '.join(map(metres, known))}"
     if scene.drift_asked is None:
         return [f"{words} ({sizes}): no F test asked for more."]
     return [f"{words} ({sizes}): degree {degree - 1} left {_left(scene.drift_asked)}."]

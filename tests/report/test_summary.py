@@ -9,8 +9,10 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks
+from barpc import report
+from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.report import Run
+from barpc.report.decisions import decisions
 from barpc.report.records import Number, plain, said, table
 from barpc.report.run import pair_ties, triangulate_tracks
 from barpc.report.summary import ViewEntry, published_schema, shift_in_image
@@ -18,6 +20,7 @@ from barpc.report.tables import read_summary
 from barpc.scene import middle_altitude
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import epipolar_offset, view_angles
+from barpc.simulate import simulate_block
 from tests.report.conftest import summarize
 
 SCHEMA = published_schema()
@@ -63,6 +66,17 @@ def test_summaries_follow_the_published_schema(fixture, request):
     folder = request.getfixturevalue(fixture).folder
     summary = json.loads((folder / "summary.json").read_text())
     assert faults(summary, SCHEMA) == []
+
+
+def test_the_summary_of_views_added_to_an_earlier_run_follows_the_schema():
+    block = simulate_block(3, 300, seed=3)
+    old = block.tracks.select(block.tracks.view < 2)
+    prior = block_prior(adjust_tracks(block.views[:2], old))
+    adjustment = adjust_tracks(block.views, block.tracks, prior=prior)
+    record = report.summarize(Run("adjust", block.views, (), block.tracks, adjustment=adjustment))
+    assert record.scene.drift_sigma_m == (None,)  # the earlier run's matrix has it
+    assert faults(json.loads(json.dumps(plain(record))), SCHEMA) == []
+    assert "as those of the earlier run do" in " ".join(decisions(record))
 
 
 def test_the_schema_refuses_what_is_missing_unknown_or_of_another_kind(block_run):

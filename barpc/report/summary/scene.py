@@ -102,8 +102,9 @@ class SceneEntry(Record):
     weakest_modes: tuple[ModeEntry, ...] = said("What the images cannot tell, the weakest first")
     noise: Number = said("Observed over stated standard deviation of the observations")
     drift_degree: Count = said("Degree of the rotation in the row")
-    drift_sigma_m: tuple[float, ...] = said(
-        "Standard deviation of the drift at the first and last row, by degree", "m"
+    drift_sigma_m: tuple[Number, ...] = said(
+        "Standard deviation of the drift at the first and last row, by degree; null where an earlier run tells",
+        "m",
     )
     prior_ratio: Number = said("Squared corrections over stated variances and degrees of freedom")
     cost_history: tuple[Number, ...] = said("Sum of squared whitened residuals, by linearisation")
