@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -354,7 +355,6 @@ def _adjustment(
     points[found.after.index] = found.after.points
     inlier = block.in_order(outcome.inlier)
     ties = slice(0, len(inlier) - (block.point >= block.num_tracks).sum())
-    known = slice(ties.stop, ties.stop + len(block.gcps.view))
     is_tie = found.problem.structure.point < block.num_tracks
     view = np.maximum(block.in_order(block.view), outer.in_order(outer.view))[ties]
     before, after = (
@@ -362,7 +362,6 @@ def _adjustment(
         for inside, outside in ((found.before, found.start), (outcome.residual, found.after))
     )
     gauge, shares = _place(found, block, covariance)
-    w = block.in_order(_control_w(found, block, covariance))
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
     return Adjustment(
         names=block.names,
@@ -392,15 +391,26 @@ def _adjustment(
         held=found.heights.weak[: block.num_tracks],
         terrain=found.heights.test(final.points, seen),
         left_out=block.left_out,
-        gcp_inlier=inlier[known],
-        reference_inlier=inlier[known.stop :],
-        control=found.tested,
-        gcp_w=w[known],
-        reference_w=w[known.stop :],
-        gcp_residuals=enu_offsets(final.points[block.num_tracks : block.num_known], block.gcps.lonlatalt),
+        **_control(found, block, covariance, inlier[ties.stop :]),
         seconds=time.process_time() - start,
         options=options,
     )
+
+
+def _control(found: _Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:
+    """What is said of GCPs and of a reference's points, whose observations (M + R,) were kept or not."""
+    w, gcps = block.in_order(_control_w(found, block, covariance)), len(block.gcps.view)
+    w = w[len(w) - len(inlier) :]
+    return {
+        "control": found.tested,
+        "gcp_inlier": inlier[:gcps],
+        "reference_inlier": inlier[gcps:],
+        "gcp_w": w[:gcps],
+        "reference_w": w[gcps:],
+        "gcp_residuals": enu_offsets(
+            found.final.points[block.num_tracks : block.num_known], block.gcps.lonlatalt
+        ),
+    }
 
 
 def _control_w(found: _Solution, block: Block, covariance: Covariance) -> Array:
