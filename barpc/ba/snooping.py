@@ -29,6 +29,7 @@ CRITICAL = 4.0
 _PART = 3  # of so many points one may be wrong, or the stated accuracies are
 _LEAST = 1e-6  # redundancy of a direction that nothing else tells about: along the ray of a point seen once
 CHECKED = 0.1  # redundancy of a point that something beside the cameras' priors tells about
+_TOGETHER = 60  # observations whose cameras are solved for at a time
 _CHANCE = 1e-3  # that points which are as good as stated scatter by more
 MOST_TESTED = 1000
 """Observations of a reference that are tested in the images: of more, every n-th."""
@@ -167,26 +168,42 @@ def image_test(
     inverse = solve_transposed(lower, np.eye(3)[..., None]).transpose(2, 0, 1)  # L^-T
     place = {} if reduced.common is None else {int(p): n for n, p in enumerate(reduced.common.index)}
     left = np.empty((len(rows), 2))
+    waiting: list[
+        tuple[int, Array]
+    ] = []  # rows (2, N q) of the derivative by all cameras, solved for together
     for n, k in enumerate(rows.tolist()):
         p = int(structure.point[k])
         together = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
         own = weight[k] * by_point[n] @ inverse[n]
         moves = -own @ reduced.cross[together]
         moves[together == k] += weight[k] * by_unknown[n]
-        known = np.eye(2) - own @ own.T
-        if p in place:
-            assert reduced.common is not None
-            shared = (
-                own @ la.solve_triangular(reduced.common.upper, reduced.common.cross[place[p]].T, trans="T").T
-            )
-            whole = shared @ reduced.common.by_camera
-            for view, move in zip(structure.view[together].tolist(), moves, strict=True):
-                whole[:, view * q : (view + 1) * q] += move
-            known -= shared @ shared.T + whole @ covariance.solve(whole.T)
-        else:
+        left[n] = 1.0 - (own**2).sum(axis=1)
+        if p not in place:
             flat = moves.transpose(1, 0, 2).reshape(2, -1)
-            known -= flat @ covariance.joint(structure.view[together]) @ flat.T
-        left[n] = np.diag(known)
+            left[n] -= np.diag(flat @ covariance.joint(structure.view[together]) @ flat.T)
+            continue
+        assert reduced.common is not None
+        shared = (
+            own @ la.solve_triangular(reduced.common.upper, reduced.common.cross[place[p]].T, trans="T").T
+        )
+        whole = shared @ reduced.common.by_camera
+        for view, move in zip(structure.view[together].tolist(), moves, strict=True):
+            whole[:, view * q : (view + 1) * q] += move
+        left[n] -= (shared**2).sum(axis=1)
+        waiting.append((n, whole))
+        if len(waiting) == _TOGETHER:
+            _take_off(left, waiting, covariance)
+    _take_off(left, waiting, covariance)
     with np.errstate(invalid="ignore", divide="ignore"):
         w = np.abs(residual[:, rows].T * weight[rows, None]) / np.sqrt(np.where(left > _LEAST, left, np.nan))
     return np.asarray(np.fmax(*w.T))
+
+
+def _take_off(left: Array, waiting: list[tuple[int, Array]], covariance: Covariance) -> None:
+    """Subtract what the cameras' uncertainty explains of the observations that wait, and let them go."""
+    if not waiting:
+        return
+    index, parts = zip(*waiting, strict=True)
+    waiting.clear()
+    whole = np.concatenate(parts)
+    left[list(index)] -= np.einsum("ij,ji->i", whole, covariance.solve(whole.T)).reshape(-1, 2)
