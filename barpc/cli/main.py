@@ -173,6 +173,8 @@ def cli(ctx: click.Context, verbose: int, quiet: bool, debug: bool) -> None:
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(Formatter("%(levelname).1s %(name)s: %(message)s"))
+    if not verbose:  # libraries log what is raised again, with its traceback
+        handler.addFilter(logging.Filter("barpc"))
     logging.basicConfig(level=level, handlers=[handler])
     warnings.showwarning = _log_warning
 

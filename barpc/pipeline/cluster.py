@@ -58,22 +58,26 @@ def _require_own_version(client: Any) -> None:
 
 
 def _watch(client: Any, end: threading.Event) -> None:
-    since = said = None
+    seen, said = time.monotonic(), None
     while not end.wait(POLL):
         number, now = _workers(client), time.monotonic()
-        if number:
-            if since is not None:
-                logger.warning("the cluster has %d worker(s), after %.0f s without", number, now - since)
-            since = said = None
+        if number or (number == 0 and not _waits(client)):
+            if number and said is not None:
+                logger.warning("the cluster has %d worker(s), after %.0f s without", number, now - seen)
+            seen, said = now, None
         elif said is None or now - said >= REMIND:
-            since, said = since or now, now
-            what = "has no worker" if number == 0 else "does not answer"
+            said = now
             logger.warning(
-                "the cluster %s since %.0f s: waiting; what is finished is kept, Ctrl-C ends the run and the "
+                "the cluster %s for %.0f s: waiting; what is finished is kept, Ctrl-C ends the run and the "
                 "same command goes on with it",
-                what,
-                now - since,
+                "has had no worker" if number == 0 else "has not answered",
+                now - seen,
             )
+
+
+def _waits(client: Any) -> bool:
+    """Whether a task is under way: a cluster that adapts may do without workers while there is none."""
+    return any(state.status == "pending" for state in list(client.futures.values()))
 
 
 def _workers(client: Any) -> int | None:

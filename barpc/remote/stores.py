@@ -29,6 +29,8 @@ def _store(scheme: str) -> Any:
         raise OSError(
             f"{scheme}:// needs the extra: pip install 'barpc[remote]' ({_NAMES[scheme]} is missing)"
         ) from error
+    except Exception as error:  # no credentials
+        raise _one_line(error) from error
 
 
 class _Opened:
@@ -46,7 +48,14 @@ class _Opened:
     def read(self, start: int, stop: int) -> bytes:
         with self._lock:
             _told(self._file.seek, start)
-            return bytes(_told(self._file.read, stop - start))
+            data = bytes(_told(self._file.read, stop - start))
+            if not self._url.startswith("s3:"):  # s3fs asks for bytes of the version that it opened
+                self.require(*_version(_told(self._store.info, self._url)))
+            return data
+
+    def require(self, size: int, tag: str) -> None:
+        if self.version != (size, tag):
+            raise OSError("it was changed in its store while it was read; run the same command again")
 
 
 def _version(found: Mapping[str, Any]) -> tuple[int, str]:
@@ -59,8 +68,7 @@ def _version(found: Mapping[str, Any]) -> tuple[int, str]:
 @lru_cache(_OPEN)
 def _pinned(url: str, size: int, tag: str) -> _Opened:
     found = _Opened(Remote(url))
-    if found.version != (size, tag):
-        raise OSError("it was changed in its store while it was read; run the same command again")
+    found.require(size, tag)
     return found
 
 
@@ -119,8 +127,12 @@ def _told(ask: Any, *args: Any, **given: Any) -> Any:
     """What a store answers; its errors, which are of many classes, as an OSError of one line."""
     try:
         return ask(*args, **given)
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError("its store has no such object or bucket") from error
     except Exception as error:
-        words = " ".join(str(error).split())[:300]
-        raise OSError(f"its store answers {type(error).__name__}: {words}") from error
+        raise _one_line(error) from error
+
+
+def _one_line(error: Exception) -> OSError:
+    first = next(iter(str(error).strip().splitlines()), "")  # Azure adds the whole answer
+    return OSError(f"its store answers {type(error).__name__}: {first[:300]}")

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -25,8 +26,11 @@ SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
 class Counted:
     """A client whose workers are counted, one number a poll."""
 
-    def __init__(self, *numbers: int | None) -> None:
+    def __init__(self, *numbers: int | None, waits: bool = True) -> None:
         self.numbers, self.status = list(numbers), "running"
+        self.futures = {"a": SimpleNamespace(status="finished"), "b": SimpleNamespace(status="pending")}
+        if not waits:
+            del self.futures["b"]
 
     def nthreads(self) -> dict[str, int]:
         number = self.numbers.pop(0) if len(self.numbers) > 1 else self.numbers[0]
@@ -67,6 +71,9 @@ def test_a_cluster_with_workers_and_an_executor_that_is_none_are_not_spoken_of(
 ) -> None:
     monkeypatch.setattr(cluster, "POLL", 0.01)
     assert told(caplog, Counted(1), 0.2) == []
+    assert told(caplog, Counted(1, 0, waits=False), 0.2) == []  # it adapts, and nothing is waited for
+    caplog.clear()
+    assert told(caplog, Counted(1, None, waits=False), 0.2)
     with cluster.watched(None):
         assert not [t for t in threading.enumerate() if t.name == cluster.__name__]
 

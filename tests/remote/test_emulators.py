@@ -1,0 +1,210 @@
+"""Google's and Azure's stores: against their emulators on this machine, and stores that misbehave against a stub."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.cameras import open_camera
+from barpc.errors import ImageError, OutputError
+from barpc.pipeline import load_views
+from barpc.remote import BLOCK, RemoteFile, located, stores
+from barpc.sidefile import IMAGE, read_bytes, versioned
+from barpc.tie.store import Bucket
+
+SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
+DATA = (SAMPLES / "view_00.tif").read_bytes()
+ACCOUNT = "DefaultEndpointsProtocol=http;AccountName=devstoreaccount1;AccountKey="
+KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr/KBHBeksoGMGw=="  # everyone's
+
+
+def forget() -> None:
+    for cached in (stores._store, stores._pinned, stores._listed):
+        cached.cache_clear()
+    for module, name in (("gcsfs", "GCSFileSystem"), ("adlfs", "AzureBlobFileSystem")):
+        if module in sys.modules:
+            getattr(sys.modules[module], name).clear_instance_cache()
+
+
+@pytest.fixture(autouse=True)
+def _forgotten() -> Iterator[None]:
+    forget()
+    yield
+    forget()
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+def answering(port: int) -> None:
+    for _ in range(300):
+        with socket.socket() as tried:
+            if tried.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.1)
+    pytest.fail("the emulator did not start")
+
+
+@pytest.fixture(scope="module")
+def google() -> Iterator[dict[str, str]]:
+    with pytest.MonkeyPatch.context() as patch:  # looked at when it is imported
+        patch.setenv("GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT", "false")
+        pytest.importorskip("gcsfs")
+    emulator = pytest.importorskip("gcp_storage_emulator.server")
+    port = free_port()
+    found = emulator.create_server("127.0.0.1", port, in_memory=True)
+    found.start()
+    yield {"STORAGE_EMULATOR_HOST": f"http://127.0.0.1:{port}", "FSSPEC_GS_TOKEN": "anon"}
+    found.stop()
+
+
+@pytest.fixture(scope="module")
+def azure(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    pytest.importorskip("adlfs")
+    program = shutil.which("azurite-blob")
+    if program is None:
+        pytest.skip("azurite-blob is not on the PATH (npm install azurite)")
+    port, place = free_port(), str(tmp_path_factory.mktemp("azurite"))
+    words = [program, "--blobPort", str(port), "--location", place, "--silent", "--skipApiVersionCheck"]
+    with subprocess.Popen([*words, "--disableTelemetry"], stdout=subprocess.DEVNULL) as process:
+        answering(port)
+        at = f"BlobEndpoint=http://127.0.0.1:{port}/devstoreaccount1;"
+        yield {"AZURE_STORAGE_CONNECTION_STRING": f"{ACCOUNT}{KEY};{at}"}
+        process.terminate()
+
+
+@pytest.fixture(params=["gs", "az"])
+def scheme(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    for name, value in request.getfixturevalue({"gs": "google", "az": "azure"}[request.param]).items():
+        monkeypatch.setenv(name, value)
+    import fsspec
+
+    fsspec.config.set_conf_env(fsspec.config.conf)
+    store = fsspec.filesystem(request.param)
+    if not store.exists("scenes"):
+        store.mkdir("scenes")
+    for name in ("view_00.tif", "view_01.tif"):
+        store.pipe_file(f"scenes/a/{name}", (SAMPLES / name).read_bytes())
+    return str(request.param)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_an_emulated_store_is_read_and_written(scheme: str) -> None:
+    hosts, root = [f"{scheme}://scenes"], f"{scheme}://scenes"
+    assert read_bytes(located(f"{root}/a/view_00.tif", hosts), IMAGE) == DATA
+    loaded = load_views([f"{root}/a/view_00.tif"], min_views=1, hosts=hosts)
+    assert loaded.views[0].sensor == open_camera(SAMPLES / "view_00.tif").rpc
+    bucket = Bucket(f"{root}/runs", "x")
+    for name in ("detect/1", f"{bucket.scratch}/1"):
+        bucket.write(name, {"a": np.arange(5.0)})
+        assert np.array_equal(bucket.need(name)["a"], np.arange(5.0))
+    bucket.clear()
+    assert bucket.read(f"{bucket.scratch}/1") is None
+    assert bucket.read("detect/1")
+    with pytest.raises(ImageError, match=r"no such file \(its store has no such object or bucket\)"):
+        versioned(located(f"{root}/a/missing.tif", hosts), IMAGE)
+    with pytest.raises(OutputError, match="cannot be written") as refused:
+        Bucket(f"{scheme}://nobody", "x").write("1", {"a": np.zeros(1)})
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_an_emulated_object_that_is_replaced_is_noticed_by_who_reads_it(scheme: str) -> None:
+    import fsspec
+
+    at = versioned(located(f"{scheme}://scenes/a/view_01.tif", [f"{scheme}://scenes"]), IMAGE)
+    with RemoteFile(at) as file:
+        file.read(BLOCK)
+        file.seek(3 * BLOCK)
+        file.read(BLOCK)
+        fsspec.filesystem(scheme).pipe_file("scenes/a/view_01.tif", bytes(at.size or 0))  # type: ignore[union-attr]
+        file.seek(9 * BLOCK)
+        with pytest.raises(OSError, match="changed in its store"):
+            file.read(BLOCK)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_an_account_that_is_not_given_costs_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("adlfs")
+    monkeypatch.delenv("AZURE_STORAGE_CONNECTION_STRING", raising=False)
+    with pytest.raises(ImageError, match="ValueError: unable to connect to account") as caught:
+        versioned(located("az://scenes/a.tif", ["az://scenes"]), IMAGE)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_wrong_key_is_said(azure: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = azure["AZURE_STORAGE_CONNECTION_STRING"].replace("Eby8", "Aby8")
+    monkeypatch.setenv("AZURE_STORAGE_CONNECTION_STRING", wrong)
+    with pytest.raises(ImageError, match="failed to authenticate") as caught:
+        versioned(located("az://scenes/a/view_00.tif", ["az://scenes"]), IMAGE)
+    assert "\n" not in str(caught.value)
+    assert "Aby8" not in str(caught.value)
+
+
+# --- a store of no kind ------------------------------------------------------------------------------------
+
+
+class Stub:
+    """One object, of versions that follow each other as they are asked for; no server, no fsspec."""
+
+    def __init__(self, *tags: str) -> None:
+        self.tags, self.position = list(tags), 0
+
+    def open(self, _url: str, _mode: str, cache_type: str) -> Stub:
+        assert cache_type == "none"
+        return self
+
+    def info(self, _url: str) -> dict[str, Any]:
+        return {"size": 4 * BLOCK, "etag": self.tags.pop(0) if len(self.tags) > 1 else self.tags[0]}
+
+    def seek(self, position: int) -> None:
+        self.position = position
+
+    def read(self, size: int) -> bytes:
+        return bytes(size)
+
+    def pipe_file(self, _url: str, _data: bytes) -> None:
+        raise FileNotFoundError("http://inner/upload")
+
+
+@pytest.mark.parametrize(("scheme", "noticed"), [("gs", True), ("az", True), ("s3", False)])
+def test_a_version_is_looked_at_after_each_read_where_the_store_does_not_hold_it(
+    scheme: str, noticed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stores, "_store", lambda _scheme, stub=Stub("1", "1", "1", "1", "2"): stub)
+    at = located(f"{scheme}://b/stub-{scheme}.tif", [f"{scheme}://b"])
+    assert stores.fetch(at, 0, 10).tag == "1"  # type: ignore[arg-type]
+    pinned = type(at)(str(at), 4 * BLOCK, "1")  # type: ignore[call-arg, arg-type]
+    assert stores.fetch(pinned, 0, 10).data == bytes(10)  # type: ignore[arg-type]
+    if noticed:
+        with pytest.raises(OSError, match="changed in its store"):
+            stores.fetch(pinned, 10, 20)  # type: ignore[arg-type]
+    else:
+        assert stores.fetch(pinned, 10, 20).data == bytes(10)  # type: ignore[arg-type]
+
+
+def test_what_a_store_says_is_cut_to_its_first_line() -> None:
+    def ask() -> None:
+        raise ValueError("\nrefused\n<xml>\n  <RequestId>1</RequestId>")
+
+    with pytest.raises(OSError, match=r"^its store answers ValueError: refused$"):
+        stores._told(ask)
+
+
+def test_a_bucket_that_is_not_there_is_said_when_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stores, "_store", lambda _scheme: Stub("1"))
+    with pytest.raises(OutputError, match=r"cannot be written \(its store has no such object or bucket\)"):
+        stores.put("gs://nobody/1", b"")
