@@ -252,6 +252,15 @@ def test_general_flags_stand_before_and_after_the_verb(image, tmp_path, capsys, 
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("words", "shown"), [((), [True, False]), (("-v",), [True, True])])
+def test_what_libraries_log_is_shown_with_v(words, shown, image, monkeypatch):
+    handlers: list[logging.Handler] = []
+    monkeypatch.setattr(logging, "basicConfig", lambda **given: handlers.extend(given["handlers"]))
+    run(*words, "info", image)
+    records = [logging.LogRecord(name, logging.ERROR, "", 0, "x", (), None) for name in ("barpc.a", "gcsfs")]
+    assert [bool(handlers[0].filter(record)) for record in records] == shown
+
+
 def test_info_says_where_the_rpc_comes_from_and_what_was_passed_over(image, capsys):
     write_rpc(make_rpc(), image.with_suffix(".RPB"))
     assert run("info", image, "--json") == 0

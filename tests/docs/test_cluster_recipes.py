@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
+import barpc
 from barpc.cli.main import cli
+from barpc.cli.terminal import EXIT_GATE
+from barpc.options import RunOptions, TieOptions
 from tests.docs.pages import DOCS
 
 PAGE = (DOCS / "recipes/cluster.md").read_text(encoding="utf-8")
@@ -28,6 +35,42 @@ def test_the_job_script_is_a_script_and_its_commands_parse(tmp_path):
     line = re.search(r"barpc (adjust .*)", block("slurm"))
     assert line is not None
     parses(line[1].replace('"$address"', "tcp://127.0.0.1:8786").replace("images.txt", "none.txt").split())
+
+
+def here(tmp_path: Path, run: str) -> str:
+    """The job script on folders of this test, and on the loopback interface."""
+    script = block("slurm").replace("/shared/adjusted", f"{tmp_path}/{run} --images none --options {tmp_path}/o.toml")
+    for program in ("scheduler", "worker"):
+        script = script.replace(f"dask_{program}", f"dask_{program} --interface lo")
+    return script.replace("/shared", str(tmp_path)).replace("images.txt", f"{tmp_path}/images.txt")
+
+
+def sbatch(script: str, tmp_path: Path, *words: str) -> int:
+    if shutil.which("sbatch") is None:
+        pytest.skip("SLURM is not installed (sbatch)")
+    if " UP" not in subprocess.run(["scontrol", "ping"], capture_output=True, text=True, timeout=60).stdout:
+        pytest.skip("no SLURM controller answers (scontrol ping)")
+    (tmp_path / "job.sh").write_text(script)
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    call = ["sbatch", "--wait", "-n", "3", "-t", "10", "-o", tmp_path / "job.log", *words, tmp_path / "job.sh"]
+    return subprocess.run(call, env=environment, cwd=tmp_path, timeout=540).returncode
+
+
+@pytest.mark.slow
+def test_slurm_runs_the_job_script_and_gives_the_same_bytes(tmp_path):
+    images = sorted((DOCS.parent / "data_samples").glob("*.tif"))[:2]
+    (tmp_path / "images.txt").write_text("".join(f"{image}\n" for image in images))
+    (tmp_path / "o.toml").write_text("[tie]\nkeypoints_per_image = 3000\n")
+    assert sbatch(here(tmp_path, "run"), tmp_path) == 0, (tmp_path / "job.log").read_text()
+    barpc.adjust(images, tmp_path / "alone", RunOptions(images="none", tie=TieOptions(keypoints_per_image=3000)))
+    for name in ("observations.csv", "block.npz", "view_01_RPC.TXT"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_a_job_whose_scheduler_does_not_start_ends(tmp_path):
+    script = here(tmp_path, "run").replace("distributed.cli", "distributed.none")
+    assert sbatch(script, tmp_path) == 1
 
 
 def parses(words: list[str]) -> None:
@@ -80,6 +123,14 @@ def test_the_parts_of_the_manifest_find_each_other():
         mounted = {mount["name"] for mount in pod["spec"]["containers"][0].get("volumeMounts", [])}
         assert mounted == {volume["name"] for volume in pod["spec"].get("volumes", [])}, name
     parses([word.replace("/run/barpc/urls.txt", "none.txt") for word in commands["barpc"][1:]])
+
+
+def test_what_is_finished_is_not_run_again_and_what_was_evicted_is():
+    job = next(d["spec"] for d in documents() if d["kind"] == "Job")
+    assert job["template"]["spec"]["restartPolicy"] == "Never"  # which rules on exit codes ask for
+    evicted, ended = job["podFailurePolicy"]["rules"]
+    assert evicted["action"] == "Ignore"
+    assert (ended["action"], ended["onExitCodes"]["values"]) == ("FailJob", [2, EXIT_GATE])
 
 
 @pytest.mark.parametrize("command", ["scheduler", "worker"])

@@ -196,6 +196,17 @@ def test_a_version_is_looked_at_after_each_read_where_the_store_does_not_hold_it
         assert stores.fetch(pinned, 10, 20).data == bytes(10)  # type: ignore[arg-type]
 
 
+def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fsspec")
+
+    def missing(*_: object, **__: object) -> None:
+        raise ImportError("Please install gcsfs to access Google Storage")
+
+    monkeypatch.setattr("fsspec.filesystem", missing)
+    with pytest.raises(ImageError, match=r"pip install 'barpc\[remote\]' \(gcsfs is missing\)"):
+        versioned(located("gs://scenes/a.tif", ["gs://scenes"]), IMAGE)
+
+
 def test_what_a_store_says_is_cut_to_its_first_line() -> None:
     def ask() -> None:
         raise ValueError("\nrefused\n<xml>\n  <RequestId>1</RequestId>")

@@ -196,7 +196,6 @@ def test_an_object_that_is_replaced_while_it_is_read_is_noticed(store: Store) ->
         ("s3://other/a.tif", ("s3://other",), "no such file|NoSuchBucket|not exist"),
         ("s3://other/a.tif", HOSTS, "--allow-remote s3://other"),
         ("s3://scenes/a", HOSTS, "folder|no such file"),
-        ("gs://scenes/a.tif", ("gs://scenes",), "pip install"),
     ],
 )
 def test_what_cannot_be_read_costs_one_line(
