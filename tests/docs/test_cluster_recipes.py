@@ -39,7 +39,9 @@ def test_the_job_script_is_a_script_and_its_commands_parse(tmp_path):
 
 def here(tmp_path: Path, run: str) -> str:
     """The job script on folders of this test, and on the loopback interface."""
-    script = block("slurm").replace("/shared/adjusted", f"{tmp_path}/{run} --images none --options {tmp_path}/o.toml")
+    script = block("slurm").replace(
+        "/shared/adjusted", f"{tmp_path}/{run} --images none --options {tmp_path}/o.toml"
+    )
     for program in ("scheduler", "worker"):
         script = script.replace(f"dask_{program}", f"dask_{program} --interface lo")
     return script.replace("/shared", str(tmp_path)).replace("images.txt", f"{tmp_path}/images.txt")
@@ -52,7 +54,18 @@ def sbatch(script: str, tmp_path: Path, *words: str) -> int:
         pytest.skip("no SLURM controller answers (scontrol ping)")
     (tmp_path / "job.sh").write_text(script)
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    call = ["sbatch", "--wait", "-n", "3", "-t", "10", "-o", tmp_path / "job.log", *words, tmp_path / "job.sh"]
+    call = [
+        "sbatch",
+        "--wait",
+        "-n",
+        "3",
+        "-t",
+        "10",
+        "-o",
+        tmp_path / "job.log",
+        *words,
+        tmp_path / "job.sh",
+    ]
     return subprocess.run(call, env=environment, cwd=tmp_path, timeout=540).returncode
 
 
@@ -62,7 +75,9 @@ def test_slurm_runs_the_job_script_and_gives_the_same_bytes(tmp_path):
     (tmp_path / "images.txt").write_text("".join(f"{image}\n" for image in images))
     (tmp_path / "o.toml").write_text("[tie]\nkeypoints_per_image = 3000\n")
     assert sbatch(here(tmp_path, "run"), tmp_path) == 0, (tmp_path / "job.log").read_text()
-    barpc.adjust(images, tmp_path / "alone", RunOptions(images="none", tie=TieOptions(keypoints_per_image=3000)))
+    barpc.adjust(
+        images, tmp_path / "alone", RunOptions(images="none", tie=TieOptions(keypoints_per_image=3000))
+    )
     for name in ("observations.csv", "block.npz", "view_01_RPC.TXT"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
 

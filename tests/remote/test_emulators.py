@@ -129,7 +129,7 @@ def test_an_emulated_object_that_is_replaced_is_noticed_by_who_reads_it(scheme: 
         file.read(BLOCK)
         file.seek(3 * BLOCK)
         file.read(BLOCK)
-        fsspec.filesystem(scheme).pipe_file("scenes/a/view_01.tif", bytes(at.size or 0))  # type: ignore[union-attr]
+        fsspec.filesystem(scheme).pipe_file("scenes/a/view_01.tif", bytes(at.size or 0))
         file.seek(9 * BLOCK)
         with pytest.raises(OSError, match="changed in its store"):
             file.read(BLOCK)
@@ -184,16 +184,17 @@ class Stub:
 def test_a_version_is_looked_at_after_each_read_where_the_store_does_not_hold_it(
     scheme: str, noticed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stores, "_store", lambda _scheme, stub=Stub("1", "1", "1", "1", "2"): stub)
+    stub = Stub("1", "1", "1", "1", "2")
+    monkeypatch.setattr(stores, "_store", lambda _scheme: stub)
     at = located(f"{scheme}://b/stub-{scheme}.tif", [f"{scheme}://b"])
-    assert stores.fetch(at, 0, 10).tag == "1"  # type: ignore[arg-type]
-    pinned = type(at)(str(at), 4 * BLOCK, "1")  # type: ignore[call-arg, arg-type]
-    assert stores.fetch(pinned, 0, 10).data == bytes(10)  # type: ignore[arg-type]
+    assert stores.fetch(at, 0, 10).tag == "1"
+    pinned = type(at)(str(at), 4 * BLOCK, "1")
+    assert stores.fetch(pinned, 0, 10).data == bytes(10)
     if noticed:
         with pytest.raises(OSError, match="changed in its store"):
-            stores.fetch(pinned, 10, 20)  # type: ignore[arg-type]
+            stores.fetch(pinned, 10, 20)
     else:
-        assert stores.fetch(pinned, 10, 20).data == bytes(10)  # type: ignore[arg-type]
+        assert stores.fetch(pinned, 10, 20).data == bytes(10)
 
 
 def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
