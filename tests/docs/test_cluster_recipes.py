@@ -133,7 +133,9 @@ def test_the_parts_of_the_manifest_find_each_other():
     assert {port["port"] for port in service["ports"]} == {8786}
     commands = {name: pod["spec"]["containers"][0]["command"] for name, pod in pods.items()}
     assert commands["barpc-worker"][2] == "tcp://barpc-scheduler:8786"
-    assert len({pod["spec"]["containers"][0]["image"] for pod in pods.values()}) == 1
+    images = {pod["spec"]["containers"][0]["image"] for pod in pods.values()}
+    assert images == {f"registry.example.org/barpc:{barpc.__version__}"}
+    assert f"FROM barpc:{barpc.__version__}\n" in block("dockerfile")
     for name, pod in pods.items():
         mounted = {mount["name"] for mount in pod["spec"]["containers"][0].get("volumeMounts", [])}
         assert mounted == {volume["name"] for volume in pod["spec"].get("volumes", [])}, name
