@@ -26,7 +26,6 @@ import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import RPCTransformer
-from scipy.interpolate import RegularGridInterpolator
 
 from barpc.cameras import open_camera
 from barpc.errors import OutputError
@@ -345,6 +344,8 @@ def _own_grid(path: Path) -> Projection:
 
 
 def _linear_grid(path: Path) -> Projection:
+    from scipy.interpolate import RegularGridInterpolator  # a quarter of a second, of grids alone
+
     grid = open_camera(path).model
     assert isinstance(grid, DirectGrid)
     lonlat = RegularGridInterpolator((grid.alts, grid.rows, grid.cols), grid.lonlat, bounds_error=False)
@@ -353,6 +354,8 @@ def _linear_grid(path: Path) -> Projection:
 
 def _gdal_correction(path: Path) -> Projection:
     """As whoever resamples reads it: values at the places that GDAL gives for the centres of its pixels."""
+    from scipy.interpolate import RegularGridInterpolator
+
     rpc = _gdal_raster(path)
     with rasterio.Env(**GDAL_OPTIONS), rasterio.open(path) as dataset:
         cols = np.array(dataset.xy(np.zeros(dataset.width), np.arange(dataset.width))[0]) - 0.5

@@ -17,7 +17,6 @@ import rasterio
 from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.windows import Window
-from scipy.ndimage import distance_transform_edt, map_coordinates, spline_filter
 
 from barpc.errors import ImageError
 from barpc.geodesy import Array
@@ -115,6 +114,8 @@ def _require_sums(partial: Path, sums: list[int], target: Path) -> None:
 
 def _interpolated(pixels: Pixels, known: BoolArray, place: Array) -> Array:
     """Values of a block at places (2, H, W), row before col; unknown pixels take the value of the nearest known one."""
+    from scipy.ndimage import distance_transform_edt, map_coordinates, spline_filter  # of no other output
+
     values = pixels.astype(np.float64)
     if not known.any():
         return np.zeros(place.shape[1:])

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
 from barpc.geodesy import Array
 from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import LINEAR, linear_axes
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RegularGridInterpolator
 
 _LONGEST = 1024.0  # px, from node to node
 _STEPS = 12  # displacements change by thousandths of a pixel a pixel: each step gains two digits
@@ -39,6 +42,8 @@ class CorrectionGrid(Frozen):
             if len(axis) < 2 or not (np.diff(axis) > 0).all():
                 raise RpcError(f"correction grid: {name} must ascend")
         shift = self._array("shift", (len(self.rows), len(self.cols), 2), RpcError)
+        from scipy.interpolate import RegularGridInterpolator  # a quarter of a second, of grids alone
+
         self._keep("_linear", RegularGridInterpolator((self.rows, self.cols), shift, bounds_error=False))
 
     @classmethod

@@ -33,6 +33,7 @@ _CHUNK = 256  # patches worked on at a time: they stay in cache
 _BAND = 512  # rows that are swept by columns where points are few: strips and blocks are decoded once
 _TOGETHER = 512  # such points of a task, at most
 _ALL_OF_A_PAIR = 8192  # points of a task where they are many: its tiles share what is decoded
+_PIECE = 512  # px a side that are upsampled at a time: memory is taken again, and not asked of the system
 _STEPS = 12
 _SETTLED = 0.003  # px; a step below it is the last
 _ROUGHLY = 0.05  # px; the same where a place is only compared
@@ -90,7 +91,9 @@ def register_places(
     cv2.setNumThreads(1)
     margin = patch + _TAPS + int(_REACH)
     sparse, every = _sparse(reference, margin), Registration.none(start)
-    read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, tile))
+    read, groups = (
+        (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, _PIECE)))
+    )
     with PixelReader(files[0][0], band) as first, PixelReader(files[1][0], band) as second:
         for rows in groups:
             a, valid_a, shift_a = read(first, files[0][1], reference[rows], margin)
