@@ -224,25 +224,25 @@ def _heights(out: Path) -> dict[str, str]:
 
 
 def cars(folder: Path, place: Path) -> Figures:
+    """On the first pair alone: minutes a pair."""
     scene = read_scene(folder)
     export_run(folder, "cars", place / "export")
-    text = (place / "export/inputs.yaml").read_text(encoding="utf-8")
+    ready = (place / "export/inputs.yaml").read_text(encoding="utf-8")
+    ready = re.sub(
+        r'"pairing":\n(    - .*\n)+', f'"pairing":\n    - {json.dumps(pairs_of(scene)[0])}\n', ready
+    )
+    ready += '"subsampling":\n  "advanced":\n    "resolutions": [1]\n'  # a quarter of a small image matches nothing
     found: Figures = {}
     for kind in ("delivered", "corrected"):
-        if kind == "delivered":
-            for shot in scene.shots:
-                text = text.replace(f'"{shot.name}.geom"', json.dumps(str(Path(shot.file).absolute())))
-        config = place / "export" / f"{kind}.yaml"
-        out = re.sub('"directory": .*', f'"directory": {json.dumps(str(place / kind))}', text)
-        # without small images' resolutions of their own: a quarter of them shows too little to match
-        config.write_text(out + '"subsampling":\n  "advanced":\n    "resolutions": [1]\n', encoding="utf-8")
-        text = (place / "export/inputs.yaml").read_text(encoding="utf-8")
-        run(["cars", config.name], config.parent)
+        text = ready.replace('"cars_out"', json.dumps(str(place / kind)))
+        for shot in scene.shots if kind == "delivered" else ():
+            text = text.replace(f'"{shot.name}.geom"', json.dumps(str(Path(shot.file).absolute())))
+        (place / "export" / f"{kind}.yaml").write_text(text, encoding="utf-8")
+        run(["cars", f"{kind}.yaml"], place / "export")
         told = (place / kind / "intermediate_data/surface_modeling/res1/metadata.yaml").read_text()
         for name in ("mean", "std"):
-            values = re.findall(rf"before_correction_epi_error_{name}: (\S+)", told)
-            text_of = " / ".join(f"{float(value):+.3f}" for value in values)
-            found.setdefault(f"before_correction_epi_error_{name} [px]", []).append(text_of)
+            (value,) = re.findall(rf"before_correction_epi_error_{name}: (\S+)", told)
+            found.setdefault(f"before_correction_epi_error_{name} [px]", []).append(f"{float(value):+.3f}")
         with rasterio.open(place / kind / "dsm/dsm.tif") as data:
             found.setdefault("cells of the DSM", []).append(str(data.read(1, masked=True).count()))
     return found

@@ -12,7 +12,10 @@ from barpc import adjust
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "benchmarks/handover.py"
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::PendingDeprecationWarning", "ignore:Dataset has no geotransform"),
+]
 
 spec = importlib.util.spec_from_file_location("handover", SCRIPT)
 assert spec is not None
