@@ -46,6 +46,7 @@ _MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model ma
 _SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
 _PER_SPLINE = 30  # observations of a view
 _FEWEST = 7  # splines
+_LOOKS = 2  # for detectors
 _MISSES = 2  # one after the other
 _MOST_SPLINES = 2600  # of all views: what a block of 200 takes is three times as long
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
@@ -209,14 +210,23 @@ def _followed(found: _Solution, block: Block, outer: Block, options: AdjustOptio
             break
         tried = _with_waves(found, block, outer, options, Waves(count, _given_edges(block, options)))
         if not options.detectors and tried.has_waves:
-            outcome = tried.outcome
-            sigma = block.sigma * outcome.noise
-            edges = find_edges(outcome.problem, tried.final, outcome.residual, outcome.inlier, sigma)
-            if edges.size:
-                tried = _with_waves(tried, block, outer, options, Waves(count, edges))
+            tried = _with_edges(tried, block, outer, options)
         better = given or (asked and best is found) or is_better(tried.after, best.after, outer)
         best, misses = (tried, 0) if better else (best, misses + 1)
     return best if best is found else replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
+
+
+def _with_edges(found: _Solution, block: Block, outer: Block, options: AdjustOptions) -> _Solution:
+    """The block with steps between detectors where residuals show them, and those that were seen by them alone."""
+    for _ in range(_LOOKS):
+        outcome, before = found.outcome, found.problem.cameras.unknowns.waves
+        assert before is not None
+        sigma = block.sigma * outcome.noise
+        edges = find_edges(outcome.problem, found.final, outcome.residual, outcome.inlier, sigma)
+        if edges.shape[1] <= before.edges.shape[1]:
+            break
+        found = _with_waves(found, block, outer, options, Waves(before.count, edges))
+    return found
 
 
 def _given_edges(block: Block, options: AdjustOptions) -> Array:

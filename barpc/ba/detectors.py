@@ -1,9 +1,8 @@
 """Where one detector of a focal plane ends and the next begins: change points of the residuals over the columns.
 
 A step in one view is seen in the residuals of all that share its points, smaller. So the largest changes of all
-views are taken first, what they explain is taken out of all residuals, the points following, and so on. Where images
-are equally wide and two of them show a step at the same column, they come from one focal plane, and the changes of
-all are added up.
+views are taken first, what they explain is taken out of all residuals, the points following, and so on. Images that
+are equally wide may come from one focal plane: then the changes of all are added up. What explains more is taken.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ _AS_LARGE = (
 )
 _ROUNDS = 12
 _BACKFITTING = 6
-_SAME = 0.02  # of an image's width
 _FEWEST = 30  # observations of a detector
 
 Edges = list[list[float]]  # of every group of views, ascending
@@ -79,30 +77,35 @@ def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, 
     """Columns (N, C) [px] where other detectors begin, infinite where a view has fewer, of residuals (2, K) [px] with
     standard deviations `sigma` (K,) as they were observed.
     """
-    weight = use / sigma
-    projected = problem.project_points(state.params, state.points)
-    views, widths = list(range(problem.structure.num_views)), problem.cameras.unknowns.half[0] * 2.0
-
-    def settled(rest: Array) -> Array:
-        return problem.settled_residual(rest, projected, weight)
-
-    edges = _grown(_Columns(problem, use, sigma, [[v] for v in views]), residual, settled)
-    if (widths == widths[0]).all() and _in_common(edges, _SAME * widths[0]):
-        edges = _grown(_Columns(problem, use, sigma, [views]), residual, settled) * len(views)
+    weight, widths = use / sigma, problem.cameras.unknowns.half[0]
+    settled = problem.settling(problem.project_points(state.params, state.points), weight)
+    residual, views = settled(_without_steps(problem, state, residual)), list(range(len(widths)))
+    edges, cost = _grown(_Columns(problem, use, sigma, [[v] for v in views]), residual, settled, weight)
+    if any(edges) and len(views) > 1 and (widths == widths[0]).all():
+        common, in_common = _grown(_Columns(problem, use, sigma, [views]), residual, settled, weight)
+        edges = common * len(views) if in_common < cost else edges
     out = np.full((len(edges), max(map(len, edges))), np.inf)
     for v, of_view in enumerate(edges):
         out[v, : len(of_view)] = of_view
     return out
 
 
-def _in_common(edges: Edges, near: float) -> bool:
-    """Whether two views have an edge at the same column."""
-    every = sorted((col, v) for v, of_view in enumerate(edges) for col in of_view)
-    return any(b[0] - a[0] < near and a[1] != b[1] for a, b in pairwise(every))
+def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
+    """Residuals (2, K) [px] of cameras without the steps that were found before."""
+    unknowns, steps = problem.cameras.unknowns, np.zeros_like(residual)
+    if unknowns.waves is not None and unknowns.waves.edges.size:
+        params = state.params.copy()
+        params[:, unknowns.in_waves][:, unknowns.waves.kinds[0]] = 0.0
+        unknowns.add_waves(steps, steps[:, None, :][:, :0], params, problem.structure.view, problem.xy)
+    return residual - steps
 
 
-def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array]) -> Edges:
-    """Edges one after the other, the largest first; then each where it is best between its neighbours."""
+def _grown(
+    columns: _Columns, residual: Array, settled: Callable[[Array], Array], weight: Array
+) -> tuple[Edges, float]:
+    """Edges one after the other, the largest first; then each where it is best between its neighbours. And what is
+    left of the squared residuals, with as much for every edge as it has to explain.
+    """
     edges: Edges = [[] for _ in columns.groups]
     part = np.zeros_like(residual)
     for _ in range(_ROUNDS):
@@ -120,8 +123,13 @@ def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array]
                 edges[g] = sorted([*edges[g], col])
         for _ in range(_BACKFITTING):
             part += columns.means(settled(residual - part), edges)
-    left = part + settled(residual - part)
-    return [_placed(columns, g, of_group, left) for g, of_group in enumerate(edges)]
+    left = settled(residual - part)
+    cost = float(((left * weight) ** 2).sum())
+    cost += sum(
+        len(one) * (_LARGE + _A_VIEW * (len(group) - 1))
+        for one, group in zip(edges, columns.groups, strict=True)
+    )
+    return [_placed(columns, g, of_group, part + left) for g, of_group in enumerate(edges)], cost
 
 
 def _placed(columns: _Columns, g: int, edges: list[float], residual: Array) -> list[float]:

@@ -225,7 +225,7 @@ def _eliminate(structure: Structure, by_point: Array, by_unknown: Array, lower: 
     cross = np.empty((count, 3, q))
     for part in parts(count, CHUNK):
         point = structure.point[part]
-        whitened = _whiten(by_point[..., part], lower.take(point, axis=1, mode="clip"))
+        whitened = whiten(by_point[..., part], lower.take(point, axis=1, mode="clip"))
         unknown = by_unknown[..., part]
         rows = whitened[0, :, None] * unknown[0]
         rows += whitened[1, :, None] * unknown[1]
@@ -233,7 +233,7 @@ def _eliminate(structure: Structure, by_point: Array, by_unknown: Array, lower: 
     return cross
 
 
-def _whiten(by_point: Array, lower: Array) -> Array:
+def whiten(by_point: Array, lower: Array) -> Array:
     """A L^-T, (2, 3, n), of derivatives (2, 3, n) and factors (6, n)."""
     l00, l10, l20, l11, l21, l22 = lower
     out = np.empty_like(by_point)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from barpc.ba.normal import (
     reduce_normal,
     solve_lower,
     solve_transposed,
+    whiten,
 )
 from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.structure import Structure
@@ -113,12 +115,18 @@ class Problem:
         step = solve_transposed(lower, solve_lower(lower, sums[6:] + gradient))
         return points - step.T
 
-    def settled_residual(self, residual: Array, projected: Projected, weight: Array) -> Array:
-        """Residuals (2, K) [px] once the points have moved to where they are smallest, to first order."""
-        sums = self.structure.sum_points(point_products(projected.by_point * weight, residual * weight))
-        lower = cholesky3(sums[:6])
-        step = solve_transposed(lower, solve_lower(lower, sums[6:])).take(self.structure.point, axis=1)
-        settled: Array = residual - (projected.by_point * step).sum(axis=1)
+    def settling(self, projected: Projected, weight: Array) -> Callable[[Array], Array]:
+        """Residuals (2, K) [px] -> the same once the points have moved to where they are smallest, to first order."""
+        structure, by_point = self.structure, projected.by_point
+        sums = structure.sum_points(point_products(by_point * weight, np.zeros_like(projected.image))[:6])
+        whitened = whiten(by_point, cholesky3(sums).take(structure.point, axis=1))
+        counted = whitened * weight**2
+
+        def settled(residual: Array) -> Array:
+            half = structure.sum_points(counted[0] * residual[0] + counted[1] * residual[1])
+            moved: Array = (whitened * half.take(structure.point, axis=1)).sum(axis=1)
+            return residual - moved
+
         return settled
 
     def _point_terms(self, points: Array) -> tuple[Array, Array]:

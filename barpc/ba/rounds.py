@@ -201,10 +201,10 @@ class Rounds:
             return residual - part
         projected = self.problem.project_points(self.state.params, self.state.points)
         weight = counted**0.5 / sigma
+        settled = self.problem.settling(projected, weight)
         for _ in range(_BACKFITTING):
-            left = self.problem.settled_residual(residual - part, projected, weight)
-            part += self.smooth.part(left, counted)
-        return self.problem.settled_residual(residual - part, projected, weight)
+            part += self.smooth.part(settled(residual - part), counted)
+        return settled(residual - part)
 
 
 def _robust(

@@ -78,8 +78,8 @@ class Observations:
         self.structure, self.sigma, self.noise_floor = problem.structure, sigma, noise_floor
         self.is_tie = is_tie
         waves = problem.cameras.unknowns.waves
-        # errors that neighbours share are others in every stretch of a spline
-        self.stretches = 1 if waves is None else sum(waves.parts)
+        # errors that neighbours share are others in every stretch of a spline, of columns and of rows
+        self.stretches = 1 if waves is None else waves.size
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True

@@ -160,7 +160,7 @@ def test_points_follow_what_is_smooth_where_it_is_seen(monkeypatch, wave: float,
     smooth = wave * np.sin(5 * row) * (block.view == 1)
     noise = np.random.default_rng(0).normal(0, 0.02, block.xy.shape)
     each.residual = noise + np.stack([smooth, smooth])
-    again = seen(monkeypatch, rounds.Problem, "settled_residual")
+    again = seen(monkeypatch, rounds.Problem, "settling")
     left = each._scatter()
     assert bool(again) == settled
     assert np.sqrt((left**2).mean()) < 0.025
