@@ -193,7 +193,7 @@ class Scene:
     gcps: GroundPoints | None
 
 
-_SINES = (-0.5, 0.5)
+_HALF = (-10.0, 10.0)  # m, along an epipolar curve: a step between detectors in this stretch hardly turns it
 
 
 def _relief() -> Callable[[Array, Array], Array]:
@@ -471,7 +471,7 @@ def _epipolar(scene: Scene, sensors: Sequence[SensorModel], i: int, j: int) -> A
         return np.zeros((0, 2))
     a, b = np.array(both).T
     alt = truth[check.point[a], 2]
-    low, high = (sensors[j].project(sensors[i].localize(check.xy[a], alt + d)) for d in _SINES)
+    low, high = (sensors[j].project(sensors[i].localize(check.xy[a], alt + d)) for d in _HALF)
     direction = (high - low) / np.linalg.norm(high - low, axis=1, keepdims=True)
     miss = check.xy[b] - 0.5 * (low + high)
     return np.column_stack(
