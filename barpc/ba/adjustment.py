@@ -258,7 +258,7 @@ def _with_waves(
     there, _ = revived(problem, ended, found.outcome.residual, found.outcome.inlier, block.use / block.sigma)
     space = there.params[:, : unknowns.in_waves.start]
     there = replace(there, params=np.hstack([space, np.zeros((len(space), waves.size))]))
-    outcome = Rounds(bent, block, there, options, found.heights, block.use, found.outcome.inlier).run()
+    outcome = Rounds(bent, block, there, options, found.heights, block.use, found.outcome).run()
     return _ended(found, bent, block, outer, options, outcome)
 
 

@@ -35,7 +35,6 @@ _AS_STATED = 1.5  # times the noise stated, and
 _CLEAN = 5.0  # sigmas
 _FEW = 0.002  # of the observations farther away than that: there is nothing to be careful about
 _NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
-_COUNTS = 0.25  # of an observation's weight: where a robust loss bends
 _SHRINK = 0.25  # of the loss's scale in one round, at most
 MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
 _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
@@ -59,9 +58,9 @@ class Outcome:
 class Rounds:
     """Robust rounds, cuts and the final least squares, with the observations in use (K,) to start with.
 
-    Where fewer unknowns were solved for before, `known` (K,) are those that were kept: what is smooth in them is what
-    the others are to follow. Outliers are judged by what is left of their residuals once the smooth part of every view is taken away: a
-    camera that the unknowns cannot follow yet does not make its tie points wrong.
+    Outliers are judged by what is left of their residuals once the smooth part of every view is taken away: a
+    camera that the unknowns cannot follow yet does not make its tie points wrong. Where a solve with fewer unknowns
+    is `known`, it told them: robust rounds would let go of what the further unknowns are to follow.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class Rounds:
         options: AdjustOptions,
         heights: Heights,
         use: BoolArray,
-        known: BoolArray | None = None,
+        known: Outcome | None = None,
     ) -> None:
         unknowns = problem.cameras.unknowns
         residual, projected = problem.prepare(state.params, state.points)
@@ -86,16 +85,16 @@ class Rounds:
         self.variances = Variances.of(problem.camera_prior, unknowns, options, bool(block.gcps.names))
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
-        self.counted = (self.use if known is None else self.use & known).astype(np.float64)
-        self.warm = known is not None
+        self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
+        self.is_known = known is not None
         self.projected = projected  # of the state, until the first pass moves it
-        self.passes, self.noise = 0, 1.0
+        self.passes, self.noise = 0, 1.0 if known is None else known.noise
         self.misfit: Array | float = 0.0
         self.weight = self.counted
 
     def run(self) -> Outcome:
         """Go on until nothing changes."""
-        if self.robust:
+        if self.robust and not self.is_known:
             self._search()
         while True:
             outcome = self._cut_and_solve()
@@ -110,14 +109,12 @@ class Rounds:
             self.observations,
             self.state,
             self.residual,
-            self._scatter() if self.warm else self.residual,
             self.projected,
             self.use,
             self.options,
             self.smooth,
         )
-        counts = self.counted > _COUNTS if self.warm else self.use
-        self.misfit = self.smooth.test(self.residual, self.use & counts).rms
+        self.misfit = self.smooth.test(self.residual, self.use).rms
 
     def _cut_and_solve(self) -> Outcome | None:
         """One pass; the outcome where it is the last."""
@@ -212,13 +209,12 @@ def _robust(
     observations: Observations,
     state: State,
     residual: Array,
-    scatter: Array,
     projected: Projected | None,
     use: BoolArray,
     options: AdjustOptions,
     smooth: Smooth,
 ) -> tuple[State, Array, Array, float, Projected | None]:
-    """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise; the first by `scatter`.
+    """Reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
 
     The state, its residuals, how much every observation counts, the noise, and what is kept of the state's projection.
     The noise is a median that counts observations by
@@ -227,7 +223,7 @@ def _robust(
     """
     loss = LOSSES[options.loss]
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
-    s = observations.squared(scatter, counted)
+    s = observations.squared(residual, counted)
     for _ in range(_ROBUST_ROUNDS):
         least = float(np.sqrt(np.quantile(s[use], _LOW) / _LOW)) if use.any() else 1.0
         noise = max(float(np.sqrt(_median(s, counted) / MEDIAN)), least, _LEAST_NOISE)
