@@ -22,7 +22,7 @@ from barpc.ba.incremental import BlockPrior, apply_prior
 from barpc.ba.priors import DRIFT_SIGMA, CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
 from barpc.ba.result import Adjustment
-from barpc.ba.rounds import Outcome, Rounds, revived
+from barpc.ba.rounds import MAX_PASSES, Outcome, Rounds, revived
 from barpc.ba.smooth import SmoothTest
 from barpc.ba.snooping import MOST_TESTED, ControlTest, control_test, image_test
 from barpc.ba.solve import State
@@ -208,25 +208,32 @@ def _followed(found: _Solution, block: Block, outer: Block, options: AdjustOptio
     for count in _spline_counts(block, options, found.has_waves):
         if misses == _MISSES or not (best.has_waves or (asked and best is found)):
             break
-        tried = _with_waves(found, block, outer, options, Waves(count, _given_edges(block, options)))
-        if not options.detectors and tried.has_waves:
-            tried = _with_edges(tried, block, outer, options)
+        waves = Waves(count, _given_edges(block, options))
+        if options.detectors:
+            tried = _with_waves(found, block, outer, options, waves)
+        else:
+            tried = _with_edges(_with_waves(found, block, outer, options, waves, 1), block, outer, options)
         better = given or (asked and best is found) or is_better(tried.after, best.after, outer)
         best, misses = (tried, 0) if better else (best, misses + 1)
     return best if best is found else replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
 
 
 def _with_edges(found: _Solution, block: Block, outer: Block, options: AdjustOptions) -> _Solution:
-    """The block with steps between detectors where residuals show them, and those that were seen by them alone."""
-    for _ in range(_LOOKS):
-        outcome, before = found.outcome, found.problem.cameras.unknowns.waves
-        assert before is not None
+    """The block, of which one pass was solved with splines, with steps between detectors where residuals show them.
+
+    What they explain shows others: it is looked for them again.
+    """
+    waves = found.problem.cameras.unknowns.waves
+    assert waves is not None
+    for _ in range(_LOOKS if found.has_waves else 0):
+        outcome = found.outcome
         sigma = block.sigma * outcome.noise
         edges = find_edges(outcome.problem, found.final, outcome.residual, outcome.inlier, sigma)
-        if edges.shape[1] <= before.edges.shape[1]:
+        if edges.shape[1] <= waves.edges.shape[1]:
             break
-        found = _with_waves(found, block, outer, options, Waves(before.count, edges))
-    return found
+        waves = Waves(waves.count, edges)
+        found = _with_waves(found, block, outer, options, waves)
+    return found if waves.edges.size else _with_waves(found, block, outer, options, waves)
 
 
 def _given_edges(block: Block, options: AdjustOptions) -> Array:
@@ -243,22 +250,28 @@ def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> lis
         return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), _FEWEST)]
     most = min(most, _MOST_SPLINES // len(block.views))
     wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
-    dense = np.unique(np.maximum(wanted, _FEWEST)).tolist()
-    dense = [n for n in dense if n <= most and has_waves]
+    dense = np.unique(np.clip(wanted, _FEWEST, most)).tolist() if has_waves and most >= _FEWEST else []
     return dense or [0] * bool(options.detectors)
 
 
 def _with_waves(
-    found: _Solution, block: Block, outer: Block, options: AdjustOptions, waves: Waves
+    found: _Solution,
+    block: Block,
+    outer: Block,
+    options: AdjustOptions,
+    waves: Waves,
+    most: int = MAX_PASSES,
 ) -> _Solution:
     """A block solved again with splines and steps, from where it ended; every observation may come back."""
     problem, ended = found.problem, found.outcome.minimum.state
     unknowns = problem.cameras.unknowns
     bent = make_problem(block, options, unknowns.center, None, unknowns.drift, waves)
     there, _ = revived(problem, ended, found.outcome.residual, found.outcome.inlier, block.use / block.sigma)
-    space = there.params[:, : unknowns.in_waves.start]
-    there = replace(there, params=np.hstack([space, np.zeros((len(space), waves.size))]))
-    outcome = Rounds(bent, block, there, options, found.heights, block.use, found.outcome).run()
+    known = unknowns.waves.kinds[0].stop if unknowns.waves and unknowns.waves.count == waves.count else 0
+    params = np.zeros_like(bent.camera_prior.mean)
+    params[:, : unknowns.in_waves.start + known] = there.params[:, : unknowns.in_waves.start + known]
+    there = replace(there, params=params)
+    outcome = Rounds(bent, block, there, options, found.heights, block.use, found.outcome).run(most)
     return _ended(found, bent, block, outer, options, outcome)
 
 

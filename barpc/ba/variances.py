@@ -289,7 +289,7 @@ class Variances:
         for degree in range(self._degrees):
             total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
             factors[degree] = (_STRENGTH + total) / (_STRENGTH + freedom)
-            if self.cautious and freedom > _LEAST and chdtrc(freedom, total) < _UNEXPECTED:
+            if self.cautious and not self.learn_waves and freedom > _LEAST and chdtrc(freedom, total) < _UNEXPECTED:
                 factors[degree] = max(factors[degree], _possible(total, freedom))
         return np.sqrt(factors)
 
