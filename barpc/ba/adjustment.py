@@ -48,7 +48,7 @@ _PER_SPLINE = 30  # observations of a view
 _FEWEST = 7  # splines
 _LOOKS = 2  # for detectors
 _MISSES = 2  # one after the other
-_MOST_SPLINES = 2600  # of all views: what a block of 200 takes is three times as long
+_MOST_SPLINES = 4000  # of all views: what a block of 300 takes is 2.6 times as long
 _FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
 
 

@@ -285,11 +285,12 @@ class Variances:
 
     def _drift(self, params: Array, known: Array) -> Array:
         """By how much the drift's standard deviations are to be changed (D,), the given ones counting for a few."""
+        careful = self.cautious and not self.learn_waves  # what else bends heights is followed
         factors = np.ones(self._degrees)
         for degree in range(self._degrees):
             total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))
             factors[degree] = (_STRENGTH + total) / (_STRENGTH + freedom)
-            if self.cautious and not self.learn_waves and freedom > _LEAST and chdtrc(freedom, total) < _UNEXPECTED:
+            if careful and freedom > _LEAST and chdtrc(freedom, total) < _UNEXPECTED:
                 factors[degree] = max(factors[degree], _possible(total, freedom))
         return np.sqrt(factors)
 
