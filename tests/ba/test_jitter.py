@@ -94,6 +94,33 @@ def test_all_errors_together_with_detectors_found_and_given():
         assert medians("all", lambda j: j.shape, seeds, **options) < min(delivered, off)
 
 
+def test_what_robust_rounds_would_let_go_is_followed():
+    found, after = solved("all", 14)
+    off, without = solved("all", 14, jitter="off")
+    rows = scene("all", 14).tracks.view == 0
+    assert (off.inlier | off.held_out)[
+        rows
+    ].mean() < 0.6  # a view of which most ties were cut, right as they are
+    assert 0.75 < (found.inlier | found.held_out)[rows].mean() < 1.0
+    assert 0.01 < after.across < 0.04 < 0.5 < without.across
+
+
+def test_the_drift_is_not_taken_wider_than_it_is_seen_where_jitter_is_followed():
+    found, after = solved("all", 18)  # flown: 2.1 m, of degree 2 1.0 m
+    assert 1.5 < found.prior.drift_sigma[0] < 4.0
+    assert 0.4 < found.prior.drift_sigma[1] < 2.0
+    assert 0.5 < after.shape < 4.0  # 6.1 with a drift that may be 5.5 m
+
+
+@pytest.mark.parametrize("seed", [3, 7])
+def test_detectors_of_one_focal_plane_are_found_where_single_views_do_not_show_them(seed):
+    found, after = solved("all", seed)
+    (edges,) = {tuple(spline.edges) for spline in found.splines}
+    assert len(edges) == 7
+    np.testing.assert_allclose(edges, EDGES, atol=300.0)
+    assert 0.01 < after.across < 0.035
+
+
 def test_detectors_are_found_where_they_begin():
     found, after = solved("steps 0.1 px", 1)
     for spline in found.splines:

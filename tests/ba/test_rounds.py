@@ -168,6 +168,23 @@ def test_points_follow_what_is_smooth_where_it_is_seen(monkeypatch, wave: float,
         assert np.abs(left - noise).mean() < 0.012
 
 
+def test_residuals_settle_where_no_move_of_a_point_makes_them_smaller() -> None:
+    made = simulate_block(3, 200, seed=5)
+    block = adjustment.join(made.views, made.tracks, None, AdjustOptions(drift=0))
+    problem = adjustment.make_problem(block, AdjustOptions(drift=0), centers_of(made), None)
+    state, _ = adjustment._start(problem, block, AdjustOptions(drift=0), None)
+    projected = problem.project_points(state.params, state.points)
+    rng = np.random.default_rng(0)
+    residual, weight = rng.normal(0, 1, block.xy.shape), rng.uniform(0.5, 2, len(block.view))
+    settled = problem.settling(projected, weight)(residual)
+    for point in (0, 50):
+        rows = block.point == point
+        matrix = (projected.by_point[:, :, rows] * weight[rows]).transpose(0, 2, 1).reshape(-1, 3)
+        whitened = (residual[:, rows] * weight[rows]).ravel()
+        left = whitened - matrix @ np.linalg.lstsq(matrix, whitened, rcond=None)[0]
+        np.testing.assert_allclose((settled[:, rows] * weight[rows]).ravel(), left, atol=1e-7)
+
+
 def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
     dirty = simulate_block(3, 400, seed=5, outliers=0.1)
     passes = []
