@@ -35,12 +35,13 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.sparse import bsr_array, coo_matrix
 from scipy.sparse.linalg import splu
 
-from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment, structure
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, solution, structure
 from barpc.ba.block import join
 from barpc.ba.multifrontal import Cholesky
 from barpc.ba.problem import Problem
 from barpc.ba.smooth import Smooth
 from barpc.ba.solve import State, camera_step, minimise
+from barpc.ba.starting import make_problem
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.geometry import triangulate
@@ -186,13 +187,13 @@ def large(views: int, tracks: int) -> None:
 
 
 STAGES = {
-    "start": [(adjustment, "make_problem"), (adjustment, "_start")],
+    "start": [(solution, "make_problem"), (solution, "first_state")],
     "linearise": [(Problem, "reduce")],
     "order": [(structure, "dissect")],
     "factorise": [(Cholesky, "factorize")],
     "solve": [(Cholesky, "solve")],
     "smooth": [(Smooth, "fit"), (Smooth, "test")],
-    "held out": [(adjustment, "measure")],
+    "held out": [(solution, "measure")],
 }
 """Functions whose CPU seconds are counted; those of one stage may call each other."""
 
@@ -288,7 +289,7 @@ def _fill_of(views: int, made: Block) -> None:
     options = AdjustOptions(**PLAIN)
     joined = join(made.views, made.tracks, None, options)
     centers = np.array([correction.center for correction in made.truth.corrections])
-    problem = adjustment.make_problem(joined, options, centers, None)
+    problem = make_problem(joined, options, centers, None)
     reduced = problem.reduce(
         problem.camera_prior.mean, ecef_from_ground(made.truth.ground), 1.0 / joined.sigma
     )

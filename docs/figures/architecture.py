@@ -29,6 +29,8 @@ JOURNEYS = {
         ("ba/adjustment.py", "adjust_tracks", "views, tracks, control"),
         ("ba/block.py", "join", "-> one block, sorted by view"),
         ("ba/heldout.py", "keep_out", "a tenth of the tracks aside"),
+        ("ba/solution.py", "solve_block", "one model, its control tested"),
+        ("ba/starting.py", "make_problem", "cameras, priors, structure"),
         ("ba/rounds.py", "Rounds", "search, cut, solve until nothing changes"),
         ("ba/solve.py", "minimise", "scipy or sparse Levenberg-Marquardt"),
         ("ba/heldout.py", "measure", "what the tenth says"),

@@ -11,10 +11,10 @@ from scipy.linalg import null_space
 from scipy.optimize import minimize
 
 from barpc.ba import AdjustOptions
-from barpc.ba.adjustment import make_problem
 from barpc.ba.block import join
 from barpc.ba.consensus import TwoGroups, _across, _mixture, _on_one_plane, agreeing, two_groups
 from barpc.ba.problem import Problem
+from barpc.ba.starting import make_problem
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of

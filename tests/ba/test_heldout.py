@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions
-from barpc.ba.adjustment import make_problem
 from barpc.ba.block import Block, join
 from barpc.ba.heldout import HeldOut, _scrambled, keep_out, measure
+from barpc.ba.starting import make_problem
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of

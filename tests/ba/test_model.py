@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, adjustment, block_prior
-from barpc.ba.adjustment import _Solution, make_problem
 from barpc.ba.block import join
 from barpc.ba.rounds import Outcome
+from barpc.ba.solution import Solution
+from barpc.ba.starting import first_state, make_problem
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks
@@ -44,8 +45,8 @@ def choose(
         said = {"is_skew": skew, "has_trend": trend, "has_waves": False, "tested": None}
         return SimpleNamespace(**said, after=after, model=options.model, problem=in_space)
 
-    monkeypatch.setattr(adjustment, "_solve", solved)
-    monkeypatch.setattr(adjustment, "_followed", lambda found, *_: found)
+    monkeypatch.setattr(adjustment, "solve_block", solved)
+    monkeypatch.setattr(adjustment, "follow", lambda found, *_: found)
     prior = given.pop("prior", None)
     found, in_space = adjustment._choose_model(None, None, AdjustOptions(**given), None, None, prior)
     return found.model, in_space, asked
@@ -91,10 +92,10 @@ def outcome_of(rms: float, noise: float = 1.0, drift: tuple[float, ...] = ()) ->
     return SimpleNamespace(smooth=smooth, noise=noise, prior=SimpleNamespace(drift_sigma=drift))
 
 
-def solution(outcome: Outcome, error: float = 1.0, problem: Any = None) -> _Solution:
+def solution(outcome: Outcome, error: float = 1.0, problem: Any = None) -> Solution:
     state = SimpleNamespace(params=None, points=None)
     outcome.minimum = SimpleNamespace(state=state)  # type: ignore[misc]
-    return _Solution(problem, None, None, None, outcome, None, SimpleNamespace(error=error), None)  # type: ignore[arg-type]
+    return Solution(problem, None, None, None, outcome, None, SimpleNamespace(error=error), None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -190,7 +191,7 @@ def test_points_start_where_the_delivered_cameras_see_them_by_their_sigmas(made)
     options = AdjustOptions(drift=0)
     block = join(given.views, given.tracks, None, options)
     problem = make_problem(block, options, centers_of(made), None)
-    state, _ = adjustment._start(problem, block, options, None)
+    state, _ = first_state(problem, block, options, None)
     sensors = [view.sensor for view in given.views]
     weighted, equal = (
         triangulated(sensors, given.tracks, given.tracks.xy, s) for s in (given.tracks.sigma, None)
@@ -206,12 +207,12 @@ def test_the_scenes_move_is_from_where_the_delivered_cameras_put_what_is_seen_no
     options = AdjustOptions(drift=0)
     block = join(given.views, given.tracks, None, options)
     problem = make_problem(block, options, centers_of(made), None)
-    state, _ = adjustment._start(problem, block, options, None)
+    state, _ = first_state(problem, block, options, None)
     params = np.random.default_rng(1).normal(0, 3, (3, 6))
     final = replace(state, params=params, points=state.points + 5.0)
     inlier = np.arange(len(block.view)) < kept * len(block.view)
     outcome: Any = SimpleNamespace(inlier=inlier, minimum=SimpleNamespace(state=final))
-    found = _Solution(problem, state, None, None, outcome, None, None, None).first_points(block)  # type: ignore[arg-type]
+    found = Solution(problem, state, None, None, outcome, None, None, None).first_points(block)  # type: ignore[arg-type]
     if kept == 1.0:
         np.testing.assert_array_equal(found, state.points)
         return

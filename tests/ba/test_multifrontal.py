@@ -10,13 +10,13 @@ import pytest
 import scipy.linalg as la
 
 from barpc.ba import adjust_tracks, dissection, multifrontal, normal
-from barpc.ba.adjustment import make_problem
 from barpc.ba.block import join
 from barpc.ba.dissection import Dissection, dissect
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.linear import factorize_blocks
 from barpc.ba.multifrontal import Blocks
 from barpc.ba.solve import camera_step
+from barpc.ba.starting import make_problem
 from barpc.geodesy import ecef_from_ground
 from barpc.options import AdjustOptions
 from barpc.scene import GroundPoints, Tracks

@@ -11,7 +11,6 @@ import pytest
 import scipy.linalg as la
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior, normal, rounds
-from barpc.ba.adjustment import make_problem
 from barpc.ba.block import join
 from barpc.ba.datum import datum_shares
 from barpc.ba.gauge import MOTIONS, _modes, gauge_report
@@ -19,6 +18,7 @@ from barpc.ba.ground import Heights, convergence_angles, ground_control
 from barpc.ba.problem import Problem
 from barpc.ba.snooping import image_test
 from barpc.ba.solve import Minimum, State, _Compressed, camera_step, gauss_newton
+from barpc.ba.starting import make_problem
 from barpc.ba.weights import Observations
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks, adjustment, rounds
+from barpc.ba import AdjustOptions, adjust_tracks, rounds, solution
+from barpc.ba.block import join
 from barpc.ba.rounds import _median
+from barpc.ba.solve import State
+from barpc.ba.starting import first_state, make_problem
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve
 
@@ -42,7 +45,7 @@ def moved_together(block: Block, view: int, share: float, by: float) -> Block:
 
 
 def test_a_clean_block_is_solved_twice_and_nothing_is_looked_at_again(clean, monkeypatch) -> None:
-    again = seen(monkeypatch, rounds, "revived"), seen(monkeypatch, adjustment, "agreeing")
+    again = seen(monkeypatch, rounds, "revived"), seen(monkeypatch, solution, "agreeing")
     solves = seen(monkeypatch, rounds, "minimise")
     found = solve(clean, **CALM)
     assert found.status.startswith("2 passes of cutting")
@@ -88,7 +91,7 @@ def test_tracks_that_were_cut_are_looked_at_again_where_they_are_many(monkeypatc
 
 
 def test_a_view_that_lost_much_is_solved_again_from_an_agreement(clean, monkeypatch) -> None:
-    again = seen(monkeypatch, adjustment, "agreeing")
+    again = seen(monkeypatch, solution, "agreeing")
     for share, asked in ((0.10, 0), (0.20, 1)):
         again.clear()
         found = solve(moved_together(clean, 1, share, 40.0), **CALM)
@@ -108,8 +111,8 @@ def test_a_median_counts_each_value_by_its_weight() -> None:
 
 def test_points_that_were_cut_are_seen_where_the_cameras_see_them_now(clean) -> None:
     """The truth's cameras; every third point 300 m away, and not in use."""
-    problem = adjustment.make_problem(
-        adjustment.join(clean.views, clean.tracks, None, AdjustOptions(drift=0)), AdjustOptions(drift=0),
+    problem = make_problem(
+        join(clean.views, clean.tracks, None, AdjustOptions(drift=0)), AdjustOptions(drift=0),
         centers_of(clean), None,
     )  # fmt: skip
     good = solve(clean, **CALM)
@@ -119,7 +122,7 @@ def test_points_that_were_cut_are_seen_where_the_cameras_see_them_now(clean) -> 
     use = ~lost[problem.structure.point]
     use[np.flatnonzero(~use)[0]] = True  # of this one, one observation was kept: it stays where it is
     kept = problem.structure.point[np.flatnonzero(use & lost[problem.structure.point])[0]]
-    state = adjustment.State(good.params, points, 7.0, (9.0, 8.0))
+    state = State(good.params, points, 7.0, (9.0, 8.0))
     residual = np.full(problem.xy.shape, 0.25)
     again, left = rounds.revived(problem, state, residual, use, np.full(len(use), 10.0))
     lost[kept] = False
@@ -150,11 +153,9 @@ def test_points_follow_what_is_smooth_where_it_is_seen(monkeypatch, wave: float,
     """Of noise of 0.1 px: a smooth part of less than 0.3 sigmas is taken from each view by itself."""
     made = simulate_block(3, 1500, seed=5, noise=0.0)
     options = AdjustOptions(drift=0)
-    block = adjustment.join(
-        made.views, replace(made.tracks, sigma=np.full(len(made.tracks), 0.1)), None, options
-    )
-    problem = adjustment.make_problem(block, options, centers_of(made), None)
-    state, heights = adjustment._start(problem, block, options, None)
+    block = join(made.views, replace(made.tracks, sigma=np.full(len(made.tracks), 0.1)), None, options)
+    problem = make_problem(block, options, centers_of(made), None)
+    state, heights = first_state(problem, block, options, None)
     each = rounds.Rounds(problem, block, state, options, heights, block.use)
     row = (block.xy[1] - 1e4) / 1e4
     smooth = wave * np.sin(5 * row) * (block.view == 1)
@@ -170,9 +171,9 @@ def test_points_follow_what_is_smooth_where_it_is_seen(monkeypatch, wave: float,
 
 def test_residuals_settle_where_no_move_of_a_point_makes_them_smaller() -> None:
     made = simulate_block(3, 200, seed=5)
-    block = adjustment.join(made.views, made.tracks, None, AdjustOptions(drift=0))
-    problem = adjustment.make_problem(block, AdjustOptions(drift=0), centers_of(made), None)
-    state, _ = adjustment._start(problem, block, AdjustOptions(drift=0), None)
+    block = join(made.views, made.tracks, None, AdjustOptions(drift=0))
+    problem = make_problem(block, AdjustOptions(drift=0), centers_of(made), None)
+    state, _ = first_state(problem, block, AdjustOptions(drift=0), None)
     projected = problem.project_points(state.params, state.points)
     rng = np.random.default_rng(0)
     residual, weight = rng.normal(0, 1, block.xy.shape), rng.uniform(0.5, 2, len(block.view))

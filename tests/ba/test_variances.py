@@ -11,10 +11,10 @@ import pytest
 from scipy.stats import chi2
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.adjustment import make_problem
 from barpc.ba.block import join
 from barpc.ba.priors import CameraPrior, prior_sigmas
 from barpc.ba.solve import State, minimise
+from barpc.ba.starting import make_problem
 from barpc.ba.unknowns import Unknowns
 from barpc.ba.variances import Variances, _Around, same_prior
 from barpc.errors import BarpcWarning

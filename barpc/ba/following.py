@@ -1,0 +1,102 @@
+"""A block solved again with splines over the rows and steps between detectors, where residuals ask for them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barpc.ba.block import Block
+from barpc.ba.detectors import find_edges
+from barpc.ba.heldout import is_better
+from barpc.ba.rounds import MAX_PASSES, Rounds, revived
+from barpc.ba.solution import Solution, finished
+from barpc.ba.starting import make_problem
+from barpc.ba.waves import Waves
+from barpc.geodesy import Array
+from barpc.options import AUTO, OFF, AdjustOptions
+
+_SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
+_PER_SPLINE = 30  # observations of a view
+_FEWEST = 7  # splines
+_LOOKS = 2  # for detectors
+_MISSES = 2  # one after the other
+_MOST_SPLINES = 4000  # of all views: what a block of 300 takes is 2.6 times as long
+
+
+def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
+    """The block with splines over the rows and steps between detectors, where asked for or where they tell.
+
+    Knots are set twice as dense until nothing is left that neighbours share, the observations are too few, or the
+    tracks that took no part are met no better.
+    """
+    given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
+    best, misses = found, 0
+    for count in _spline_counts(block, options, found.has_waves):
+        if misses == _MISSES or not (best.has_waves or (asked and best is found)):
+            break
+        waves = Waves(count, _given_edges(block, options))
+        if options.detectors:
+            tried = _with_waves(found, block, outer, options, waves)
+        else:
+            tried = _with_edges(_with_waves(found, block, outer, options, waves, 1), block, outer, options)
+        better = given or (asked and best is found) or is_better(tried.after, best.after, outer)
+        best, misses = (tried, 0) if better else (best, misses + 1)
+    return best if best is found else replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
+
+
+def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
+    """The block, of which one pass was solved with splines, with steps between detectors where residuals show them.
+
+    What they explain shows others: it is looked for them again.
+    """
+    waves = found.problem.cameras.unknowns.waves
+    assert waves is not None
+    for _ in range(_LOOKS if found.has_waves else 0):
+        outcome = found.outcome
+        sigma = block.sigma * outcome.noise
+        edges = find_edges(outcome.problem, found.final, outcome.residual, outcome.inlier, sigma)
+        if edges.shape[1] <= waves.edges.shape[1]:
+            break
+        waves = Waves(waves.count, edges)
+        found = _with_waves(found, block, outer, options, waves)
+    return found if waves.edges.size else _with_waves(found, block, outer, options, waves)
+
+
+def _given_edges(block: Block, options: AdjustOptions) -> Array:
+    return np.tile(np.array(options.detectors, dtype=np.float64) - 0.5, (len(block.views), 1))
+
+
+def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
+    """Numbers of splines to try, the fewest first, as many as the observations of a view hold."""
+    rows = max(view.size[1] for view in block.views)
+    if options.jitter == OFF:
+        return [0] if options.detectors else []
+    most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // _PER_SPLINE
+    if options.spacing:
+        return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), _FEWEST)]
+    most = min(most, _MOST_SPLINES // len(block.views))
+    wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
+    dense = np.unique(np.clip(wanted, _FEWEST, most)).tolist() if has_waves and most >= _FEWEST else []
+    return dense or [0] * bool(options.detectors)
+
+
+def _with_waves(
+    found: Solution,
+    block: Block,
+    outer: Block,
+    options: AdjustOptions,
+    waves: Waves,
+    most: int = MAX_PASSES,
+) -> Solution:
+    """A block solved again with splines and steps, from where it ended; every observation may come back."""
+    problem, ended = found.problem, found.outcome.minimum.state
+    unknowns = problem.cameras.unknowns
+    bent = make_problem(block, options, unknowns.center, None, unknowns.drift, waves)
+    there, _ = revived(problem, ended, found.outcome.residual, found.outcome.inlier, block.use / block.sigma)
+    known = unknowns.waves.kinds[0].stop if unknowns.waves and unknowns.waves.count == waves.count else 0
+    params = np.zeros_like(bent.camera_prior.mean)
+    params[:, : unknowns.in_waves.start + known] = there.params[:, : unknowns.in_waves.start + known]
+    there = replace(there, params=params)
+    outcome = Rounds(bent, block, there, options, found.heights, block.use, found.outcome).run(most)
+    return finished(found, bent, block, outer, options, outcome)

@@ -1,0 +1,177 @@
+"""A block solved with one model: where it started, how the rounds ended, what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from barpc.ba.block import Block
+from barpc.ba.consensus import agreeing
+from barpc.ba.ground import Heights, Terrain
+from barpc.ba.heldout import HeldOut, measure
+from barpc.ba.incremental import BlockPrior
+from barpc.ba.priors import DRIFT_SIGMA
+from barpc.ba.problem import Problem
+from barpc.ba.rounds import Outcome, Rounds, revived
+from barpc.ba.smooth import SmoothTest
+from barpc.ba.snooping import ControlTest, control_test
+from barpc.ba.solve import State
+from barpc.ba.starting import FIRST_STEPS, first_state, make_problem
+from barpc.ba.structure import Structure
+from barpc.geodesy import Array
+from barpc.options import AdjustOptions
+from barpc.scene import BoolArray
+
+SMOOTH_LEAST = 0.06  # smooth residuals below this [px] are left alone: two views share what one is wrong by
+_TREND = 0.03  # px: another model is tried
+_MUCH_NOISE = 1.5  # times what is stated
+_MUCH_LOST = 0.85  # of a view's observations are to be left
+_SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
+_MANY_KEPT = 0.99  # of the observations: the others do not tell in a mean
+_BETTER = 0.8  # of the noise
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A block solved with one model."""
+
+    problem: Problem  # as it was solved last
+    state: State  # where it started: delivered cameras, points triangulated with them
+    before: Array  # (2, K) residuals there [px]
+    heights: Heights  # what holds points
+    outcome: Outcome  # of the rounds
+    start: HeldOut  # what the tracks that took no part say before
+    after: HeldOut  # and after
+    tested: ControlTest | None  # control points against the rest
+    # "drift", "jitter" -> what was smooth before another degree was taken, splines or steps followed
+    asked: Mapping[str, SmoothTest] = field(default_factory=dict)
+
+    @property
+    def final(self) -> State:
+        """The minimum."""
+        return self.outcome.minimum.state
+
+    @property
+    def seen(self) -> BoolArray:
+        """Points (P,) with an observation that was kept."""
+        seen = np.zeros(self.problem.structure.num_points, dtype=bool)
+        seen[self.problem.structure.point[self.outcome.inlier]] = True
+        return seen
+
+    def first_points(self, block: Block) -> Array:
+        """Where the delivered cameras put the points (P, 3) [m] if what was cut is seen where it should be."""
+        points, kept = self.state.points, self.outcome.inlier
+        if kept.sum() < _MANY_KEPT * block.use.sum():
+            problem, final, delivered = self.problem, self.final, self.problem.camera_prior.mean
+            mended = replace(problem, xy=problem.residuals(final.params, final.points) + problem.xy)
+            for _ in range(FIRST_STEPS + 1):
+                projected = problem.project_points(delivered, points)
+                points = mended.triangulate(points, projected, block.use / block.sigma)
+        return points
+
+    @property
+    def has_trend(self) -> bool:
+        """Whether something is left that another model may follow: smooth, or in what was cut."""
+        left = bool(self.outcome.smooth.found(_TREND).any())
+        return left or self.after.error > _MUCH_NOISE * self.outcome.noise
+
+    @property
+    def has_waves(self) -> bool:
+        """Whether neighbours share something that splines over the rows or steps between detectors may follow."""
+        tested = self.outcome.smooth
+        return bool((tested.found(_TREND) | (tested.shared > _TREND)).any())
+
+    @property
+    def is_skew(self) -> bool:
+        """Whether the drift that was learnt shears images more than a platform does: one of them was turned."""
+        learnt = self.outcome.prior.drift_sigma
+        if not learnt or learnt[0] < 2.0 * DRIFT_SIGMA:
+            return False
+        problem = self.problem
+        by_point = problem.project_points(self.final.params, self.final.points).by_point
+        pixels = float(np.nanmedian(np.linalg.norm(by_point[1], axis=0)))  # a metre
+        return learnt[0] > _SKEW * float(np.median(problem.cameras.unknowns.half[1])) / pixels
+
+
+def solve_block(
+    block: Block,
+    outer: Block,
+    options: AdjustOptions,
+    dem: Terrain | None,
+    centers: Array | None,
+    prior: BlockPrior | None,
+) -> Solution:
+    """Rounds with the model of the options, again from an agreement or with more drift where they ask for it.
+
+    Measured on the observations of `outer`.
+    """
+    problem = make_problem(block, options, centers, prior)
+    state, heights = first_state(problem, block, options, dem)
+    start = measure(problem, state.params, outer)
+    rounds = Rounds(problem, block, state, options, heights, block.use)
+    before, outcome = rounds.residual, rounds.run()
+    if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
+        projected = problem.project_points(state.params, state.points)
+        agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
+        again = Rounds(problem, block, state, options, heights, agree).run()
+        if again.noise < _BETTER * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
+            outcome = again
+    drift, asked = problem.cameras.unknowns.drift, dict[str, SmoothTest]()
+    if options.drift is None and prior is None and drift and outcome.smooth.found(SMOOTH_LEAST).any():
+        bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
+        ended, weight = outcome.minimum.state, block.use / block.sigma
+        there, _ = revived(problem, ended, outcome.residual, outcome.inlier, weight)
+        there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
+        asked = {"drift": outcome.smooth}
+        problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
+    first = Solution(problem, state, before, heights, outcome, start, start, None, asked)
+    return finished(first, problem, block, outer, options, outcome)
+
+
+def finished(
+    found: Solution, problem: Problem, block: Block, outer: Block, options: AdjustOptions, outcome: Outcome
+) -> Solution:
+    """What the rounds of a problem ended with, its control tested and measured; where it started is `found`'s."""
+    heights, tested = found.heights, None
+    if block.gcps.names:
+        outcome, heights, tested = _tested(problem, block, options, outcome, heights, found.state)
+    after = measure(problem, outcome.minimum.state.params, outer)
+    return replace(found, problem=problem, heights=heights, outcome=outcome, after=after, tested=tested)
+
+
+def _tested(
+    problem: Problem, block: Block, options: AdjustOptions, outcome: Outcome, heights: Heights, start: State
+) -> tuple[Outcome, Heights, ControlTest]:
+    """The block without the control points that the rounds cut, then without those that the rest finds wrong, one at a
+    time and the worst first; each time solved from the start, as a gross error takes good tie points with it.
+    """
+    control, start = heights.control[0], replace(start, params=problem.camera_prior.mean)
+    points, weight = start.points.copy(), block.use / block.sigma
+    of_points = np.arange(block.num_tracks, block.num_known)
+    cut = np.isin(of_points, block.point[block.use & ~outcome.inlier])
+    used = np.ones(len(cut), dtype=bool)
+    while True:
+        if cut.any():
+            used = used & ~cut
+            heights = replace(heights, control=(control.select(used), *heights.control[1:]))
+            let_go = heights.hold(problem, points)
+            for _ in range(FIRST_STEPS + 1):  # where their rays see them
+                moved = let_go.triangulate(points, let_go.project_points(start.params, points), weight)
+                points[of_points[cut]] = moved[of_points[cut]]
+            there = replace(start, points=points.copy())
+            outcome = Rounds(problem, block, there, options, heights, block.use).run()
+        covariance = outcome.minimum.covariance(problem.free)
+        final = outcome.minimum.state.points
+        tested = control_test(covariance, final, block.num_tracks, block.gcps, used)
+        culprit = tested.culprit()
+        if culprit is None:
+            return outcome, heights, tested
+        cut = np.arange(len(used)) == culprit
+
+
+def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
+    """Whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
+    had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
+    return outcome.noise > _MUCH_NOISE or bool((kept < _MUCH_LOST * had).any())
