@@ -258,7 +258,7 @@ class AdjustOptions(Options):
     jitter: str = option(
         "auto",
         """What rotations leave along the rows: a spline in every image. `auto`: where the residuals ask for it and tie
-        points that took no part are met better; `off`; or the rows between its knots.""",
+        points that took no part are met better, and `drift` is not 0; `off`; or the rows between its knots.""",
         unit="auto|off|rows",
     )
     detectors: tuple[float, ...] = option(

@@ -70,7 +70,8 @@ def _given_edges(block: Block, options: AdjustOptions) -> Array:
 def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
     """Numbers of splines to try, the fewest first, as many as the observations of a view hold."""
     rows = max(view.size[1] for view in block.views)
-    if options.jitter == OFF:
+    # who has rotations stand still wants what they leave to be seen, not to be bent away
+    if options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
         return [0] if options.detectors else []
     most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // _PER_SPLINE
     if options.spacing:

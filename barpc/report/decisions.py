@@ -125,6 +125,8 @@ def _jitter(scene: SceneEntry, summary: Summary) -> list[str]:
         return found
     if _option(summary, "adjust", "jitter") == "off":
         return ["Jitter was not looked for, as asked."]
+    if _option(summary, "adjust", "drift") == 0 and _option(summary, "adjust", "jitter") == "auto":
+        return ["Jitter was not looked for, as one rotation an image was asked for."]
     return [_calm(summary.views)] if any(view.shared_px is not None for view in summary.views) else []
 
 

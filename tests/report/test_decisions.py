@@ -126,6 +126,8 @@ def test_jitter_is_followed_looked_for_or_not_looked_for(record):
     assert "Detectors begin at up to 2 columns of 1 images." in steps
     assert "Jitter was not looked for, as asked." in said(asked(calm, jitter="off"))
     assert "Jitter was not" not in said(asked(waving, jitter="off"))
+    assert "Jitter was not looked for, as one rotation an image was asked for." in said(asked(calm, drift=0))
+    assert "Jitter was not" not in said(asked(calm, drift=1)) + said(asked(calm, drift=0, jitter="2000"))
 
 
 def test_priors_hold_or_were_widened(record):
