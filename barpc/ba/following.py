@@ -9,7 +9,7 @@ import numpy as np
 from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
 from barpc.ba.heldout import is_better
-from barpc.ba.rounds import MAX_PASSES, Rounds, revived
+from barpc.ba.rounds import Rounds, revived
 from barpc.ba.solution import Solution, finished
 from barpc.ba.starting import make_problem
 from barpc.ba.waves import Waves
@@ -39,7 +39,7 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
         if options.detectors:
             tried = _with_waves(found, block, outer, options, waves)
         else:
-            tried = _with_edges(_with_waves(found, block, outer, options, waves, 1), block, outer, options)
+            tried = _with_edges(_with_waves(found, block, outer, options, waves, True), block, outer, options)
         better = given or (asked and best is found) or is_better(tried.after, best.after, outer)
         best, misses = (tried, 0) if better else (best, misses + 1)
     return best if best is found else replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
@@ -88,7 +88,7 @@ def _with_waves(
     outer: Block,
     options: AdjustOptions,
     waves: Waves,
-    most: int = MAX_PASSES,
+    once: bool = False,
 ) -> Solution:
     """A block solved again with splines and steps, from where it ended; every observation may come back."""
     problem, ended = found.problem, found.outcome.minimum.state
@@ -99,5 +99,5 @@ def _with_waves(
     params = np.zeros_like(bent.camera_prior.mean)
     params[:, : unknowns.in_waves.start + known] = there.params[:, : unknowns.in_waves.start + known]
     there = replace(there, params=params)
-    outcome = Rounds(bent, block, there, options, found.heights, block.use, found.outcome).run(most)
+    outcome = Rounds(bent, block, there, options, found.heights, block.use, found.outcome).run(once)
     return finished(found, bent, block, outer, options, outcome)

@@ -36,7 +36,7 @@ _CLEAN = 5.0  # sigmas
 _FEW = 0.002  # of the observations farther away than that: there is nothing to be careful about
 _NEAR = 12.0  # sigmas: a loss that is no wider asks what is smooth
 _SHRINK = 0.25  # of the loss's scale in one round, at most
-MAX_PASSES = 6  # rounds of cutting and solving, at most: they end when nothing changes
+MAX_PASSES = 5  # rounds of cutting and solving, at most: they end when nothing changes
 _FIRST_TOLERANCE = 0.1  # of the first pass after robust rounds: the second, which follows always, is exact
 
 
@@ -92,12 +92,12 @@ class Rounds:
         self.misfit: Array | float = 0.0
         self.weight = self.counted
 
-    def run(self, most: int = MAX_PASSES) -> Outcome:
-        """Go on until nothing changes, after `most` passes at most."""
+    def run(self, once: bool = False) -> Outcome:
+        """Go on until nothing changes, or pass `once`."""
         if self.robust and not self.is_known:
             self._search()
         while True:
-            outcome = self._cut_and_solve(most)
+            outcome = self._cut_and_solve(once)
             if outcome is not None:
                 return outcome
 
@@ -116,7 +116,7 @@ class Rounds:
         )
         self.misfit = self.smooth.test(self.residual, self.use).rms
 
-    def _cut_and_solve(self, most: int) -> Outcome | None:
+    def _cut_and_solve(self, once: bool) -> Outcome | None:
         """One pass; the outcome where it is the last."""
         options, was_in_use, noise = self.options, self.use, self.noise
         many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
@@ -134,7 +134,7 @@ class Rounds:
         same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
         settled &= same_prior(prior, self.problem.camera_prior, _SAME_PRIOR)
-        if self.passes >= most or (settled and (same or not self.robust)):
+        if once or self.passes > MAX_PASSES or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:
                 tested = self.variances.learnt(self.problem, found, exact=True)[1]
