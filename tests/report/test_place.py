@@ -53,23 +53,27 @@ def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, mod
         assert abs((found.azimuth_deg - azimuth + 90) % 180 - 90) < 12
 
 
-def test_that_of_a_radar_is_of_clocks_drawn_from_theirs():
+def test_that_of_a_radar_is_what_its_clocks_do_to_a_place():
+    """Against differences of the whole model, one clock after the other."""
     radar, pixel, alt = Product().model(), np.array([8000.0, 6000.0]), np.array(120.0)
     timed = Timed(radar, Timing([[3.0, 2e-4]]))
     covariance = np.array(
         [[0.5, 0.3, 9.0], [0.3, 1.2, 9.0], [9.0, 9.0, 9.0]]
     )  # range and along the flight first
-    moved, sigma, found = clocks_in_image(timed, covariance, timed.localize(pixel, alt))
-    drawn = np.random.default_rng(1).multivariate_normal(np.zeros(2), covariance[:2, :2], 3000)
-    clocks = [Timed(radar, Timing([[3.0 + m, 2e-4 + n / radar.speed]])) for m, n in drawn]
     at = timed.localize(pixel, alt)
-    east_north = ((np.array([one.localize(pixel, alt) for one in clocks]) - at) * metres_per_unit(at))[:, :2]
-    assert [found.minor_m, found.major_m] == pytest.approx(
-        np.sqrt(np.linalg.eigvalsh(np.cov(east_north.T))), rel=0.05
+    moved, sigma, found = clocks_in_image(timed, covariance, at)
+    steps = [(0.5, 0.0), (0.0, 0.5 / radar.speed)]  # half a metre to each side
+    ahead, behind = (
+        [Timed(radar, Timing([[3.0 + s * m, 2e-4 + s * n]])) for m, n in steps] for s in (1.0, -1.0)
     )
-    assert np.mean(np.hypot(*east_north.T) < found.ce90_m) == pytest.approx(0.9, abs=0.02)
-    seen = np.array([one.project(at) for one in clocks])
-    assert sigma == pytest.approx(seen.std(axis=0), rel=0.05)
+    there, here = (np.array([one.localize(pixel, alt) for one in side]) for side in (ahead, behind))
+    by_clock = ((there - here) * metres_per_unit(at))[:, :2].T
+    values, axes = np.linalg.eigh(by_clock @ covariance[:2, :2] @ by_clock.T)
+    assert [found.minor_m, found.major_m] == pytest.approx(np.sqrt(values), rel=1e-3)
+    assert found.azimuth_deg == pytest.approx(np.degrees(np.arctan2(*axes[:, 1])) % 180.0, abs=0.1)
+    assert found.ce90_m == ce90(found.major_m, found.minor_m)
+    in_image = np.array([a.project(at) - b.project(at) for a, b in zip(ahead, behind, strict=True)]).T
+    assert sigma**2 == pytest.approx(np.diag(in_image @ covariance[:2, :2] @ in_image.T), rel=1e-3)
     assert moved == pytest.approx(pixel - radar.project(at), abs=1e-6)
 
 
