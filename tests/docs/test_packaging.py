@@ -80,9 +80,12 @@ def test_the_conda_recipe_asks_for_what_the_project_asks_for():
     assert entry.split(" = ") == list(*said["scripts"].items())
 
 
-def test_the_recipe_is_one_that_a_builder_of_conda_packages_understands():
-    rattler = pytest.importorskip("rattler_build")
-    rattler.Stage0Recipe.from_file(ROOT / "recipe" / "recipe.yaml")
+def test_the_recipe_is_one_that_a_builder_of_conda_packages_understands(tmp_path):
+    rattler, path = pytest.importorskip("rattler_build"), ROOT / "recipe" / "recipe.yaml"
+    assert rattler.Stage0Recipe.from_file(path) is not None
+    (wrong := tmp_path / "recipe.yaml").write_text(path.read_text().replace("noarch:", "noarhc:"))
+    with pytest.raises(Exception, match="noarhc"):
+        rattler.Stage0Recipe.from_file(wrong)
 
 
 def test_the_container_copies_what_the_wheel_is_made_of_and_is_named_by_the_version():
