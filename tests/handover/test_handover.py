@@ -58,11 +58,3 @@ def test_s2p_asks_for_no_correction_and_its_pairs_agree_in_height(finished, tmp_
     assert max(after) < 0.1
     heights = found["pairs apart in height [m], pointing correction off"]
     assert abs(numbers(heights[1])[0]) < 0.2
-
-
-def test_cars_finds_the_epipolar_lines_where_they_are(finished, tmp_path):
-    before, after = map(
-        numbers, measured("cars", finished, tmp_path)["before_correction_epi_error_mean [px]"]
-    )
-    assert max(abs(v) for v in before) > 1.0
-    assert max(abs(v) for v in after) < 0.1
