@@ -1,12 +1,13 @@
-"""Small errors put into the numerical core on purpose: how many do the fast tests catch?
+"""Small errors put into barpc on purpose: how many do the fast tests catch?
 
-    python benchmarks/mutation.py --sample 200 --seed 1 --json score.json
+    python benchmarks/mutation.py --sample 150 --seed 1 --json score.json
     python benchmarks/mutation.py --chosen
-    python benchmarks/mutation.py --sample 10 --bar 0.7
+    python benchmarks/mutation.py --part ba --sample 10 --bar 0.9
 
-Every mutant changes one place of one module in a copy of the tree; the fast tests of the module's folder are
-run there and stop at the first failure. Texts, messages, annotations, logging and sizes of chunks are left
-alone. Mutants that no test can tell from the original are named in mutation.toml, with the reason.
+Every mutant changes one place of one module in a copy of the tree; the fast tests of the module's part (its folder;
+`top`: the modules beside the folders) are run there and stop at the first failure. Before that they must pass without a
+mutant. Texts, messages, annotations, logging and sizes of chunks are left alone. Mutants that no test can tell from
+the original are named in mutation.toml, with the reason.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import accumulate
@@ -40,20 +41,9 @@ import shapely  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[1]
 TOML = Path(__file__).with_suffix(".toml")
-GATE = ("barpc/pipeline/outputs.py", "barpc/pipeline/grids.py", "barpc/handoff.py")
-TESTS = {
-    **{name: f"tests/{name}/test_*.py" for name in ("ba", "fit", "tie", "sensor", "rpcio")},
-    "gate": "tests/*/test_outputs.py tests/pipeline/test_grids.py tests/test_handoff.py",
-}
-"""Part of the core -> its tests."""
-SLOW = ("test_real_images.py", "test_simulated.py", "test_sentinel1_example.py")
-"""Left out: full runs over images, minutes each."""
-LATE = (
-    "pieces", "features", "real", "sar_optical", "options", "fit_rpc", "solvers", "sentinel1", "guided", "link",
-    "snooping", "recovery", "area", "uncertainty", "matcher", "referee",
-)  # fmt: skip
-"""Tests that run last, in this order, unless they are named after the module: many seconds each."""
-
+TOP = "top"
+LONGEST = 1200.0  # seconds of a part's tests without a mutant
+SKIPPED = (".git", "__pycache__", ".venv", "site", "dist", ".*_cache")  # of a tree that is copied
 
 COMPARISONS = {
     ast.Lt: ("<", "<=", ">"), ast.LtE: ("<=", "<", ">="), ast.Gt: (">", ">=", "<"), ast.GtE: (">=", ">", "<="),
@@ -82,7 +72,7 @@ class Mutant:
     @property
     def part(self) -> str:
         """Which tests are to catch it."""
-        return "gate" if self.file in GATE else self.file.split("/")[1]
+        return part_of(Path(self.file))
 
     def source(self) -> tuple[str, str]:
         """The file before and after."""
@@ -179,16 +169,29 @@ class Places:
                 yield self._span(one)[0], self._span(two)[1], f"{self._text(two)}, {self._text(one)}"
 
 
-def mutants(parts: list[str]) -> list[Mutant]:
-    """All mutants of the core's modules, in the order of their places."""
-    folders = [
-        path for part in parts if part != "gate" for path in sorted((ROOT / "barpc" / part).rglob("*.py"))
-    ]
+def part_of(path: Path) -> str:
+    """The part of a file barpc/part/... or barpc/module.py."""
+    return path.parts[1] if len(path.parts) > 2 else TOP
+
+
+def parts() -> dict[str, list[str]]:
+    """Every part of barpc -> its tests, those of a folder or those that stand beside the folders."""
+    names = dict.fromkeys(part_of(path.relative_to(ROOT)) for path in sorted((ROOT / "barpc").rglob("*.py")))
+    tests = {name: sorted((ROOT / "tests" / name).glob("test_*.py")) for name in names}
+    tests[TOP] = sorted((ROOT / "tests").glob("test_*.py"))
+    own = Path("tests/test_mutation.py")
+    return {name: [str(p) for path in tests[name] if (p := path.relative_to(ROOT)) != own] for name in names}
+
+
+def mutants(chosen_parts: Iterable[str]) -> list[Mutant]:
+    """All mutants of the modules of some parts, in the order of their places."""
     found = []
-    for path in [*folders, *(ROOT / name for name in GATE if "gate" in parts)]:
-        raw = path.read_bytes()
-        for start, stop, new in Places(raw).walk(ast.parse(raw)):
-            found.append(Mutant(str(path.relative_to(ROOT)), start, stop, new))
+    for path in sorted((ROOT / "barpc").rglob("*.py")):
+        name = path.relative_to(ROOT)
+        if part_of(name) in chosen_parts:
+            raw = path.read_bytes()
+            for start, stop, new in Places(raw).walk(ast.parse(raw)):
+                found.append(Mutant(str(name), start, stop, new))
     return found
 
 
@@ -218,99 +221,116 @@ def changed(mutant: Mutant) -> str:
     return " ".join(row[1:].strip() for row in mutant.diff().splitlines()[1:] if row.startswith("+"))
 
 
-def caught(tree: Path, mutant: Mutant, limit: float) -> tuple[bool, str, float]:
-    """Whether the tests fail with the mutant in a tree; the test that did; seconds."""
-    target = tree / mutant.file
-    before, after = mutant.source()
-    target.write_text(after)
-    try:
-        return _failing(tree, mutant.part, target.stem, limit)
-    finally:
-        target.write_text(before)
+class Tree:
+    """A copy of the working tree, in which tests are run."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root = folder
+        shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*SKIPPED), dirs_exist_ok=True)
+
+    def caught(self, mutant: Mutant, tests: list[str], limit: float) -> tuple[bool, str, float]:
+        """Whether tests fail with the mutant in the tree; the test that did; seconds."""
+        target = self.root / mutant.file
+        before, after = mutant.source()
+        target.write_text(after)
+        named = target.stem.removeprefix("_")
+        try:
+            return self.failing(sorted(tests, key=lambda path: named not in Path(path).name), limit)
+        finally:
+            target.write_text(before)
+
+    def failing(self, tests: list[str], limit: float) -> tuple[bool, str, float]:
+        """Run tests in a forked process, file by file as given, up to the first that fails."""
+        start, log = time.monotonic(), self.root / "log.txt"
+        child = multiprocessing.get_context("fork").Process(target=self._run, args=(log, tests))
+        child.start()
+        child.join(limit)
+        if child.is_alive():
+            os.killpg(child.pid or 0, signal.SIGKILL)
+            child.join()
+            return True, "too slow", limit
+        named = [line for line in log.read_text().splitlines() if line.startswith(("FAILED", "ERROR"))]
+        return child.exitcode != 0, named[0][:160] if named else "", time.monotonic() - start
+
+    def _run(self, log: Path, tests: list[str]) -> None:
+        """The forked process: pytest on the tree's own modules, none of which is imported yet."""
+        os.setsid()
+        os.chdir(self.root)
+        sys.path.insert(0, str(self.root))
+        # code kept of a mutant could be taken for that of the next one: same second, same length
+        sys.dont_write_bytecode = True
+        shared = os.environ.get("BARPC_SHARED", str(ROOT.parent / "shared"))
+        os.environ.update(PYTHONPATH=str(self.root), BARPC_SHARED=shared, PYTHONDONTWRITEBYTECODE="1")
+        with log.open("w") as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+        clock = Clock(self.root / "seconds.json")
+        arguments = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *tests]
+        os._exit(int(pytest.main(arguments, plugins=[clock])))
 
 
-def _failing(tree: Path, part: str, stem: str, limit: float) -> tuple[bool, str, float]:
-    """Run a part's tests in a forked process, those that are named after the module first."""
-    every = sorted(path for pattern in TESTS[part].split() for path in tree.glob(pattern))
-    found = (path for path in every if path.name not in SLOW)
-    paths = sorted(found, key=lambda path: (stem.removeprefix("_") not in path.name, _late(path)))
-    start, log = time.monotonic(), tree / "log.txt"
-    child = multiprocessing.get_context("fork").Process(
-        target=_tests, args=(tree, log, list(map(str, paths)))
-    )
-    child.start()
-    child.join(limit)
-    if child.is_alive():
-        os.killpg(child.pid or 0, signal.SIGKILL)
-        return True, "too slow", limit
-    named = [line for line in log.read_text().splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return child.exitcode != 0, named[0][:160] if named else "", time.monotonic() - start
+class Clock:
+    """Pytest's plugin that writes the seconds of each file of tests."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.seconds: dict[str, float] = {}
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Count the seconds of a test."""
+        name = report.nodeid.partition("::")[0]
+        self.seconds[name] = self.seconds.get(name, 0.0) + report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        """Write them."""
+        self.path.write_text(json.dumps(self.seconds))
 
 
-def _late(path: Path) -> int:
-    """Place among the files that run last; 0 for the others."""
-    name = path.stem.removeprefix("test_")
-    return LATE.index(name) + 1 if name in LATE else 0
-
-
-def _tests(tree: Path, log: Path, paths: list[str]) -> None:
-    """The forked process: pytest on the tree's own modules, none of which is imported yet."""
-    os.setsid()
-    os.chdir(tree)
-    sys.path.insert(0, str(tree))
-    os.environ.update(
-        PYTHONPATH=str(tree), BARPC_SHARED=os.environ.get("BARPC_SHARED", str(ROOT.parent / "shared"))
-    )
-    with log.open("w") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-    os._exit(int(pytest.main(["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *paths])))
-
-
-def copy_tree(folder: Path) -> Path:
-    """The working tree, without its history, in a folder."""
-    for name in ("barpc", "tests", "data_samples", "docs", "examples", "pyproject.toml", "README.md"):
-        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-        copy(ROOT / name, folder / name)
-    return folder
-
-
-def run(picked: list[Mutant], jobs: int, limit: float, sound: bool = True) -> Iterator[dict[str, object]]:
+def run(picked: list[Mutant], jobs: int) -> Iterator[dict[str, object]]:
     """Every mutant's fate, one after the other, as rows of the score."""
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
-        trees: SimpleQueue[Path] = SimpleQueue()
+        trees: SimpleQueue[Tree] = SimpleQueue()
         for i in range(jobs):
-            (Path(temporary) / str(i)).mkdir()
-            trees.put(copy_tree(Path(temporary) / str(i)))
-        for part in dict.fromkeys(mutant.part for mutant in picked if sound):
-            failed, test, seconds = _failing(Path(temporary) / "0", part, "", limit)
+            trees.put(Tree(Path(temporary) / str(i)))
+        tests: dict[str, list[str]] = {}
+        limit: dict[str, float] = {}
+
+        def sound(part: str) -> None:
+            """Refuse tests that fail anyway; the quick ones run first from then on."""
+            tree = trees.get()
+            failed, test, seconds = tree.failing(parts()[part], LONGEST)
             print(f"{part}: {seconds:.0f} s without a mutant", flush=True)
             if failed:
                 raise SystemExit(f"{part}: the tests fail without a mutant: {test}")
+            known = json.loads((tree.root / "seconds.json").read_text())
+            trees.put(tree)
+            tests[part] = sorted(parts()[part], key=lambda path: known.get(path, 0.0))
+            limit[part] = 60.0 + 5.0 * seconds
 
         def one(mutant: Mutant) -> dict[str, object]:
             why = equivalents().get((mutant.file, changed(mutant)))
-            tree = trees.get()
-            found, test, seconds = (False, "", 0.0) if why else caught(tree, mutant, limit)
+            tree, part = trees.get(), mutant.part
+            found, test, seconds = (False, "", 0.0) if why else tree.caught(mutant, tests[part], limit[part])
             trees.put(tree)
             fate = "equivalent" if why else "caught" if found else "SURVIVED"
             print(f"{fate} {seconds:.0f} s {test or why or ''}\n{mutant.diff()}", flush=True)
-            return {"part": mutant.part, "fate": fate, "test": test, "why": why, "diff": mutant.diff()}
+            return {"part": part, "fate": fate, "test": test, "why": why, "diff": mutant.diff()}
 
+        list(pool.map(sound, dict.fromkeys(mutant.part for mutant in picked)))
         yield from pool.map(one, picked)
 
 
 def score(rows: list[dict[str, object]]) -> dict[str, object]:
     """Counts by part, and the share of what is not equivalent that was caught."""
-    parts = {}
-    for part in [*TESTS, "all"]:
+    shares = {}
+    for part in [*dict.fromkeys(str(row["part"]) for row in rows), "all"]:
         fates = [row["fate"] for row in rows if part in ("all", row["part"])]
         counts = {fate: fates.count(fate) for fate in ("caught", "SURVIVED", "equivalent")}
         if fates:
             real = len(fates) - counts["equivalent"]
-            parts[part] = {**counts, "share": round(counts["caught"] / real, 3) if real else None}
+            shares[part] = {**counts, "share": round(counts["caught"] / real, 3) if real else None}
     return {
-        "score": parts,
+        "score": shares,
         "survivors": [row["diff"] for row in rows if row["fate"] == "SURVIVED"],
         "rows": rows,
     }
@@ -322,20 +342,16 @@ def main() -> None:
     )
     parser.add_argument("--sample", type=int, default=60, help="mutants drawn at random")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--part", action="append", choices=[*TESTS], help="part of the core; all by default")
+    parser.add_argument("--part", action="append", choices=[*parts()], help="part of barpc; all by default")
     parser.add_argument("--chosen", action="store_true", help="the listed mutants instead of a sample")
     parser.add_argument("--survivors", type=Path, help="only the survivors of this score, again")
     parser.add_argument("--skip", type=int, default=0, help="leave out so many of the sample's first mutants")
     parser.add_argument("--json", type=Path, help="where the score is written")
     parser.add_argument("--bar", type=float, default=0.0, help="least share that must be caught")
-    parser.add_argument(
-        "--limit", type=float, default=600.0, help="seconds after which a mutant counts as caught"
-    )
-    parser.add_argument("--trust", action="store_true", help="do not run the tests without a mutant first")
     parser.add_argument("-j", type=int, default=1, dest="jobs")
     args = parser.parse_args()
-    parts = args.part or [*TESTS]
-    picked = chosen() if args.chosen else mutants(parts)
+    wanted = args.part or [*parts()]
+    picked = chosen() if args.chosen else mutants(wanted)
     if args.survivors:
         again = set(json.loads(args.survivors.read_text())["survivors"])
         picked = [mutant for mutant in picked if mutant.diff() in again]
@@ -343,7 +359,7 @@ def main() -> None:
         picked = random.Random(args.seed).sample(picked, min(args.sample, len(picked)))[args.skip :]
     rows: list[dict[str, object]] = []
     found = score(rows)
-    for row in run([m for m in picked if m.part in parts], args.jobs, args.limit, not args.trust):
+    for row in run([m for m in picked if m.part in wanted], args.jobs):
         rows.append(row)
         found = score(rows)
         if args.json:

@@ -1,24 +1,23 @@
 """In which order the views of a block are eliminated: nested dissection (George 1973), so that little fills in.
 
-Views are tied to those beside them on the ground: a block is nearly a planar graph. It is cut in two by the fewest
-views that touch all ties across a line, each side is cut again, and what cuts is eliminated after what it parts. The
-factor of a square of n views then has n log n numbers and costs n^1.5 products, that of a strip n of both.
+Views are tied to those beside them on the ground, or to those next in time where all see one place. A block is cut in
+two by the fewest views that touch all ties across a cut, each side is cut again, and what cuts is eliminated after what
+it parts. The factor of a square of n views has n log n numbers then and costs n^1.5 products, that of a strip n of both.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.csgraph import maximum_bipartite_matching
+from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
 LEAF = 32  # views that are not cut any further
-_CUTS = (0.44, 0.5, 0.56)  # part of the views before the line
-_NARROW = 0.7  # of the longer side: a shorter one is not cut across
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +41,9 @@ class Dissection:
 def dissect(pairs: IntArray, place: Array, use: BoolArray) -> Dissection:
     """The order for views tied in `pairs` (M, 2) that stand at `place` (N, 2), those in `use` (N,) only."""
     n = len(place)
-    i, j = pairs[use[pairs].all(axis=1)].astype(np.int32).T
-    ones = np.ones(2 * len(i), dtype=np.int8)
-    graph = sp.csr_array((ones, (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(n, n))
+    (i, j), own = pairs[use[pairs].all(axis=1)].astype(np.int32).T, np.arange(n, dtype=np.int32)
+    ties = np.concatenate([i, j, own]), np.concatenate([j, i, own])
+    graph = sp.csr_array((np.ones(len(ties[0]), dtype=np.int8), ties), shape=(n, n))
     pieces: list[IntArray] = []
     _cut(graph, np.nan_to_num(place), np.flatnonzero(use), pieces)
     rank, owner, at = np.full(n, -1), np.full(n, -1), 0
@@ -60,8 +59,8 @@ def _fronts(graph: sp.csr_array, pieces: list[IntArray], rank: IntArray, owner: 
     below: list[list[IntArray]] = [[] for _ in pieces]
     for number, piece in enumerate(pieces):
         touched = np.concatenate([graph.indices[slice(*graph.indptr[v : v + 2])] for v in piece])
-        near = np.unique(np.concatenate([touched.astype(np.int64), *below[number]]))
-        border = near[rank[near] > rank[piece[-1]]]
+        later = [views[rank[views] > rank[piece[-1]]] for views in (touched, *below[number])]
+        border = np.unique(np.concatenate(later).astype(np.int64))
         border = border[np.argsort(rank[border])]
         parent = int(owner[border[0]]) if len(border) else -1
         if len(border):
@@ -72,35 +71,65 @@ def _fronts(graph: sp.csr_array, pieces: list[IntArray], rank: IntArray, owner: 
 
 def _cut(graph: sp.csr_array, place: Array, views: IntArray, pieces: list[IntArray]) -> None:
     """Append the views (n,) piece by piece: one side, the other, what parts them."""
-    parted = _part(graph, place, views) if len(views) > LEAF else None
-    if parted is None:
-        if len(views):
-            pieces.append(views)
-        return
-    *sides, between = parted
-    for side in sides:
-        _cut(graph, place, side, pieces)
-    if len(between):
-        pieces.append(between)
+    waiting = [(views, False)]
+    while waiting:
+        piece, whole = waiting.pop()
+        parted = None if whole or len(piece) <= LEAF else _part(graph, place, piece)
+        if parted is not None:
+            near, far, between = parted
+            waiting += [(between, True), (far, False), (near, False)]
+        elif len(piece):
+            pieces.append(piece)
 
 
 def _part(graph: sp.csr_array, place: Array, views: IntArray) -> tuple[IntArray, IntArray, IntArray] | None:
-    """Two sides of the views and the fewest between them, of some straight cuts; None where a side has none left."""
+    """Two sides of the views and the fewest between them; None where every cut leaves a side empty."""
+    own = graph[views][:, views]
     at = place[views]
-    extent = at.max(axis=0) - at.min(axis=0)
-    best: tuple[IntArray, IntArray, IntArray] | None = None
-    for axis in np.flatnonzero(extent >= _NARROW * extent.max()):
-        order = views[np.argsort(at[:, axis], kind="stable")]
-        for share in _CUTS:
-            middle = int(share * len(views))
-            near, far = np.sort(order[:middle]), np.sort(order[middle:])
-            between = _touching(graph, near, far)
-            if best is None or len(between) < len(best[2]):
-                along = np.argsort(place[between, 1 - axis], kind="stable")  # neighbours stay neighbours
-                best = near, far, between[along]
-    assert best is not None
-    near, far = (side[~np.isin(side, best[2])] for side in best[:2])
-    return (near, far, best[2]) if len(near) and len(far) else None
+    order, cut = min((_best_cut(own, order) for order in _orders(own, at)), key=lambda found: found[2])[:2]
+    if not cut:
+        return None
+    near, far = np.sort(order[:cut]), np.sort(order[cut:])
+    between = _touching(own, near, far)
+    narrow = int(np.argmin(np.ptp(at, axis=0)))
+    between = between[np.argsort(at[between, narrow], kind="stable")]  # neighbours stay neighbours
+    near, far = np.setdiff1d(near, between), np.setdiff1d(far, between)
+    return views[near], views[far], views[between]
+
+
+def _orders(graph: sp.csr_array, place: Array) -> Iterator[IntArray]:
+    """Orders of n views that a cut may part in two: by their parts, or along the ground and along the ties."""
+    count, part = connected_components(graph, connection="strong")  # ties go both ways
+    if count > 1:
+        yield np.argsort(part, kind="stable")
+        return
+    for axis in range(2):
+        yield np.argsort(place[:, axis], kind="stable")
+    last = 0  # of an order from anywhere: as far as ties reach, or nearly (George and Liu 1979)
+    for _ in range(2):
+        last = breadth_first_order(graph, last, return_predecessors=False)[-1]
+    yield breadth_first_order(graph, last, return_predecessors=False).astype(np.int64)
+
+
+def _best_cut(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, int, float]:
+    """An order, how many of it stand before its best cut (0: none parts it), and what that costs.
+
+    A cut that s views touch from one side, and that leaves a and b, costs s / (a b): few views, and balanced sides.
+    """
+    n = len(order)
+    rank = np.empty(n, dtype=np.int64)
+    rank[order] = np.arange(n)
+    tied = rank[graph.indices]  # each view to itself, too
+    first, last = (ufunc.reduceat(tied, graph.indptr[:-1]) for ufunc in (np.minimum, np.maximum))
+    cut, every = np.arange(1, n), np.arange(n)
+    # touched from before the cut, and from behind it
+    before = np.cumsum(np.bincount(every, minlength=n) - np.bincount(last, minlength=n))[:-1]
+    behind = np.cumsum(np.bincount(first, minlength=n) - np.bincount(every, minlength=n))[:-1]
+    fewest = np.minimum(before, behind)
+    product = np.where(before < behind, (cut - before) * (n - cut), cut * (n - cut - behind))
+    cost = np.where(product > 0, (fewest + 1.0) / np.maximum(product, 1), np.inf)
+    best = int(np.argmin(cost))
+    return order, int(cut[best]) if np.isfinite(cost[best]) else 0, float(cost[best])
 
 
 def _touching(graph: sp.csr_array, near: IntArray, far: IntArray) -> IntArray:
@@ -111,10 +140,9 @@ def _touching(graph: sp.csr_array, near: IntArray, far: IntArray) -> IntArray:
     if not len(rows):
         return np.zeros(0, dtype=np.int64)
     across = sp.csr_array(across[rows][:, cols])
-    of_row = maximum_bipartite_matching(across, perm_type="column")
-    of_col = np.full(len(cols), -1)
-    of_col[of_row[of_row >= 0]] = np.flatnonzero(of_row >= 0)
-    reached, by_tie = of_row < 0, np.zeros(len(cols), dtype=bool)
+    of_col = _matching(across)
+    reached, by_tie = np.ones(len(rows), dtype=bool), np.zeros(len(cols), dtype=bool)
+    reached[of_col[of_col >= 0]] = False
     new = np.flatnonzero(reached)
     while len(new):  # along ties to the far side, along the matching back
         touched = np.unique(across[new].indices)
@@ -124,3 +152,23 @@ def _touching(graph: sp.csr_array, near: IntArray, far: IntArray) -> IntArray:
         new = back[~reached[back]]
         reached[new] = True
     return np.concatenate([near[rows[~reached]], far[cols[by_tie]]])
+
+
+def _matching(across: sp.csr_array) -> IntArray:
+    """The row that each column is matched with, or -1, as many as can be: a flow of one from each row to a column.
+
+    scipy's `maximum_bipartite_matching` takes time exponential in the depth of such graphs (scipy issue 26147).
+    """
+    (rows, cols), ties = across.shape, across.nnz
+    # nodes: the source, rows, columns, the sink
+    indices = np.concatenate([1 + np.arange(rows), 1 + rows + across.indices, np.full(cols, 1 + rows + cols)])
+    starts = np.concatenate([[0], rows + across.indptr, rows + ties + 1 + np.arange(cols), [rows + ties + cols]])
+    size = rows + cols + 2
+    capacity = np.ones(len(indices), dtype=np.int32)
+    pipes = sp.csr_array((capacity, indices.astype(np.int32), starts.astype(np.int32)), shape=(size, size))
+    flow = maximum_flow(sp.csr_matrix(pipes), 0, size - 1).flow
+    back = flow[1 + rows : size - 1, 1 : 1 + rows].tocoo()  # less than nothing flows back along a tie
+    out = np.full(cols, -1)
+    used = back.data < 0
+    out[back.row[used]] = back.col[used]
+    return out

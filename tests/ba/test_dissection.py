@@ -1,0 +1,150 @@
+"""The order of elimination of graphs that adversaries would tie: each is cut at once, and where it can be, well."""
+
+from __future__ import annotations
+
+import signal
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.optimize import linear_sum_assignment
+
+from barpc.ba import dissection
+from barpc.ba.dissection import Dissection, dissect
+
+KINDS = ("ring", "grid", "clique", "star", "two cliques", "time series", "random", "parts", "path of cliques")
+
+
+def _pairs(kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Who is tied to whom, in an order of the views that says nothing."""
+    every = np.stack(np.triu_indices(n, 1), axis=1)
+    i, j = every.T
+    near = int(rng.integers(3, 40))
+    column, row = np.arange(n) % int(np.ceil(np.sqrt(n))), np.arange(n) // int(np.ceil(np.sqrt(n)))
+    tied = {
+        "ring": lambda: (j - i <= near // 4) | (n - (j - i) <= near // 4),
+        "grid": lambda: np.maximum(abs(column[i] - column[j]), abs(row[i] - row[j])) <= 1 + near // 20,
+        "clique": lambda: np.ones(len(i), dtype=bool),
+        "star": lambda: i == 0,
+        "two cliques": lambda: (i < n // 3) == (j < n // 3),
+        "time series": lambda: j - i <= near,
+        "random": lambda: rng.random(len(i)) < near / n,
+        "parts": lambda: (i // 70 == j // 70) & (j - i < near),
+        "path of cliques": lambda: (i // near == j // near) | (j - i == near),
+    }[kind]()
+    if kind == "two cliques":  # 8 ties between them
+        tied[np.flatnonzero((i < n // 3) & (j >= n // 3))[:: n**2 // 30]] = True
+    return np.sort(rng.permutation(n)[every[tied]], axis=1)
+
+
+def _work(order: Dissection) -> int:
+    """Products of blocks that a factor costs."""
+    return sum(len(f.pivots) * (len(f.pivots) + len(f.border)) ** 2 for f in order.fronts)
+
+
+@contextmanager
+def _ends(seconds: int):
+    """A guard against hanging: far above what is needed."""
+
+    def late(*_: object) -> None:
+        raise AssertionError(f"not ended in {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _parts_nothing_that_is_tied(order: Dissection, pairs: np.ndarray, n: int) -> None:
+    assert sorted(np.concatenate([front.pivots for front in order.fronts])) == list(range(n))
+    early, late = np.where(order.rank[pairs[:, 0]] < order.rank[pairs[:, 1]], pairs.T, pairs.T[::-1])
+    known = [set(front.pivots) | set(front.border) for front in order.fronts]
+    assert all(j in known[order.owner[i]] for i, j in zip(early.tolist(), late.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_graphs_of_every_kind_are_cut_soundly(kind) -> None:
+    rng = np.random.default_rng(KINDS.index(kind))
+    n = 300
+    pairs = _pairs(kind, n, rng)
+    place = rng.normal(0, 110, (n, 2)) if kind != "star" else np.zeros((n, 2))
+    with _ends(60):
+        order = dissect(pairs, place, np.ones(n, dtype=bool))
+    _parts_nothing_that_is_tied(order, pairs, n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("kind", KINDS[:8])
+def test_graphs_of_a_hundred_to_three_thousand_views_are_cut_at_once(kind, seed) -> None:
+    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    n = int(rng.integers(100, 3001))
+    pairs = _pairs(kind, n, rng)
+    place = rng.normal(0, 110, (n, 2)) if seed % 3 else np.zeros((n, 2))
+    start = time.process_time()
+    with _ends(120):
+        dissect(pairs, place, np.ones(n, dtype=bool))
+    assert time.process_time() - start < 5.0  # 0.9 at most, alone
+
+
+@pytest.mark.parametrize("spread", [0.0, 110.0])
+def test_views_of_one_place_are_ordered_by_their_ties(spread) -> None:
+    """A series in which each view is tied to its next k needs n (2 k)^2 products or so wherever its views stand."""
+    rng = np.random.default_rng(0)
+    n, k = 1000, 39
+    first = np.repeat(np.arange(n), k)
+    pairs = np.stack([first, first + np.tile(np.arange(1, k + 1), n)], axis=1)
+    pairs = np.sort(rng.permutation(n)[pairs[pairs[:, 1] < n]], axis=1)
+    order = dissect(pairs, rng.normal(0, spread, (n, 2)), np.ones(n, dtype=bool))
+    assert n * k**2 < _work(order) < 3 * n * (2 * k) ** 2
+    assert max(len(front.pivots) + len(front.border) for front in order.fronts) < 6 * k
+
+
+def test_two_cliques_are_parted_between_them_whatever_their_sizes() -> None:
+    n = 240
+    pairs = _pairs("two cliques", n, np.random.default_rng(0))
+    order = dissect(pairs, np.zeros((n, 2)), np.ones(n, dtype=bool))
+    sizes = sorted(len(front.pivots) for front in order.fronts)
+    assert sizes[-1] > 145
+    assert 60 < sizes[-2] <= 80
+
+
+def _layered(levels: int) -> sp.csr_array:
+    """A row may be reached along 2^levels ways, none of which ends at a free column (scipy issue 26147)."""
+    tied = [(2 * d + k, 2 * d + k) for d in range(levels) for k in range(2)]
+    tied += [(2 * d + k, 2 * d + 2 + m) for d in range(levels - 1) for k in range(2) for m in range(2)]
+    beside = 2 * levels  # a chain as long as that, at whose end a column is free
+    tied += [(beside + d, beside + d + m) for d in range(levels) for m in range(2)]
+    top = beside + levels
+    tied += [(top, 0), (top, 1), (top + 1, beside)]
+    row, col = np.array(sorted(tied)).T
+    return sp.csr_array((np.ones(len(row), dtype=np.int8), (row, col)), shape=(top + 2, beside + levels + 1))
+
+
+def _covered(graph: sp.csr_array) -> np.ndarray:
+    """What `_touching` takes, of rows then columns of a bipartite graph."""
+    rows, cols = graph.shape
+    whole = sp.csr_array(sp.block_array([[None, graph], [graph.T, None]]))
+    cover = dissection._touching(whole, np.arange(rows), rows + np.arange(cols))
+    row, col = graph.nonzero()
+    assert (np.isin(row, cover) | np.isin(rows + col, cover)).all()
+    return cover
+
+
+def test_a_cover_ends_where_a_search_that_forgets_would_not() -> None:
+    with _ends(60):
+        assert len(_covered(_layered(60))) == 181  # every column is matched
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_cut_takes_as_few_views_as_any_could(seed) -> None:
+    """König: the fewest rows and columns that touch all ties are as many as ties that share none."""
+    rng = np.random.default_rng(seed)
+    tied = rng.random(rng.integers(3, 30, 2)) < rng.uniform(0.02, 0.5)
+    row, col = linear_sum_assignment(tied, maximize=True)
+    assert len(_covered(sp.csr_array(tied.astype(np.int8)))) == tied[row, col].sum()
