@@ -1,0 +1,46 @@
+"""Which members of a table of cases run before a commit: one of each kind; the rest wait for the slower lanes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import product
+from typing import Any
+
+import pytest
+
+
+def rest_slow(
+    values: Iterable[Any], keep: int = 1, mark: pytest.MarkDecorator = pytest.mark.slow
+) -> list[Any]:
+    """Arguments of `parametrize`: the first `keep` are fast, the others are marked.
+
+    >>> [bool(param.marks) for param in rest_slow("abc")]
+    [False, True, True]
+    """
+    return [_param(value, [mark] if number >= keep else []) for number, value in enumerate(values)]
+
+
+def diagonal(*axes: Iterable[Any], mark: pytest.MarkDecorator = pytest.mark.slow) -> list[Any]:
+    """Arguments of `parametrize` for the product of some axes: fast are as few as show every value once.
+
+    >>> [param.values for param in diagonal("ab", (1, 2, 3)) if not param.marks]
+    [('a', 1), ('b', 2), ('b', 3)]
+    """
+    table = [list(axis) for axis in axes]
+    longest = max(map(len, table))
+    shown = {tuple(min(n, len(axis) - 1) for axis in table) for n in range(longest)}
+    places = product(*(range(len(axis)) for axis in table))
+    return [
+        pytest.param(
+            *(axis[i] for axis, i in zip(table, place, strict=True)), marks=() if place in shown else mark
+        )
+        for place in places
+    ]
+
+
+def _param(value: Any, marks: list[pytest.MarkDecorator]) -> Any:
+    """A value as a param with more marks; one that is a param already keeps its own and its id."""
+    known = pytest.param(value)
+    if isinstance(value, type(known)):
+        return pytest.param(*value.values, marks=[*value.marks, *marks], id=value.id)
+    return pytest.param(value, marks=marks)
