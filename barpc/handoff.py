@@ -52,12 +52,14 @@ class Reading:
     """What one of `CONSUMERS` makes of one file.
 
     `max_error`: largest distance to the model over the grid [px], NaN where it was not read; `note`: why it was not.
+    `rms`: of the distances at the points of a sample [px], where there is one.
     """
 
     path: Path
     consumer: str
     max_error: float
     note: str = ""
+    rms: float = float("nan")
 
     @property
     def passed(self) -> bool:
@@ -156,10 +158,12 @@ def _grid_reading(
     try:
         with warnings.catch_warnings(), _lent(path) as lent:
             warnings.simplefilter("ignore")
-            error = float(np.linalg.norm(sample.sought(partial(off, consumer.open(lent)))[1]))
+            errors, largest = sample.sought(partial(off, consumer.open(lent)))
     except Exception as failure:  # noqa: BLE001 - a foreign reader may raise anything; that is the finding
         return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
-    return Reading(path, name, error, "" if np.isfinite(error) else "it has no finite point")
+    error = float(np.linalg.norm(largest))
+    note = "" if np.isfinite(error) else "it has no finite point"
+    return Reading(path, name, error, note, float(np.linalg.norm(errors.rmse)))
 
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:

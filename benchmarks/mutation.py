@@ -55,7 +55,17 @@ ARITHMETIC = {
     ast.Mod: ("%", "*"), ast.Pow: ("**", "*"), ast.BitAnd: ("&", "|"), ast.BitOr: ("|", "&"),
 }  # fmt: skip
 NO_CODE = {"annotation", "returns", "decorator_list", "type_params", "msg"}
-SILENT = ("_LOG.", "warnings.", "np.errstate", "field(", "TypeVar", "_LISTED", "CHUNK", "logging.")
+SILENT = (
+    b"_LOG.",
+    b"warnings.",
+    b"np.errstate",
+    b"field(",
+    b"TypeVar",
+    b"_LISTED",
+    b"CHUNK",
+    b"logging.",
+    b"logger.",
+)
 
 Change = tuple[int, int, str]
 
@@ -79,12 +89,23 @@ class Mutant:
         raw = (ROOT / self.file).read_bytes()
         return raw.decode(), (raw[: self.start] + self.new.encode() + raw[self.stop :]).decode()
 
+    def lines(self) -> tuple[int, list[str], list[str]]:
+        """Where the lines begin that it changes (from 1), and what stands there before and after."""
+        raw = (ROOT / self.file).read_bytes()
+        first = raw.rfind(b"\n", 0, self.start) + 1
+        last = len(raw) if (end := raw.find(b"\n", self.stop)) < 0 else end
+        after = raw[first : self.start] + self.new.encode() + raw[self.stop : last]
+        return (
+            raw.count(b"\n", 0, first) + 1,
+            raw[first:last].decode().splitlines(),
+            after.decode().splitlines(),
+        )
+
     def diff(self) -> str:
         """The changed lines."""
-        before, after = (text.splitlines() for text in self.source())
-        changed = difflib.unified_diff(before, after, lineterm="", n=0)
-        rows = [row for row in changed if not row.startswith(("---", "+++"))]
-        return "\n".join([f"{self.file} {rows[0]}", *rows[1:]])
+        number, before, after = self.lines()
+        rows = list(difflib.unified_diff(before, after, lineterm="", n=0))
+        return "\n".join([f"{self.file}:{number}", *(row for row in rows[2:] if not row.startswith("@@"))])
 
 
 class Places:
@@ -105,7 +126,7 @@ class Places:
         """All changes below a node, outside of texts, annotations, messages and logging."""
         if isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom | ast.Assert):
             return
-        if isinstance(node, ast.stmt | ast.Call) and self._text(node).startswith(SILENT):
+        if isinstance(node, ast.stmt | ast.Call) and self.raw.startswith(SILENT, self._span(node)[0]):
             return
         yield from getattr(self, f"_{type(node).__name__.lower()}", lambda _: ())(node)
         for name, value in ast.iter_fields(node):
@@ -257,16 +278,20 @@ class Tree:
         os.setsid()
         os.chdir(self.root)
         sys.path.insert(0, str(self.root))
+        for name in [name for name in sys.modules if name.split(".")[0] in ("barpc", "benchmarks", "tests")]:
+            del sys.modules[name]
         # code kept of a mutant could be taken for that of the next one: same second, same length
         sys.dont_write_bytecode = True
         shared = os.environ.get("BARPC_SHARED", str(ROOT.parent / "shared"))
         os.environ.update(PYTHONPATH=str(self.root), BARPC_SHARED=shared, PYTHONDONTWRITEBYTECODE="1")
+        clock = Clock(self.root / "seconds.json")
+        arguments = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *tests]
         with log.open("w") as file:
             os.dup2(file.fileno(), 1)
             os.dup2(file.fileno(), 2)
-        clock = Clock(self.root / "seconds.json")
-        arguments = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *tests]
-        os._exit(int(pytest.main(arguments, plugins=[clock])))
+            sys.stdout = sys.stderr = file
+            found = int(pytest.main(arguments, plugins=[clock]))
+        os._exit(found)
 
 
 class Clock:

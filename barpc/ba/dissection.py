@@ -2,7 +2,7 @@
 
 Views are tied to those beside them on the ground, or to those next in time where all see one place. A block is cut in
 two by the fewest views that touch all ties across a cut, each side is cut again, and what cuts is eliminated after what
-it parts. The factor of a square of n views has n log n numbers then and costs n^1.5 products, that of a strip n of both.
+it parts. The factor of a square of n views then has n log n numbers and costs n^1.5 products; that of a strip, n both.
 """
 
 from __future__ import annotations
@@ -162,11 +162,12 @@ def _matching(across: sp.csr_array) -> IntArray:
     (rows, cols), ties = across.shape, across.nnz
     # nodes: the source, rows, columns, the sink
     indices = np.concatenate([1 + np.arange(rows), 1 + rows + across.indices, np.full(cols, 1 + rows + cols)])
-    starts = np.concatenate([[0], rows + across.indptr, rows + ties + 1 + np.arange(cols), [rows + ties + cols]])
+    to_sink = rows + ties + np.arange(cols + 1)
+    starts = np.concatenate([[0], rows + across.indptr[:-1], to_sink, [rows + ties + cols]])
     size = rows + cols + 2
     capacity = np.ones(len(indices), dtype=np.int32)
     pipes = sp.csr_array((capacity, indices.astype(np.int32), starts.astype(np.int32)), shape=(size, size))
-    flow = maximum_flow(sp.csr_matrix(pipes), 0, size - 1).flow
+    flow = maximum_flow(pipes, 0, size - 1).flow
     back = flow[1 + rows : size - 1, 1 : 1 + rows].tocoo()  # less than nothing flows back along a tie
     out = np.full(cols, -1)
     used = back.data < 0

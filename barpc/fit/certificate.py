@@ -7,7 +7,7 @@ error is largest more are drawn around the worst, closer and closer. Poles are e
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import comb
 
 import numpy as np
@@ -38,6 +38,8 @@ class Errors:
     count: int = 0
     squares: Array = field(default_factory=lambda: np.zeros(2))
     largest: Array = field(default_factory=lambda: np.zeros(2))
+    # (k, 3) col, row [px], altitude [m] of the largest
+    worst: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     def add(self, residual: Array) -> None:
         """Take in residuals (N, 2); one that is NaN makes the result NaN."""
@@ -90,6 +92,16 @@ class Sample:
             model, size, alt_range, points[known], ground[known], int(known[: len(inside)].sum()), 1.0 - share
         )
 
+    def also(self, points: Array) -> Sample:
+        """With more points (M, 3) col, row [px], altitude [m] from which the largest error is looked for."""
+        ground = self.model.localize(points[:, :2], points[:, 2])
+        known = np.isfinite(ground).all(axis=1)
+        return replace(
+            self,
+            points=np.concatenate([self.points, points[known]]),
+            ground=np.concatenate([self.ground, ground[known]]),
+        )
+
     def errors(self, rpc: RPC) -> tuple[Errors, Array]:
         """What an RPC makes of the points all over the image, and its largest errors (2,) [px], found by looking on.
 
@@ -119,6 +131,8 @@ class Sample:
                 np.concatenate([miss, found]),
                 reach * _NEARER,
             )
+        if len(miss):
+            errors.worst = _scaled(unit[miss.argmax(axis=0)], self.size, self.alt_range)
         return errors, miss.max(axis=0, initial=0.0)
 
     @property

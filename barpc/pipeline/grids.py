@@ -19,6 +19,7 @@ from barpc.errors import BarpcError, BarpcWarning, FitError, OutputError, RpcErr
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
+from barpc.geodesy import Array
 from barpc.handoff import verify_grid
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.executor import CachingExecutor
@@ -45,7 +46,9 @@ _GROUP = 8  # tiles that are fitted in one task, whose result is kept
 _BOX = "col", "row", "width", "height"
 
 Written = dict[str, dict[str, float | str]]
-Misses = dict[str, tuple[float, float]]  # file -> RMS and largest distance to the camera that it holds [px]
+Miss = tuple[float, float, Array]
+"""RMS and largest distance to a camera [px], and where that is: (M, 3) col, row [px], altitude [m]."""
+Misses = dict[str, Miss]  # file -> how far it is off the camera that it holds
 Box = tuple[int, int, int, int]
 
 
@@ -110,18 +113,23 @@ def _write(
         try:
             made = ordered(fresh, make_grids, [(*task, str(room)) for task in tasks], "grids", progress)
             for (view, *_), errors in zip(tasks, made, strict=True):
-                for name, (rms, largest) in errors.items():
+                for name in errors:
                     with run.output(name) as partial:
                         (room / view.name / name).replace(partial)
-                    if not largest <= MISFIT:
-                        logger.warning("%s: %.3g px RMS off, up to %.3g px (at steps?)", name, rms, largest)
         finally:
             shutil.rmtree(room, ignore_errors=True)
         again = [
             (view, model, errors, str(run.folder))
             for (view, _, model, _), errors in zip(tasks, made, strict=True)
         ]
-        return ordered(fresh, verify_grids, again, "verify grids", progress)
+        written = ordered(fresh, verify_grids, again, "verify grids", progress)
+    for errors, seen in zip(made, written, strict=True):
+        for name, (rms, largest, _) in errors.items():
+            read = seen[name]["barpc"]
+            worst = max(largest, read) if isinstance(read, float) else largest
+            if not worst <= MISFIT:
+                logger.warning("%s: %.3g px RMS off, up to %.3g px (at steps?)", name, rms, worst)
+    return written
 
 
 def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str) -> Misses:
@@ -145,14 +153,14 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str
     return errors
 
 
-def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, tuple[float, float]]:
-    """An RPC and what it lacks, and RMS and largest distance of both together to the camera of a sample [px].
+def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss]:
+    """An RPC and what it lacks, and how far both together are off the camera of a sample.
 
     What `rpc` lacks may depend on the altitude: the best RPC of all trades denominators, which see altitudes, for what
     changes with the rows. Then another one serves better here, though it misses by more.
     """
     model, size, alts = sample.model, sample.size, sample.alt_range
-    found: list[tuple[float, float, RPC, CorrectionGrid]] = []
+    found: list[tuple[float, float, Array, RPC, CorrectionGrid]] = []
     failed: BarpcError | None = None
     methods: tuple[Literal["vendor-denominators", "ridge"] | None, ...] = None, "vendor-denominators", "ridge"
     for method in methods:
@@ -171,31 +179,35 @@ def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, tuple[
     if not found:
         assert failed is not None
         raise failed
-    rms, largest, best, lacking = min(
+    rms, largest, where, best, lacking = min(
         found, key=lambda row: row[0]
     )  # the largest is a step's, if there is one
-    return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, (rms, largest)
+    return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, (rms, largest, where)
 
 
-def _off(sample: Sample, camera: SensorModel) -> tuple[float, float]:
-    """RMS and largest distance [px] of a camera to the model of a sample."""
+def _off(sample: Sample, camera: SensorModel) -> Miss:
+    """How far a camera is off the model of a sample."""
     errors, largest = sample.sought(lambda ground, at: camera.project(ground) - at[:, :2])
-    return float(np.linalg.norm(errors.rmse)), float(np.linalg.norm(largest))
+    return float(np.linalg.norm(errors.rmse)), float(np.linalg.norm(largest)), errors.worst
 
 
 def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) -> Written:
-    """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads more than their errors."""
-    sample, written = Sample.of(model, view.size, widened(view.alt_range)), Written()
-    for name, (_, error) in errors.items():
+    """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads other errors than theirs.
+
+    Compared is what both see at the same points. Between them a step is narrow: who looks for it finds it or not.
+    """
+    every, written = Sample.of(model, view.size, widened(view.alt_range)), Written()
+    for name, (rms, _, where) in errors.items():
+        sample = every.also(where)  # what was seen as it was written is seen again
         path, lacking = Path(folder) / name, None
         if name.endswith(RESAMPLED):
             lacking = read_correction(Path(folder) / (view.name + CORRECTION))[1]
         readings = verify_grid(path, sample, lacking)
         for reading in readings:
-            if reading.consumer in ("barpc", "gdal") and not reading.max_error <= 2 * error + REOPENED:
+            if reading.consumer in ("barpc", "gdal") and not abs(reading.rms - rms) <= REOPENED:
                 raise OutputError(
-                    f"{path}: {reading.consumer} reads it {reading.max_error:.3g} px off ({reading.note}); "
-                    "is the disk full, or another RPC file beside it?"
+                    f"{path}: {reading.consumer} reads it {reading.rms:.3g} px RMS off, not {rms:.3g}"
+                    f"{f' ({reading.note})' if reading.note else ''}; is the disk full, or another RPC file beside it?"
                 )
         written[name] = {one.consumer: one.note or one.max_error for one in readings}
     return written
