@@ -39,6 +39,7 @@ from barpc.atomic import PARTIAL, STATE, replacing
 from barpc.errors import BarpcError, OutputError
 from barpc.frozen import Arrays, load_npz
 from barpc.remote import Remote
+from barpc.sidefile import IMAGE, opened
 
 logger = logging.getLogger(__name__)
 
@@ -72,10 +73,9 @@ def fingerprint(path: str | Path) -> str:
     """
     if isinstance(path, Remote):
         return hashlib.sha256(f"{path} {path.size} {path.tag}".encode()).hexdigest()
-    path = Path(path)
-    found = path.stat()
-    digest = hashlib.sha256(str(found.st_size).encode())
-    with path.open("rb") as file:
+    with opened(path, IMAGE) as file:  # a pipe or a device would never end
+        found = os.fstat(file.fileno())
+        digest = hashlib.sha256(str(found.st_size).encode())
         if found.st_size <= _WHOLE_FILE:
             while block := file.read(_SAMPLE):
                 digest.update(block)
