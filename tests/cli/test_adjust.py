@@ -116,6 +116,7 @@ def test_check_shows_the_same_residuals_and_writes_nothing(crops, finished):
     assert abs(json.loads(out)["pairs"][0]["epipolar_before"]["median"]) < 0.03
 
 
+@pytest.mark.slow
 def test_images_can_be_copied_or_left_out_and_formats_chosen(crops, finished, tmp_path):
     for name in "ab":
         shutil.copytree(finished[0] / ".barpc/cache", tmp_path / name / ".barpc/cache")
@@ -133,6 +134,7 @@ def test_images_can_be_copied_or_left_out_and_formats_chosen(crops, finished, tm
     assert_refused(code, out, err, tmp_path / "c", "doc", "txt, rpb", exit_code=2)
 
 
+@pytest.mark.slow
 def test_an_existing_folder_needs_overwrite(crops, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/notes.txt").write_text("mine")
@@ -220,6 +222,7 @@ def test_images_that_show_nothing_in_common(crops, tmp_path, what):
     assert_refused(*result, tmp_path / "o", "view_00", "blank", "keypoints", kept=what == "noise")
 
 
+@pytest.mark.slow
 def test_a_bad_file_among_good_ones_is_left_out_with_keep_going(crops, tmp_path):
     (tmp_path / "bad.tif").write_text("hello")
     code, out, err = barpc("adjust", *crops, tmp_path / "bad.tif", "-o", tmp_path / "o", "--keep-going")
@@ -229,6 +232,7 @@ def test_a_bad_file_among_good_ones_is_left_out_with_keep_going(crops, tmp_path)
     assert (tmp_path / "o/view_00.vrt").exists()
 
 
+@pytest.mark.slow
 def test_options_from_a_file_and_flags_that_win(crops, finished, tmp_path):
     for name in "ab":
         shutil.copytree(finished[0] / ".barpc/cache", tmp_path / name / ".barpc/cache")
@@ -329,6 +333,7 @@ def test_check_compares_with_other_cameras(crops, finished, tmp_path):
     assert "view_00.vrt" in err
 
 
+@pytest.mark.slow
 def test_adjusted_images_can_be_adjusted_again(crops, finished, tmp_path):
     code, out, err = barpc("adjust", *sorted(finished[0].glob("*.vrt")), "-o", tmp_path / "two", "--json")
     assert code == 0, err

@@ -69,6 +69,7 @@ def test_a_file_left_out_ends_with_3(pristine, tmp_path):  # noqa: F811
     assert json.loads(said.out)["status"] == "bad"
 
 
+@pytest.mark.slow
 def test_a_fit_that_misses_its_tolerance_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
     (tmp_path / "o.toml").write_text("[fit]\ntolerance = 1e-15\n")
     given = ("adjust", *pristine, "--matches", ties, "--matches-only", "--options", tmp_path / "o.toml", "-o")

@@ -177,6 +177,7 @@ def test_a_localisation_rpc_is_written_where_the_file_holds_it(
     assert "holds no localisation RPC" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_of_a_radar_swath_all_ground_on_earth_is_held_to_five_thousandths_of_a_pixel(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

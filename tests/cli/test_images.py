@@ -299,6 +299,7 @@ def bare(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_writes_the_corrected_configuration(bare, capsys):
     out = bare / "run"
     assert run("-q", "adjust", "--from", "s2p", bare / "config.json", "-o", out) == 0
@@ -322,3 +323,164 @@ def test_a_run_writes_the_corrected_configuration(bare, capsys):
 def test_a_refused_camera_is_no_traceback(folder):
     with pytest.raises(BarpcError):
         read_config("s2p", str(folder / "none.json"))
+
+
+# --- names and configurations, one branch after the other -------------------------------------------------
+
+
+def test_an_empty_name_is_refused_and_a_point_is_the_folder(folder, monkeypatch):
+    with pytest.raises(InputError, match="an empty name among the images"):
+        expanded(["a.tif", ""])
+    monkeypatch.chdir(folder / "images")
+    assert expanded(["."]) == ["img 1.tif", "img 2.tif"]
+    assert expanded(["./img*1.tif"]) == ["./img 1.tif"]
+
+
+@pytest.mark.parametrize(
+    ("spec", "found"),
+    [
+        ("{f}/img*1.tif,band=2,size=3:4", "{f}/img 1.tif,band=2,size=3:4"),
+        ("{f}/none.tif,band=2", "{f}/none.tif,band=2"),
+        ("{f}/img 1.tif,band=2", "{f}/img 1.tif,band=2"),
+        ("https://host/x[1].tif,band=2", "https://host/x[1].tif,band=2"),
+    ],
+)
+def test_choices_stay_behind_what_a_pattern_finds(spec, found, folder):
+    f = folder / "images"
+    assert expanded([spec.format(f=f)]) == [found.format(f=f)]
+
+
+@pytest.mark.parametrize("name", ["S1A.SAFE", "s1a.safe"])
+def test_a_product_is_known_by_its_folder_s_name_and_never_by_a_raster_in_it(name, folder):
+    product = folder / name
+    product.mkdir()
+    shutil.copy(folder / "images" / "img 1.tif", product / "a.tiff")
+    assert expanded([str(product)]) == [str(product)]
+
+
+def test_a_folder_says_by_which_ends_images_are_known(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"x")
+    (tmp_path / "deep.tif").mkdir()
+    with pytest.raises(InputError) as error:
+        expanded([str(tmp_path)])
+    ends = ".tif, .tiff, .ntf, .nitf, .nsf, .jp2, .j2k, .vrt"
+    assert str(error.value) == f"{tmp_path}: a folder without images ({ends})"
+    write_image(tmp_path / "B.TIF")
+    assert expanded([str(tmp_path)]) == [str(tmp_path / "B.TIF")]
+
+
+def test_a_camera_on_the_web_is_taken_as_named(folder):
+    image = f"{folder}/images/img 1.tif"
+    assert with_cameras([image], ["img 1=https://h/a.RPB"]) == [f"{image},camera=https://h/a.RPB"]
+    assert with_cameras(["https://h/a.tif"], ["a=b.RPB"]) == ["https://h/a.tif,camera=b.RPB"]
+    assert with_cameras([f"{image},band=2"], ["img 1=b.RPB"]) == [f"{image},band=2,camera=b.RPB"]
+    assert with_cameras([image], []) == [image]
+
+
+def listed(tool, folder, data, name="config.json"):
+    (folder / name).write_text(json.dumps(data))
+    return [(item.image, item.camera) for item in read_config(tool, str(folder / name)).items]
+
+
+@pytest.mark.parametrize("rpc", [{}, {"rpc": None}, {"rpc": ""}])
+def test_s2p_may_leave_the_camera_to_the_image(rpc, folder):
+    assert listed("s2p", folder, {"images": [{"img": "a.tif", **rpc}]}) == [(f"{folder}/a.tif", None)]
+    config = read_config("s2p", str(folder / "config.json"))
+    assert config.images() == [f"{folder}/a.tif"]
+
+
+def test_names_on_the_web_and_absolute_ones_stay(folder):
+    data = {"images": [{"img": "https://h/a.tif", "rpc": "/b.RPB"}, {"img": "/c.tif", "rpc": {"row_num": 1}}]}
+    assert listed("s2p", folder, data) == [("https://h/a.tif", "/b.RPB"), ("/c.tif", {"row_num": 1})]
+
+
+@pytest.mark.parametrize("key", ["input", "inputs"])
+def test_cars_spells_an_image_in_three_ways(key, folder):
+    sensors = {
+        "one": "a.tif",
+        "two": {"image": {"main_file": "b.tif", "bands": {}}},
+        "three": {"image": {"bands": {"x": {"path": "c.tif"}, "y": {"path": "d.tif"}}}, "geomodel": "c.geom"},
+        "four": {"image": "e.tif", "geomodel": {"path": "e.geom"}},
+    }
+    assert listed("cars", folder, {key: {"sensors": sensors}}) == [
+        (f"{folder}/a.tif", None),
+        (f"{folder}/b.tif", None),
+        (f"{folder}/c.tif", f"{folder}/c.geom"),
+        (f"{folder}/e.tif", f"{folder}/e.geom"),
+    ]
+
+
+@pytest.mark.parametrize("source", [{}, {"rpc_src": "geotiff", "rpc_dir": "nowhere"}])
+def test_sat_bundleadjust_may_find_rpcs_in_the_images(source, folder):
+    found = listed("sat-bundleadjust", folder, {"geotiff_dir": "images", **source})
+    assert found == [(f"{folder}/images/img {n}.tif", None) for n in (1, 2)]
+
+
+def test_an_error_of_a_file_that_a_configuration_names_keeps_its_words(folder):
+    with pytest.raises(InputError) as error:
+        listed("sat-bundleadjust", folder, {"geotiff_dir": "cams"})
+    assert str(error.value).startswith(f"{folder / 'cams'}: a folder without images")
+    with pytest.raises(
+        InputError, match=r"config\.json: not a configuration of s2p \(KeyError\('images'\)\)"
+    ):
+        listed("s2p", folder, {})
+    with pytest.raises(InputError, match="it lists no images"):
+        listed("s2p", folder, {"images": []})
+    (folder / "config.json").write_text("{,}")
+    with pytest.raises(InputError, match=r"config\.json: not JSON that can be read"):
+        read_config("s2p", str(folder / "config.json"))
+
+
+def written_back(folder, data, tool="s2p", name="config.json", views=None):
+    (folder / name).write_text(json.dumps(data))
+    run_folder = folder / "a" / "run"
+    run_folder.mkdir(parents=True, exist_ok=True)
+    config = read_config(tool, str(folder / name))
+    views = views or [View("v", "", (60, 40), make_rpc(), (0.0, 1.0))] * len(config.items)
+    return json.loads(corrected(config, run_folder, views))
+
+
+def test_names_of_files_that_are_there_hold_from_the_new_folder(folder):
+    data = {
+        "images": [{"img": "images/img 1.tif"}],
+        "there": ["cams/rpc_1.RPB", {"deep": "cams"}],
+        "other": ["cams/none.RPB", ".", "..", "", "a\0b", str(folder / "cams"), 1, 1.5, None, True],
+    }
+    found = written_back(folder, data)
+    assert found["images"][0]["img"] == "../../images/img 1.tif"
+    assert found["there"] == ["../../cams/rpc_1.RPB", {"deep": "../../cams"}]
+    assert found["other"] == data["other"]
+
+
+@pytest.mark.parametrize(("depth", "ok"), [(38, True), (39, True), (40, False)])
+def test_a_configuration_is_at_most_forty_deep(depth, ok, folder):
+    deep: object = 1
+    for _ in range(depth):
+        deep = [deep]
+    data = {"images": [{"img": "images/img 1.tif"}], "deep": deep}
+    if ok:
+        assert written_back(folder, data)["deep"] == deep
+    else:
+        with pytest.raises(InputError, match="nested more than 40 deep"):
+            written_back(folder, data)
+
+
+@pytest.mark.parametrize(
+    ("end", "image"), [(".vrt", "v.vrt"), (".tif", "v.tif"), ("", "../../images/img 1.tif")]
+)
+def test_cars_gets_the_image_that_the_run_wrote(end, image, folder):
+    (folder / "a" / "run").mkdir(parents=True)
+    if end:
+        (folder / "a" / "run" / f"v{end}").touch()
+    found = written_back(folder, {"input": {"sensors": {"one": "images/img 1.tif"}}}, "cars")
+    assert found["input"]["sensors"]["one"] == {
+        "image": image,
+        "geomodel": {"path": "v.geom", "model_type": "RPC"},
+    }
+
+
+def test_an_rpc_within_s2p_is_a_view_with_its_altitudes(folder):
+    first, second = read_config("s2p", str(s2p(folder))).images()
+    assert isinstance(first, str)
+    assert (second.name, second.path) == ("img 2", f"{folder}/images/img 2.tif")
+    assert second.alt_range == pytest.approx((166.6667 - 142.8571, 166.6667 + 142.8571), abs=1e-3)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.cameras import open_camera
-from barpc.cli.terrain import altitude_of
+from barpc.cameras import Camera, open_camera
+from barpc.cli.terrain import altitude_of, exchanged
 from barpc.rpcio import read_rpc, write_rpc_copy
 from tests.cli.test_images import run
 from tests.report.conftest import run_of_block, written
@@ -172,3 +172,66 @@ def test_what_a_box_loses_at_the_border_is_said(image, tmp_path, capsys):
     assert run("convert", image, tmp_path / "b.tif", "--alt", 100, "--bbox", *box) == 0
     share = float(capsys.readouterr().err.split("image; ")[1].split(" %")[0])
     assert 40 < share < 60
+
+
+class Map:
+    """100 columns a degree from 10 E, 100 rows a degree from 50 N southwards; 5 px for 100 m."""
+
+    def __init__(self) -> None:
+        self.asked = []
+
+    def localize(self, image, alt):
+        self.asked.append((image.tolist(), float(alt)))
+        return np.array([11.0, 49.5, alt])
+
+    def project(self, ground):
+        return np.stack([(ground[..., 0] - 10) * 100, (50 - ground[..., 1]) * 100], axis=-1)
+
+    def project_jacobian(self, ground):
+        return self.project(ground), np.array([[1.0, 2.0, 0.03], [3.0, 4.0, -0.04]])
+
+
+def a_map(**changes) -> Camera:
+    usual = {
+        "model": Map(),
+        "path": Path("map"),
+        "format": "rpb",
+        "size": (200, 100),
+        "alt_range": (0.0, 50.0),
+    }
+    return Camera(**{**usual, **changes})
+
+
+def test_what_an_unknown_altitude_is_worth_is_measured_in_the_middle(capsys):
+    camera = a_map()
+    assert altitude_of(camera, Path("map.tif")) == 25.0
+    told = "barpc: map.tif: its ground is taken at 25 m, the middle of its altitudes"
+    assert capsys.readouterr().err == f"{told}: 100 m more or less are 5 px; give --alt or --dem\n"
+    assert camera.model.asked == [([99.5, 49.5], 25.0)]
+    assert altitude_of(a_map(size=None), Path("map.tif")) == 25.0
+    assert capsys.readouterr().err == f"{told}; give --alt or --dem\n"
+    assert altitude_of(camera, Path("map.tif"), 0.0) == 0.0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "near"),
+    [
+        (11.0, 49.5, True),
+        (8.01, 49.5, True),
+        (7.99, 49.5, False),
+        (13.99, 49.5, True),
+        (14.01, 49.5, False),
+        (11.0, 50.99, True),
+        (11.0, 51.01, False),
+        (11.0, 48.01, True),
+        (11.0, 47.99, False),
+    ],
+)
+def test_coordinates_are_exchanged_where_only_the_other_order_is_near_the_image(lon, lat, near):
+    point = np.array([[lat, lon, 0.0]])
+    assert bool(exchanged(a_map(), point)) == near
+    assert exchanged(a_map(), point[:, [1, 0, 2]]) == ""
+    assert exchanged(a_map(), np.vstack([point, [[11.0, 49.5, 0.0]]])) == ""  # one is on the image
+    assert exchanged(a_map(size=None), point) == ""
+    assert exchanged(a_map(), point[:0]) == ""

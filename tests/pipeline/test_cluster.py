@@ -10,6 +10,7 @@ from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -19,8 +20,13 @@ from barpc.options import RunOptions, TieOptions
 from barpc.pipeline import cluster
 from barpc.pipeline.executor import run_batch
 
-distributed = pytest.importorskip("distributed")
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
+
+
+@pytest.fixture
+def distributed() -> Any:
+    """Only real workers ask for it."""
+    return pytest.importorskip("distributed")
 
 
 class Counted:
@@ -112,7 +118,7 @@ def test_a_worker_that_comes_later_with_another_version_works_on_nothing() -> No
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_the_version_of_real_workers_is_asked_for(tmp_path: Path) -> None:
+def test_the_version_of_real_workers_is_asked_for(distributed: Any, tmp_path: Path) -> None:
     folder = tmp_path / "barpc-9.9.dist-info"
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: barpc\nVersion: 9.9\n")
@@ -136,7 +142,7 @@ def test_the_last_worker_is_said_within_ten_seconds_and_then_once_a_minute() -> 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_workers_close_and_come_during_a_run_and_the_bytes_are_the_same(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    distributed: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "POLL", 0.2)
     caplog.set_level(logging.WARNING)
@@ -171,3 +177,104 @@ def test_workers_close_and_come_during_a_run_and_the_bytes_are_the_same(
     assert any("worker(s), after" in line for line in lines)
     for name in ("view_00_RPC.TXT", "view_01_RPC.TXT", "observations.csv", "block.npz"):
         assert (tmp_path / "dask_run" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
+
+
+# --- the watch, by a clock of its own ----------------------------------------------------------------------
+
+
+class Clock:
+    """Time that goes on by POLL with each wait, and an end after so many of them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, polls: int) -> None:
+        self.now, self.left = 1000.0, polls
+        monkeypatch.setattr(cluster, "time", SimpleNamespace(monotonic=lambda: self.now))
+
+    def wait(self, seconds: float) -> bool:
+        self.now += seconds
+        self.left -= 1
+        return self.left < 0
+
+
+@pytest.mark.parametrize(
+    ("numbers", "waits", "said"),
+    [
+        ([1] * 9, True, []),
+        ([0] * 13, True, ["has had no worker for 5 s", "has had no worker for 65 s"]),
+        ([0] * 12, True, ["has had no worker for 5 s"]),
+        ([1, 1, 0, 0, 3, 3], True, ["has had no worker for 5 s", "has 3 worker(s), after 15 s without"]),
+        ([1, None, None, 2], True, ["has not answered for 5 s", "has 2 worker(s), after 15 s without"]),
+        ([0] * 20, False, []),
+        ([None] * 2, False, ["has not answered for 5 s"]),
+        ([1, 0, 1, 0, 1], True, ["has had no worker for 5 s", "has 1 worker(s), after 10 s without"] * 2),
+    ],
+)  # fmt: skip
+def test_what_is_said_of_workers_and_when(monkeypatch, caplog, numbers, waits, said) -> None:
+    """Workers are counted every 5 s; the seconds without any count from when there was one for the last time."""
+    cluster._watch(Counted(*numbers, waits=waits), Clock(monkeypatch, len(numbers)))
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == [
+        f"the cluster {line}" for line in said
+    ]
+    waiting = [record.getMessage() for record in caplog.records if ":" in record.getMessage()]
+    assert all(line.endswith("Ctrl-C ends the run and the same command goes on with it") for line in waiting)
+
+
+def test_an_end_of_work_ends_the_reminders(monkeypatch, caplog) -> None:
+    """While nothing is waited for there need be no worker, and that there was none before is not said of a new one."""
+    client, clock = Counted(0), Clock(monkeypatch, 6)
+    real = clock.wait
+
+    def wait(seconds: float) -> bool:
+        if clock.left == 4:
+            client.futures.clear()
+        if clock.left == 2:
+            client.numbers = [1]
+        return real(seconds)
+
+    clock.wait = wait  # type: ignore[method-assign]
+    cluster._watch(client, clock)
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == [
+        "the cluster has had no worker for 5 s"
+    ]
+
+
+def test_workers_of_a_scheduler_that_is_gone_are_not_known() -> None:
+    client = Counted(2)
+    assert cluster._workers(client) == 2
+    assert cluster._workers(Counted(0)) == 0
+    assert cluster._workers(Counted(None)) is None
+    client.status = "closed"
+    assert cluster._workers(client) is None
+    assert cluster._waits(Counted(1))
+    assert not cluster._waits(Counted(1, waits=False))
+
+
+def test_the_watch_begins_with_the_work_and_ends_with_it(monkeypatch) -> None:
+    ends: list[threading.Event] = []
+    begun = threading.Event()
+
+    def watch(client, end) -> None:
+        ends.append(end)
+        assert threading.current_thread().daemon  # it holds nobody up who leaves
+        begun.set()
+
+    monkeypatch.setattr(cluster, "_watch", watch)
+    with pytest.raises(KeyError), cluster.watched(Works(Counted(1))):  # type: ignore[arg-type]
+        assert begun.wait(60.0)
+        assert not ends[0].is_set()
+        raise KeyError
+    assert ends[0].is_set()
+    assert len(ends) == 1
+
+
+def test_where_barpc_is_not_installed_there_is_nothing_to_compare_with(monkeypatch) -> None:
+    def missing(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    client = Mixed("0.0.9")
+    with monkeypatch.context() as patch:
+        known = {"version": missing, "PackageNotFoundError": metadata.PackageNotFoundError}
+        patch.setattr(cluster, "metadata", SimpleNamespace(**known))
+        cluster._require_own_version(client)
+    with pytest.raises(InputError, match=r"has barpc 0\.0\.9"):
+        cluster._require_own_version(client)
+    cluster._require_own_version(Mixed(metadata.version("barpc")))

@@ -10,6 +10,7 @@ import pytest
 
 from barpc.errors import InputError
 from barpc.options import RunOptions, TieOptions
+from barpc.pipeline import control
 from barpc.pipeline.control import load_gcps
 from barpc.pointio.ground import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.scene import GroundPoints, View
@@ -288,3 +289,176 @@ def test_several_files_are_one_and_each_is_left_out_alone(tmp_path):
     np.testing.assert_array_equal(
         found.lonlatalt[found.point], np.tile(POINTS.lonlatalt, (2, 1))[found.point]
     )
+
+
+# --- its parts ---------------------------------------------------------------------------------------------
+
+
+def test_without_files_there_are_no_points() -> None:
+    assert load_gcps([], VIEWS, RunOptions()) is None
+
+
+def test_ten_names_are_listed_and_the_others_counted() -> None:
+    names = [f"g{n}" for n in range(13)]
+    ten = ", ".join(names[:10])
+    assert [control._listed(names[:count]) for count in (1, 2, 10)] == ["g0", "g0, g1", ten]
+    assert [control._listed(names[:count]) for count in (11, 13)] == [f"{ten} and {n} more" for n in (1, 3)]
+
+
+class Plain:
+    """A camera that looks straight down: column and row are hundredths of a degree; the pixel is said by its row."""
+
+    def localize(self, image, alt):
+        return np.column_stack([np.asarray(image) / 100.0, alt])
+
+
+def made(*rows: tuple[int, int, float, float], lonlatalt) -> GroundPoints:
+    """Points with observations: point, view, column, row."""
+    place = np.array(lonlatalt, dtype=float).reshape(-1, 3)
+    point, view, xy = [row[0] for row in rows], [row[1] for row in rows], [row[2:] for row in rows]
+    names = tuple(f"g{n}" for n in range(len(place)))
+    return GroundPoints(names, place, np.ones((len(place), 3)), point, view, xy, np.ones(len(rows)))
+
+
+def flat(count: int = 2) -> tuple[View, ...]:
+    ends = [(0.0, 300.0), (1000.0, 2000.0)]
+    return tuple(View(f"v{n}", f"v{n}.tif", (9000, 9000), Plain(), ends[n]) for n in range(count))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def pixel(monkeypatch):
+    """Ground sample distances of `Plain`: a metre."""
+    monkeypatch.setattr(
+        control, "ground_sample_distance", lambda sensor, ground: (None, np.ones(len(ground)))
+    )
+
+
+def told(points: GroundPoints, search: float = 1.0, views=None) -> list[tuple[list[int], str]]:
+    """Which points cannot be meant, and how the reason begins; reasons of none are left out."""
+    found = control._implausible(points, views or flat(), search)
+    return [(np.flatnonzero(wrong).tolist(), what) for wrong, what in found if wrong.any()]
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "says"),
+    [
+        (30.0, 40.0, ""), (40.0, 30.0, "longitude and latitude are exchanged"),
+        (-40.0, 30.0, "as far as"), (-30.0, 40.0, "the sign"), (30.0, -40.0, "the sign"), (-30.0, -40.0, "the sign"),
+        (40.0, -30.0, "as far as"), (31.0, 40.0, "as far as"),
+    ],
+)  # fmt: skip
+def test_each_mistake_is_recognised_by_itself(pixel, lon, lat, says) -> None:
+    """The image shows 30 east, 40 north."""
+    found = told(made((0, 0, 3000.0, 4000.0), lonlatalt=[lon, lat, 10.0]))
+    assert [which for which, _ in found] == ([[0]] if says else [])
+    assert not says or found[0][1].startswith(says)
+
+
+def test_a_point_is_told_by_any_of_its_images_and_how_far_is_the_farthest_of_them(pixel) -> None:
+    """A degree of longitude is 109.6 km at ten degrees north, of latitude 110.6."""
+    points = made(
+        (0, 0, 30e2, 10e2), (0, 1, 32e2, 10e2), (1, 0, 33e2, 10e2), (1, 1, 33e2, 10e2), (2, 1, 30e2, 11e2),
+        lonlatalt=[[30, 10, 100], [33, 10, 100], [30, 10, 1500]],
+    )  # fmt: skip
+    ((which, what),) = [row for row in told(points) if row[1].startswith("as far as")]
+    assert which == [0, 2]
+    assert what == "as far as 219 km from where the images show it, by their cameras"
+
+
+def test_beyond_a_pole_there_is_no_ground_however_near_it_would_be(pixel) -> None:
+    """90.001 north is 111 m from the pole, nearer than a camera is wrong by."""
+    for lat, wrong in ((90.0, False), (90.001, True)):
+        found = told(made((0, 0, 0.0, 9000.0), lonlatalt=[0.0, lat, 10.0]))
+        assert bool(found) == wrong
+
+
+@pytest.mark.parametrize(
+    ("view", "alt", "fine"),
+    [
+        (0, -500.0, True), (0, -501.0, False), (0, 800.0, True), (0, 801.0, False),
+        (1, 500.0, True), (1, 499.0, False), (1, 2500.0, True), (1, 2501.0, False),
+    ],
+)  # fmt: skip
+def test_altitudes_belong_to_the_image_that_shows_the_point(pixel, view, alt, fine) -> None:
+    points = made((0, 0, 0.0, 0.0), (1, view, 100.0, 100.0), lonlatalt=[[0, 0, 100.0], [1, 1, alt]])
+    ends = "0 to 300 m" if view == 0 else "0 to 2000 m"
+    says = f"altitudes far outside {ends}, where the cameras are used: metres above the ellipsoid are needed"
+    assert told(points) == ([] if fine else [([1], says)])
+
+
+def test_points_are_sought_at_the_altitude_of_the_camera_that_is_nearest_theirs(pixel) -> None:
+    """At an altitude beyond the camera's, height makes no distance."""
+    points = made((0, 0, 0.0, 0.0), (1, 1, 0.0, 0.0), lonlatalt=[[0, 0, 790.0], [0, 0, 510.0]])
+    assert told(points) == []
+    seen: list[float] = []
+
+    class Asked(Plain):
+        def localize(self, image, alt):
+            seen.extend(alt.tolist())
+            return super().localize(image, alt)
+
+    told(points, views=[replace(view, sensor=Asked()) for view in flat()])
+    assert seen == [300.0, 1000.0]
+
+
+@pytest.mark.parametrize(("search", "reach"), [(1.0, 1000.0), (499.0, 1000.0), (3000.0, 6000.0)])
+def test_the_reach_is_that_of_pixels_on_the_ground_or_a_kilometre(monkeypatch, search, reach) -> None:
+    sizes = lambda sensor, ground: (None, np.full(len(ground), 2.0))  # noqa: E731
+    monkeypatch.setattr(control, "ground_sample_distance", sizes)
+    degree = 110574.0  # m of latitude at the equator
+    for share, fine in ((0.99, True), (1.01, False)):
+        points = made((0, 0, 0.0, 0.0), lonlatalt=[0.0, share * reach / degree, 0.0])
+        assert (told(points, search) == []) == fine
+
+
+def test_each_image_is_asked_for_its_own_observations(monkeypatch) -> None:
+    monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, 10.0 * ground[:, 0]))
+    points = made((0, 1, 300.0, 1.0), (1, 0, 100.0, 2.0), (0, 0, 200.0, 3.0), lonlatalt=np.zeros((2, 3)))
+    ground, pixel = control._shown(points, flat(), np.array([5.0, 6.0, 7.0]))
+    np.testing.assert_allclose(ground, [[3.0, 0.01, 5.0], [1.0, 0.02, 6.0], [2.0, 0.03, 7.0]])
+    np.testing.assert_allclose(pixel, [30.0, 10.0, 20.0])
+    monkeypatch.setattr(
+        control, "ground_sample_distance", lambda sensor, ground: (None, np.full(len(ground), np.nan))
+    )
+    assert control._shown(points, flat(), np.zeros(3))[1].tolist() == [0.0] * 3
+
+
+def test_several_faults_are_several_lines_and_a_point_has_the_first_that_fits(tmp_path) -> None:
+    """Of the file: exchanged (0, 1), too high (2), and an image that is none; of a run that goes on all are told."""
+    place = POINTS.lonlatalt.copy()
+    place[[0, 1]] = place[[0, 1]][:, [1, 0, 2]]
+    place[1, 2] = place[2, 2] = 9000.0
+    text = asp(replace(POINTS, lonlatalt=place)).replace(f"/{VIEWS[2].name}.tif", "/else.tif")
+    path = tmp_path / "p.gcp"
+    found = load(path, text, keep_going=True)
+    assert found.names == POINTS.names[3:]
+    first, second, third = found.left_out
+    assert first.startswith(f"{path}: 2 of 6 points (gcp_000, gcp_001): longitude and latitude are exchanged")
+    assert second.startswith(f"{path}: point gcp_002: altitudes far outside")
+    assert third == f"{path}: it names images that are not in this run: /some/where/else.tif; left out"
+    assert first.endswith("; left out")
+    with pytest.raises(InputError, match=r"exchanged.*; correct it, or leave it out with --keep-going$"):
+        load(path, text)
+
+
+def test_of_several_files_each_observation_keeps_its_point_and_strangers_are_named_once(tmp_path) -> None:
+    paths = [tmp_path / name for name in ("a.gcp", "b.gcp", "c.gcp")]
+    for n, path in enumerate(paths):
+        some = POINTS.select(np.arange(6) % 3 == n)
+        path.write_text(asp(some).replace(f"/{VIEWS[2].name}.tif", "/else.tif"))
+    found = load_gcps([str(path) for path in paths], VIEWS, RunOptions(keep_going=True))
+    assert found is not None
+    order = [0, 3, 1, 4, 2, 5]
+    assert found.names == tuple(POINTS.names[g] for g in order)
+    np.testing.assert_array_equal(found.lonlatalt, POINTS.lonlatalt[order])
+    np.testing.assert_array_equal(found.sigma, POINTS.sigma[order])
+    seen = {
+        (POINTS.names[g], v, *xy)
+        for g, v, xy in zip(POINTS.point, POINTS.view, POINTS.xy.tolist(), strict=True)
+    }
+    kept = {
+        (found.names[g], v, *xy) for g, v, xy in zip(found.point, found.view, found.xy.tolist(), strict=True)
+    }
+    assert kept == {row for row in seen if row[1] != 2}
+    assert found.strangers == ("/some/where/else.tif",)
+    assert [line.split(":")[0] for line in found.left_out] == list(map(str, paths))

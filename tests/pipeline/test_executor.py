@@ -167,7 +167,7 @@ class Later(Executor):
         future.set_result((made, spent))
 
 
-def test_workers_are_counted_by_their_pool() -> None:
+def test_workers_are_counted_by_their_pool(monkeypatch) -> None:
     assert worker_count(None) == os.cpu_count()
     assert worker_count(ThreadPoolExecutor(3)) == 3
 
@@ -176,6 +176,8 @@ def test_workers_are_counted_by_their_pool() -> None:
             return {"a": 30, "b": 5}
 
     assert worker_count(SimpleNamespace(_client=Client())) == 35  # type: ignore[arg-type]
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert worker_count(None) == 1
 
 
 def test_three_batches_for_each_worker_are_in_flight_and_one_follows_another(tmp_path) -> None:

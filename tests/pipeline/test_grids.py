@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from barpc.scene import View
 from barpc.sensor.direct_grid import LINEAR
 from barpc.workspace import Workspace, own_files
 from tests.jitter import scene
-from tests.rpcio.conftest import write_image
+from tests.rpcio.conftest import make_rpc, write_image
 
 from .test_growth import write_block
 
@@ -125,6 +126,7 @@ def test_an_rpc_of_a_tile_is_the_camera_in_its_own_pixels(tmp_path, view, camera
     assert worst < LINEAR < 0.02 < fit.max_ckp.max()
 
 
+@pytest.mark.slow
 def test_tiles_that_are_too_large_are_told(tmp_path, view, camera, fit, caplog):
     with caplog.at_level(logging.WARNING):
         (written,) = run_of(tmp_path, (view, fit, camera), tiles=2000)
@@ -147,6 +149,7 @@ def test_tiles_cover_an_image_once(size, side):
     assert (count == 1).all()
 
 
+@pytest.mark.slow  # before a commit: the option
 def test_a_resampled_image_has_one_rpc_that_holds(tmp_path, view, camera, fit):
     """Its pixels are those of the image, taken where the camera sees what its RPC sees."""
     (written,) = run_of(tmp_path, (view, fit, camera), resample=True)
@@ -218,6 +221,7 @@ def test_a_camera_without_ground_in_a_part_of_its_image_is_one_line(tmp_path, vi
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
     """A grid does not hold a step between detectors in the cell that it runs through: said, with how much it is."""
 
@@ -247,6 +251,313 @@ def test_all_names_are_known_before_the_run(view):
         *(f"a_tiles/{r:05d}_{c:05d}_RPC.TXT" for r in (0, 800, 1600) for c in (0, 800)),
         "a" + TILES,
     ]
+
+
+# --- its parts ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("size", "side", "cols", "rows"),
+    [
+        ((100, 30), 40, [0, 40], [0]),  # a rest of half a side joins its neighbour
+        ((101, 61), 40, [0, 40, 80], [0, 40]),
+        ((40, 20), 40, [0], [0]),
+        ((1, 2), 64, [0], [0]),
+        ((120, 80), 40, [0, 40, 80], [0, 40]),
+    ],
+)
+def test_tiles_go_row_by_row_from_multiples_of_their_side(size, side, cols, rows) -> None:
+    right, low = [*cols[1:], size[0]], [*rows[1:], size[1]]
+    wanted = [
+        (c, r, c2 - c, r2 - r)
+        for r, r2 in zip(rows, low, strict=True)
+        for c, c2 in zip(cols, right, strict=True)
+    ]
+    assert tile_boxes(size, side) == wanted
+
+
+@pytest.mark.parametrize(
+    ("asked", "resampled", "ends"),
+    [
+        (False, False, []), (True, False, [GRID, CORRECTION]), (False, True, [CORRECTION, RESAMPLED]),
+        (True, True, [GRID, CORRECTION, RESAMPLED]),
+    ],
+)  # fmt: skip
+def test_a_resampled_image_has_its_correction_beside_it(view, asked, resampled, ends) -> None:
+    assert grids.Files(asked, resampled).names(view) == ["a" + end for end in ends]
+
+
+def plane(left: float = 0.0, **more) -> SimpleNamespace:
+    """As much of a fit as is looked at: its largest errors."""
+    return SimpleNamespace(max_ckp=np.array([left, 0.0]), rpc="rpc", **more)
+
+
+@pytest.fixture
+def tasks(monkeypatch) -> list:
+    """What would be written: of each view, its grids and whether it is resampled."""
+    found: list = []
+
+    def write(run, tasks, executor, progress):
+        found.extend((view.name, rpc, files.grids, files.resampled) for view, rpc, _, files in tasks)
+        return [{f"{view.name}.x": {"barpc": 1.0}} for view, *_ in tasks]
+
+    monkeypatch.setattr(grids, "_write", write)
+    return found
+
+
+def test_grids_are_for_cameras_that_their_rpc_misses_by_a_fiftieth_of_a_pixel(tmp_path, view, tasks) -> None:
+    """Also where it is not known by how much; the names of the others are kept apart."""
+    misses = {"a": 0.02, "b": 0.0201, "c": np.nan, "d": 0.0}
+    given = [(replace(view, name=name), plane(left), None) for name, left in misses.items()]
+    written = run_of(tmp_path / "out", *given)
+    assert tasks == [("b", "rpc", True, False), ("c", "rpc", True, False)]
+    assert written == [{}, {"b.x": {"barpc": 1.0}}, {"c.x": {"barpc": 1.0}}, {}]
+    tasks.clear()
+    run_of(tmp_path / "resampled", *given, resample=True)
+    assert tasks == [(name, "rpc", name in "bc", True) for name in "abcd"]
+    tasks.clear()
+    run_of(tmp_path / "asked", *given, grids=True)
+    assert tasks == [(name, "rpc", True, False) for name in "abcd"]
+
+
+def test_stages_of_grids_and_tiles_are_only_those_there_are(tmp_path, view, tasks, monkeypatch) -> None:
+    monkeypatch.setattr(grids, "_write_tiles", lambda run, view, *given: {view.name + TILES: {"barpc": 2.0}})
+    for options, stages in (({}, []), ({"grids": True}, ["grids"]), ({"tiles": 500}, ["tiles"])):
+        with Workspace(tmp_path / "-".join(["run", *stages])) as run:
+            written = write_grids(run, [(view, plane(), None)], RunOptions(**options))
+            assert [stage["stage"] for stage in run.stages] == stages
+    assert written == [{"a" + TILES: {"barpc": 2.0}}]
+
+
+def read_as(monkeypatch, **rms: float) -> list:
+    """Readers of files that see these errors; what each of them was asked for."""
+    asked: list = []
+
+    def verify(path, sample, lacking):
+        asked.append((path.name, lacking, len(sample.points)))
+        return [SimpleNamespace(consumer=name, rms=px, max_error=2 * px, note="") for name, px in rms.items()]
+
+    monkeypatch.setattr(grids, "verify_grid", verify)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("rms", "fine"),
+    [
+        ({"barpc": 0.005, "gdal": 0.005}, True), ({"barpc": 0.005009, "gdal": 0.004991}, True),
+        ({"barpc": 0.005011}, False), ({"barpc": 0.004989}, False), ({"gdal": 0.005011}, False),
+        ({"gdal": np.nan}, False), ({"linear": 9.0}, True),
+    ],
+)  # fmt: skip
+def test_a_reader_sees_the_error_that_was_seen_in_writing(tmp_path, view, monkeypatch, rms, fine) -> None:
+    asked = read_as(monkeypatch, **rms)
+    where = np.array([[3.0, 4.0, 5.0], [6.0, 7.0, 8.0]])
+    errors = {"a" + GRID: (0.005, 0.01, where)}
+    model = make_rpc()
+    if fine:
+        found = grids.verify_grids(view, model, errors, str(tmp_path))
+        assert found == {"a" + GRID: {name: 2 * px for name, px in rms.items()}}
+        count = len(grids.Sample.of(model, view.size, grids.widened(view.alt_range)).points)
+        assert asked == [("a" + GRID, None, count + 2)]
+        return
+    ((name, px),) = rms.items()
+    said = rf"a_grid\.tif: {name} reads it {px:.3g} px RMS off, not 0\.005; is the disk full"
+    with pytest.raises(OutputError, match=said):
+        grids.verify_grids(view, model, errors, str(tmp_path))
+
+
+def test_only_a_resampled_image_is_seen_through_its_correction(tmp_path, view, monkeypatch) -> None:
+    asked = read_as(monkeypatch, barpc=0.0)
+    monkeypatch.setattr(grids, "read_correction", lambda path: (None, path.name))
+    errors = {"a" + end: (0.0, 0.0, np.empty((0, 3))) for end in (GRID, CORRECTION, RESAMPLED)}
+    assert list(grids.verify_grids(view, make_rpc(), errors, str(tmp_path))) == list(errors)
+    assert [row[1] for row in asked] == [None, None, "a" + CORRECTION]
+
+
+@pytest.mark.parametrize(
+    ("written", "read", "told"),
+    [
+        (0.02, 0.019, None), (0.0201, 0.01, "0.0201"), (0.01, 0.0301, "0.0301"), (0.05, 0.03, "0.05"),
+        (0.01, "cannot be read", None), (np.nan, 0.01, "nan"),
+    ],
+)  # fmt: skip
+def test_the_larger_of_the_errors_written_and_read_is_told(
+    tmp_path, view, monkeypatch, caplog, written, read, told
+) -> None:
+    def made(view, rpc, model, files, room):
+        place = Path(room) / view.name
+        place.mkdir(parents=True)
+        (place / "a.x").write_text("grid")
+        return {"a.x": (0.007, written, np.zeros((0, 3)))}
+
+    monkeypatch.setattr(grids, "make_grids", made)
+    monkeypatch.setattr(grids, "verify_grids", lambda *given: {"a.x": {"barpc": read, "gdal": 9.0}})
+    with Workspace(tmp_path / "out") as run:
+        found = grids._write(run, [(view, None, None, None)], None, None)  # type: ignore[arg-type, list-item]
+        assert not (run.partial / "grids").exists()
+    assert found == [{"a.x": {"barpc": read, "gdal": 9.0}}]
+    assert (tmp_path / "out/a.x").read_text() == "grid"
+    lines = [record.getMessage() for record in caplog.records]
+    assert lines == ([] if told is None else [f"a.x: 0.007 px RMS off, up to {told} px (at steps?)"])
+
+
+@pytest.mark.parametrize(
+    ("largest", "rms", "chosen", "tried"),
+    [
+        ((0.005, 9, 9), (0.005, 0, 0), "given", 1),  # as exact as a grid: no other is tried
+        ((0.0051, 0.005, 9), (0.006, 0.005, 0), "vendor-denominators", 2),
+        ((0.5, 0.4, 0.3), (0.2, 0.1, 0.3), "vendor-denominators", 3),  # the RMS counts, not the largest
+        ((0.5, 0.4, 0.3), (0.1, 0.2, 0.3), "given", 3),
+        ((0.5, 0.4, 0.3), (0.3, 0.2, 0.1), "ridge", 3),
+        ((0.5, None, 0.3), (0.3, None, 0.1), "ridge", 3),  # one that fails is passed over
+        ((0.5, 0.4, None), (0.3, 0.1, None), "vendor-denominators", 3),
+    ],
+)
+def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(
+    monkeypatch, largest, rms, chosen, tried
+) -> None:
+    assert LINEAR == 0.005
+    names = ("given", "vendor-denominators", "ridge")
+    known = {name: (one, big) for name, one, big in zip(names, rms, largest, strict=True)}
+    rpcs = {name: replace(make_rpc(), err_bias=5.0, err_rand=float(n)) for n, name in enumerate(names)}
+    given = replace(rpcs["given"], err_bias=1.5, err_rand=0.25)
+    asked: list[str] = []
+
+    def fit(model, size, alts, *, options, strict):
+        assert (model, size, alts, strict) == ("model", (10, 20), (100.0, 300.0), False)
+        if known[options.method][0] is None:
+            asked.append(options.method)
+            raise FitError("no fit")
+        return SimpleNamespace(rpc=rpcs[options.method])
+
+    def between(rpc, model, size, alt):
+        assert (model, size, alt) == ("model", (10, 20), 200.0)
+        name = "given" if rpc is given else next(name for name in names if rpcs[name] is rpc)
+        asked.append(name)
+        return name
+
+    where = np.zeros((1, 3))
+    monkeypatch.setattr(grids, "fit_rpc", fit)
+    monkeypatch.setattr(grids, "CorrectionGrid", SimpleNamespace(between=between))
+    monkeypatch.setattr(grids, "GridCorrected", lambda rpc, lacking: lacking)
+    monkeypatch.setattr(grids, "_off", lambda sample, camera: (*known[camera], where))
+    sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0))
+    rpc, lacking, miss = grids.correction_of(given, sample)  # type: ignore[arg-type]
+    assert asked == list(names[:tried])
+    assert lacking == chosen
+    assert miss == (*known[chosen], where)
+    assert (rpc.err_bias, rpc.err_rand) == (1.5, 0.25)
+
+
+def test_where_no_rpc_can_be_added_to_the_last_reason_is_given(monkeypatch) -> None:
+    def between(rpc, model, size, alt):
+        raise FitError("nothing lies there")
+
+    def fit(*given, options, **how):
+        raise FitError(f"no fit by {options.method}")
+
+    monkeypatch.setattr(grids, "CorrectionGrid", SimpleNamespace(between=between))
+    monkeypatch.setattr(grids, "fit_rpc", fit)
+    sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0))
+    with pytest.raises(FitError, match="no fit by ridge"):
+        grids.correction_of(make_rpc(), sample)  # type: ignore[arg-type]
+
+
+def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
+    rpc = make_rpc()
+    sample = grids.Sample.of(rpc, (2000, 1900), (30.0, 300.0), cells=5)
+    beside = SimpleNamespace(project=lambda ground: rpc.project(ground) + [3.0, -4.0])
+    rms, largest, where = grids._off(sample, beside)  # type: ignore[arg-type]
+    assert rms == pytest.approx(5.0, abs=1e-5)
+    assert largest == pytest.approx(5.0, abs=1e-5)
+    assert where.shape[1] == 3
+
+
+@pytest.mark.parametrize("worst", [0.005, 0.0051, np.nan])
+def test_tiles_are_fitted_eight_at_a_time_and_the_worst_is_told(
+    tmp_path, view, monkeypatch, caplog, worst
+) -> None:
+    """Ten tiles of 100 x 100 pixels; the fourth is the worst. Each states the errors of the image's RPC."""
+    groups: list[int] = []
+
+    def fits(model, boxes, alts, options):
+        groups.append(len(boxes))
+        assert alts == grids.widened(view.alt_range)
+        return [SimpleNamespace(rpc=make_rpc(), as_written=lambda rpc, box=box: left(box)) for box in boxes]
+
+    def left(box):
+        return plane(worst if box == (300, 0, 100, 100) else 0.001)
+
+    monkeypatch.setattr(grids, "fit_tiles", fits)
+    monkeypatch.setattr(grids, "ordered", lambda pool, fn, tasks, stage: [fn(*task) for task in tasks])
+    fit = SimpleNamespace(rpc=replace(make_rpc(), err_bias=2.5, err_rand=0.125))
+    with Workspace(tmp_path) as run:
+        told = grids._write_tiles(
+            run, replace(view, size=(1000, 100)), fit, None, RunOptions(tiles=100), None
+        )  # type: ignore[arg-type]
+    assert groups == [8, 2]
+    assert list(told) == ["a" + TILES]
+    np.testing.assert_equal(told["a" + TILES], {"barpc": worst})
+    table = json.loads((tmp_path / ("a" + TILES)).read_text())
+    assert [tile["max_px"] for tile in table["tiles"]] == [
+        (None if np.isnan(worst) else worst) if n == 3 else 0.001 for n in range(10)
+    ]
+    assert table["tiles"][3] == {
+        "file": "a_tiles/00000_00300_RPC.TXT", "col": 300, "row": 0, "width": 100, "height": 100,
+        "max_px": table["tiles"][3]["max_px"],
+    }  # fmt: skip
+    assert table["alt_range_m"] == list(grids.widened(view.alt_range))
+    written = read_rpc(tmp_path / "a_tiles/00000_00900_RPC.TXT")
+    assert (written.err_bias, written.err_rand) == (2.5, 0.125)
+    lines = [record.getMessage() for record in caplog.records]
+    wrong = [f"a: tiles of 100 px miss the camera by up to {worst:.3g} px"]
+    assert lines == ([] if worst == 0.005 else wrong)
+
+
+@pytest.mark.parametrize(("asked", "resampled"), [(True, False), (False, True), (True, True)])
+def test_what_a_dead_run_left_in_the_room_is_written_again(
+    tmp_path, view, monkeypatch, asked, resampled
+) -> None:
+    """Which file holds what, how far each is off, and that none of an earlier try is in the way."""
+    where, written = np.zeros((1, 3)), {}
+    alts = grids.widened(view.alt_range)
+
+    def grid(model, size, alt_range):
+        assert (model, size, alt_range) == (rpc, SIZE, alts)
+        return "grid"
+
+    def correction(given, sample):
+        assert (given, sample.model, sample.size, sample.alt_range) == (rpc, rpc, SIZE, alts)
+        return "better", "lacking", (0.3, 0.4, where)
+
+    def recorded(kind):
+        def write(*given, overwrite):
+            written[Path(given[-1]).relative_to(tmp_path).as_posix()] = (kind, *given[:-1], overwrite)
+
+        return write
+
+    rpc = make_rpc()
+    (tmp_path / "a").mkdir()
+    monkeypatch.setattr(grids, "DirectGrid", SimpleNamespace(of=grid))
+    monkeypatch.setattr(grids, "correction_of", correction)
+    monkeypatch.setattr(grids, "_off", lambda sample, camera: (0.1, 0.2, where))
+    for kind in ("grid", "correction", "resampled"):
+        monkeypatch.setattr(grids, f"write_{kind}", recorded(kind))
+    errors = grids.make_grids(view, rpc, rpc, grids.Files(asked, resampled), str(tmp_path))
+    known = {
+        "a" + GRID: (asked, (0.1, 0.2, where), ("grid", "grid", True)),
+        "a" + CORRECTION: (True, (0.3, 0.4, where), ("correction", "lacking", "better", True)),
+        "a" + RESAMPLED: (resampled, (0.3, 0.4, where), ("resampled", "better", "lacking", view.path, True)),
+    }
+    assert errors == {name: miss for name, (there, miss, _) in known.items() if there}
+    assert written == {f"a/{name}": row for name, (there, _, row) in known.items() if there}
+
+
+def test_what_ends_the_work_before_any_file_is_said_itself(tmp_path, view, monkeypatch) -> None:
+    """There is no room to clear then."""
+    monkeypatch.setattr(grids, "make_grids", lambda *given: 1 / 0)
+    with Workspace(tmp_path / "out") as run, pytest.raises(ZeroDivisionError):
+        grids._write(run, [(view, None, None, None)], None, None)  # type: ignore[arg-type, list-item]
 
 
 # --- whole runs -------------------------------------------------------------------------------------------

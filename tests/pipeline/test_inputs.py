@@ -89,6 +89,7 @@ def test_control_points_of_other_images_are_refused_before_any_work(corner, tmp_
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow  # before a commit: a list that leaves an image alone, and the option
 def test_a_stray_image_is_named_and_left_out_when_asked(known, tmp_path):
     stray = tmp_path / "img_01.tif"
     elsewhere(known.images[0], stray)
@@ -121,6 +122,7 @@ def test_a_real_stray_image_is_left_out(shared_data, tmp_path):
     assert result.summary["left_out"][0]["path"] == str(stray)
 
 
+@pytest.mark.slow  # before a commit: the option
 def test_a_later_run_goes_on_from_an_earlier_block(known, matched, tmp_path):
     given = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), pictures=False)
     two = tmp_path / "two.csv"

@@ -340,8 +340,8 @@ def test_every_option_has_a_row() -> None:
     assert set(ROWS) == {field.name for field in fields(RunOptions)}
 
 
-ELSEWHERE = ("overlap_list", "aoi", "gcp", "check_points", "geoid", "num_passes")
-"""Options whose fast tests stand in test_pairs_and_area, test_inputs and tests/test_dem."""
+ELSEWHERE = ("overlap_list", "aoi", "gcp", "check_points", "geoid", "num_passes", "grids", "tiles")
+"""Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids and tests/test_dem."""
 
 
 @pytest.mark.parametrize(

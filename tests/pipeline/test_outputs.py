@@ -17,7 +17,7 @@ from barpc import handoff
 from barpc.errors import OutputError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.handoff import CONSUMERS, Consumer, Reading, control_grid, difference, verify
-from barpc.options import RunOptions
+from barpc.options import RunOptions, TieOptions
 from barpc.pipeline import outputs
 from barpc.pipeline.inputs import PRIOR
 from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, write_views
@@ -316,3 +316,131 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
     assert summary == {"of": "what was found", "stages": [asdict(stage) for stage in told.stages]}
     assert [stage["stage"] for stage in summary["stages"]] == ["tables", "report"]
     assert (folder / "summary.json").read_text().endswith("\n")
+
+
+# --- its parts ---------------------------------------------------------------------------------------------
+
+
+def test_what_ends_the_work_before_any_file_is_said_itself(tmp_path, view, fit, monkeypatch) -> None:
+    monkeypatch.setattr(outputs, "make_files", lambda *given: 1 / 0)
+    with Workspace(tmp_path / "out") as run, pytest.raises(ZeroDivisionError):
+        write_view(run, view, fit, make_rpc(), "none", ("txt",))
+
+
+@pytest.mark.parametrize(
+    ("stem", "pair"),
+    [
+        ("a__b", True), ("b__a", True), ("a__a", True), ("a__b__c", True), ("b__c__a", True), ("b__c__b__c", True),
+        ("a", False), ("b__c", False), ("a__x", False), ("x__a", False), ("a_b", False), ("a__b__x", False),
+        ("a____b", False), ("", False), ("__", False), ("a__", False),
+    ],
+)  # fmt: skip
+def test_a_pair_is_two_names_of_views(stem, pair) -> None:
+    assert outputs._is_pair(stem, {"a", "b", "b__c"}) == pair
+
+
+def test_json_has_an_item_of_a_list_a_line() -> None:
+    assert outputs._json([]) == "[]"
+    assert outputs._json([1, {"a": [2, 3]}]) == '[\n1,\n{"a": [2, 3]}\n]'
+    assert outputs._json({"a": [1]}) == '{"a": [1]}'
+    assert outputs._json(None) == "null"
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(28, "No space left on device"), r"out/scene_RPC\.TXT: cannot be written \(No space left on device\)"),
+        (OutputError("it says itself"), "^it says itself$"), (OSError("of no number"), "^of no number$"),
+    ],
+)  # fmt: skip
+def test_why_a_file_cannot_be_written_is_said_with_its_own_place(
+    tmp_path, view, monkeypatch, error, said
+) -> None:
+    def write(*given, **how):
+        raise error
+
+    monkeypatch.setattr(outputs, "write_camera", write)
+    with pytest.raises(type(error) if error.errno is None else OutputError, match=said) as caught:
+        outputs.make_files(view, make_rpc(), "none", ("txt",), str(tmp_path / "out"), str(tmp_path / "room"))
+    assert (caught.value is error) == (error.errno is None)
+
+
+def test_files_are_made_in_a_room_of_their_view_for_their_place(tmp_path, view, monkeypatch) -> None:
+    """Also where an earlier try left some of them."""
+    seen = []
+    monkeypatch.setattr(
+        outputs,
+        "write_camera",
+        lambda rpc, path, image, *, place, overwrite: seen.append((path, place, overwrite)),
+    )
+    for _ in range(2):
+        made = outputs.make_files(
+            view, make_rpc(), "vrt", ("txt",), str(tmp_path / "out"), str(tmp_path / "r")
+        )
+    names = ["scene.vrt", "scene_RPC.TXT"]
+    assert made == tuple(str(tmp_path / "r/scene" / name) for name in names)
+    assert seen == [(tmp_path / "r/scene" / name, tmp_path / "out" / name, True) for name in names] * 2
+    assert (tmp_path / "r/scene").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("largest", "error", "fine"),
+    [((0.3, 0.4), 1.00002, True), ((0.3, 0.4), 1.00003, False), ((0.0, 0.0), 2e-5, True), ((0.0, 0.0), 2.1e-5, False),
+     ((0.3, 0.4), np.nan, False)],
+)  # fmt: skip
+def test_a_reading_may_be_off_by_twice_the_fit_s_largest_error(
+    view, fit, monkeypatch, largest, error, fine
+) -> None:
+    loose = replace(fit, max_ckp=np.array(largest))
+    readings = [Reading(Path("x/a.txt"), "barpc", error), Reading(Path("x/b.txt"), "other", 9.0, "not read")]
+    monkeypatch.setattr(outputs, "verify", lambda *given: readings)
+    if fine:
+        found = outputs.verify_files(["x/a.txt", "x/b.txt"], view, loose, make_rpc())
+        assert found == {"a.txt": {"barpc": error}, "b.txt": {"other": "not read"}}
+    else:
+        with pytest.raises(OutputError, match=r"x/a\.txt: barpc reads it \S+ px off \(\); is the disk full"):
+            outputs.verify_files(["x/a.txt", "x/b.txt"], view, loose, make_rpc())
+
+
+@pytest.mark.parametrize(
+    ("reference", "control", "adjusted", "written"),
+    [
+        (False, False, True, False),
+        (True, False, True, False),
+        (True, True, False, False),
+        (True, True, True, True),
+    ],
+)
+def test_points_of_a_reference_are_written_where_it_held_the_block(
+    tmp_path, monkeypatch, reference, control, adjusted, written
+) -> None:
+    monkeypatch.setattr(outputs, "TABLES", {})
+    monkeypatch.setattr(outputs, "can_render", lambda: False)
+    monkeypatch.setattr(outputs, "gcps_geojson", lambda run: b"points")
+    held = SimpleNamespace(control=object() if control else None) if reference else None
+    run = SimpleNamespace(reference=held, adjustment=object() if adjusted else None, options=None)
+    with Workspace(tmp_path / "out") as workspace:
+        outputs.write_tables(workspace, run, Said("x"))  # type: ignore[arg-type]
+    assert (tmp_path / "out/gcps.geojson").exists() == written
+
+
+@pytest.mark.parametrize(("page", "wanted"), [(True, True), (True, False), (False, True)])
+def test_pictures_are_drawn_of_the_band_that_is_matched(tmp_path, monkeypatch, page, wanted) -> None:
+    monkeypatch.setattr(outputs, "TABLES", {})
+    monkeypatch.setattr(outputs, "can_render", lambda: page)
+    monkeypatch.setattr(outputs, "report_html", lambda summary, folder: "page")
+    monkeypatch.setattr(outputs, "pictures", lambda run, band: f"band {band}")
+    options = RunOptions(pictures=wanted, tie=TieOptions(band=3))
+    run = SimpleNamespace(reference=None, adjustment=None, options=options)
+    said = Said("x", (StageEntry("before", 1.0, 1.0, 1.0),))
+    with Workspace(tmp_path / "out") as workspace:
+        with workspace.stage("earlier"):
+            pass
+        told = outputs.write_tables(workspace, run, said)  # type: ignore[arg-type]
+    place = tmp_path / "out/pictures.json"
+    assert (place.read_text() if place.exists() else None) == ("band 3" if page and wanted else None)
+    stages = ["before", *["pictures"] * (page and wanted), "tables", "report"]
+    assert [stage.stage for stage in told.stages] == stages
+    assert json.loads((tmp_path / "out/summary.json").read_text())["stages"] == [
+        asdict(one) for one in told.stages
+    ]

@@ -12,9 +12,11 @@ import pytest
 import rasterio
 from rasterio.io import MemoryFile
 
+from barpc.errors import ImageError
 from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline import pictures as part
 from barpc.pipeline.pictures import HALF, pictures
+from barpc.remote import Remote
 from barpc.simulate import simulate_block
 
 pytest.importorskip("jinja2")
@@ -212,3 +214,139 @@ def test_of_many_images_at_most_sixty_are_shown(adjusted, monkeypatch) -> None:
         looks = json.loads(pictures(run, 1))["quicklooks"]
         assert len(looks) == shown
         assert run.views[0].name in looks
+
+
+# --- tie points in two images, small ones ------------------------------------------------------------------
+
+
+class Flat:
+    """A camera whose columns and rows are a ten-thousandth of a degree; moved by some pixels."""
+
+    def __init__(self, col: float = 0.0, row: float = 0.0) -> None:
+        self.move = np.array([col, row])
+
+    def localize(self, image, alt):
+        return np.column_stack([(np.asarray(image) - self.move) * 1e-4, alt])
+
+    def project(self, ground):
+        return np.asarray(ground)[:, :2] * 1e4 + self.move
+
+
+@pytest.fixture
+def shown(tmp_path, monkeypatch):
+    """A run of three images of one scene, each moved by (7, 3) px more than its camera said before the adjustment."""
+    scene = np.random.default_rng(3).integers(0, 250, (2, 160, 160)).astype(np.uint8)
+    views = []
+    for n in range(3):
+        path = tmp_path / f"v{n}.tif"
+        with rasterio.open(path, "w", "GTiff", 110, 100, 2, dtype="uint8") as out:
+            out.write(scene[:, 3 * n : 3 * n + 100, 7 * n : 7 * n + 110])
+        views.append(SimpleNamespace(name=f"v{n}", path=str(path)))
+    xy = np.array(
+        [[60.0, 55.0], [53.0, 52.0], [50.0, 60.0], [43.0, 57.0], [5.0, 5.0], [1.0, 2.0], [58.0, 50.0]]
+    )
+    tracks = SimpleNamespace(
+        point=np.array([0, 0, 1, 1, 2, 2, 0]), view=np.array([0, 1, 1, 2, 0, 1, 1]), xy=xy, num_points=3
+    )
+    # the first is best in image 0, the second in image 2, the third lies at the edge
+    size = np.array([1.0, 5.0, 4.0, 2.0, 0.5, 0.6, 9.0])
+    tied = SimpleNamespace(residuals=np.column_stack([size, 0 * size]))
+    found = SimpleNamespace(
+        views=views, tracks=tracks, keep=np.array([True] * 6 + [False]), ties_after=tied, ties_before=None,
+        ground=np.array([[0.0, 0.0, 30.0]] * 3), before=[Flat()] * 3,
+        after=[Flat(-7.0 * n, -3.0 * n) for n in range(3)],
+    )  # fmt: skip
+
+    def offset(a, b, first, second, alt, steps):
+        """Rows that the second is beside the first; the altitude is what was asked for."""
+        assert steps == 2
+        np.testing.assert_array_equal(alt, np.full(len(first), 30.0))
+        return (second - b.project(a.localize(first, alt)))[:, 1], alt
+
+    monkeypatch.setattr(part, "epipolar_offset", offset)
+    monkeypatch.setattr(part, "_text", lambda grey: grey.tolist())
+    return found
+
+
+def test_patches_of_a_tie_point_are_its_place_and_where_the_cameras_see_it(shown) -> None:
+    first, second = part._ties(shown, 2)
+    assert [(tie["kind"], tie["a"], tie["b"]) for tie in (first, second)] == [
+        ("worst", "v0", "v1"),
+        ("worst", "v2", "v1"),
+    ]
+    np.testing.assert_allclose(first["offset_px"], [-3.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(second["offset_px"], [3.0, 0.0], atol=1e-9)
+    for tie, place in ((first, (60, 55)), (second, (43, 57))):
+        here, before, after = map(np.array, tie["patches"])
+        assert here.shape == (49, 49)
+        np.testing.assert_allclose(after, here, atol=1)  # the same ground
+        assert np.abs(before - here).mean() > 50  # noise at another place
+        with rasterio.open(shown.views[int(tie["a"][1])].path) as image:
+            col, row = place
+            wanted = image.read(2)[row - 24 : row + 25, col - 24 : col + 25].astype(float)
+        np.testing.assert_array_equal(here, part._stretched(wanted))
+
+
+@pytest.mark.parametrize(
+    ("change", "left"),
+    [
+        ({}, 2), ({"path": ""}, 1), ({"path": "/nowhere/v0.tif"}, 1),
+        ({"path": Remote("https://example.org/v0.tif", "https")}, 1),
+    ],
+    ids=["all", "none", "gone", "remote"],
+)  # fmt: skip
+def test_a_tie_point_needs_both_its_images_here(shown, change, left) -> None:
+    vars(shown.views[0]).update(change)
+    assert [tie["a"] for tie in part._ties(shown, 1)] == ["v0", "v2"][2 - left :]
+
+
+def test_a_check_has_patches_by_the_cameras_as_delivered_only(shown) -> None:
+    shown.after, shown.ties_before, shown.ties_after = None, shown.ties_after, None
+    for tie in part._ties(shown, 1):
+        assert (len(tie["patches"]), len(tie["offset_px"])) == (2, 1)
+
+
+def test_a_track_in_one_image_alone_is_not_shown(shown) -> None:
+    shown.tracks.view = np.array([1, 1, 1, 2, 0, 1, 1])
+    assert [tie["a"] for tie in part._ties(shown, 1)] == ["v2"]
+
+
+def test_a_patch_that_one_camera_brings_out_of_its_image_is_not_shown(shown) -> None:
+    for moved, left in ((0.0, 2), (60.0, 1)):
+        shown.before = [Flat(), Flat(moved), Flat(moved)]
+        assert len(part._ties(shown, 1)) == left
+
+
+@pytest.mark.parametrize(("count", "every"), [(59, 1), (60, 1), (61, 2), (120, 2), (121, 3)])
+def test_quicklooks_are_of_every_so_many_images(monkeypatch, count, every) -> None:
+    """Images on other hosts and those without a file do not count; one that shows nothing has none."""
+    away = [
+        SimpleNamespace(name="r", path=Remote("https://example.org/r.tif", "https")),
+        SimpleNamespace(name="n", path=""),
+    ]
+    views = [*away, *(SimpleNamespace(name=f"v{n}", path=f"v{n}.tif") for n in range(count))]
+    asked = []
+
+    def look(path, band):
+        asked.append(path)
+        if path == "v0.tif":
+            return None
+        if path == f"v{every}.tif":
+            raise ImageError("gone")
+        return np.zeros((2, 2), np.uint8) + band
+
+    monkeypatch.setattr(part, "_quicklook", look)
+    monkeypatch.setattr(part, "_ties", lambda run, band: [band])
+    found = json.loads(pictures(SimpleNamespace(views=views), 7))  # type: ignore[arg-type]
+    assert asked == [f"v{n}.tif" for n in range(0, count, every)]
+    assert list(found["quicklooks"]) == [f"v{n}" for n in range(2 * every, count, every)]
+    assert found["ties"] == [7]
+    assert (pixels(found["quicklooks"][f"v{2 * every}"]) == 7).all()
+
+
+def test_grey_values_of_a_narrow_range_are_stretched_as_far() -> None:
+    """Of 0 to 1e-6 as of 0 to 1; rounding is downwards."""
+    values = np.arange(101.0)
+    np.testing.assert_array_equal(part._stretched(values * 1e-6), part._stretched(values))
+    np.testing.assert_array_equal(part._stretched(values - 1000.0), part._stretched(values))
+    np.testing.assert_array_equal(part._stretched(np.array([0.0, np.inf, 1.0])), [0, 255, 255])

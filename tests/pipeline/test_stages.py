@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,9 +15,10 @@ from rasterio import Affine
 from barpc.errors import BarpcWarning, FitError, InputError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.options import AdjustOptions, RunOptions
+from barpc.pipeline import inputs
 from barpc.pipeline import run as stages
 from barpc.pipeline.given import given_matches, given_tracks
-from barpc.pipeline.inputs import PRIOR, input_files, side_inputs, with_located
+from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs, with_located
 from barpc.pipeline.outputs import output_names
 from barpc.report import Run
 from barpc.scene import Tracks, View
@@ -116,6 +118,122 @@ def test_matches_of_a_pair_are_the_same_whatever_the_order_of_the_file(tmp_path)
             )
             assert (one.score == 0).all()
     assert found[0] == found[1] == found[2]
+
+
+def test_a_match_is_told_from_the_earlier_image_of_its_pair_in_the_order_of_its_places(tmp_path) -> None:
+    """Ordered by column, then row in the earlier image, then by those in the later one."""
+    places = {"v2": [(9, 1), (3, 7), (3, 2), (3, 2)], "v0": [(4, 4), (5, 5), (6, 6), (1, 8)]}
+    rows = [f"{name},{col},{row},{t}\n" for name, seen in places.items() for t, (col, row) in enumerate(seen)]
+    (tmp_path / "m.csv").write_text("image,col,row,track\n" + "".join(rows))
+    ((pair, found),) = given_matches([tmp_path / "m.csv"], views()).items()
+    assert pair == (0, 2)
+    wanted = sorted(
+        [[list(map(float, a)), list(map(float, b))] for a, b in zip(places["v0"], places["v2"], strict=True)]
+    )
+    assert found.xy.tolist() == wanted
+    assert found.score.tolist() == [0.0] * 4
+    assert (found.index < 0).all()  # numbers of keypoints begin at 0: these are of files
+    assert len(set(found.index[:, 0].tolist())) == 4
+
+
+def test_matches_of_an_image_with_itself_are_none_of_a_pair(tmp_path) -> None:
+    rows = "v0,1,1,0\nv1,2,2,0\nv1,50,50,1\nv1,60,60,1\n"
+    (tmp_path / "m.csv").write_text("image,col,row,track\n" + rows)
+    assert given_matches([tmp_path / "m.csv"], views()).keys() <= {(0, 1)}
+
+
+def test_of_files_with_nothing_for_a_part_of_the_images_that_is_said(tmp_path, caplog) -> None:
+    (tmp_path / "m.csv").write_text("image,col,row,track\nother,1,1,0\nmore,2,2,0\n")
+    with pytest.raises(InputError, match="no track is seen in two"):
+        given_matches([tmp_path / "m.csv"], views())
+    assert given_matches([tmp_path / "m.csv"], views(), partly=True) == {}
+    assert "no track is seen in two" in caplog.text
+    (tmp_path / "out.csv").write_text("image,col,row,track\nv0,1000,1,0\nv1,2,2,0\n")
+    with pytest.raises(InputError, match="1 of 2 points lie outside"):
+        given_matches([tmp_path / "out.csv"], views(), partly=True)
+
+
+# --- lists of pairs ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "number", "says"),
+    [
+        ("v0 v1\nv0\n", 2, "two image names are expected, found 1; quote names with spaces"),
+        ("v0 v1 v2\n", 1, "two image names are expected, found 3"),
+        ("\n# a\nv1 v1\n", 3, "v1 is paired with itself"),
+        ("v0 v1\nv0 /x/v0.tif\n", 2, "v0 is paired with itself"),
+        ("v0 'v1\n", 1, "No closing quotation"), ("v0 v9\n", 1, "v9"),
+    ],
+)  # fmt: skip
+def test_a_line_that_is_no_pair_is_named(tmp_path, text, number, says) -> None:
+    path = tmp_path / "p.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=rf"p\.txt, line {number}: .*{says}"):
+        read_pairs(path, views())
+
+
+def test_paths_of_a_list_start_where_it_lies_or_from_here(tmp_path, monkeypatch) -> None:
+    """Images of one stem in several folders: only their paths tell them apart."""
+    folders = [tmp_path / name for name in ("list", "here", "far")]
+    for folder in folders:
+        folder.mkdir()
+    given = [replace(view, path=str(folder / "i.tif")) for view, folder in zip(views(), folders, strict=True)]
+    path = folders[0] / "p.txt"
+    path.write_text(f"i.tif ../here/i.tif\nhere/i.tif {folders[2]}/i.tif\n")
+    monkeypatch.chdir(tmp_path)
+    assert read_pairs(path, given) == [(0, 1), (1, 2)]
+    assert read_pairs(path, given[:2], [folders[2] / "i.tif"]) == [(0, 1)]
+    with pytest.raises(InputError, match=r"p\.txt: lists no pair of the images given"):
+        read_pairs(path, given[:1], [folder / "i.tif" for folder in folders[1:]])
+
+
+# --- what an earlier block knew ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_of_each_track_with_something_new_the_surest_old_observation_is_kept(seed) -> None:
+    """Against the rule, track by track."""
+    rng = np.random.default_rng(seed)
+    seen = [(t, v) for t in range(30) for v in range(5) if rng.random() < 0.6]
+    point = np.unique([t for t, _ in seen], return_inverse=True)[1]
+    sigma = rng.permutation(len(seen)) + 1.0
+    xy = np.column_stack([np.arange(len(seen)), sigma])
+    given = Tracks(np.array([v for _, v in seen]), point, xy.astype(float), sigma)
+    old = np.array([True, False, True, True, False])
+    wanted = []
+    for t in range(given.num_points):
+        rows = np.flatnonzero(given.point == t)
+        new, known = rows[~old[given.view[rows]]], rows[old[given.view[rows]]]
+        kept = [*new, *known[np.argsort(sigma[known])][:1]]
+        if len(new) and len(kept) > 1:  # one alone is no tie
+            wanted += kept
+    assert only_new(given, old).xy[:, 0].tolist() == sorted(map(float, wanted))
+
+
+# --- what is read before any work -------------------------------------------------------------------------
+
+
+def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(
+    tmp_path, caplog, monkeypatch
+) -> None:
+    """Of GCPs and of check points, in the order given; a reference that is none stops the run here."""
+    for name in ("g.csv", "c.csv"):
+        (tmp_path / name).write_text("nothing\n")
+    given = RunOptions(
+        gcp=(str(tmp_path / "g.csv"),), check_points=(str(tmp_path / "c.csv"),), keep_going=True
+    )
+    assert side_inputs(given, views()) == (None, None)
+    lines = [record.getMessage() for record in caplog.records]
+    assert [Path(line.split(",")[0]).name for line in lines] == ["g.csv", "c.csv"]
+    read = []
+    monkeypatch.setattr(inputs, "Sheet", SimpleNamespace(read=read.append))
+    monkeypatch.setattr(inputs, "_require_cover", lambda *given: None)
+    monkeypatch.setattr(inputs, "Dem", SimpleNamespace(open=lambda *given: given))
+    monkeypatch.setattr(inputs, "BlockPrior", SimpleNamespace(load=lambda path: path))
+    with_all = RunOptions(dem="d.tif", geoid="g.gtx", reference=("r.tif", "s.tif"), fixed_run="earlier")
+    assert side_inputs(with_all, views()) == (("d.tif", "g.gtx"), Path("earlier") / PRIOR)
+    assert read == ["r.tif", "s.tif"]
 
 
 # --- outputs ----------------------------------------------------------------------------------------------
@@ -240,3 +358,24 @@ def test_a_check_has_no_folder_to_make_a_report_of() -> None:
     for length, shown in ((50, "/" * 50), (51, "..." + "/" * 47)):
         wrote = stages.AdjustResult((), replace(run, out_dir="/" * length), result.record)
         assert repr(wrote).endswith(f", in {shown})")
+
+
+def test_a_stage_that_is_one_task_says_its_beginning_and_its_end(corner, tmp_path) -> None:
+    """Also where it ends in an error its beginning; nobody need listen."""
+    told: list[tuple[str, int, int]] = []
+    options = RunOptions(pictures=False, stop_after="adjustment")
+    result = stages.adjust(
+        corner.images[:2], tmp_path / "out", options, progress=lambda *now: told.append(now)
+    )
+    single = ("adjustment", "block", "summary", "report")
+    assert [now for now in told if now[0] in single] == [
+        (name, done, 1) for name in single for done in (0, 1)
+    ]
+    took = [stage["stage"] for stage in result.summary["stages"]]
+    assert took[-6:] == ["tie points", "adjustment", "block", "summary", "tables", "report"]
+    told.clear()
+    stages._tell(None, "x", 0)
+    space = SimpleNamespace(stage=nullcontext)
+    with pytest.raises(KeyError), stages._told(space, "x", lambda *now: told.append(now)):  # type: ignore[arg-type]
+        raise KeyError
+    assert told == [("x", 0, 1)]

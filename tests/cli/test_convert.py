@@ -1,0 +1,352 @@
+"""What `barpc convert` refuses, cuts out and says, on files of a few hundred pixels."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+
+from barpc.cameras import Camera, open_camera
+from barpc.cli import convert as module
+from barpc.cli.convert import _check, _shadow_reasons, _tell, _window, check_target
+from barpc.errors import InputError, OutputError
+from barpc.fit.certificate import Sample
+from barpc.handoff import Reading
+from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
+from tests.cli.test_main import run
+from tests.rpcio.conftest import make_rpc, write_image
+
+NAN = float("nan")
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    raw = write_image(tmp_path / "raw.tif", shape=(1, 200, 300))
+    write_rpc_copy(make_rpc().crop(900, 900), raw, tmp_path / "in" / "scene.tif")
+    return tmp_path / "in" / "scene.tif"
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    write_rpc(make_rpc(), tmp_path / "cams" / "a.RPB")
+    return tmp_path / "cams" / "a.RPB"
+
+
+# --- the command line -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            ["a", "-o", "d", "--window", "0", "0", "1", "1"],
+            "--window and --bbox go with a TARGET, not with -o",
+        ),
+        (["a", "-o", "d", "--bbox", "0", "0", "1", "1"], "--window and --bbox go with a TARGET, not with -o"),
+        (["a"], "give SOURCE and TARGET, or images and -o DIR"),
+        (["a", "b", "c"], "give SOURCE and TARGET, or images and -o DIR"),
+        (["a", "b", "--rpc", "c"], "give SOURCE and TARGET, or images and -o DIR"),
+        (["a", "b", "--images", "copy"], "give SOURCE and TARGET, or images and -o DIR"),
+        ([], "Missing argument"),
+    ],
+)
+def test_what_does_not_go_together_is_wrong_usage(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("convert", *words) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_the_help_lists_the_formats(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("convert", "--help") == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Of txt (_RPC.TXT)," in text
+    assert "default: TARGET's name; txt" in text
+
+
+def test_an_rpc_is_copied_as_it_is_and_read_back(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = file.parent / "b.geom"
+    assert run("convert", str(file), str(target)) == 0
+    said = capsys.readouterr()
+    assert said.out == f"{file} (rpb) -> {target} (read back: 0 px)\n"
+    assert said.err == ""
+    assert read_rpc(target) == read_rpc(file)
+    assert run("convert", str(file), str(target)) == 1
+    assert run("convert", str(file), str(target), "--overwrite", "--json") == 0
+    row = json.loads(capsys.readouterr().out)
+    assert row == {"source": str(file), "format": "rpb", "target": str(target), "max_px": 0.0}
+
+
+def test_a_format_may_be_named(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = file.parent / "c_RPC.TXT"
+    assert run("convert", str(file), str(target), "--rpc-format", "txt") == 0
+    assert read_rpc(target) == read_rpc(file)
+    other = file.parent / "odd.txt"
+    assert run("convert", str(file), str(other), "--rpc-format", "txt") == 0
+    assert "LINE_OFF" in other.read_text()
+    assert run("convert", str(file), str(other), "--rpc-format", "txt") == 1
+    assert run("convert", str(file), str(other), "--rpc-format", "txt", "--overwrite") == 0
+
+
+def test_what_reads_back_elsewhere_ends_with_3(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for shift, code in ((0.9e-6, 0), (1.1e-6, 3)):
+        monkeypatch.setattr(module, "read_rpc", lambda path, shift=shift: read_rpc(path).crop(shift, 0))
+        assert run("convert", str(file), str(file.parent / f"{code}.geom")) == code
+        assert ("too few digits for this RPC" in capsys.readouterr().err) == (code == 3)
+
+
+def test_notes_of_a_camera_are_told_but_not_beside_json(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "open_camera", lambda spec: replace(open_camera(spec), notes=("a note",)))
+    assert run("convert", str(file), str(file.parent / "b.geom")) == 0
+    assert capsys.readouterr().err == "barpc: a note\n"
+    assert run("convert", str(file), str(file.parent / "c.geom"), "--json") == 0
+    assert capsys.readouterr().err == ""
+
+
+# --- targets ----------------------------------------------------------------------------------------------
+
+
+def test_no_input_is_ever_replaced(image: Path, tmp_path: Path) -> None:
+    write_rpc(make_rpc(), image.with_suffix(".RPB"))
+    for target in (image, image.with_suffix(".RPB"), image.parent / ".." / "in" / "scene.tif"):
+        with pytest.raises(OutputError, match="belongs to the input and is never replaced"):
+            check_target(target, [image], overwrite=True)
+    check_target(tmp_path / "new.tif", [image], overwrite=False)
+
+
+def test_a_file_that_would_be_read_in_place_of_an_rpc_is_refused_or_told(
+    image: Path, file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = image.with_suffix(".RPB")  # of an image that is no input here
+    with pytest.raises(OutputError, match="would be read in place of the RPC that") as error:
+        check_target(target, [file], overwrite=False)
+    assert str(image) in str(error.value)
+    assert capsys.readouterr().err == ""
+    check_target(target, [file], overwrite=True)
+    assert capsys.readouterr().err == f"barpc: {target} is read in place of the RPC that {image} had\n"
+    check_target(target, [file], overwrite=False, rpc=read_rpc(image))  # the same: nothing changes
+    assert capsys.readouterr().err == ""
+    with pytest.raises(OutputError):
+        check_target(target, [file], overwrite=False, rpc=make_rpc())
+
+
+def test_an_image_may_get_its_own_rpc_as_a_file_beside_it(image: Path) -> None:
+    beside = image.with_suffix(".RPB")
+    assert run("convert", str(image), str(beside)) == 0
+    assert read_rpc(beside).off(make_rpc().crop(900, 900)).max() < 1e-6
+
+
+# --- windows ----------------------------------------------------------------------------------------------
+
+
+class Flat:
+    """A camera over a map: 100 columns a degree from 10 E, 100 rows a degree from 50 N southwards."""
+
+    def project(self, ground: Any) -> np.ndarray:
+        ground = np.asarray(ground)
+        lean = ground[..., 2] / 1000.0  # a column for a kilometre
+        return np.stack([(ground[..., 0] - 10) * 100 + lean, (50 - ground[..., 1]) * 100], axis=-1)
+
+
+CAMERA = Camera(Flat(), Path("flat"), "rpb", (200, 100), (0.0, 2000.0))  # type: ignore[arg-type]
+
+
+def window(bbox: Any, alt: float | None = 0.0, dem: Any = None, camera: Camera = CAMERA) -> Any:
+    return _window(camera, Path("flat.tif"), None, bbox, alt, dem)
+
+
+@pytest.mark.parametrize(
+    ("bbox", "expected"),
+    [
+        ((10.1, 49.6, 10.3, 49.8), (10, 20, 21, 21)),  # columns 10 to 30, rows 20 to 40, whole pixels
+        ((10.104, 49.604, 10.296, 49.796), (10, 20, 21, 21)),
+        ((10.106, 49.594, 10.304, 49.796), (11, 20, 20, 22)),
+    ],
+)
+def test_a_box_is_cut_to_the_pixels_that_it_touches(
+    bbox: Any, expected: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert window(bbox) == expected
+    assert capsys.readouterr().err == ""
+
+
+def test_a_box_moves_with_its_altitude_and_a_dem() -> None:
+    assert window((10.1, 49.6, 10.3, 49.8), alt=7000.0) == (17, 20, 21, 21)
+    slope = window((10.1, 49.6, 10.3, 49.8), dem=lambda lon, lat: 1e5 * (lon - 10.1) + 0 * lat)
+    assert slope == (10, 20, 41, 21)
+
+
+def test_a_box_beyond_the_image_is_cut_off_and_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert window((9.894, 49.756, 10.094, 50.254)) == (0, 0, 10, 25)  # of 21 x 50
+    told = "barpc: flat.tif: --bbox reaches beyond the image; 76 % of it is cut off\n"
+    assert capsys.readouterr().err == told
+
+
+@pytest.mark.parametrize("bbox", [(12.1, 49.6, 12.3, 49.8), (10.1, 48.0, 10.3, 48.9), (9.5, 49.6, 9.9, 49.8)])
+def test_a_box_beside_the_image_is_wrong_usage(bbox: Any) -> None:
+    with pytest.raises(click.UsageError, match=r"does not meet flat \(ground at 5 m\)"):
+        window(bbox, alt=5.0)
+
+
+def test_a_box_may_lie_across_the_antimeridian() -> None:
+    class East(Flat):
+        def project(self, ground: Any) -> np.ndarray:
+            return super().project(np.asarray(ground) - [169.5, 0, 0])
+
+    camera = replace(CAMERA, model=East())  # from 179.5 E
+    assert window((179.8, 49.6, -179.8, 49.8), camera=camera) == (30, 20, 41, 21)
+
+
+def test_a_window_stands_as_given_and_one_of_both_is_taken() -> None:
+    assert _window(CAMERA, Path("a"), (1, 2, 3, 4), None, None, None) == (1, 2, 3, 4)
+    for both in ((None, None), ((1, 2, 3, 4), (0.0, 0.0, 1.0, 1.0))):
+        with pytest.raises(click.UsageError, match="give either --window or --bbox"):
+            _window(CAMERA, Path("a"), *both, None, None)  # type: ignore[arg-type]
+
+
+def test_a_window_is_cut_and_told(image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--window", "50", "60", "100", "80")
+    target = str(tmp_path / "w.tif")
+    assert run("convert", str(image), target, *words) == 0
+    assert capsys.readouterr().out == f"{target}: col 50, row 60, 100 x 80 px\n"
+    np.testing.assert_allclose(
+        read_rpc(target).image_offset, read_rpc(image).image_offset - [50, 60], atol=1e-9
+    )
+    assert run("convert", str(image), target, *words) == 1
+    assert run("convert", str(image), target, *words, "--overwrite", "--json") == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found == {"path": target, "window": [50, 60, 100, 80]}
+
+
+# --- grids ------------------------------------------------------------------------------------------------
+
+
+def test_a_camera_goes_into_a_grid_and_back(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = file.parent / "a_grid.tif"
+    assert run("convert", f"{file},size=600:500", str(target)) == 0
+    said = capsys.readouterr()
+    assert all(line.startswith(f"{target}: ") and line.endswith(" px") for line in said.out.splitlines())
+    assert said.err == ""
+    grid = open_camera(str(target)).model
+    at = np.array([[100.0, 200.0], [550.0, 30.0]])
+    np.testing.assert_allclose(grid.localize(at, 150.0), make_rpc().localize(at, 150.0), atol=1e-3)
+    assert run("convert", f"{file},size=600:500", str(target)) == 1  # exists
+
+
+def test_a_grid_goes_into_an_rpc_where_one_holds_it(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid, target = file.parent / "a_grid.tif", file.parent / "back.geom"
+    assert run("convert", f"{file},size=600:500", str(grid)) == 0
+    capsys.readouterr()
+    assert run("convert", str(grid), str(target)) == 0
+    (told,) = capsys.readouterr().err.splitlines()
+    assert told.startswith(f"barpc: {grid}: grid, fitted to ")
+    at = np.array([[100.0, 200.0], [550.0, 30.0]])
+    seen = read_rpc(target).project(make_rpc().localize(at, 150.0))
+    np.testing.assert_allclose(seen, at, atol=2e-2)
+    assert run("convert", str(grid), str(grid), "--overwrite") == 1
+    assert "belongs to the input and is never replaced" in capsys.readouterr().err
+    assert run("convert", str(file), str(file), "--overwrite") == 1
+    assert "belongs to the input and is never replaced" in capsys.readouterr().err
+    poor = type("Fit", (), {"verdict": lambda self, tolerance: f"misses {tolerance == options.tolerance}"})()
+    options = module.FitOptions()
+    monkeypatch.setattr(module, "fit_rpc", lambda *_, **__: poor)
+    assert run("convert", str(grid), str(file.parent / "none.geom")) == 1
+    assert f"{grid}: misses True ('barpc fit --keep-going' writes it" in capsys.readouterr().err
+    assert not (file.parent / "none.geom").exists()
+
+
+@pytest.mark.parametrize(("worst", "code"), [(0.009, 0), (0.011, 3), (NAN, 3)])
+def test_a_grid_that_does_not_hold_the_camera_ends_with_3(
+    worst: float, code: int, file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    worst = worst / 0.01 * module.LINEAR
+    reading = Reading(Path("x"), "gdal", worst, "" if worst == worst else "not read")
+    monkeypatch.setattr(module, "verify_grid", lambda path, sample: [reading] * isinstance(sample, Sample))
+    assert run("convert", f"{file},size=600:500", str(file.parent / "a_grid.tif")) == code
+    error = capsys.readouterr().err
+    assert ("does not hold the camera to" in error) == (code == 3)
+    if code:
+        assert f"gdal: {'not read' if worst != worst else worst}" in error
+
+
+# --- a folder ---------------------------------------------------------------------------------------------
+
+
+def test_what_readers_see_is_a_line_or_a_row_each(capsys: pytest.CaptureFixture[str]) -> None:
+    readings = [Reading(Path("a"), "gdal", 1.3e-9), Reading(Path("b"), "rpcm", NAN, "no field")]
+    _tell(readings, as_json=False)
+    assert capsys.readouterr().out == "a: gdal 1.3e-09 px\nb: rpcm no field\n"
+    _tell(readings, as_json=True)
+    assert json.loads(capsys.readouterr().out) == [
+        {"path": "a", "consumer": "gdal", "max_px": 1.3e-9, "note": ""},
+        {"path": "b", "consumer": "rpcm", "max_px": None, "note": "no field"},
+    ]
+
+
+def test_names_of_a_hand_off_are_checked_first(tmp_path: Path) -> None:
+    a, b = tmp_path / "a" / "x.tif", tmp_path / "b" / "x.tif"
+    out = tmp_path / "out"
+    _check([a, b.with_name("y.tif")], out, ["txt", "geom"])
+    with pytest.raises(click.UsageError, match="--rpc-format doc: not a format that is written"):
+        _check([a], out, ["txt", "doc"])
+    with pytest.raises(InputError, match="several images named x: apply them one folder at a time"):
+        _check([a, b], out, ["txt"])
+    with pytest.raises(InputError, match="the folder of the images; choose a new one"):
+        _check([b, a.with_name("y.tif")], a.parent, ["txt"])
+    with pytest.raises(InputError):
+        _check([a], Path(str(tmp_path / "a\0b")), ["txt"])
+
+
+def test_what_hides_an_rpc_is_told_of_the_input_and_counts_in_the_output(
+    image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out" / "scene.tif"
+    write_rpc_copy(read_rpc(image), image, out)
+    assert _shadow_reasons(image, [out]) == []
+    assert capsys.readouterr().err == ""
+    write_rpc(make_rpc(), image.with_suffix(".RPB"))
+    write_rpc(make_rpc(), out.with_suffix(".RPB"))
+    hiding = out.with_suffix(".RPB")
+    assert _shadow_reasons(image, [out]) == [f"{hiding} hides the RPC of {out}: move it away."]
+    assert capsys.readouterr().err == f"barpc: beside {image}: scene.RPB hides an RPC put into the image\n"
+    assert _shadow_reasons(image, [out, hiding]) == []  # it is one of those just written
+
+
+def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = []
+
+    def verify(paths: Any, model: Any, size: Any, alts: Any) -> list[Reading]:
+        asked.append((sorted(path.name for path in paths), size, alts, all(path.is_file() for path in paths)))
+        return [Reading(paths[0], "gdal", 2e-6), Reading(paths[1], "rpcm", NAN, "no field")]
+
+    monkeypatch.setattr(module, "verify", verify)
+    monkeypatch.setattr(module, "unverified", lambda paths: [f"not tried: {len(paths)}"])
+    write_rpc(make_rpc(), tmp_path / "rpc.geom")
+    out = tmp_path / "out"
+    words = ("-o", str(out), "--rpc", str(tmp_path / "rpc.geom"), "--rpc-format", " txt,,json ")
+    assert run("convert", str(image.parent), *words) == 3
+    alts = open_camera(str(tmp_path / "rpc.geom")).alt_range
+    assert asked == [(["scene.rpc.json", "scene.vrt", "scene_RPC.TXT"], (300, 200), alts, True)]
+    assert read_rpc(out / "scene_RPC.TXT") == make_rpc()
+    said = capsys.readouterr()
+    assert said.out == f"{out / 'scene.vrt'}: gdal 2.0e-06 px\n{out / 'scene_RPC.TXT'}: rpcm no field\n"
+    assert said.err.splitlines() == [
+        "barpc: not tried: 3",
+        f"barpc: exit code 3: The hand-off needs a look. {out / 'scene.vrt'}: gdal reads it 2.0e-06 px off. "
+        f"{out / 'scene_RPC.TXT'}: rpcm no field.",
+    ]
+    assert run("convert", str(image), *words) == 1  # the folder is not empty
+    assert run("convert", str(image), *words, "--overwrite") == 3

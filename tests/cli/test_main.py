@@ -1,0 +1,295 @@
+"""What the command makes of words, errors and signals before and after a verb does its work."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable
+
+import click
+import pytest
+
+from barpc.cli.main import COMMANDS, MOVED, Verbs, _interruptible, _log_warning, _told, cli, main
+from barpc.cli.terminal import THREADS
+from barpc.errors import BarpcWarning, InputError
+
+
+def run(*args: str) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main(list(args))
+    assert isinstance(stop.value.code, int)
+    return stop.value.code
+
+
+def refused(*args: str) -> str:
+    """What is said of a command line before its verb is called."""
+    context = click.Context(cli, **cli.context_settings)
+    context.params = {"verbose": 0, "quiet": False, "debug": False}
+    with pytest.raises(click.UsageError) as error:
+        cli.resolve_command(context, list(args))
+    return error.value.message
+
+
+# --- words ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["projct"], "No such verb 'projct'. Did you mean 'project'?"),
+        (["xyz"], f"No such verb 'xyz'. One of: {', '.join(COMMANDS)}."),
+        (["crop", "a.tif"], f"'crop' is said otherwise now: barpc {MOVED['crop']}"),
+        (["info", "a.tif", "--size=3"], "--size is said otherwise now: FILE,size=WIDTH:HEIGHT"),
+        (["info", "--swath", "iw1"], "--swath is said otherwise now: PRODUCT,swath=iw1"),
+        (["adjust", "--loss", "huber"], "--loss is said otherwise now: [adjust] loss of a file given with --options"),
+        (["adjust", "--tile", "9"], "--tile is said otherwise now: [tie] tile of a file given with --options"),
+        (["fit", "--method=lcurve"], "--method is said otherwise now: [fit] method of a file given with --options"),
+        (["match", "--stop-after", "x"],
+         "--stop-after is said otherwise now: barpc match, or stop_after in a file given with --options"),
+    ],
+)  # fmt: skip
+def test_a_word_that_is_not_known_is_met_with_the_one_that_is(words: list[str], told: str) -> None:
+    assert refused(*words) == told
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["info", "--loss"],  # its verb takes no options file
+        ["adjust", "--nothing"],
+        ["adjust", "--overwrite"],
+        ["info", "--", "--size"],  # the name of a file
+        ["fit", "size"],
+        ["--nothing"],
+    ],
+)
+def test_other_words_are_left_to_click(words: list[str]) -> None:
+    context = click.Context(cli, **cli.context_settings)
+    context.params = {"verbose": 0, "quiet": False, "debug": False}
+    if words[0].startswith("--"):
+        with pytest.raises(click.UsageError, match="No such"):
+            cli.resolve_command(context, words)
+        return
+    name, command, rest = cli.resolve_command(context, words)
+    assert (name, rest) == (words[0], words[1:])
+    assert command is not None
+
+
+@pytest.mark.parametrize(
+    ("words", "rest", "params"),
+    [
+        ("info a -v", "info a", (1, False, False)),
+        ("info -vv a --verbose", "info a", (3, False, False)),
+        ("info -q a", "info a", (0, True, False)),
+        ("info --quiet --debug", "info", (0, True, True)),
+        ("info a -- -v -q", "info a -- -v -q", (0, False, False)),
+        ("info -v -- --debug", "info -- --debug", (1, False, False)),
+        ("-v info", "-v info", (0, False, False)),
+        ("info -vvv", "info -vvv", (0, False, False)),
+    ],
+)
+def test_flags_of_every_verb_are_taken_out_of_its_words(
+    words: str, rest: str, params: tuple[int, bool, bool]
+) -> None:
+    context = click.Context(cli, **cli.context_settings)
+    context.params = {"verbose": 0, "quiet": False, "debug": False}
+    assert isinstance(cli, Verbs)
+    assert cli._general(context, words.split()) == rest.split()
+    assert (context.params["verbose"], context.params["quiet"], context.params["debug"]) == params
+
+
+def test_there_is_no_verb_beside_the_table() -> None:
+    assert cli.get_command(click.Context(cli, **cli.context_settings), "nothing") is None
+    assert cli.list_commands(click.Context(cli, **cli.context_settings)) == list(COMMANDS)
+    for name in ("match", "report", "localize", "export"):
+        command = cli.get_command(click.Context(cli, **cli.context_settings), name)
+        assert command is not None
+        assert command.name == name
+        assert "\b\n" in str(command.help)
+        assert "\\b" not in str(command.help)
+
+
+def test_help_lists_the_verbs_and_a_wrong_word_ends_with_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--help") == 0
+    told = capsys.readouterr().out
+    lines = [line.split(maxsplit=1) for line in told.splitlines()]
+    assert all([name, text] in lines for name, text in COMMANDS.items() if len(text) < 70)
+    assert "Verbs:" in told
+    assert "\\b" not in told
+    assert max(map(len, told.splitlines())) <= 110
+    assert run("-h") == 0
+    assert run("--version") == 0
+    assert run("info", "--nothing", "a") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("barpc: No such option")
+    assert said.endswith(" (see 'barpc info --help')\n")
+    assert run() == 2
+
+
+# --- errors -----------------------------------------------------------------------------------------------
+
+
+def _os_error(number: int, text: str, name: str | None) -> OSError:
+    error = OSError(number, text)
+    error.filename = name
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted; run the same command again to go on"),
+        (click.Abort(), 130, "interrupted; run the same command again to go on"),
+        (click.UsageError("no"), 2, "no (see 'barpc --help')"),
+        (click.UsageError("no", click.Context(click.Command("x"), info_name="x")), 2, "no (see 'x --help')"),
+        (click.ClickException("no"), 1, "no (see 'barpc --help')"),
+        (InputError("a.tif: no"), 1, "a.tif: no"),
+        (MemoryError(), 1, "out of memory; what was finished is kept: run the same command again, with a smaller -j "
+         "or [tie] tile"),
+        (_os_error(28, "No space left on device", "a.tif"), 1, "a.tif: No space left on device"),
+        (_os_error(5, "Input/output error", None), 1, "the system: Input/output error"),
+        (OSError("odd"), 1, "unexpected OSError: odd; this is a bug: please report what --debug shows"),
+        (KeyError("k"), 1, "unexpected KeyError: 'k'; this is a bug: please report what --debug shows"),
+    ],
+)  # fmt: skip
+def test_an_error_is_an_exit_code_and_a_sentence(error: BaseException, code: int, text: str) -> None:
+    assert _told(error) == (code, text)
+
+
+@pytest.fixture
+def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[object], None]:
+    """Sets what every call of the group does: it returns a value or raises an error."""
+
+    def does(what: object) -> None:
+        def called(**_: object) -> object:
+            if isinstance(what, BaseException):
+                raise what
+            return what() if callable(what) else what
+
+        monkeypatch.setattr(cli, "main", called)
+
+    return does
+
+
+@pytest.mark.parametrize(("value", "code"), [(0, 0), (3, 3), (None, 0), ("text", 0)])
+def test_what_a_verb_returns_is_the_exit_code(
+    value: object, code: int, verb: Callable[[object], None]
+) -> None:
+    verb(value)
+    assert run("info") == code
+
+
+def test_an_error_is_one_line_and_debug_shows_where_it_came_from(
+    verb: Callable[[object], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb(InputError("a.tif: no"))
+    assert run("info") == 1
+    assert capsys.readouterr() == ("", "barpc: a.tif: no\n")
+    assert run("info", "--debug") == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("Traceback")
+    assert told.err.endswith("barpc: a.tif: no\n")
+    verb(KeyboardInterrupt())
+    assert run("info") == 130
+
+
+def test_a_reader_that_has_gone_is_no_error_to_speak_of(
+    verb: Callable[[object], None], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb(BrokenPipeError())
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    assert run("info") == 1
+    assert sys.stdout.name == os.devnull
+    sys.stdout.close()
+    assert capsys.readouterr().err == ""
+
+
+def test_only_a_process_of_its_own_has_its_garbage_left_alone(
+    verb: Callable[[object], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[object]()
+    monkeypatch.setattr(gc, "set_threshold", asked.append)
+    monkeypatch.setattr(gc, "freeze", lambda: asked.append("freeze"))
+    monkeypatch.setattr(sys, "argv", ["barpc", "info", "a b"])
+    monkeypatch.delenv(THREADS[0], raising=False)
+    monkeypatch.setenv(THREADS[1], "4")
+    verb(0)
+    assert run("info") == 0
+    assert asked == []
+    assert [os.environ[name] for name in THREADS[:2]] == ["1", "4"]
+    given = list[object]()
+    monkeypatch.setattr(cli, "main", lambda **how: given.append(how))
+    with pytest.raises(SystemExit):
+        main()
+    assert asked == [50_000, "freeze"]
+    assert given == [{"args": ["info", "a b"], "prog_name": "barpc", "standalone_mode": False}]
+
+
+# --- signals and the log ----------------------------------------------------------------------------------
+
+
+def test_a_sigterm_ends_it_like_ctrl_c_and_is_left_as_it_was() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), _interruptible():
+        os.kill(os.getpid(), signal.SIGTERM)
+        signal.pause()
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_in_a_thread_no_signal_is_touched() -> None:
+    found = list[object]()
+
+    def work() -> None:
+        with _interruptible():
+            found.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found == [signal.getsignal(signal.SIGTERM)]
+
+
+def test_a_warning_of_barpc_is_told_always_and_of_a_library_with_v(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    _log_warning("one\n two", BarpcWarning, "f.py", 3)
+    _log_warning("old\n thing", DeprecationWarning, "f.py", 3)
+    assert caplog.record_tuples == [
+        ("barpc", logging.WARNING, "one two"),
+        ("py.warnings", logging.INFO, "f.py:3: DeprecationWarning: old thing"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "level", "all_of_it"),
+    [((), logging.WARNING, False), (("-q",), logging.ERROR, False), (("-v",), logging.INFO, True),
+     (("-vv",), logging.DEBUG, True), (("-v", "-v", "-v"), logging.DEBUG, True), (("-q", "-v"), logging.ERROR, True)],
+)  # fmt: skip
+def test_how_much_is_logged(
+    words: tuple[str, ...], level: int, all_of_it: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = list[dict[str, object]]()
+    seen = list[object]()
+
+    @click.command()
+    @click.pass_obj
+    def probe(obj: dict[str, object]) -> int:
+        seen.append((obj, warnings.showwarning))
+        return 0
+
+    monkeypatch.setattr(logging, "basicConfig", lambda **how: given.append(how))
+    monkeypatch.setattr(Verbs, "get_command", lambda *_: probe)
+    assert run(*words, "info") == 0
+    verbose = sum(word.count("v") for word in words)
+    assert seen == [({"quiet": "-q" in words, "verbose": verbose}, _log_warning)]
+    (how,) = given
+    assert how["level"] == level
+    (handler,) = how["handlers"]  # type: ignore[misc]
+    assert handler.stream is sys.stderr
+    assert bool(handler.filter(logging.LogRecord("gcsfs", 40, "", 0, "x", (), None))) == all_of_it
+    assert warnings.showwarning is not _log_warning

@@ -1,0 +1,183 @@
+"""Flags made of declarations: what they take, refuse and say of themselves, and the order in which they count."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from barpc.cli.main import cli
+from barpc.cli.options import _jobs, field_of, flag, flag_name, image_paths, run_options
+from barpc.errors import InputError
+from barpc.options import AdjustOptions, RunOptions, TieOptions
+
+
+def given(target: str, *words: str) -> Any:
+    """The value of a flag on a command line; the text of the refusal."""
+    found: list[Any] = []
+
+    @click.command()
+    @flag(target)
+    def verb(**flags: Any) -> None:
+        found.extend(flags.values())
+
+    said = CliRunner().invoke(verb, list(words))
+    return found[0] if found else said.output
+
+
+def option_of(target: str) -> click.Option:
+    @click.command()
+    @flag(target)
+    def verb(**_: Any) -> None: ...
+
+    (option,) = verb.params
+    assert isinstance(option, click.Option)
+    return option
+
+
+@pytest.mark.parametrize(
+    ("target", "words", "value"),
+    [
+        ("fit.tolerance", (), None),
+        ("fit.tolerance", ("--tolerance", "0.25"), 0.25),
+        ("overwrite", (), None),
+        ("overwrite", ("--overwrite",), True),
+        ("adjust.model", ("--model", "shift"), "shift"),
+        ("tie.keypoints_per_image", ("--ip-per-image", "5000"), 5000),
+        ("rpc_formats", ("--rpc-format", "txt, geom"), ("txt", "geom")),
+        ("rpc_formats", (), None),
+        ("gcp", ("--gcp", "a", "--gcp", "b"), ("a", "b")),
+        ("gcp", (), None),
+        ("dem", ("--dem", "a.tif"), "a.tif"),
+    ],
+)
+def test_a_flag_is_of_the_field_s_type(target: str, words: tuple[str, ...], value: Any) -> None:
+    found = given(target, *words)
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        ("fit.tolerance", ("--tolerance", "x")),
+        ("fit.tolerance", ("--tolerance", "-1")),
+        ("fit.tolerance", ("--tolerance", "nan")),
+        ("tie.keypoints_per_image", ("--ip-per-image", "1.5")),
+        ("adjust.model", ("--model", "nothing")),
+        ("rpc_formats", ("--rpc-format", "txt,doc")),
+    ],
+)
+def test_what_the_field_cannot_hold_is_wrong_usage(target: str, words: tuple[str, ...]) -> None:
+    assert "Error: Invalid value for" in given(target, *words)
+
+
+def test_a_flag_says_its_default_bounds_and_choices() -> None:
+    tolerance = field_of("fit.tolerance")
+    text = str(option_of("fit.tolerance").help)
+    assert text.startswith(tolerance.rule.help)
+    assert f"[default: {tolerance.default}; above 0]" in text
+    model = option_of("adjust.model")
+    assert model.metavar == "[auto|rotation+translation|rotation|translation|shift|shift-drift|affine]"
+    assert "[default: auto]" in str(model.help)
+    formats = option_of("rpc_formats")
+    assert (formats.metavar, formats.multiple) == ("NAMES", False)
+    assert "commas between.  [default: txt]" in str(formats.help)
+    gcp = option_of("gcp")
+    assert gcp.multiple
+    assert str(gcp.help).endswith("(repeatable)")
+    assert "default" not in str(option_of("dem").help)
+    assert option_of("tie.keypoints_per_image").opts == ["--ip-per-image"]
+    assert option_of("overwrite").is_flag
+
+
+def test_a_shell_completes_the_choices() -> None:
+    option = option_of("adjust.model")
+    found = option.shell_complete(click.Context(click.Command("x")), "shift")
+    assert [getattr(one, "value", one) for one in found] == ["shift", "shift-drift"]
+
+
+@pytest.mark.parametrize(
+    ("target", "name"),
+    [
+        ("tie.keypoints_per_image", "--ip-per-image"),
+        ("rpc_formats", "--rpc-format"),
+        ("adjust.dem_sigma", "--dem-sigma"),
+        ("aoi", "--aoi"),
+    ],
+)
+def test_a_flag_has_the_field_s_name(target: str, name: str) -> None:
+    assert flag_name(target) == name
+
+
+@pytest.mark.parametrize(
+    ("text", "jobs"),
+    [("1", 1), ("8", 8), ("9999", 9999), ("tcp://host:8786", "tcp://host:8786"), ("0", None), ("10000", None),
+     ("-1", None), ("", None), ("2.0", None), ("host", None)],
+)  # fmt: skip
+def test_jobs_are_a_number_or_an_address(text: str, jobs: Any) -> None:
+    context, parameter = click.Context(click.Command("x")), click.Option(["--jobs"])
+    if jobs is None:
+        with pytest.raises(click.BadParameter, match="no number of processes"):
+            _jobs(context, parameter, text)
+    else:
+        assert _jobs(context, parameter, text) == jobs
+
+
+def test_a_list_of_images_is_read_behind_those_of_the_command_line(tmp_path: Path) -> None:
+    path = tmp_path / "list.txt"
+    path.write_text("# two images\n\n  a.tif \nhttps://host/b.tif\n/c.tif\n   \n")
+    assert image_paths(("x.tif",), str(path)) == [
+        "x.tif",
+        str(tmp_path / "a.tif"),
+        "https://host/b.tif",
+        "/c.tif",
+    ]
+    assert image_paths(("x.tif", "y.tif"), None) == ["x.tif", "y.tif"]
+    assert image_paths((), None) == []
+
+
+def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "o.toml"
+    path.write_text('overwrite = true\n[tie]\nkeypoints_per_image = 700\n[adjust]\nmodel = "shift"\n')
+    assert run_options({}, None) == RunOptions()
+    read = run_options({}, str(path))
+    assert (read.overwrite, read.tie.keypoints_per_image, read.adjust.model) == (True, 700, "shift")
+    flags = {
+        "flag_tie_keypoints_per_image": 900,
+        "flag_adjust_model": None,
+        "flag_adjust_dem_sigma": 7.0,
+        "flag_overwrite": None,
+        "flag_fit_tolerance": 0.5,
+        "flag_dem": "d.tif",
+        "other": 3,
+    }
+    found = run_options(flags, str(path))
+    assert (found.tie.keypoints_per_image, found.adjust.model, found.adjust.dem_sigma) == (900, "shift", 7.0)
+    assert (found.overwrite, found.fit.tolerance, found.dem) == (True, 0.5, "d.tif")
+    alone = run_options(flags, None)
+    assert (alone.tie, alone.adjust) == (
+        TieOptions(keypoints_per_image=900),
+        AdjustOptions(dem_sigma=7.0),
+    )
+    with pytest.raises(InputError, match="command line"):
+        run_options({"flag_fit_tolerance": -1.0}, None)
+
+
+def test_the_help_of_a_run_has_its_flags_under_what_they_are_about() -> None:
+    text = CliRunner().invoke(cli, ["adjust", "--help"], prog_name="barpc").output
+    found: dict[str, set[str]] = {}
+    for line in text.splitlines():
+        if line.endswith(":") and not line.startswith(" "):
+            found[line[:-1]] = flags = set()
+        elif line.startswith("  -"):
+            flags.update(word.strip(",") for word in line.split() if word.startswith("--"))
+    assert list(found) == ["Files and the run", "Tie points", "Cameras", "Ground"]
+    assert {"--out-dir", "--overwrite", "--jobs", "--help"} <= found["Files and the run"]
+    assert {"--matcher", "--ip-per-image"} <= found["Tie points"]
+    assert {"--model", "--fixed"} <= found["Cameras"]
+    assert {"--gcp", "--dem", "--geoid"} <= found["Ground"]
+    assert "Tie points:" not in CliRunner().invoke(cli, ["info", "--help"]).output

@@ -1,0 +1,253 @@
+"""Tables of points: every form in which they come in, and how they go out to the last digit."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+from barpc.cli import points as module
+from barpc.cli.points import _print_points, _tell_failures, read_points
+from barpc.errors import InputError
+from barpc.rpcio import write_rpc
+from barpc.sensor.rpc import RPC
+from tests.cli.test_main import run
+from tests.rpcio.conftest import make_rpc
+
+XYZ = ("lon", "lat", "alt")
+
+
+def table(
+    tmp_path: Path, text: str, fill: float | None = None, names: tuple[str, ...] = XYZ
+) -> list[list[float]]:
+    (tmp_path / "t.csv").write_text(text)
+    return read_points((), str(tmp_path / "t.csv"), names, fill).tolist()
+
+
+# --- what comes in ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("numbers", "fill", "rows"),
+    [
+        ((1, 2, 3), None, [[1, 2, 3]]),
+        ((1, 2, 3, 4, 5, 6), None, [[1, 2, 3], [4, 5, 6]]),
+        ((1, 2), 9.0, [[1, 2, 9]]),
+        ((1, 2, 3, 4), 9.0, [[1, 2, 9], [3, 4, 9]]),
+    ],
+)
+def test_numbers_are_points_one_behind_the_other(
+    numbers: tuple[float, ...], fill: float | None, rows: list[list[float]]
+) -> None:
+    assert read_points(numbers, None, XYZ, fill).tolist() == rows
+
+
+@pytest.mark.parametrize(
+    ("numbers", "fill", "told"),
+    [((), None, "0 numbers; give LON LAT ALT of"), ((1, 2, 3, 4), None, "4 numbers; give LON LAT ALT of"),
+     ((), 0.0, "0 numbers; give LON LAT of"), ((1, 2, 3), 0.0, "3 numbers; give LON LAT of")],
+)  # fmt: skip
+def test_numbers_that_are_no_whole_points_are_wrong_usage(
+    numbers: tuple[float, ...], fill: float | None, told: str
+) -> None:
+    with pytest.raises(click.UsageError, match=f"^{told} each point, or --points FILE$"):
+        read_points(numbers, None, XYZ, fill)
+
+
+@pytest.mark.parametrize(
+    ("text", "fill", "rows"),
+    [
+        ("1,2,3\n4,5,6\n", None, [[1, 2, 3], [4, 5, 6]]),
+        ("1 2\t3", None, [[1, 2, 3]]),
+        ("1,2,3,99\n", None, [[1, 2, 3]]),
+        ("ALT, Lon ,lat\n3,1,2\n", None, [[1, 2, 3]]),
+        ("lon lat alt # heads\n# nothing\n\n1 2 3 # here\n", None, [[1, 2, 3]]),
+        ('"name","lon","lat","alt"\n"a,b",1,2,3\n', None, [[1, 2, 3]]),
+        ("lon,lat\n1,2\n", 7.0, [[1, 2, 7]]),
+        ("lat,lon\n2,1\n", 7.0, [[1, 2, 7]]),
+        ("1,2\n3,4,5\n", 7.0, [[1, 2, 7], [3, 4, 5]]),
+        ("lon,lat,alt\n1,2\n3,4,5\n", 7.0, [[1, 2, 7], [3, 4, 5]]),
+        ("-1e1,+2.5,.5", None, [[-10, 2.5, 0.5]]),
+        ("", None, []),
+        ("lon,lat,alt\n", None, []),
+    ],
+)
+def test_a_table_has_a_header_or_its_columns_in_order(
+    text: str, fill: float | None, rows: list[list[float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert table(tmp_path, text, fill) == rows
+    monkeypatch.setattr("sys.stdin", io.StringIO(text))
+    assert read_points((), "-", XYZ, fill).tolist() == rows
+
+
+@pytest.mark.parametrize(
+    ("text", "fill", "told"),
+    [
+        ("lon,lat\n1,2\n", None, "columns lon, lat, alt expected, found lon, lat"),
+        ("lon,alt\n1,2\n", 7.0, "columns lon, lat, alt expected, found lon, alt"),
+        ("1,2,3\n1,x,3\n", None, "point 2: 'x' is no number"),
+        ("1,2,3\n4,5\n", None, "point 2 has 2 columns, expected lon, lat, alt"),
+        ("1\n", 7.0, "point 1 has 1 columns, expected lon, lat, alt"),
+        ("lon,lat,alt\n1,2,\n", 7.0, "point 1: '' is no number"),
+    ],
+)
+def test_a_table_that_lacks_something_says_what(
+    text: str, fill: float | None, told: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError) as error:
+        table(tmp_path, text, fill)
+    assert str(error.value) == f"{tmp_path / 't.csv'}: {told}"
+
+
+# --- what goes out ----------------------------------------------------------------------------------------
+
+
+def test_points_are_printed_with_their_digits(capsys: pytest.CaptureFixture[str]) -> None:
+    values = np.array([[1 / 3, 2.0], [np.nan, -2 / 3]])
+    _print_points(("a", "b"), values, (6, 3), as_json=False)
+    assert capsys.readouterr().out == "a,b\n0.333333,2.000\nnan,-0.667\n"
+    _print_points(("a", "b"), values, (6, 3), as_json=True)
+    assert json.loads(capsys.readouterr().out) == [{"a": 0.333333, "b": 2.0}, {"a": None, "b": -0.667}]
+
+
+def test_a_point_fails_with_any_of_its_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _tell_failures(np.array([[1.0, 2.0]]), "went") == 0
+    assert _tell_failures(np.empty((0, 2)), "went") == 0
+    assert capsys.readouterr().err == ""
+    assert _tell_failures(np.array([[1.0, np.nan], [np.inf, 1.0], [1.0, 1.0]]), "went") == 3
+    assert capsys.readouterr().err == "barpc: exit code 3: 2 of 3 points went\n"
+
+
+# --- the verbs --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def rpc_file(tmp_path: Path) -> tuple[Path, RPC]:
+    write_rpc(make_rpc(), tmp_path / "a.RPB")
+    return tmp_path / "a.RPB", make_rpc()
+
+
+def rows(text: str) -> np.ndarray:
+    return np.array([[float(cell) for cell in line.split(",")] for line in text.splitlines()[1:]])
+
+
+def test_project_prints_six_digits_and_takes_an_altitude_for_all(
+    rpc_file: tuple[Path, RPC], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, rpc = rpc_file
+    assert run("project", str(file), "5.4", "43.2", "5.401", "43.201", "--alt", "120") == 0
+    told = capsys.readouterr().out
+    expected = rpc.project([[5.4, 43.2, 120.0], [5.401, 43.201, 120.0]])
+    np.testing.assert_allclose(rows(told), expected, atol=6e-7)
+    assert all(len(cell.partition(".")[2]) == 6 for line in told.splitlines()[1:] for cell in line.split(","))
+
+
+def test_localize_prints_ten_digits_of_degrees_and_four_of_metres(
+    rpc_file: tuple[Path, RPC], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, rpc = rpc_file
+    assert run("localize", str(file), "-12.25", "700.5", "--alt", "-3") == 0
+    told = capsys.readouterr()
+    expected = rpc.localize([-12.25, 700.5], -3.0)
+    np.testing.assert_allclose(rows(told.out)[0], expected, atol=6e-11)
+    assert [len(cell.partition(".")[2]) for cell in told.out.splitlines()[1].split(",")] == [10, 10, 4]
+    assert told.err == ""
+
+
+def test_altitudes_of_a_table_count_and_the_others_are_the_one_given(
+    rpc_file: tuple[Path, RPC], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, rpc = rpc_file
+    (tmp_path / "t.csv").write_text("100,200,50\n300,400\n")
+    assert run("localize", str(file), "--points", str(tmp_path / "t.csv"), "--alt", "80") == 0
+    found = rows(capsys.readouterr().out)
+    np.testing.assert_allclose(found, rpc.localize([[100.0, 200.0], [300.0, 400.0]], [50.0, 80.0]), atol=1e-9)
+    assert run("localize", str(file), "--points", str(tmp_path / "t.csv")) == 0
+    told = capsys.readouterr()
+    assert rows(told.out)[:, 2].tolist() == pytest.approx([50.0, rpc.ground_offset[2]], abs=1e-4)
+    assert "its ground is taken at" in told.err
+
+
+def test_a_dem_tells_the_altitudes_of_projected_points(
+    rpc_file: tuple[Path, RPC], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, rpc = rpc_file
+    monkeypatch.setattr(
+        module, "opened_dem", lambda dem, geoid: lambda lon, lat: 100.0 + 10 * (lon - 5) - (lat - 43)
+    )
+    assert run("project", str(file), "5.4", "43.2", "--dem", "d.tif") == 0
+    np.testing.assert_allclose(rows(capsys.readouterr().out)[0], rpc.project([5.4, 43.2, 103.8]), atol=6e-7)
+
+
+@pytest.fixture
+def three(tmp_path: Path) -> tuple[list[str], list[RPC]]:
+    """Three cameras that look from three sides."""
+    found = []
+    for number, tilt in enumerate((0.0, 0.09, -0.12)):
+        rpc = make_rpc()
+        coeffs = np.array(rpc.coeffs)
+        coeffs[0, 3] += tilt
+        coeffs[2, 3] -= tilt
+        found.append(RPC(coeffs, rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale))
+        write_rpc(found[-1], tmp_path / f"{number}.RPB")
+    return [str(tmp_path / f"{number}.RPB") for number in range(3)], found
+
+
+def test_triangulate_takes_the_images_that_see_a_point(
+    three: tuple[list[str], list[RPC]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files, rpcs = three
+    ground = np.array([[5.4, 43.2, 150.0], [5.402, 43.199, 100.0], [5.399, 43.201, 200.0]])
+    seen = np.column_stack([rpc.project(ground) for rpc in rpcs])
+    seen[1, 2:4] = np.nan  # two of the three
+    seen[2, 2:] = np.nan  # one alone
+    head = "col1,row1,col2,row2,col3,row3"
+    np.savetxt(tmp_path / "t.csv", seen, delimiter=",", header=head, comments="", fmt="%.9f")
+    assert run("triangulate", *files, "--points", str(tmp_path / "t.csv")) == 3
+    told = capsys.readouterr()
+    assert told.out.startswith("lon,lat,alt,error\n")
+    found = rows(told.out)
+    np.testing.assert_allclose(found[:2, :3], ground[:2], atol=2e-4)
+    np.testing.assert_allclose(found[:2, :2], ground[:2, :2], atol=2e-9)
+    np.testing.assert_allclose(found[:2, 3], 0.0, atol=1e-4)
+    assert np.isnan(found[2, :3]).all()
+    assert [len(cell.partition(".")[2]) for cell in told.out.splitlines()[1].split(",")] == [10, 10, 4, 4]
+    assert told.err == "barpc: exit code 3: 1 of 3 points could not be intersected\n"
+
+
+def test_triangulate_tells_the_root_mean_square_over_the_images(
+    three: tuple[list[str], list[RPC]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files, rpcs = three
+    seen = np.array([rpc.project([5.4, 43.2, 150.0]) for rpc in rpcs]) + [[2, -1], [-1, 2], [0.5, 1]]
+    words = [word for pair in seen for word in ("--at", repr(float(pair[0])), repr(float(pair[1])))]
+    assert run("triangulate", *files, *words, "--json") == 0
+    (point,) = json.loads(capsys.readouterr().out)
+    again = np.array([rpc.project([point["lon"], point["lat"], point["alt"]]) for rpc in rpcs])
+    expected = np.sqrt(((again - seen) ** 2).sum(axis=1).mean())
+    assert expected > 0.3
+    assert point["error"] == pytest.approx(expected, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("count", "words", "told"),
+    [
+        (1, ["--at", "1", "2"], "one image; the lines of sight of at least two can meet"),
+        (2, ["--at", "1", "2"], "1 points given with --at for 2 images"),
+        (2, [], "0 points given with --at for 2 images"),
+        (2, ["--at", "1", "2"] * 3, "3 points given with --at for 2 images"),
+    ],
+)
+def test_triangulate_needs_a_point_of_each_of_two_images(
+    count: int,
+    words: list[str],
+    told: str,
+    three: tuple[list[str], list[RPC]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run("triangulate", *three[0][:count], *words) == 2
+    assert told in capsys.readouterr().err

@@ -1,0 +1,346 @@
+"""What `fit`, `check`, `report`, `adjust` and `export` say and return, with their work done by stand-ins."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from barpc.cli import adjust as adjusting
+from barpc.cli import fit as fitting
+from barpc.cli.adjust import _tell
+from barpc.cli.fit import _certificate
+from barpc.rpcio import write_rpc
+from tests.cli.test_main import run
+from tests.report.made import a_summary
+from tests.rpcio.conftest import make_rpc, write_image
+
+# --- fit --------------------------------------------------------------------------------------------------
+
+
+def a_fit(**changes: Any) -> Any:
+    usual = {
+        "method": "lcurve", "iterations": 4, "h": (1e-6, 0.25), "num_cnp": 1000, "num_ckp": 500, "coverage": 0.985,
+        "rmse_cnp": (1e-3, 2e-3), "max_cnp": (3e-3, 4e-3), "rmse_ckp": (5e-3, 6e-3), "max_ckp": (7e-3, 8e-3),
+        "beyond": 0.0123, "min_denominator": 0.9, "roundtrip": 1e-9, "localisation": None,
+    }  # fmt: skip
+    return SimpleNamespace(**{**usual, **changes})
+
+
+def test_a_certificate_has_a_figure_in_every_line() -> None:
+    assert _certificate(a_fit(), "").split("\n") == [
+        "method        lcurve, 4 passes, h 1e-06 0.25",
+        "points        1000 control, 500 check, 98% of the image covered",
+        "              col [px]     row [px]",
+        "control rmse  0.001        0.002",
+        "control max   0.003        0.004",
+        "check rmse    0.005        0.006",
+        "check max     0.007        0.008",
+        "beyond        1.23% of the image may miss by more, at most (95 % confidence)",
+        "denominators  at least 0.9 over the box and 25 % around it",
+        "round trip    1e-09 px",
+        "verdict       within tolerance",
+    ]
+    given = _certificate(a_fit(beyond=1.0), "it misses").split("\n")
+    assert not any(line.startswith("beyond") for line in given)
+    assert given[-1] == "verdict       it misses"
+    found = SimpleNamespace(rmse_m=0.1, max_m=0.2, rmse_px=0.3, max_px=0.4, min_denominator=0.5)
+    assert _certificate(a_fit(localisation=found), "").split("\n")[-2] == (
+        "localisation  rmse 0.1 m, max 0.2 m; projected again 0.3 and 0.4 px; denominators at least 0.5"
+    )
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> str:
+    write_rpc(make_rpc(), tmp_path / "a.RPB")
+    return f"{tmp_path / 'a.RPB'},size=600:500"
+
+
+@pytest.fixture
+def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """What every fit is asked for: size, altitudes, options."""
+    from barpc import fit
+
+    asked, real = list[tuple[Any, ...]](), fit.fit_rpc
+
+    def fit_rpc(model: Any, size: Any, alts: Any, *, options: Any, strict: bool) -> Any:
+        asked.append((size, tuple(alts), options, strict))
+        return real(model, size, alts, options=options, strict=strict)
+
+    monkeypatch.setattr(fit, "fit_rpc", fit_rpc)
+    return asked
+
+
+def test_a_fit_measures_writes_and_is_quiet_when_told(
+    source: str, tmp_path: Path, fitted: list[tuple[Any, ...]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("fit", source) == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines()[-1] == "verdict       within tolerance"
+    assert said.err == ""
+    (size, alts, options, strict) = fitted[0]
+    assert (size, strict, options.tolerance) == (
+        (600, 500),
+        False,
+        fitting.run_options({}, None).fit.tolerance,
+    )
+    assert alts == pytest.approx((166.6667 - 142.8571, 166.6667 + 142.8571))
+    out = tmp_path / "b.geom"
+    assert run("-q", "fit", source, "-o", str(out), "--alt-range", "10", "400", "--tolerance", "0.5") == 0
+    assert capsys.readouterr().out == ""
+    assert out.is_file()
+    assert fitted[1][1] == (10.0, 400.0)
+    assert fitted[1][2].tolerance == 0.5
+    assert run("fit", source, "-o", str(out)) == 1
+    assert run("fit", source, "-o", str(out), "--overwrite") == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines()[-1] == f"written       {out} (read back: these are its figures)"
+    assert run("fit", source, "-o", str(tmp_path / "a.RPB"), "--overwrite") == 1
+
+
+def test_a_miss_writes_nothing_unless_told_to(
+    source: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "b.geom"
+    words = ("fit", source, "-o", str(out), "--tolerance", "1e-15")
+    assert run(*words) == 3
+    said = capsys.readouterr()
+    assert said.err.endswith("; nothing written (--keep-going writes it all the same)\n")
+    assert "written  " not in said.out
+    assert not out.exists()
+    assert run(*words, "--json") == 3
+    assert json.loads(capsys.readouterr().out)["output"] is None
+    assert run(*words, "--keep-going", "--json") == 3
+    said = capsys.readouterr()
+    assert said.err.endswith("; written all the same\n")
+    assert json.loads(said.out)["output"] == str(out)
+    assert json.loads(said.out)["verdict"] != ""
+    assert out.is_file()
+
+
+def test_altitudes_come_from_a_dem_and_its_margin_unless_they_are_given(
+    source: str, fitted: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from barpc.dem import Dem
+
+    asked = list[Any]()
+
+    def terrain_range(model: Any, size: Any, alts: Any, dem: Any, margin: float) -> tuple[float, float]:
+        asked.append((size, dem, margin))
+        return 100.0 - margin, 100.0 + margin
+
+    monkeypatch.setattr(Dem, "open", lambda dem, geoid: (dem, geoid))
+    monkeypatch.setattr("barpc.fit.points.terrain_range", terrain_range)
+    assert run("fit", source, "--dem", "d.tif", "--geoid", "g.gtx", "--dem-margin", "50") == 0
+    assert run("fit", source, "--dem", "d.tif") == 0
+    assert asked == [((600, 500), ("d.tif", "g.gtx"), 50.0), ((600, 500), ("d.tif", None), 500.0)]
+    assert [row[1] for row in fitted] == [(50.0, 150.0), (-400.0, 600.0)]
+    assert run("fit", source, "--dem", "d.tif", "--alt-range", "0", "300") == 0
+    assert len(asked) == 2
+    assert fitted[-1][1] == (0.0, 300.0)
+    assert run("fit", source, "--dem", "d.tif", "--dem-margin", "-1") == 2
+
+
+@pytest.mark.parametrize(("wide", "count"), [("", 1), ("too far", 2)])
+def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
+    wide: str, count: int, source: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from barpc import cameras, fit
+
+    asked = list[Any]()
+
+    def fit_rpc(model: Any, size: Any, alts: Any, *, options: Any, strict: bool) -> Any:
+        asked.append((alts, options.grid))
+        return a_fit(verdict=lambda tolerance: wide if alts == (-500.0, 9000.0) else "")
+
+    camera = SimpleNamespace(
+        model=SimpleNamespace(all_ground=(-500.0, 9000.0)), extent=(5, 5), alt_range=(1.0, 200.5)
+    )
+    monkeypatch.setattr(fit, "fit_rpc", fit_rpc)
+    monkeypatch.setattr(cameras, "open_camera", lambda _: camera)
+    assert run("fit", source) == 0
+    assert [alts for alts, _ in asked] == [(-500.0, 9000.0), (1.0, 200.5)][:count]
+    error = capsys.readouterr().err
+    assert ("fitted over the scene's altitudes, 1 to 200.5 m" in error) == (count == 2)
+    asked.clear()
+    assert run("fit", source, "--alt-range", "0", "9") == 0
+    assert [alts for alts, _ in asked] == [(0.0, 9.0)]
+    assert run("fit", f"{source},swath=MOSAIC") == 0
+    assert asked[-1][1] == (20, 20, 10) != asked[0][1]
+
+
+# --- check, report, adjust --------------------------------------------------------------------------------
+
+
+def test_a_check_against_other_cameras_tells_the_largest_difference(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = []
+    for number, shift in enumerate((0.0, 0.25)):
+        image = write_image(tmp_path / f"i{number}.tif", shape=(1, 40, 60))
+        write_rpc(make_rpc().crop(900 + shift, 900), tmp_path / f"i{number}.RPB")
+        write_rpc(make_rpc().crop(900, 900), tmp_path / "other" / f"i{number}_RPC.TXT")
+        images.append(str(image))
+    other = tmp_path / "other"
+    assert run("check", *images, "--against", str(other)) == 3
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [
+        f"{images[0]}  {other / 'i0_RPC.TXT'}  max 0 px",
+        f"{images[1]}  {other / 'i1_RPC.TXT'}  max 0.25 px",
+    ]
+    assert said.err == f"barpc: exit code 3: 1 of 2 RPCs differ. {images[1]}: 0.25 px.\n"
+    assert run("check", images[0], "--against", str(other / "i1_RPC.TXT"), "--json") == 0
+    text = capsys.readouterr().out
+    (row,) = json.loads(text)
+    assert text.splitlines()[:2] == ["[", " {"]
+    assert row == {"image": images[0], "against": str(other / "i1_RPC.TXT"), "max_px": 0.0}
+
+
+@pytest.mark.parametrize(("far", "code"), [(1e-6, 0), (1.01e-6, 3), (float("nan"), 3)])
+def test_a_millionth_of_a_pixel_is_the_bound(
+    far: float, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = write_image(tmp_path / "i.tif", shape=(1, 40, 60))
+    write_rpc(make_rpc().crop(900, 900), tmp_path / "i.RPB")
+    monkeypatch.setattr("barpc.handoff.difference", lambda *_: far)
+    assert run("check", str(image), "--against", str(tmp_path / "i.RPB")) == code
+
+
+def test_two_runs_are_compared_and_one_is_reported_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = {"a": "x", "b": "y", "views": [], "pairs": [], "lines": ["All alike."]}
+    monkeypatch.setattr("barpc.report.compare.compare_runs", lambda one, two: {**found, "a": one, "b": two})
+    monkeypatch.setattr("barpc.report.page.remake_report", lambda one: f"{one}/report.html")
+    assert run("report", "one") == 0
+    assert capsys.readouterr().out == "one/report.html\n"
+    assert run("report", "one", "two") == 0
+    said = capsys.readouterr().out
+    assert said.startswith("A: one\nB: two\n")
+    assert said.endswith("All alike.\n")
+    assert run("report", "one", "two", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {**found, "a": "one", "b": "two"}
+    assert run("report", "one", "--json") == 2
+    assert "--json goes with two runs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("quiet", "as_json", "out"),
+    [(False, False, "All well.\n"), (True, False, ""), (True, True, '{\n "a": 1\n}\n')],
+)
+def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
+    quiet: bool, as_json: bool, out: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = a_summary([], reasons=("One.",))
+    result: Any = SimpleNamespace(summary={"a": 1}, record=record, passed=True)
+    assert _tell({"quiet": quiet}, {"as_json": as_json}, result) == 0
+    assert capsys.readouterr() == (out, "")
+    result.passed = False
+    assert _tell({"quiet": quiet}, {"as_json": as_json}, result) == 3
+    assert capsys.readouterr() == (out, "barpc: exit code 3: All well. One.\n")
+
+
+def test_match_stops_after_matching_and_check_asks_another_entry(monkeypatch: pytest.MonkeyPatch) -> None:
+    from barpc import pipeline
+
+    asked = list[tuple[str, Any, str, dict[str, Any]]]()
+
+    def entry(name: str) -> Any:
+        def work(images: Sequence[str], *, options: Any, executor: Any, progress: Any, **where: str) -> Any:
+            assert executor is None
+            assert callable(progress)
+            asked.append((name, list(images), options.stop_after, where))
+            return SimpleNamespace(summary={}, record=a_summary([]), passed=True)
+
+        return work
+
+    for name in ("adjust", "check"):
+        monkeypatch.setattr(pipeline, name, entry(name))
+    assert run("adjust", "a.tif", "b.tif", "-o", "out") == 0
+    assert run("match", "a.tif", "-o", "out") == 0
+    assert run("check", "a.tif") == 0
+    usual = asked[0][2]
+    assert usual != "matching"
+    assert asked == [
+        ("adjust", ["a.tif", "b.tif"], usual, {"out_dir": "out"}),
+        ("adjust", ["a.tif"], "matching", {"out_dir": "out"}),
+        ("check", ["a.tif"], usual, {}),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("tool", "views", "fits", "text"),
+    [("s2p", 1, 1, True), ("s2p", 1, 0, False), ("s2p", 0, 1, False), ("cars", 1, 1, True),
+     ("sat-bundleadjust", 1, 1, False)],
+)  # fmt: skip
+def test_a_configuration_is_written_where_every_image_has_a_new_rpc(
+    tool: str, views: int, fits: int, text: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    (tmp_path / "images").mkdir()
+    write_image(tmp_path / "images" / "a.tif")
+    data = {
+        "s2p": {"images": [{"img": "images/a.tif"}]},
+        "cars": {"input": {"sensors": {"a": "images/a.tif"}}},
+        "sat-bundleadjust": {"geotiff_dir": "images"},
+    }[tool]
+    (tmp_path / "c.json").write_text(json.dumps(data))
+    asked = list[Any]()
+
+    def result(obj: Any, work: Any, images: Any, options: Any, flags: Any, where: Any) -> Any:
+        asked.append((images, options.rpc_formats, where))
+        found = SimpleNamespace(fits=[1] * fits)
+        return SimpleNamespace(views=[1] * views, run=found, summary={}, record=a_summary([]), passed=True)
+
+    monkeypatch.setattr(adjusting, "_result", result)
+    monkeypatch.setattr(
+        adjusting, "corrected", lambda config, folder, views: f"{config.tool} {folder.name} {views}"
+    )
+    out = tmp_path / "out"
+    words = ("adjust", "--from", tool, str(tmp_path / "c.json"), "-o", str(out))
+    assert run(*words) == 0
+    assert asked == [
+        ([f"{tmp_path}/images/a.tif"], ("txt", "geom") if tool == "cars" else ("txt",), {"out_dir": str(out)})
+    ]
+    assert (out / "c.json").exists() == text
+    if text:
+        assert (out / "c.json").read_text() == f"{tool} out [1]"
+    missing = "c.json is not written: not every image that it lists has a new RPC" in capsys.readouterr().err
+    assert missing == (not (views and fits))
+    assert run(*words, "a.tif") == 2
+    assert run(*words, "--image-list", "l.txt") == 2
+    assert len(asked) == 1
+
+
+# --- export -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("target", "vrt", "told"), [("s2p", True, True), ("s2p", False, False), ("points", True, False)]
+)
+def test_an_export_names_its_files_and_says_where_images_stay(
+    target: str, vrt: bool, told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    if vrt:
+        (tmp_path / "a.vrt").touch()
+    asked = list[Any]()
+    monkeypatch.setattr(
+        "barpc.export.export_run", lambda *a, **k: asked.append((a, k)) or [Path("x"), Path("y")]
+    )
+    words = ("export", str(tmp_path), "out", "--to", target)
+    assert run(*words) == 0
+    said = capsys.readouterr()
+    assert said.out == "x\ny\n"
+    assert ("the images stay where they are" in said.err) == told
+    assert run(*words, "--json", "--overwrite", "--alt", "80", "320") == 0
+    said = capsys.readouterr()
+    assert (json.loads(said.out), said.err) == (["x", "y"], "")
+    assert asked == [
+        ((str(tmp_path), target, "out"), {"alt_range": None, "overwrite": False}),
+        ((str(tmp_path), target, "out"), {"alt_range": (80.0, 320.0), "overwrite": True}),
+    ]
