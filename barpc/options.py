@@ -570,7 +570,20 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
             raise InputError(
                 f"{path}: {name} is not taken from a file, which may be anybody's; give the flag"
             )
+    _refuse_code(path, RunOptions, data)
     return with_values(options or RunOptions(), data, str(path))
+
+
+def _refuse_code(path: str | Path, record: type[Options], values: Mapping[str, Any]) -> None:
+    """InputError where a file names a module that would be run: only a person may, by a flag or in Python."""
+    for name, one in declared(record).items():
+        value = values.get(name)
+        if isinstance(one.default, Options) and isinstance(value, Mapping):
+            _refuse_code(path, type(one.default), value)
+        elif one.rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value):
+            raise InputError(
+                f"{path}: {name} {value!r} would run code, which is not taken from a file; give the flag --{name}"
+            )
 
 
 def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
@@ -595,8 +608,7 @@ def _schema(kind: Any, rule: Rule) -> dict[str, Any]:
         count = {} if parts[-1] is ... else {"minItems": len(parts), "maxItems": len(parts)}
         return {"type": "array", "items": _schema(parts[0], rule), **count}
     if choices := rule.choices(kind):
-        listed = {"enum": list(choices)}
-        return {"anyOf": [listed, {"type": "string", "pattern": f"^{HOOK}$"}]} if rule.hook else listed
+        return {"enum": list(choices)}
     bounds = {
         "minimum": rule.least,
         "exclusiveMinimum": rule.above,

@@ -38,7 +38,6 @@ from barpc import __version__
 from barpc.atomic import PARTIAL, STATE, replacing
 from barpc.errors import BarpcError, OutputError
 from barpc.frozen import Arrays, load_npz
-from barpc.remote import Remote
 
 logger = logging.getLogger(__name__)
 
@@ -50,9 +49,6 @@ _CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr
 KEEP_AFTER = 30.0
 """A run that is refused within so many seconds leaves nothing; after that its stages are kept."""
 
-_WHOLE_FILE = 64 << 20  # bytes: larger inputs are sampled for their fingerprint
-_SAMPLE = 1 << 20
-
 
 @cache
 def code_version() -> str:
@@ -63,28 +59,6 @@ def code_version() -> str:
         digest.update(path.relative_to(root).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def fingerprint(path: str | Path) -> str:
-    """A hash of a file's content; of files above 64 MiB 64 samples, the size and the time of change.
-
-    Of a file on another host its URL and the version that the host names: nothing is read for it.
-    """
-    if isinstance(path, Remote):
-        return hashlib.sha256(f"{path} {path.size} {path.tag}".encode()).hexdigest()
-    path = Path(path)
-    found = path.stat()
-    digest = hashlib.sha256(str(found.st_size).encode())
-    with path.open("rb") as file:
-        if found.st_size <= _WHOLE_FILE:
-            while block := file.read(_SAMPLE):
-                digest.update(block)
-        else:
-            digest.update(str(found.st_mtime_ns).encode())
-            for start in np.linspace(0, found.st_size - _SAMPLE, 64).astype(np.int64):
-                file.seek(int(start))
-                digest.update(file.read(_SAMPLE))
-    return digest.hexdigest()
 
 
 def key_of(*parts: object) -> str:
