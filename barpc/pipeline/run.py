@@ -40,7 +40,7 @@ from barpc.report import Run, Summary, summarize
 from barpc.report.page import REPORT, remake_report
 from barpc.report.records import plain
 from barpc.report.run import pair_ties
-from barpc.report.summary import StageEntry
+from barpc.report.summary import InputEntry, StageEntry
 from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
@@ -170,7 +170,9 @@ def adjust(
         with _told(workspace, "summary", progress):
             run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
             summary = summarize(run)
-        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
+        files = {one.path: one for given in inputs.values() for one in given.every()}
+        read = tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
+        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)), inputs=read)
         _tell(progress, REPORT, 0)
         summary = write_tables(workspace, run, summary)
         _tell(progress, REPORT, 1)
