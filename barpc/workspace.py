@@ -38,6 +38,7 @@ from barpc import __version__
 from barpc.atomic import PARTIAL, STATE, replacing
 from barpc.errors import BarpcError, OutputError
 from barpc.frozen import Arrays, load_npz
+from barpc.rpcio import hidden_by
 
 logger = logging.getLogger(__name__)
 
@@ -119,13 +120,15 @@ class Workspace:
     folder : str or Path, that of an unfinished run is gone on with; another that is not empty needs `overwrite`
     overwrite : bool, replace what an earlier run wrote here and nobody has changed since; never anything else
     keep : iterable of Path, files that must never be written: the inputs
-    names : iterable of str, the outputs to come, if known: what is in their way is refused before any work
+    names : iterable of str, the outputs to come, if known: what is in their way is refused before any work, and they
+        where an image in the folder would be read with another RPC because of them
     adds : bool, other things may be in the folder: what earlier runs wrote stays theirs, free names are written
 
     Raises
     ------
     OutputError
-        The folder is not empty, holds a file that is in the way, is in use by another run, or cannot be written.
+        The folder is not empty, holds a file that is in the way or an image whose RPC would be hidden, is in use by
+        another run, or cannot be written.
     """
 
     def __init__(
@@ -179,8 +182,22 @@ class Workspace:
         if present and not self._adds and not self._may_replace:
             raise OutputError(f"{self.folder}: exists and is not empty; give --overwrite or another -o")
         self._earlier = _read_own(self.folder)
-        for name in names:
+        self._named = set(names)
+        for name in self._named:
             self._refuse_foreign(name)
+        self._refuse_hiding(self._named)
+
+    def _refuse_hiding(self, names: Iterable[str]) -> None:
+        """Raise if a file to be written would be read in place of the RPC of an image that is there.
+
+        For the inputs it does not matter whether barpc wrote such a file before.
+        """
+        for path, image, _ in hidden_by(self.folder / name for name in names):
+            known = "the input " * (image.resolve() in self._keep)
+            if known or not (self.owns(image.name) or os.path.lexists(path)):
+                raise OutputError(
+                    f"{path}: would be read in place of the RPC of {known}{image}; give another -o"
+                )
 
     def _refuse_foreign(self, name: str) -> None:
         path = self.folder / name
@@ -265,6 +282,8 @@ class Workspace:
         with replacing(self.folder / name, overwrite=True, room=self.partial) as partial:
             yield partial
             self._refuse_foreign(name)
+            if name not in self._named:
+                self._refuse_hiding([name])
             sha = _digest(partial)
             if sha is None:
                 raise OutputError(f"{self.folder / name}: cannot be written (its temporary file is gone)")

@@ -21,7 +21,7 @@ from barpc.ba.ground import DEM_BIAS
 from barpc.dem import Dem
 from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
-from barpc.handoff import refuse_hiding, unverified
+from barpc.handoff import unverified
 from barpc.identity import Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.cluster import watched
@@ -253,7 +253,6 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
     keep = {Path(path) for path in inputs if not isinstance(path, Remote)}
     keep |= set(input_files(options))
     names = output_names(views, options, folder)
-    refuse_hiding(folder, names, keep)
     refuse_shadows(folder, names)
     return names, keep
 
