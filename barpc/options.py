@@ -32,6 +32,7 @@ Model = Literal["auto", "rotation+translation", "rotation", "translation", "shif
 
 HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
 _MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
+_REAL = 1e30  # no option is larger, or smaller and not 0: squares, and squares of them, are numbers then
 _SHORT = reprlib.Repr()
 _SHORT.maxstring, _SHORT.maxother = 60, 200
 
@@ -189,7 +190,8 @@ def _plain(kind: Any, rule: Rule, value: Any) -> Any:
     if isinstance(value, Integral) and abs(int(value)) >= _MOST:
         return None
     number = kind(value)
-    return number if rule.holds(number) else None
+    beyond = kind is float and number != 0 and not 1 / _REAL <= abs(number) <= _REAL
+    return number if rule.holds(number) and not beyond else None
 
 
 # --- the records ------------------------------------------------------------------------------------------
