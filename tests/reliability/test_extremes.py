@@ -208,3 +208,23 @@ def test_a_scheme_may_be_written_in_any_case() -> None:
     assert str(found) == "https://a.org/X.tif"
     assert str(located("http://a.org:8080/x.tif", ["http://a.org:8080"])) == "http://a.org:8080/x.tif"
     assert str(located("https://[::1]:8080/x.tif", ["[::1]:8080"])) == "https://[::1]:8080/x.tif"
+
+
+@pytest.mark.parametrize("reader", ["matches", "gcp", "points", "asp"])
+def test_no_reader_shows_lines_of_a_text_that_is_none_of_its_files(tmp_path, reader) -> None:
+    """A link in a folder of somebody else's may lead anywhere that this user may read."""
+    from barpc.pointio.ground import read_correspondences, read_gcps
+
+    secret = tmp_path / "secret"
+    secret.write_text(
+        "the-key-of-the-house is under, the, stone, 42\nand the gate is open on mondays, 1, 2, 3\n"
+    )
+    name = {"matches": "m.csv", "gcp": "g.csv", "points": "p.csv", "asp": "g.gcp"}[reader]
+    (tmp_path / name).symlink_to(secret)
+    read = {
+        "matches": lambda path: read_links(path, ["a", "b"]),
+        "points": read_correspondences,
+    }.get(reader, lambda path: read_gcps(path, ["a", "b"]))
+    with pytest.raises(BarpcError) as caught:
+        read(tmp_path / name)
+    assert not {"key", "house", "stone", "gate", "mondays"} & set(str(caught.value).replace("-", " ").split())
