@@ -18,6 +18,7 @@ from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.rpc import RPC
 from barpc.simulate.orbit import Look, fly
 from tests.fit.cameras import Camera, random_points, synthetic
+from tests.lanes import rest_slow
 
 PECULIAR = "rpc_formats/md_ov_rpc.txt"  # P_BA of this RPC is no rational cubic: 1.2e-6 px remain in col
 
@@ -28,7 +29,7 @@ def miss(camera: Camera) -> float:
     return float(np.abs(camera.rpc.project(ground) - image).max())
 
 
-@pytest.mark.parametrize("grid", [(12, 12, 7), (10, 10, 6)])
+@pytest.mark.parametrize("grid", rest_slow([(10, 10, 6), (12, 12, 7)]))
 def test_every_vendors_rpc_is_refitted_to_a_hundred_millionth_of_a_pixel(
     vendors: list[Camera], grid: tuple[int, int, int]
 ) -> None:
@@ -79,8 +80,8 @@ def test_every_grid_reaches_the_rounding_of_coordinates(camera: Camera, space: s
     assert fit.coverage == 1.0
 
 
-def test_the_error_does_not_grow_with_the_area(vendors: list[Camera]) -> None:
-    for camera in vendors:
+def test_the_error_does_not_grow_with_the_area(some_vendors: list[Camera]) -> None:
+    for camera in some_vendors:
         if camera.name == PECULIAR:
             continue
         errors = []
@@ -139,10 +140,10 @@ def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera, join
     assert (fit.h[0] == fit.h[1]) == joint
 
 
-def test_numbers_fitted_for_nitf_survive_it(vendors: list[Camera]) -> None:
+def test_numbers_fitted_for_nitf_survive_it(some_vendors: list[Camera]) -> None:
     """Copying a good RPC into that format costs whole pixels."""
     limits = PRECISIONS["nitf"]
-    for camera in vendors:
+    for camera in some_vendors:
         fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(precision="nitf"))
         rpc = fit.rpc
         assert np.array_equal(limits.coeffs(rpc.coeffs), rpc.coeffs)

@@ -73,6 +73,20 @@ def test_points_of_one_value_determine_no_image(column: int, name: str, value: f
         screened(*given, allow_mirrored=False)
 
 
+@pytest.mark.parametrize(("spread", "ok"), [(0.7e-12, False), (1.5e-12, True)])
+@pytest.mark.parametrize("value", [43.25, -43.25])
+def test_a_value_that_differs_by_parts_in_a_million_millions_is_one(
+    value: float, spread: float, ok: bool
+) -> None:
+    ground = GROUND.copy()
+    ground[:, 1] = value * (1.0 - spread * (ground[:, 1] - ground[:, 1].min()) / np.ptp(ground[:, 1]))
+    if ok:
+        assert len(screened(ground, IMAGE, allow_mirrored=True)[0]) == len(ground)
+    else:
+        with pytest.raises(FitError, match="they determine no image"):
+            screened(ground, IMAGE, allow_mirrored=True)
+
+
 def test_points_on_a_line_or_in_a_plane_are_refused_and_those_at_one_altitude_taken() -> None:
     line = IMAGE.copy()
     line[:, 1] = 3.0 * line[:, 0] + 7.0
@@ -94,6 +108,36 @@ def test_points_on_a_line_or_in_a_plane_are_refused_and_those_at_one_altitude_ta
     steep[:, 1] = 43.0 + 0.5 * (steep[:, 0] - 5.0)
     with pytest.raises(FitError, match="on the ground they lie in a plane"):
         screened(steep, IMAGE, allow_mirrored=True)
+
+
+@pytest.mark.parametrize("lat", [0.0, 60.0, -80.0])
+def test_a_mirrored_image_is_found_at_any_latitude(lat: float) -> None:
+    """Pixels are square in metres, not in degrees, which are shorter near the poles."""
+    image = np.random.default_rng(3).uniform(0, 1e4, (300, 2))
+    ground = np.column_stack(
+        [
+            5.0 + image[:, 0] * 1e-5 / np.cos(np.radians(lat)),
+            lat - image[:, 1] * 1e-5,
+            np.random.default_rng(4).uniform(0, 500, 300),
+        ]
+    )
+    screened(ground, image, allow_mirrored=False)
+    with pytest.raises(FitError, match="mirrored"):
+        screened(ground, image * [-1.0, 1.0], allow_mirrored=False)
+    oblong = ground * [2.3, 1.0, 1.0]  # pixels twice as wide as high are no swapped columns
+    screened(oblong, image * [-1.0, 1.0], allow_mirrored=False)
+
+
+@pytest.mark.parametrize(("spread", "plane"), [(0.9e-3, False), (1.2e-3, True)])
+def test_altitudes_within_a_millimetre_are_one(spread: float, plane: bool) -> None:
+    """A plane that rises by so little is taken for level ground, which is fitted for its altitude; one more is none."""
+    given = GROUND.copy()
+    given[:, 2] = 100.0 + spread * (given[:, 0] - given[:, 0].min()) / np.ptp(given[:, 0])
+    if plane:
+        with pytest.raises(FitError, match="on the ground they lie in a plane"):
+            screened(given, IMAGE, allow_mirrored=True)
+    else:
+        assert len(screened(given, IMAGE, allow_mirrored=True)[0]) == len(GROUND)
 
 
 @pytest.mark.parametrize(("distinct", "ok"), [(39, False), (40, True)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import struct
 import sys
+import types
 from contextlib import closing
 from pathlib import Path
 
@@ -220,6 +221,17 @@ def linked(h5py, file, folder: Path) -> None:
     file["sub-a.tif"] = h5py.ExternalLink(str(hloc(folder / "other")), "sub-a.tif")
 
 
+def computed(size: int):
+    """The matches are a column that computes so many zeros."""
+    return rewritten(
+        "DROP TABLE matches",
+        "CREATE TABLE matches (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, blob BLOB, "
+        f"data BLOB GENERATED ALWAYS AS (zeroblob({size})) VIRTUAL)",
+        "DELETE FROM two_view_geometries",
+        "INSERT INTO matches (pair_id, rows, cols) SELECT 3 * 2147483647 + 5, 1, 2",
+    )
+
+
 LIES = {
     "a text for a database": (file("d.db", b"SQLite format 3\0 and no more"), "not a COLMAP database"),
     "a database cut short": (cut, "not a COLMAP database"),
@@ -229,16 +241,8 @@ LIES = {
         rewritten("DROP TABLE matches", "CREATE VIEW matches AS SELECT 1 pair_id, 1 rows, 2 cols, x'00' data"),
         "matches is a view",
     ),
-    "a column that computes": (
-        rewritten(
-            "DROP TABLE matches",
-            "CREATE TABLE matches (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, blob BLOB, "
-            "data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL)",
-            "DELETE FROM two_view_geometries",
-            "INSERT INTO matches (pair_id, rows, cols) SELECT 3 * 2147483647 + 5, 1, 2",
-        ),
-        "not a COLMAP database",
-    ),
+    "a column that computes": (computed(900), "not a COLMAP database"),
+    "a column that computes a gigabyte": (computed(900_000_000), "not a COLMAP database"),
     "a blob of another length": (rewritten("UPDATE keypoints SET rows = 1000000"), "not a COLMAP database"),
     "a keypoint that is not there": (rewritten("UPDATE keypoints SET rows = 1, data = zeroblob(16)"), "beyond the"),
     "words for numbers": (rewritten("UPDATE keypoints SET rows = 'many'"), "not a COLMAP database"),
@@ -273,7 +277,9 @@ LIES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LIES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if "gigabyte" in n else n for n in LIES]
+)
 def test_a_file_that_lies_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     prepare, says = LIES[name]
     path = prepare(tmp_path)
@@ -284,6 +290,124 @@ def test_a_file_that_lies_is_refused_in_one_line(tmp_path: Path, name: str) -> N
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
+
+
+def test_two_images_of_a_database_are_enough(tmp_path: Path) -> None:
+    found = read_matches(colmap(tmp_path), ["a", "b"])
+    assert np.bincount(found.view).tolist() == [3, 3]
+    assert sorted(found.xy[found.view == 0].tolist()) == sorted(KEYPOINTS["a"].tolist())
+
+
+class Stored:
+    """An array as h5py shows it, at a place of a file."""
+
+    def __init__(self, array: np.ndarray, name: str) -> None:
+        self.array, self.name = array, name
+        self.shape, self.ndim, self.size, self.dtype = array.shape, array.ndim, array.size, array.dtype
+        self.is_virtual, self.external = False, None
+
+    def __getitem__(self, _: object) -> np.ndarray:
+        return self.array
+
+
+def shelf(monkeypatch: pytest.MonkeyPatch, contents: dict[str, dict[str, np.ndarray]]) -> None:
+    """In place of h5py, which may be missing, one that finds these arrays by what stands behind the first bytes."""
+
+    class File:
+        def __init__(self, file, _mode: str) -> None:
+            self.arrays = contents[file.read()[8:].decode()]
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def visititems(self, visit) -> None:
+            for path, array in self.arrays.items():
+                for parent in Path(path).parents[-2::-1] if "/" in path else ():
+                    visit(str(parent), object())
+                visit(path, Stored(array, f"/{path}"))
+
+    fake = types.SimpleNamespace(File=File, Dataset=Stored)
+    monkeypatch.setitem(sys.modules, "h5py", fake)
+
+
+FEATURES = {
+    "hloc": {f"sub/{name}.tif/keypoints": xy.astype(np.float32) for name, xy in KEYPOINTS.items()},
+    "plain": {f"{name}.tif": xy for name, xy in KEYPOINTS.items()},
+}
+FEATURES["hloc"]["sub/a.tif/descriptors"] = FEATURES["plain"]["more/descriptors"] = np.ones(
+    (4, 3), np.float16
+)
+FEATURES["plain"]["scores"] = np.ones(4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "beside"), [("hloc", "feats.h5"), ("plain", "keypoints.h5"), ("plain", "features.h5")]
+)
+def test_keypoints_and_matches_of_two_files_are_found_by_their_places(
+    tmp_path, monkeypatch, kind, beside
+) -> None:
+    matches: dict[str, np.ndarray] = {}
+    for (first, second), rows in MATCHES.items():
+        partner = np.full(len(KEYPOINTS[first]), -1)
+        partner[np.array(rows)[:, 0]] = np.array(rows)[:, 1]
+        if kind == "hloc":
+            matches[f"sub-{first}.tif/sub-{second}.tif/matches0"] = partner
+            matches[f"sub-{first}.tif/sub-{second}.tif/matching_scores0"] = np.ones(len(partner))
+        else:
+            matches[f"{first}.tif/{second}.tif"] = np.array(rows)
+    matches["a.tif/stranger.tif/matches0"] = np.array([0, 0, 0])
+    path = tmp_path / "feats_matches-lightglue.h5"
+    for name in (path.name, beside):
+        (tmp_path / name).write_bytes(b"\x89HDF\r\n\x1a\n" + name.encode())
+    shelf(monkeypatch, {path.name: matches, beside: FEATURES[kind]})
+    found = read_matches(path, NAMES)
+    expected = read_matches(colmap(tmp_path), NAMES)
+    for name in ("view", "point", "xy", "sigma"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert len(read_links(path, NAMES[:2]).ends) == 3
+    (tmp_path / beside).unlink()
+    with pytest.raises(
+        InputError, match=r"holds no keypoints; they are looked for beside it as feats\.h5, features"
+    ):
+        read_matches(path, NAMES)
+
+
+def test_keypoints_may_lie_beside_their_matches_in_one_file(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "all.h5"
+    path.write_bytes(b"\x89HDF\r\n\x1a\nall.h5")
+    rows = {f"{a}.tif/{b}.tif": np.array(found) for (a, b), found in MATCHES.items()}
+    shelf(monkeypatch, {"all.h5": {**FEATURES["plain"], **rows}})
+    assert len(read_links(path, NAMES).ends) == 4
+    shelf(monkeypatch, {"all.h5": {**FEATURES["plain"], "a.tif/b.tif": np.array([[0, 9]])}})
+    with pytest.raises(InputError, match=r"not an HDF5 file of matches .*beyond the 3 and 4"):
+        read_links(path, NAMES)
+    shelf(monkeypatch, {"all.h5": {**FEATURES["plain"], "a.tif/a.tif": np.array([[0, 1]])}})
+    with pytest.raises(InputError, match="no track is seen in two"):
+        read_links(path, NAMES)
+    elsewhere = Stored(np.array([[0, 1]]), "/a.tif/b.tif")
+    for field, value, words in (
+        ("is_virtual", True, "lies in another file"),
+        ("external", [("other", 0, 8)], "lies in another file"),
+        ("size", 1 << 28, "too large for the keypoints and matches of an HDF5 file"),  # of 8 bytes each
+    ):
+        shelf(monkeypatch, {"all.h5": {**FEATURES["plain"], "a.tif/b.tif": elsewhere.array}})
+        monkeypatch.setattr(Stored, "__init__", _lying(field, value))
+        with pytest.raises(InputError, match=words):
+            read_links(path, NAMES)
+        monkeypatch.undo()
+
+
+def _lying(field: str, value: object):
+    whole = Stored.__init__
+
+    def made(self, array: np.ndarray, name: str) -> None:
+        whole(self, array, name)
+        if name.endswith("a.tif/b.tif"):
+            setattr(self, field, value)
+
+    return made
 
 
 def test_a_trigger_is_not_run_and_nothing_is_left_beside_the_file(tmp_path: Path) -> None:

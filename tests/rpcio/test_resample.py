@@ -20,6 +20,7 @@ from barpc.rpcio.resample import write_resampled
 from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.simulate.orbit import fly, looks
 from tests.jitter import jittered
+from tests.lanes import rest_slow
 from tests.rpcio.conftest import make_rpc
 from tests.scenes.render import render
 from tests.scenes.terrain import Plane, make_terrain
@@ -87,7 +88,10 @@ def shift(found: np.ndarray, truth, lacking: CorrectionGrid, inside: np.ndarray)
     return np.linalg.lstsq(system, (found - truth)[inside], rcond=None)[0]
 
 
-@pytest.mark.parametrize(("dtype", "top"), [("uint8", 250.0), ("uint16", 4000.0), ("float32", 1.0)])
+@pytest.mark.parametrize(
+    ("dtype", "top"),
+    [("uint8", 250.0), ("float32", 1.0), pytest.param("uint16", 4000.0, marks=pytest.mark.slow)],
+)
 def test_every_pixel_is_what_the_camera_of_the_rpc_sees(tmp_path, dtype, top):
     lacking = grid()
     image = raster(tmp_path / "a.tif", seen(top, dtype))
@@ -108,7 +112,7 @@ def test_every_pixel_is_what_the_camera_of_the_rpc_sees(tmp_path, dtype, top):
     assert np.sqrt(((found - wrong)[inside] ** 2).mean()) > 0.05 * top  # the other sign
 
 
-@pytest.mark.parametrize("planted", [(0.02, 0.0), (0.0, -0.015)])
+@pytest.mark.parametrize("planted", rest_slow([(0.02, -0.015), (0.02, 0.0), (0.0, -0.015)]))
 def test_positions_are_not_rounded(tmp_path, planted):
     """Shifts of less than 1/32 px, which table interpolation would not see."""
     lacking = grid(lambda c, r: planted[0], lambda c, r: planted[1])
@@ -258,6 +262,7 @@ def moved(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return -np.linalg.lstsq(system, (found - truth).ravel(), rcond=None)[0]
 
 
+@pytest.mark.slow
 def test_a_rendered_image_with_jitter_becomes_that_of_a_camera_without(tmp_path):
     """Relief and houses seen by a camera that swings by a pixel, and by one that does not: strip by strip they agree to
     0.02 px once it is resampled, and by tenths before."""

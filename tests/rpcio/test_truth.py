@@ -16,6 +16,7 @@ from barpc.handoff import CONSUMERS, verify
 from barpc.rpcio import read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
+from tests.lanes import rest_slow
 
 PRINTED = 0.51e-7
 """The tables of truth have seven decimals [px]."""
@@ -51,6 +52,9 @@ EXPECTED = {
     "rpc_formats/rpc_WV2.xml": "xml",
     "rpc_formats/wv3_20.NTF": "nitf",
 }
+_FIRST = list({kind: file for file, kind in reversed(EXPECTED.items())}.values())
+ONE_OF_EACH = rest_slow([*_FIRST, *(file for file in EXPECTED if file not in _FIRST)], keep=len(_FIRST))
+"""A file of each format before a commit."""
 
 
 def table(shared_data: Path, file: str) -> dict[str, Array]:
@@ -145,7 +149,7 @@ def test_number_against_number_the_vendor_s_own_file_reads_as_other_tools_read_i
     assert (np.abs(found - image) / scale).max() <= bound
 
 
-@pytest.mark.parametrize("file", EXPECTED)
+@pytest.mark.parametrize("file", ONE_OF_EACH)
 def test_what_is_written_of_a_vendor_s_rpc_reads_the_same_in_every_tool(file, shared_data, tmp_path):
     rpc = read_rpc(shared_data / file)
     names = ["a_RPC.TXT", "a.RPB", "a.geom", "a.XML", "a.json"]

@@ -60,6 +60,14 @@ def _pushbroom(lon: float) -> Pushbroom:
     return fly(np.array([lon, 43.2, 500.0]), Look(25.0, 100.0), (20000, 19000), 0.5)
 
 
+def _curved() -> Pushbroom:
+    """Its pixels shrink by a tenth towards one edge, and its detector line is an arc."""
+    given = _pushbroom(5.4)
+    step = np.abs(given.look[:, 1]).max()
+    bend = step / 1e4 * np.array([[0.02, 1e-6], [0.03, 2e-6]])
+    return replace(given, look=np.hstack([given.look, bend]))
+
+
 def _turned_over() -> Pushbroom:
     """The last row first, under aberration and refraction."""
     given = _pushbroom(5.4)
@@ -148,6 +156,7 @@ MODELS: dict[str, Callable[[], Case]] = {
     ),
     "pushbroom": lambda: Case(_pushbroom(5.4), (20000, 19000), (0.0, 1000.0)),
     "pushbroom across the antimeridian": lambda: Case(_pushbroom(180.0), (20000, 19000), (0.0, 1000.0)),
+    "pushbroom of a curved detector": lambda: Case(_curved(), (20000, 19000), (0.0, 1000.0)),
     "pushbroom that sees bent light, turned over": lambda: Case(
         _turned_over(), (20000, 19000), (0.0, 1000.0)
     ),

@@ -131,12 +131,25 @@ def document(
 """
 
 
-def nitf(text: str, path: Path) -> Path:
-    """A NITF 2.1 with the document in a data extension behind an image of 4 bytes, by its lengths alone."""
-    image, data = b"\0" * 439 + b"\1\2\3\4", text.encode()
-    other, subheader = b"DEother".ljust(200), b"DEXML_DATA_CONTENT".ljust(230)
-    counts = b"001%06d%010d" % (439, 4) + b"000" * 3
-    counts += b"002%04d%09d%04d%09d" % (len(other), 9, len(subheader), len(data)) + b"000" * 2
+def nitf(text: str, path: Path, images: int = 1, graphics: int = 0, texts: int = 0) -> Path:
+    """A NITF 2.1 with the document in a data extension behind images of 4 bytes and more, by its lengths alone."""
+    data = text.encode()
+    kinds = (
+        [(b"IM".ljust(439, b"\0"), bytes(4 + k), b"%06d%010d") for k in range(images)],
+        [(b"SY".ljust(258, b"\0"), bytes(7 + k), b"%04d%06d") for k in range(graphics)],
+        [],  # reserved
+        [(b"TE".ljust(282, b"\0"), bytes(11 + k), b"%04d%05d") for k in range(texts)],
+        [
+            (b"DEother".ljust(200), b"no sicd !", b"%04d%09d"),
+            (b"DEXML_DATA_CONTENT".ljust(230), data, b"%04d%09d"),
+        ],
+        [],
+    )
+    counts = b"".join(
+        b"%03d" % len(kind) + b"".join(form % (len(head), len(body)) for head, body, form in kind)
+        for kind in kinds
+    )
     header = b"NITF02.10".ljust(342) + b"%012d%06d" % (0, 360 + len(counts)) + counts
-    path.write_bytes(header + image + other + b"no sicd !" + subheader + data)
+    segments = b"".join(head + body for kind in kinds for head, body, _ in kind)
+    path.write_bytes(header + segments)
     return path

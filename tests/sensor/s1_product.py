@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.optimize import brentq
@@ -99,10 +100,13 @@ class Product:
 
     def model(self) -> RangeDoppler:
         """The model read from the annotation."""
-        return RangeDoppler.from_annotation(read_annotation(self.xml(), name=self.name))
+        return _model(self)
 
     def xml(self) -> bytes:
         """The annotation, its geolocation grid computed from the truth."""
+        return _annotation(self)
+
+    def _annotation(self) -> bytes:
         rough = read_annotation(self._xml(np.zeros((1, 7))), name=self.name)
         model = _quiet(lambda: RangeDoppler.from_annotation(rough))
         step = self.lines_per_burst if self.bursts else self.lines // 9
@@ -213,6 +217,16 @@ class Product:
 <Variable_Header><Ref_Frame>EARTH_FIXED</Ref_Frame></Variable_Header></Earth_Explorer_Header>
 <Data_Block type="xml"><List_of_OSVs count="{count}">{rows}</List_of_OSVs></Data_Block></Earth_Explorer_File>
 """.encode()
+
+
+@cache
+def _annotation(product: Product) -> bytes:
+    return product._annotation()
+
+
+@cache
+def _model(product: Product) -> RangeDoppler:
+    return RangeDoppler.from_annotation(read_annotation(product.xml(), name=product.name))
 
 
 IW = {

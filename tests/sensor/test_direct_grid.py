@@ -9,8 +9,9 @@ from barpc.errors import RpcError
 from barpc.fit import fit_rpc
 from barpc.pointio.ground import read_grid
 from barpc.rpcio import read_rpc
-from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.direct_grid import DirectGrid, linear_axes
 from barpc.simulate.orbit import Look, fly
+from tests.lanes import rest_slow
 
 SIZE = (20000, 20000)
 PHYSICAL = fly(np.array([5.4, 43.3, 500.0]), Look(22.0, 140.0), SIZE, 0.5)
@@ -170,3 +171,163 @@ def test_an_rpc_is_fitted_to_a_vendor_grid_by_the_one_function(shared_data):
     fit = fit_rpc(DirectGrid.from_points(nodes.ground, nodes.image), (39999, 22900), (40.0, 1120.0))
     assert fit.rmse_ckp.max() < 2e-5
     assert fit.max_ckp.max() < 5e-5
+
+
+# --- how dense a grid is made ----------------------------------------------------------------------------------
+
+
+def chord(bend: float, step: float) -> float:
+    """By how much a parabola of the second derivative `bend` leaves its chord over a step, at most."""
+    return bend * step**2 / 8
+
+
+@pytest.mark.parametrize(("bend", "tolerance"), [(1e-6, 0.01), (4e-6, 0.01), (1e-6, 0.0005)])
+def test_an_axis_has_as_many_nodes_as_its_bend_asks_for_and_few_more(bend, tolerance):
+    """Of two axes each may take half of the tolerance; the second is straight and keeps the longest cells."""
+
+    def value(points):
+        return bend / 2 * points[:, :1] ** 2 + 0.3 * points[:, 1:] - 7.0
+
+    bent, straight = linear_axes(
+        value, np.array([-100.0, 50.0]), np.array([8092.0, 4146.0]), np.array([1024.0, 1000.0]), tolerance
+    )
+    step = bent[1] - bent[0]
+    assert chord(bend, step) <= 1.05 * tolerance / 2  # the middle of a cell is hardly ever tried
+    assert chord(bend, step) > 0.6 * tolerance / 2
+    assert len(straight) == 6  # 4096 m in cells of up to 1000
+    for axis, ends in ((bent, (-100.0, 8092.0)), (straight, (50.0, 4146.0))):
+        assert (axis[0], axis[-1]) == ends
+        np.testing.assert_allclose(np.diff(axis), axis[1] - axis[0])
+
+
+def test_what_is_straight_keeps_the_longest_cells_and_three_of_them_at_least():
+    def value(points):
+        return points @ np.array([[1.0, 2.0], [3.0, -4.0]])
+
+    axes = linear_axes(value, np.zeros(2), np.array([10_240.0, 90.0]), np.array([1024.0, 1024.0]), 1e-3)
+    assert [len(axis) for axis in axes] == [11, 4]
+
+
+def test_the_errors_of_all_values_count_together():
+    """Of (x^2, x^2) the error is larger by the root of two than that of x^2 alone."""
+    low, high, longest = np.zeros(1), np.full(1, 8192.0), np.full(1, 1024.0)
+    one = linear_axes(lambda p: 1e-6 * p**2, low, high, longest, 0.005)[0]
+    both = linear_axes(lambda p: 1e-6 * np.hstack([p**2, p**2]), low, high, longest, 0.005)[0]
+    assert len(one) < len(both) < 1.35 * len(one)
+
+
+def test_more_nodes_than_millions_are_bought_off_by_twice_the_tolerance():
+    """Waves that would take 260 cells along each axis: the promise is loosened until four million nodes do."""
+
+    def value(points):
+        return np.sin(points).sum(axis=1, keepdims=True)
+
+    def nodes(tolerance):
+        axes = linear_axes(value, np.zeros(3), np.full(3, 60.0), np.full(3, 60.0), tolerance)
+        return float(np.prod([len(axis) for axis in axes]))
+
+    # a wave of height 1 leaves the chord of a step h by h^2 / 8; a third of the tolerance for each axis
+    asked = {tolerance: (60.0 / np.sqrt(8 * tolerance / 3)) ** 3 for tolerance in (0.02, 0.1)}
+    assert asked[0.02] > 4e6 > asked[0.1]
+    assert 0.9 * asked[0.02] / 8 < nodes(0.02) < 4e6  # twice and twice again
+    assert asked[0.1] * 0.9 < nodes(0.1) < 1.6 * asked[0.1]
+
+
+def test_a_grid_of_a_camera_spans_its_image_and_its_altitudes():
+    grid = DirectGrid.of(PHYSICAL, (3000, 2000), (100.0, 700.0))
+    assert (grid.cols[0], grid.cols[-1]) == (-0.5, 2999.5)
+    assert (grid.rows[0], grid.rows[-1]) == (-0.5, 1999.5)
+    assert (grid.alts[0], grid.alts[-1]) == (100.0, 700.0)
+    nodes = np.stack(np.meshgrid(grid.cols, grid.rows), axis=-1)
+    for alt, layer in zip(grid.alts, grid.lonlat, strict=True):
+        there = PHYSICAL.localize(nodes, np.full(nodes.shape[:2], alt))[..., :2]
+        np.testing.assert_allclose(layer, there, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("tolerance", rest_slow([0.02, 0.002]))
+def test_a_grid_of_a_camera_is_true_to_its_tolerance_in_pixels_and_not_by_far_better(tolerance):
+    """Linear interpolation along each axis alone, at the middle of the cells, where it misses most."""
+    grid = DirectGrid.of(PHYSICAL, (20000, 20000), (0.0, 4000.0), tolerance)
+    total = 0.0
+    for axis in range(3):
+        ends = [[slice(None)] * 3 for _ in range(2)]
+        ends[0][axis], ends[1][axis] = slice(None, -1), slice(1, None)
+        between = (grid.lonlat[tuple(ends[0])] + grid.lonlat[tuple(ends[1])]) / 2
+        places = [grid.alts, grid.rows, grid.cols]
+        places[axis] = (places[axis][1:] + places[axis][:-1]) / 2
+        alt, row, col = np.meshgrid(*places, indexing="ij")
+        seen = PHYSICAL.project(np.concatenate([between, alt[..., None]], axis=-1))
+        total += np.linalg.norm(seen - np.stack([col, row], axis=-1), axis=-1).max()
+    assert total < 1.1 * tolerance
+    assert total > tolerance / 20
+
+
+def test_pixels_of_the_tolerance_are_those_in_the_middle_of_the_image():
+    """A camera whose pixels grow by e every 2000 columns: at the end they are seven times those of the middle."""
+
+    class Growing:
+        def localize(self, image, alt):
+            image = np.asarray(image, dtype=float)
+            lon = 5.0 + 0.02 * np.exp(image[..., 0] / 2000.0)
+            lonlat = np.stack([lon, 44.0 - 1e-5 * image[..., 1] + 0 * lon], axis=-1)
+            return np.concatenate([lonlat, np.broadcast_to(alt, lon.shape)[..., None]], axis=-1)
+
+    tolerance = 0.3
+    grid = DirectGrid.of(Growing(), (8000, 3000), (0.0, 100.0), tolerance)
+    step, pixel = grid.cols[1] - grid.cols[0], 0.02 / 2000.0 * np.exp(2.0)
+    missed = chord(0.02 / 2000.0**2 * np.exp(4.0), step) / pixel
+    assert 0.65 * tolerance / 3 < missed < 1.05 * tolerance / 3
+    assert (len(grid.rows), len(grid.alts)) == (4, 4)
+
+
+@pytest.mark.parametrize("power", [1.5, 2.5])
+def test_nodes_that_no_cubic_follows_are_found_again_to_the_last_one(power):
+    """A map in closed form whose pixels grow from one side to the other: lon = u^power, lat along the rows alone."""
+    cols, rows, alts = (
+        np.arange(0.0, 2001.0, 50.0),
+        np.arange(0.0, 1001.0, 50.0),
+        np.array([0.0, 100.0, 200.0]),
+    )
+
+    def place(col, row, alt):
+        lon = 3.0 + 0.02 * ((col + 1000.0) / 1000.0) ** power + 1e-6 * alt
+        return np.stack([lon, 44.0 - 1e-5 * row - 2e-6 * alt + 0 * col], axis=-1)
+
+    alt, row, col = np.meshgrid(alts, rows, cols, indexing="ij")
+    grid = DirectGrid(cols, rows, alts, place(col, row, alt))
+    rng = np.random.default_rng(1)
+    image, height = rng.uniform([-45.0, -45.0], [2045.0, 1045.0], (400, 2)), rng.uniform(-15.0, 215.0, 400)
+    image[:2] = [[-45.0, -45.0], [2045.0, 1045.0]]
+    ground = np.column_stack([place(*image.T, height), height])
+    np.testing.assert_allclose(grid.localize(image, height)[:, :2], ground[:, :2], rtol=0, atol=1e-6)
+    found, jacobian = grid.project_jacobian(grid.localize(image, height))
+    np.testing.assert_allclose(found, image, rtol=0, atol=1e-6)
+    by_col = 0.02 * power / 1000.0 * ((image[:, 0] + 1000.0) / 1000.0) ** (power - 1)
+    expected = np.zeros((400, 2, 3))
+    expected[:, 0, 0], expected[:, 0, 2] = 1 / by_col, -1e-6 / by_col
+    expected[:, 1, 1], expected[:, 1, 2] = -1e5, -0.2
+    np.testing.assert_allclose(jacobian, expected, rtol=5e-3, atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("change", "ok"),
+    [
+        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 0], 539.0, v)), True),
+        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 0], 541.0, v)), False),
+        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 1], -89.9, v)), True),
+        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 1], -90.1, v)), False),
+        (lambda c, r, a, v: (c + 1.1e9, r, a, v), False),
+        (lambda c, r, a, v: (c, r, a * 4e5, v), False),
+        (lambda c, r, a, v: (c, np.where(r == r[1], r[0], r), a, v), False),
+        (lambda c, r, a, v: (c[:1], r, a, v[:, :, :1]), False),
+        (lambda c, r, a, v: (c[:2], r[:2], a[:2], v[:2, :2, :2]), True),
+    ],
+)
+def test_nodes_lie_on_earth_and_in_an_image(change, ok):
+    grid = sampled(np.linspace(0, 2000, 5), np.linspace(0, 2000, 4), np.linspace(0.0, 4900.0, 3))
+    given = change(grid.cols, grid.rows, grid.alts, grid.lonlat)
+    if ok:
+        assert DirectGrid(*given).lonlat.shape[-1] == 2
+    else:
+        with pytest.raises(RpcError, match="localisation grid"):
+            DirectGrid(*given)

@@ -40,6 +40,7 @@ from barpc.sensor.sentinel1 import (
     read_annotation,
 )
 from barpc.sidefile import parse_xml
+from tests.lanes import diagonal, rest_slow
 from tests.sensor.s1_product import GRD, INTERVAL, IW, SAMPLING, START, STRIPMAP, Product
 
 AUXILIARY = ["20210216t151207", "20220104t170558", "20211223t051122"]
@@ -99,7 +100,10 @@ def safe(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     "product",
-    [*IW.values(), GRD, STRIPMAP, Product(lon=-180.0, argument=0.3), Product(swath="EW1", noise=5e-3)],
+    [
+        *(IW["IW1"], GRD, STRIPMAP, Product(lon=-180.0, argument=0.3)),
+        *rest_slow([Product(swath="EW1", noise=5e-3), IW["IW2"], IW["IW3"]], keep=0),
+    ],
 )
 def test_times_are_those_of_the_exact_orbit(product: Product) -> None:
     built = product.model()
@@ -128,9 +132,10 @@ def test_a_grd_localises_back_through_its_ground_range_polynomials(grd: RangeDop
     assert np.abs(grd.project(grd.localize(image, alt)) - image).max() <= 1e-8
 
 
-@pytest.mark.parametrize("atmosphere", [False, True])
-@pytest.mark.parametrize("bistatic", [None, "annotated"])
-@pytest.mark.parametrize("product", [IW["IW1"], GRD], ids=["slc", "grd"])
+@pytest.mark.parametrize(
+    ("product", "bistatic", "atmosphere"),
+    diagonal([IW["IW1"], GRD], [None, "annotated"], [False, True]),
+)
 def test_derivatives_with_delays_are_central_differences(
     product: Product, atmosphere: bool, bistatic: str | None
 ) -> None:
@@ -434,11 +439,12 @@ def test_a_broken_annotation_is_refused_with_what_and_where(iw1: Product, index:
         RangeDoppler.from_annotation(read_annotation(xml, name="s1a.xml"))
 
 
-def test_no_mutation_of_an_annotation_gets_past_the_errors_that_are_meant() -> None:
+@pytest.mark.parametrize("count", rest_slow([20, 200]))
+def test_no_mutation_of_an_annotation_gets_past_the_errors_that_are_meant(count: int) -> None:
     rng = np.random.default_rng(4)
     small = replace(IW["IW1"], samples=900, num_bursts=3, lines_per_burst=60, burst_cycle=50)
     sources = [small.xml(), replace(GRD, samples=900, num_bursts=1, lines_per_burst=300).xml()]
-    for k in range(200):
+    for k in range(count):
         xml = mutated(sources[k % 2], rng)
         try:
             with warnings.catch_warnings():
@@ -561,7 +567,7 @@ def test_a_point_costs_microseconds(model: RangeDoppler) -> None:
 # --- real products
 
 
-@pytest.mark.parametrize("stamp", AUXILIARY)
+@pytest.mark.parametrize("stamp", rest_slow(AUXILIARY))
 def test_an_auxiliary_orbit_meets_the_grid_of_the_product(shared_data: Path, stamp: str) -> None:
     annotation = read_annotation(annotation_path(shared_data, stamp))
     range_, azimuth = grid_residuals(annotation, RangeDoppler.from_annotation(annotation)).T
@@ -589,7 +595,7 @@ def test_an_inconsistent_grid_is_reported(shared_data: Path) -> None:
         RangeDoppler.from_annotation(annotation_path(shared_data, "20190803t164007"))
 
 
-@pytest.mark.parametrize("stamp", AUXILIARY)
+@pytest.mark.parametrize("stamp", rest_slow(AUXILIARY))
 def test_incidence_angles_are_those_of_the_grid(shared_data: Path, stamp: str) -> None:
     path = annotation_path(shared_data, stamp)
     points = parse_xml(path).iter("geolocationGridPoint")
@@ -604,7 +610,7 @@ def test_incidence_angles_are_those_of_the_grid(shared_data: Path, stamp: str) -
     assert np.abs(np.rad2deg(np.arccos(cosine)) - stated).max() <= 1e-4
 
 
-@pytest.mark.parametrize("stamp", [*SLC, "20211223t051122"])
+@pytest.mark.parametrize("stamp", rest_slow([*SLC[:1], "20211223t051122", *SLC[1:]], keep=2))
 def test_an_independent_tool_finds_the_same_image_points(shared_data: Path, stamp: str) -> None:
     """Another tool's points; its orbit is of degree 11, and its times are UNIX seconds in a float."""
     path = annotation_path(shared_data, stamp)
@@ -628,6 +634,7 @@ def test_an_independent_tool_finds_the_same_image_points(shared_data: Path, stam
     assert col <= (2.1e-2 if downlinked else 1e-4)
 
 
+@pytest.mark.slow
 def test_rpcs_of_real_swaths_reach_the_stated_accuracy(shared_data: Path) -> None:
     box, inside, rows = [], [], []
     for stamp in SLC:
@@ -645,6 +652,7 @@ def test_rpcs_of_real_swaths_reach_the_stated_accuracy(shared_data: Path) -> Non
     assert np.max(rows) <= 1e-6
 
 
+@pytest.mark.slow
 def test_an_rpc_of_three_swaths_reaches_two_thousandths_of_a_pixel(shared_data: Path) -> None:
     errors = []
     for stamp in SLC[:4]:

@@ -16,7 +16,7 @@ from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, triangulate, view_angles
-from barpc.sensor.sicd import open_sicd
+from barpc.sensor.sicd import find_sicd, open_sicd
 from barpc.simulate.orbit import Look, fly
 from tests.sensor.radar_documents import DURATION, KINDS, SIZE, document, nitf
 
@@ -117,6 +117,17 @@ def test_a_part_of_an_image_and_a_nitf_are_read_as_they_are(kind, tmp_path, mode
     assert camera.model == whole
     assert camera.extent == SIZE
     assert camera.alt_range == pytest.approx((-880.0, 1120.0), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("images", "graphics", "texts"), [(0, 0, 0), (3, 0, 0), (1, 2, 0), (1, 0, 2), (2, 12, 11)]
+)
+def test_a_document_stands_behind_all_that_a_nitf_holds(images, graphics, texts, tmp_path):
+    path = nitf(document("PFA"), tmp_path / "image.ntf", images, graphics, texts)
+    assert find_sicd(path) == document("PFA").encode()
+    assert find_sicd(nitf("<other/>", path, images, graphics, texts)) is None
+    with pytest.raises(RpcFormatError, match="no SICD metadata in it"):
+        open_sicd(path)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -152,3 +152,71 @@ def test_times_of_the_frame_begin_with_the_first_row(tmp_path):
     model = open_terrasar(Terrasar().write(tmp_path))
     late = (model.epoch - np.datetime64("2021-02-16T15:12:07.524369", "ns")) / np.timedelta64(1, "ns")
     assert late == pytest.approx((START + 1.8e-4) * 1e9, abs=1)
+
+
+def opened(path, old, new):
+    """The model of an annotation in which one thing is changed."""
+    text = re.sub(old, new, path.read_text())
+    assert text != path.read_text()
+    path.write_text(text)
+    return open_terrasar(path)
+
+
+@pytest.mark.parametrize(("tag", "count"), [("Rows", SIZE[1]), ("Columns", SIZE[0])])
+@pytest.mark.parametrize(("off", "ok"), [(1, True), (-1, True), (3, False), (-3, False)])
+def test_rows_and_columns_last_as_long_as_their_number_to_two(tmp_path, tag, count, off, ok):
+    path, change = Terrasar().write(tmp_path), (f"<numberOf{tag}>{count}<", f"<numberOf{tag}>{count + off}<")
+    if ok:
+        assert opened(path, *change).size[tag == "Rows"] == count + off
+    else:
+        with pytest.raises(RpcFormatError, match=f"{count + off} {tag.lower()} every .* do not last"):
+            opened(path, *change)
+
+
+@pytest.mark.parametrize(("late", "ok"), [(0.9e-3, True), (-0.9e-3, True), (1.1e-3, False), (-1.1e-3, False)])
+def test_no_signal_is_late_by_more_than_a_millisecond(tmp_path, late, ok):
+    product = Terrasar(late=(1.47e-8, late))
+    path = product.write(tmp_path)
+    if ok:
+        ground = product.ground(5)
+        np.testing.assert_allclose(
+            open_terrasar(path).project(ground), product.image(ground), rtol=0, atol=2e-3
+        )
+    else:
+        with pytest.raises(RpcFormatError, match=r"azimuthShift is .* s, expected at most 0\.001"):
+            open_terrasar(path)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "warned"), [(4.9, 0, False), (5.1, 0, True), (0, -4.9, False), (0, 5.1, True)]
+)
+def test_a_grid_five_pixels_off_belongs_to_another_orbit(tmp_path, rows, columns, warned):
+    path = Terrasar().write(tmp_path)
+    georef = tmp_path / "ANNOTATION" / "GEOREF.xml"
+    text = re.sub(
+        r"<t>([^<]*)</t>", lambda m: f"<t>{float(m[1]) + rows * INTERVAL!r}</t>", georef.read_text()
+    )
+    text = re.sub(r"<tau>([^<]*)</tau>", lambda m: f"<tau>{float(m[1]) + columns * SPACING!r}</tau>", text)
+    georef.write_text(text)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        open_terrasar(path)
+    assert [issubclass(one.category, BarpcWarning) for one in told] == [True] * warned
+
+
+def test_state_vectors_are_those_of_the_earth(tmp_path):
+    path = Terrasar().write(tmp_path)
+    whole = open_terrasar(path)
+    assert opened(path, ">WGS84<", ">WGS84-G873<") == whole
+    assert opened(path, "<orbitHeader>.*</orbitHeader>", "") == whole  # it says nothing of them
+    assert whole.frame.sampling_rate == pytest.approx(1 / SPACING)
+    assert whole.frame.interval == INTERVAL
+    assert not whole.delays
+
+
+@pytest.mark.parametrize("mode", ["SM", "SL", "HS", "HS300", "ST"])
+def test_stripmaps_and_spotlights_are_read(tmp_path, mode):
+    path = Terrasar().write(tmp_path)
+    if mode != "SM":
+        assert opened(path, "<imagingMode>SM<", f"<imagingMode>{mode}<").size == SIZE
+    assert open_camera(path).alt_range == (-97.0, 1399.0)

@@ -1,0 +1,483 @@
+"""Least squares of a quotient, the choice among fits, the search for the largest error: each by its definition."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from barpc.errors import BarpcWarning, FitError
+from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
+from barpc.fit import rpc as fit_module
+from barpc.fit import solve as solve_module
+from barpc.fit.certificate import CELLS, Errors, Sample, least_value, smallest_value
+from barpc.fit.localisation import Localisation, inverse, off
+from barpc.fit.points import control_points
+from barpc.fit.precision import PRECISIONS
+from barpc.fit.rpc import _plainer, underlying_rpc
+from barpc.fit.solve import COMMON, normalization, solve, tidy
+from barpc.fit.system import Problem, expected_size, solution
+from barpc.geodesy import Array, ecef_from_ground
+from barpc.sensor.rational import monomials
+from barpc.sensor.rpc import RPC
+from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
+
+# --- the least squares of a quotient -------------------------------------------------------------------------
+
+
+def wavy(
+    camera: Camera, count: int = 160, height: float = 2.0, seed: int = 3
+) -> tuple[Array, Array, Normalization]:
+    """Points whose image swings by some pixels, as no RPC does."""
+    ground, image = random_points(camera, count, np.random.default_rng(seed))
+    bent = image + height * np.sin(image[:, ::-1] / 6000.0 + [0.3, 1.0])
+    rpc = camera.rpc
+    return ground, bent, Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+
+
+def left(problem: Problem, coeffs: Array) -> Array:
+    """What coefficients (4, 20) leave of the points (N, 2) [px], weighted."""
+    norm = problem.norm
+    rpc = RPC(coeffs, norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
+    weight = 1.0 if problem.weight is None else problem.weight[:, None]
+    return (rpc.project(problem.ground) - problem.image) * weight
+
+
+def best(problem: Problem, axis: int, start: Array) -> float:
+    """Sum of squares of the best numerator and denominator of a coordinate, by scipy, from coefficients (4, 20)."""
+    norm = problem.norm
+    basis = monomials(((problem.ground - norm.ground_offset) / norm.ground_scale).T)
+    y = (problem.image[:, axis] - norm.image_offset[axis]) / norm.image_scale[axis]
+    weight = 1.0 if problem.weight is None else problem.weight
+
+    def residual(x: Array) -> Array:
+        return weight * ((x[:20] @ basis) / (np.append(1.0, x[20:]) @ basis) - y) * norm.image_scale[axis]
+
+    x = np.concatenate([start[2 * axis], start[2 * axis + 1, 1:]])
+    return float((least_squares(residual, x, method="lm", xtol=1e-14, ftol=1e-14).fun ** 2).sum())
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_gauss_newton_ends_where_no_neighbour_is_better(camera: Camera, weighted: bool) -> None:
+    ground, image, norm = wavy(camera)
+    weight = np.random.default_rng(1).uniform(0.2, 1.0, len(ground)) if weighted else None
+    problem = Problem(ground, image, norm, weight=weight)
+    coeffs, solved, h, passes = solve_module._gauss_newton(problem, None, None)
+    squares = (left(problem, coeffs) ** 2).sum(axis=0)
+    for axis in range(2):
+        assert squares[axis] <= 1.01 * best(problem, axis, coeffs)
+    assert (h == 0).all()
+    assert len(solved) == 2
+    assert 2 <= passes <= 20
+    ridge = solve_module._ridge(problem, None, None)[0]
+    assert squares.sum() < (left(problem, ridge) ** 2).sum()
+
+
+def test_rows_with_a_numerator_are_the_quotient_and_its_derivatives(camera: Camera) -> None:
+    """M x - y is what is left at x, and M how it changes."""
+    ground, image, norm = wavy(camera, 60)
+    problem, scale = Problem(ground, image, norm), norm.image_scale
+    for axis in range(2):
+        numerator, denominator = camera.rpc.coeffs[2 * axis : 2 * axis + 2]
+        rows = np.concatenate([r for _, r in problem.rows(axis, denominator, True, numerator)])
+        x = np.concatenate([numerator, denominator[1:]])
+        basis = monomials(((ground - norm.ground_offset) / norm.ground_scale).T)
+        y = (image[:, axis] - norm.image_offset[axis]) / scale[axis]
+
+        def quotient(x: Array, basis: Array = basis) -> Array:
+            return (x[:20] @ basis) / (np.append(1.0, x[20:]) @ basis)
+
+        np.testing.assert_allclose(rows[:, :-1] @ x - rows[:, -1], quotient(x) - y, atol=1e-12)
+        for k in (0, 3, 11, 20, 25, 38):
+            step = 1e-6 * np.eye(39)[k]
+            np.testing.assert_allclose(
+                rows[:, k], (quotient(x + step) - quotient(x - step)) / 2e-6, atol=1e-8
+            )
+
+
+def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypatch: Any) -> None:
+    """Gauss-Newton begins with the best polynomials of the points, each coordinate with its own."""
+    ground, image, norm = wavy(camera)
+    problem, starts = Problem(ground, image, norm), []
+    whole = solve_module._minimised
+
+    def seen(problem: Problem, axes: Any, x: Array) -> Any:
+        starts.append(x)
+        return whole(problem, axes, x)
+
+    monkeypatch.setattr(solve_module, "_minimised", seen)
+    plain, *_ = solve_module._gauss_newton(problem, None, None)
+    ridge = solve_module._ridge(problem, None, None)
+    np.testing.assert_array_equal(starts[0], np.concatenate([ridge[0][0], ridge[0][1, 1:]]))
+    basis = monomials(((ground - norm.ground_offset) / norm.ground_scale).T)
+    for slope, kept in ((0.70, True), (0.74, False)):  # 1 - 1.25 slope: above a tenth, and below
+        starts.clear()
+        poles = ridge[0].copy()
+        poles[1::2] = 0.0
+        poles[1::2, 0], poles[1::2, 1] = 1.0, slope
+        monkeypatch.setattr(solve_module, "_ridge", lambda *_, poles=poles: (poles, *ridge[1:]))
+        found, *_ = solve_module._gauss_newton(problem, None, None)
+        for axis in range(2):
+            y = (image[:, axis] - norm.image_offset[axis]) / norm.image_scale[axis]
+            polynomial = np.append(np.linalg.lstsq(basis.T, y, rcond=None)[0], np.zeros(19))
+            given = np.concatenate([poles[2 * axis], poles[2 * axis + 1, 1:]])
+            np.testing.assert_allclose(starts[axis], given if kept else polynomial, atol=1e-9)
+        squares = (left(problem, found) ** 2).sum()
+        assert squares <= 1.02 * (left(problem, plain) ** 2).sum()
+
+
+def test_a_step_that_makes_things_worse_is_not_taken(camera: Camera) -> None:
+    """From a start far off: the sum of squares never rises, and no denominator comes near zero."""
+    ground, image, norm = wavy(camera, 120, 20.0)
+    problem = Problem(ground, image, norm)
+    rng = np.random.default_rng(0)
+    for axis in range(2):
+        start = np.concatenate([rng.normal(0, 1, 20), rng.normal(0, 0.02, 19)])
+        before = problem.system((axis,), problem.expanded(start)[1], problem.expanded(start)[:1]).squares(
+            start
+        )
+        x, system, passes = solve_module._minimised(problem, (axis,), start)
+        assert system.squares(x) < 0.1 * before
+        assert least_value(problem.expanded(x)[1], np.full((3, 2), [-1.25, 1.25])) > 0.1
+        assert passes <= 20
+        error = problem.errors(axis, x)
+        assert (error**2).sum() == pytest.approx(system.squares(x), rel=1e-9)
+
+
+def test_minimax_keeps_the_round_with_the_least_largest_error(camera: Camera) -> None:
+    ground, image, norm = wavy(camera, 200)
+    problem = Problem(ground, image, norm)
+    plain, *_, few = solve_module._gauss_newton(problem, None, None)
+    even, *_, passes = solve_module._minimax(problem, None, None)
+    largest = [np.abs(left(problem, coeffs)).max(axis=0) for coeffs in (plain, even)]
+    assert (largest[1] < 0.85 * largest[0]).all()
+    squares = [(left(problem, coeffs) ** 2).sum(axis=0) for coeffs in (plain, even)]
+    assert (squares[0] <= squares[1]).all()
+    assert passes > few + 7
+    near = np.sort(np.abs(left(problem, even)), axis=0)[::-1] / largest[1]
+    assert (near[10] > 0.85).all()  # many points are about as bad as the worst
+
+
+def test_one_denominator_is_that_of_both(camera: Camera) -> None:
+    ground, image, norm = wavy(camera)
+    problem = Problem(ground, image, norm, common=True)
+    assert problem.parts == ((0, 1),)
+    assert problem.aspect == pytest.approx(9800.0 / 10100.0)
+    for found in (solve_module._ridge(problem, None, None), solve_module._gauss_newton(problem, None, None)):
+        np.testing.assert_array_equal(found[0][1], found[0][3])
+        assert (found[0][0] != found[0][2]).any()
+    both, *_ = solve_module._gauss_newton(problem, None, None)
+    each, *_ = solve_module._gauss_newton(replace(problem, common=False), None, None)
+    squares = [(left(problem, coeffs) ** 2).sum() for coeffs in (each, both)]
+    assert squares[0] < squares[1]
+    expected = expected_size(problem.active, 2)
+    assert len(expected) == 59
+    np.testing.assert_array_equal(expected[:20], expected[20:40])
+
+
+def test_coefficients_rounded_for_a_format_are_what_the_format_holds(camera: Camera) -> None:
+    ground, image, norm = wavy(camera)
+    problem, rounding = Problem(ground, image, norm), PRECISIONS["nitf"].coeffs
+    for method in ("ridge", "gauss-newton", "minimax", "lcurve", "vendor-denominators"):
+        coeffs, *_ = solve_module.METHODS[method](problem, rounding, camera.rpc)
+        np.testing.assert_array_equal(rounding(coeffs), coeffs)
+        free, *_ = solve_module.METHODS[method](problem, None, camera.rpc)
+        assert np.abs(left(problem, coeffs) - left(problem, free)).max() < 40.0, method
+
+
+def test_numbers_are_tidied_to_twelve_digits() -> None:
+    assert tidy(np.array([1.23456789012345, 1e-7 / 3, -2e5 / 3])).tolist() == [
+        1.23456789012, 3.33333333333e-8, -66666.6666667,
+    ]  # fmt: skip
+
+
+def test_offsets_and_scales_are_the_middle_and_the_half_of_the_points() -> None:
+    ground = np.array([[4.0, 42.0, 100.0], [6.0, 45.0, 900.0], [5.0, 44.0, 300.0]])
+    image = np.array([[10.0, -20.0], [30.0, 60.0], [15.0, 0.0]])
+    norm = normalization(ground, image, FitOptions())
+    assert norm.ground_offset.tolist() == [5.0, 43.5, 500.0]
+    assert norm.ground_scale.tolist() == [1.0, 1.5, 400.0]
+    assert norm.image_offset.tolist() == [20.0, 20.0]
+    assert norm.image_scale.tolist() == [10.0, 40.0]
+    flat = normalization(ground * [0, 0, 0] + [5.0, 43.0, 7.0], image * 0, FitOptions())
+    assert flat.ground_scale.tolist() == [1e-9, 1e-9, 50.0]
+    assert flat.image_scale.tolist() == [1e-6, 1e-6]
+    vendor = synthetic_rpc()
+    kept = normalization(ground, image, FitOptions(), vendor)
+    np.testing.assert_array_equal(kept.ground_offset, vendor.ground_offset)
+    np.testing.assert_array_equal(kept.ground_scale, vendor.ground_scale)
+    assert kept.image_offset.tolist() == [20.0, 20.0]
+    nitf = normalization(ground + 1e-6, image + 0.3, FitOptions(precision="nitf"))
+    assert nitf.ground_offset.tolist() == [5.0, 43.5, 500.0]
+    assert nitf.image_offset.tolist() == [20.0, 20.0]
+
+
+def test_what_rpcm_prints_has_twelve_decimals() -> None:
+    held = PRECISIONS["rpcm"]
+    assert held.coeffs(np.array([1.23456789012345, 4e-13, 6e-13])).tolist() == [1.234567890123, 0.0, 1e-12]
+    norm = held.normalization(Normalization([1 / 3] * 3, [2 / 3] * 3, [1e3 / 3] * 2, [1e3 / 3] * 2))
+    assert norm.ground_offset.tolist() == [0.333333333333] * 3
+    assert norm.ground_scale.tolist() == [0.666666666667] * 3
+    assert norm.image_offset.tolist() == [333.333333333333] * 2
+
+
+# --- which fit is taken ----------------------------------------------------------------------------------------
+
+
+def made(**changes: Any) -> RpcFit:
+    one = np.ones(2)
+    values: dict[str, Any] = {
+        "rpc": synthetic_rpc(), "rmse_cnp": one * 1e-3, "max_cnp": one * 2e-3, "rmse_ckp": one * 3e-3,
+        "max_ckp": one * 5e-3, "beyond": 1e-3, "min_denominator": 0.9, "roundtrip": 1e-9, "coverage": 1.0, "h": one,
+        "iterations": 1, "num_cnp": 100, "num_ckp": 50, "method": "ridge",
+    }  # fmt: skip
+    return RpcFit(**{**values, **changes})
+
+
+@pytest.mark.parametrize(("largest", "methods"), [(0.9e-6, ["ridge"]), (1.1e-6, ["ridge", "gauss-newton"])])
+def test_the_least_squares_are_looked_for_where_a_ridge_leaves_a_millionth_of_a_pixel(
+    largest, methods
+) -> None:
+    tried: list[str] = []
+
+    def attempt(method: str) -> RpcFit:
+        tried.append(method)
+        return made(method=method, max_ckp=np.array([largest, 1e-9]), rmse_ckp=np.full(2, 1e-7))
+
+    for option in ("auto", COMMON):
+        tried.clear()
+        fit_module._best(attempt, FitOptions(method=option), None, True, exact=True)
+        assert tried == methods
+    tried.clear()
+    fit_module._best(attempt, FitOptions(), None, True, exact=False)
+    assert tried == ["ridge"]
+    tried.clear()
+    fit_module._best(attempt, FitOptions(method="lcurve"), None, True, exact=True)
+    assert tried == ["lcurve"]
+
+
+def test_of_accepted_fits_the_one_with_the_least_error_is_taken() -> None:
+    fits = {
+        "ridge": made(rmse_ckp=np.array([3e-3, 4e-3])),
+        "gauss-newton": made(method="gauss-newton", rmse_ckp=np.array([4.5e-3, 1e-3])),
+    }
+    choose = partial(fit_module._best, exact=True)
+    assert choose(fits.__getitem__, FitOptions(), None, True).method == "gauss-newton"
+    fits["gauss-newton"] = replace(fits["gauss-newton"], rmse_ckp=np.array([5.1e-3, 0.0]))
+    assert choose(fits.__getitem__, FitOptions(), None, True).method == "ridge"
+    fits["ridge"] = replace(fits["ridge"], max_ckp=np.full(2, 0.1))  # not accepted
+    assert choose(fits.__getitem__, FitOptions(), None, True).method == "gauss-newton"
+
+
+@pytest.mark.parametrize(
+    ("rmse", "least", "plain"), [(1.09, 0.5, True), (1.11, 0.5, False), (1.5, 0.0, True), (1.5, -1.0, True)]
+)
+def test_behind_a_spline_the_calmer_fit_is_taken_where_it_is_a_tenth_worse_at_most(
+    rmse, least, plain
+) -> None:
+    fit = made(rmse_ckp=np.array([0.6, 0.8]), min_denominator=least)
+    other = made(rmse_ckp=np.array([0.8, 0.6]) * rmse, method="lcurve")
+    assert (_plainer(fit, other) is other) == plain
+
+
+@pytest.mark.parametrize(
+    ("method", "worst", "advised"),
+    [("gauss-newton", 0.029, True), ("gauss-newton", 0.031, False), ("ridge", 0.029, False)],
+)
+def test_minimax_is_advised_where_it_may_help(method: str, worst: float, advised: bool) -> None:
+    """Within three times the tolerance."""
+    said = made(method=method, max_ckp=np.array([worst, 1e-3])).verdict(0.01)
+    assert "misses its check points" in said
+    assert (", or fit by the method minimax" in said) == advised
+
+
+def test_what_a_file_lost_is_added_to_the_errors() -> None:
+    fit = made(localisation=Localisation(1.0, 2.0, 3.0, 4.0, 0.5, "ridge"))
+    written = fit.as_written(fit.rpc.crop(3.0, -4.0))
+    np.testing.assert_allclose(written.rmse_ckp, [3.003, 4.003], atol=1e-9)
+    np.testing.assert_allclose(written.max_ckp, [3.005, 4.005], atol=1e-9)
+    assert written.localisation is None
+    np.testing.assert_array_equal(written.rmse_cnp, fit.rmse_cnp)
+    direct = replace(fit.rpc, direct=np.eye(4, 20) + np.eye(20)[0])
+    assert fit.as_written(direct).localisation is fit.localisation
+    told = json.loads(json.dumps(fit.summary()))
+    assert told["localisation"]["max_px"] == 4.0
+    assert told["rmse_ckp"] == [3e-3, 3e-3]
+    assert "rpc" not in told
+
+
+def test_a_model_without_ground_for_a_tenth_of_its_image_is_refused() -> None:
+    """One point in each of 45 x 45 cells: four of 45 rows of them may be without, five may not."""
+    camera = synthetic()
+
+    class Holed:
+        def __init__(self, cells: int) -> None:
+            self.below = cells / CELLS * camera.size[1] - 0.5
+
+        def localize(self, image: Any, alt: Any) -> Any:
+            ground = camera.model.localize(image, alt)
+            return np.where(image[..., 1:] < self.below, np.nan, ground)
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(camera.model, name)
+
+    with pytest.warns(BarpcWarning, match=r"^8\.9% of the image has no ground point"):
+        fit = fit_rpc(Holed(4), camera.size, camera.alt_range)  # type: ignore[arg-type]
+    assert fit.num_ckp == 41 * 45
+    with pytest.raises(FitError, match=r"no ground point for 11% of the image over altitudes 0 to 1000 m"):
+        fit_rpc(Holed(5), camera.size, camera.alt_range)  # type: ignore[arg-type]
+
+
+def test_the_points_of_an_image_cover_it_from_corner_to_corner() -> None:
+    """However small it is; given points cover what they cover of the image that is stated."""
+    camera = synthetic()
+    assert fit_rpc(camera.model, (8, 6), camera.alt_range, options=FitOptions(method="ridge")).coverage == 1.0
+    rng = np.random.default_rng(0)
+    image = rng.uniform(-0.5, 9.5, (600, 2))
+    image[:4] = [[-0.5, -0.5], [9.5, -0.5], [9.5, 9.5], [-0.5, 9.5]]
+    ground = camera.model.localize(image, rng.uniform(0, 1000, 600))
+    for size, share in (((10, 10), 1.0), ((20, 10), 0.5), ((20, 40), 0.125), (None, 1.0)):
+        fit = fit_rpc_points(ground, image, size=size, options=FitOptions(method="ridge"), strict=False)
+        assert fit.coverage == pytest.approx(share, abs=0.001)
+
+
+def test_the_certificate_counts_what_it_says(camera: Camera) -> None:
+    options = FitOptions(grid=(6, 7, 5), method="ridge")
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
+    assert (fit.num_cnp, fit.num_ckp) == (6 * 7 * 5, CELLS**2)
+    assert fit.beyond == pytest.approx(1 - 0.05 ** (1 / CELLS**2), rel=1e-9)
+    ground, image = (
+        p.reshape(-1, k)
+        for p, k in zip(
+            control_points(camera.model, camera.size, camera.alt_range, options), (3, 2), strict=True
+        )
+    )
+    error = fit.rpc.project(ground) - image
+    np.testing.assert_allclose(fit.rmse_cnp, np.sqrt((error**2).mean(axis=0)), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(fit.max_cnp, np.abs(error).max(axis=0), rtol=1e-6, atol=1e-12)
+    assert underlying_rpc(camera.model) is camera.rpc
+    scattered = solve(ground, image, FitOptions(method="ridge"), "ridge")
+    np.testing.assert_allclose(scattered.rpc.project(ground), fit.rpc.project(ground), atol=1e-7)
+
+
+# --- looking for the largest error -----------------------------------------------------------------------------
+
+
+def test_around_the_worst_points_of_either_coordinate_more_are_looked_at_closer_and_closer() -> None:
+    camera = synthetic()
+    sample = Sample.of(camera.model, camera.size, camera.alt_range)
+    assert sample.count == CELLS**2
+    assert len(sample.points) == CELLS**2 + 12 * 2 * 2 * 2  # along the edges, at either end of the altitudes
+    scale, low = np.array([*camera.size, 1000.0]), np.array([-0.5, -0.5, 0.0])
+    peaks = np.array([[0.3, 0.4, 0.6], [0.8, 0.7, 0.2]])  # of col and of row
+    asked: list[Array] = []
+
+    def hills(_: Array, at: Array) -> Array:
+        unit = (at - low) / scale
+        asked.append(unit)
+        distance = np.linalg.norm((unit[:, None] - peaks) * [1.0, 1.0, 0.1], axis=-1)
+        return np.exp(-((distance / 0.1) ** 2)) * [1.0, -2.0]
+
+    errors, largest = sample.sought(hills)
+    assert len(asked) == 1 + 5
+    assert [len(points) for points in asked[1:]] == [2 * 16 * 8] * 5
+    known, reach = asked[0], np.array([1 / 45, 1 / 45, 0.25])
+    for points in asked[1:]:
+        shift = np.abs(points[:, None] - known) / reach
+        nearest = shift.max(axis=-1).min(axis=1)
+        assert nearest.max() <= 1.0 + 1e-9
+        worst = [
+            np.argsort(-np.abs(hills(known, known * scale + low))[:, k], kind="stable")[:16] for k in range(2)
+        ]
+        asked.pop()
+        of_worst = np.repeat(np.unique(np.concatenate(worst)), 8)
+        moved = np.abs(points - known[of_worst]) / reach
+        assert moved.max() <= 1.0 + 1e-9
+        assert moved.max() > 0.97
+        known, reach = np.concatenate([known, points]), reach / 2
+    np.testing.assert_allclose(largest, [1.0, 2.0], rtol=2e-3)
+    assert (largest >= np.abs(hills(asked[0], asked[0] * scale + low)).max(axis=0)).all()
+    first = np.abs(hills(asked[0], asked[0] * scale + low))[: sample.count]
+    np.testing.assert_allclose(errors.rmse, np.sqrt((first**2).mean(axis=0)))
+    np.testing.assert_allclose(errors.largest, first.max(axis=0))
+
+
+@pytest.mark.parametrize(("size", "rounds"), [(0.9e-7, 0), (1.1e-7, 5)])
+def test_rounding_is_not_looked_into(size: float, rounds: int) -> None:
+    camera = synthetic()
+    sample = Sample.of(camera.model, camera.size, camera.alt_range)
+    asked: list[int] = []
+
+    def level(ground: Array, _: Array) -> Array:
+        asked.append(len(ground))
+        return np.full((len(ground), 2), size)
+
+    assert sample.sought(level)[1].tolist() == [size, size]
+    assert len(asked) == 1 + rounds
+
+
+def test_a_lower_bound_is_that_of_the_worst_cubic_over_the_box_and_a_quarter_around_it() -> None:
+    """2 + x over [-1, 1] and 3 - y over [0, 2]: what they are at the centre is 2, and 2."""
+    cubics = np.zeros((2, 20))
+    cubics[0, [0, 1]], cubics[1, [0, 2]] = [2.0, 1.0], [3.0, -1.0]
+    box = np.array([[-1.0, 1.0], [0.0, 2.0], [0.0, 1.0]])
+    assert smallest_value(cubics[:1], box) == pytest.approx((2 - 1.25) / 2)
+    assert smallest_value(cubics[1:], box) == pytest.approx((3 - 2.25) / 2)
+    assert smallest_value(cubics, box[:, ::-1]) == pytest.approx(0.375)
+    cubics[1, 2] = -1.2
+    assert smallest_value(cubics, box) == pytest.approx((3 - 1.2 * 2.25) / (3 - 1.2))
+
+
+def test_errors_of_nothing_and_of_no_number() -> None:
+    errors = Errors()
+    assert np.isnan(errors.rmse).all()
+    errors.add(np.array([[1.0, np.nan]]))
+    assert errors.rmse[0] == 1.0
+    assert np.isnan(errors.rmse[1])
+
+
+# --- the localisation RPC ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("largest", "least", "words"),
+    [(0.01, 0.5, ""), (0.0101, 0.5, "misses the ground by up to 7 m"), (0.01, 0.0, "has a pole"), (0.01, 1e-6, ""),
+     (np.nan, 0.5, "misses the ground")],
+)  # fmt: skip
+def test_a_localisation_rpc_misses_or_has_a_pole_or_nothing_is_wrong(largest, least, words) -> None:
+    said = Localisation(1.0, 7.0, 0.001, largest, least, "ridge").verdict(0.01)
+    assert words in said
+    assert bool(said) == bool(words)
+
+
+def test_off_are_metres_on_the_ground_and_pixels_in_the_image() -> None:
+    rpc = synthetic_rpc(lon=179.999)
+    ground = rpc.localize(np.array([[9000.0, 4000.0], [12000.0, 9000.0]]), np.array([300.0, 700.0]))
+    found = ground + [[-360.0 + 1e-5, 0.0, 0.0], [0.0, -2e-5, 0.0]]
+    image = rpc.project(ground) + [[0.0, 0.0], [3.0, 4.0]]
+    metres, pixels = off(rpc, found, ground, image).T
+    expected = np.linalg.norm(ecef_from_ground(found) - ecef_from_ground(ground), axis=1)
+    np.testing.assert_allclose(metres, expected, rtol=1e-5)
+    np.testing.assert_allclose(pixels, np.linalg.norm(rpc.project(found) - image, axis=1), rtol=1e-9)
+
+
+def test_the_inverse_problem_exchanges_ground_and_image() -> None:
+    camera = synthetic(lon=179.99)
+    ground, image = random_points(camera, 200, np.random.default_rng(1))
+    turned = ground + np.where(np.arange(200) % 2, 360.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
+    problem = inverse(camera.rpc, turned, image, weight=np.full(200, 0.5))
+    rpc = camera.rpc
+    np.testing.assert_array_equal(problem.ground, np.column_stack([image, ground[:, 2]]))
+    np.testing.assert_allclose(problem.image, ground[:, :2], rtol=0, atol=1e-12)
+    assert problem.norm.ground_offset.tolist() == [*rpc.image_offset, rpc.ground_offset[2]]
+    assert problem.norm.ground_scale.tolist() == [*rpc.image_scale, rpc.ground_scale[2]]
+    np.testing.assert_array_equal(problem.norm.image_offset, rpc.ground_offset[:2])
+    np.testing.assert_array_equal(problem.norm.image_scale, rpc.ground_scale[:2])
+    assert (problem.weight == 0.5).all()
+    x = [solution(problem.compressed(axis)) for axis in range(2)]
+    assert max(np.abs(problem.errors(axis, x[axis])).max() for axis in range(2)) < 1e-6

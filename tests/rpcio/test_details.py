@@ -1,0 +1,686 @@
+"""What readers and writers decide by a number, a sign or a name: either side of each."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import struct
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.windows import Window
+
+from barpc.errors import ImageError, InputError, OutputError, RpcError, RpcFormatError
+from barpc.raster import open_raster
+from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, resample, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio import formats as formats_module
+from barpc.rpcio.acquisition import Light, light_of
+from barpc.rpcio.fields import collect_numbered, number, numbers
+from barpc.rpcio.formats import files_of, find_rpc, parse, row_of, write_camera
+from barpc.rpcio.grids import read_correction, write_correction, write_grid
+from barpc.rpcio.images import write_crop, write_rpc_nitf
+from barpc.rpcio.sources import hidden_by, metadata_beside, shadows, sidecars
+from barpc.rpcio.text import nitf_record
+from barpc.rpcio.tiff import (
+    Directory,
+    Entry,
+    printable,
+    put_tag,
+    read_directory,
+    read_tag,
+    read_values,
+    survives,
+)
+from barpc.sensor.correction_grid import CorrectionGrid
+from barpc.sensor.direct_grid import DirectGrid
+from barpc.sensor.rpc import RPC
+from tests.rpcio.conftest import dimap_v2, grid, make_rpc, write_image, yaml
+
+# --- TIFF ------------------------------------------------------------------------------------------------------
+
+KINDS = {
+    1: 1,
+    2: 1,
+    3: 2,
+    4: 4,
+    5: 8,
+    6: 1,
+    7: 1,
+    8: 2,
+    9: 4,
+    10: 8,
+    11: 4,
+    12: 8,
+    13: 4,
+    16: 8,
+    17: 8,
+    18: 8,
+}
+"""Types of TIFF 6.0 and BigTIFF: bytes of one value."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("big", [False, True])
+def test_a_value_of_each_type_takes_its_bytes(kind: int, big: bool) -> None:
+    """As many as fit stand in the entry itself, one more stands elsewhere."""
+    width, room = KINDS[kind], 8 if big else 4
+    data = bytes(range(1, 65))
+    directory = Directory("<", big, (), b"")
+    inside = room // width
+    if inside:
+        entry = Entry(1, kind, inside, data[:room])
+        assert read_values(io.BytesIO(b""), directory, entry, "a") == data[: inside * width]
+    place = struct.pack("<Q" if big else "<I", 16)
+    entry = Entry(1, kind, inside + 1, place)
+    assert read_values(io.BytesIO(bytes(16) + data), directory, entry, "a") == data[: (inside + 1) * width]
+
+
+@pytest.mark.parametrize(
+    ("count", "words"), [(1 << 24, "lies beyond the end"), ((1 << 24) + 1, "claims 16777217 bytes")]
+)
+def test_a_value_of_sixteen_megabytes_is_the_largest(count: int, words: str) -> None:
+    with pytest.raises(RpcFormatError, match=words):
+        read_values(io.BytesIO(b""), Directory("<", False, (), b""), Entry(7, 1, count, bytes(4)), "a")
+
+
+@pytest.mark.parametrize(("count", "ok"), [(0, False), (1, True), (4096, True), (4097, False)])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("big", [False, True])
+def test_a_directory_has_one_to_4096_entries(count: int, ok: bool, order: str, big: bool) -> None:
+    mark = {"<": b"II", ">": b"MM"}[order]
+    head = (
+        mark + struct.pack(f"{order}HHHQ", 43, 8, 0, 16)
+        if big
+        else mark + struct.pack(f"{order}HI8x", 42, 16)
+    )
+    number_, entry = ("Q", "HHQQ") if big else ("H", "HHII")
+    body = struct.pack(order + number_, count)
+    body += b"".join(struct.pack(order + entry, 256 + k, 4, 1, k) for k in range(count))
+    file = io.BytesIO(head + body + struct.pack(order + ("Q" if big else "I"), 77))
+    if not ok:
+        with pytest.raises(RpcFormatError, match=f"a TIFF directory of {count} entries"):
+            read_directory(file, "a")
+        return
+    found = read_directory(file, "a")
+    assert (found.order, found.big, len(found.entries)) == (order, big, count)
+    assert found.entries[-1].tag == 255 + count
+    assert struct.unpack(order + ("Q" if big else "I"), found.following) == (77,)
+    assert found.find(256) == found.entries[0]
+    assert found.find(9) is None
+
+
+@pytest.mark.parametrize("options", [{}, {"BIGTIFF": "YES"}, {"ENDIANNESS": "BIG"}])
+def test_a_tag_is_put_into_every_kind_of_tiff(options: dict[str, str], tmp_path: Path) -> None:
+    """Behind the pixels, at a multiple of sixteen; its 92 numbers to the bit, an unknown accuracy as -1."""
+    rpc = replace(make_rpc(), err_rand=None)
+    path = write_image(tmp_path / "a.tif", **options)
+    size = path.stat().st_size
+    put_tag(path, rpc)
+    assert read_tag(path) == rpc
+    raw = path.read_bytes()
+    order = "<" if raw[:2] == b"II" else ">"
+    start = size + -size % 16
+    values = struct.unpack(f"{order}92d", raw[start : start + 736])
+    assert values[:2] == (3.1, -1.0)
+    assert values[2:7] == (950.7, 999.1, 43.2, 5.4, 166.6667)
+    assert values[7:12] == (980.9, 1010.3, 0.0045, 0.0062, 142.8571)
+    np.testing.assert_array_equal(np.reshape(values[12:], (4, 20)), rpc.coeffs[[2, 3, 0, 1]])
+    with path.open("rb") as file:
+        tags = [entry.tag for entry in read_directory(file, "a").entries]
+    assert tags == sorted(tags)
+
+
+@pytest.mark.parametrize(("placed", "kept"), [(True, True), (False, False)])
+def test_a_geotransform_stays_where_the_image_is_placed(placed: bool, kept: bool, tmp_path: Path) -> None:
+    transform = rasterio.Affine(0.5, 0.0, 100.0, 0.0, -0.5, 200.0)
+    path = write_image(tmp_path / "a.tif", transform=transform, crs=32631)
+    put_tag(path, make_rpc(), placed=placed)
+    with open_raster(path) as dataset:
+        assert (dataset.transform == transform) == kept
+
+
+@pytest.mark.parametrize(
+    ("size", "ok"), [(0xFFFFFFFF - (1 << 16) - 15, True), (0xFFFFFFFF - (1 << 16) + 17, False)]
+)
+def test_a_classic_tiff_of_four_gigabytes_has_no_room_for_a_tag(size: int, ok: bool, tmp_path: Path) -> None:
+    path = write_image(tmp_path / "a.tif")
+    os.truncate(path, size)  # a hole
+    if ok:
+        put_tag(path, make_rpc())
+        assert read_tag(path) == make_rpc()
+    else:
+        with pytest.raises(ImageError, match=f"does not fit behind {size} bytes of classic TIFF"):
+            put_tag(path, make_rpc())
+        assert path.stat().st_size == size
+
+
+def test_numbers_of_seventeen_digits_are_printable_and_the_camera_stays() -> None:
+    rng = np.random.default_rng(2)
+    rpc = make_rpc()
+    long = RPC(
+        rpc.coeffs + rng.normal(0, 1e-3, (4, 20)) * (np.arange(20) > 0),
+        rpc.ground_offset + rng.normal(0, 1e-4, 3),
+        rpc.ground_scale * (1 + rng.normal(0, 1e-3, 3)),
+        rpc.image_offset + rng.normal(0, 1.0, 2),
+        rpc.image_scale * (1 + rng.normal(0, 1e-3, 2)),
+    )
+    assert not survives(long)
+    short = printable(long)
+    assert survives(short)
+    for name in ("ground_offset", "ground_scale", "image_offset", "image_scale"):
+        given, made = getattr(long, name), getattr(short, name)
+        np.testing.assert_array_equal(made, [float(f"{v:.15g}") for v in given])
+    np.testing.assert_allclose(short.project(grid(long)), long.project(grid(long)), rtol=0, atol=2e-11 * 1e3)
+    exaggerated = replace(
+        long,
+        image_offset=short.image_offset + 1e-4,
+        image_scale=short.image_scale,
+        ground_offset=short.ground_offset,
+    )
+    assert np.abs(exaggerated.project(grid(long)) - long.project(grid(long))).max() > 5e-5
+    assert printable(short) is short
+
+
+def test_coefficients_make_up_for_digits_that_are_not_printed(monkeypatch) -> None:
+    """Exaggerated: of nine digits, which by themselves move the image by a hundred times what is left."""
+    from barpc.rpcio import tiff
+
+    rng = np.random.default_rng(4)
+    rpc = make_rpc()
+    long = replace(
+        rpc,
+        coeffs=rpc.coeffs + rng.normal(0, 1e-2, (4, 20)) * (np.arange(20) > 0),
+        ground_offset=rpc.ground_offset + [1.2345e-9, -1.9876e-8, 1.2345e-7],
+        ground_scale=rpc.ground_scale * (1 + 3.3e-9),
+        image_offset=rpc.image_offset + 4.4e-6,
+        image_scale=rpc.image_scale * (1 + 2.2e-9),
+    )
+    monkeypatch.setattr(
+        tiff, "_fifteen", lambda values: np.array([float(f"{v:.9g}") for v in values.tolist()])
+    )
+    short = printable(long)
+    off = [
+        np.abs(
+            replace(short, **{name: getattr(long, name)}).project(grid(rpc)) - long.project(grid(rpc))
+        ).max()
+        for name in ("ground_offset", "ground_scale", "image_offset", "image_scale")
+    ]
+    assert min(off) > 1e-7
+    np.testing.assert_allclose(short.project(grid(rpc)), long.project(grid(rpc)), rtol=0, atol=1e-8)
+
+
+# --- rasters ---------------------------------------------------------------------------------------------------
+
+
+def mosaic(folder: Path) -> Path:
+    """A VRT written here: its pixels are those of scene.tif."""
+    write_image(folder / "scene.tif")
+    write_rpc_vrt(make_rpc(), folder / "scene.tif", folder / "scene.vrt")
+    return folder / "scene.vrt"
+
+
+def pixels(path: Path) -> np.ndarray:
+    with open_raster(path) as dataset:
+        return np.asarray(dataset.read())
+
+
+def test_a_vrt_is_copied_with_its_pixels(tmp_path: Path) -> None:
+    rpc = make_rpc().crop(1.0, 2.0)
+    write_rpc_copy(rpc, mosaic(tmp_path), tmp_path / "copy.tif")
+    assert read_rpc(tmp_path / "copy.tif").off(rpc).max() < 1e-9
+    np.testing.assert_array_equal(pixels(tmp_path / "copy.tif"), pixels(tmp_path / "scene.tif"))
+
+
+def test_a_vrt_becomes_a_nitf_with_its_pixels(tmp_path: Path) -> None:
+    rpc = replace(
+        make_rpc(), image_offset=[950.0, 900.0], image_scale=[1010.0, 980.0], ground_offset=[5.4, 43.2, 167.0],
+        ground_scale=[0.0062, 0.0045, 143.0],
+    )  # fmt: skip
+    write_rpc_nitf(rpc, mosaic(tmp_path), tmp_path / "copy.ntf")
+    np.testing.assert_array_equal(pixels(tmp_path / "copy.ntf"), pixels(tmp_path / "scene.tif"))
+    np.testing.assert_allclose(read_rpc(tmp_path / "copy.ntf").image_offset, [950.0, 900.0])
+
+
+def test_a_vrt_of_a_part_of_an_image_is_not_pointed_at(tmp_path: Path) -> None:
+    """Its pixels are not those of the image: a copy is made of it, no other VRT."""
+    path = mosaic(tmp_path)
+    write_rpc_vrt(make_rpc(), path, tmp_path / "again.vrt")
+    assert "scene.tif" in (tmp_path / "again.vrt").read_text()
+    text = path.read_text()
+    part = text.replace('<SrcRect xOff="0"', '<SrcRect xOff="1"')
+    assert part != text
+    path.write_text(part)
+    with pytest.raises(ImageError, match="more than one whole image is not pointed at"):
+        write_rpc_vrt(make_rpc(), path, tmp_path / "again.vrt", overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("window", "ok"),
+    [
+        ((0, 0, 60, 40), True), ((59, 39, 1, 1), True), ((-1, 0, 5, 5), False), ((0, -1, 5, 5), False),
+        ((0, 0, 61, 5), False), ((0, 0, 5, 41), False), ((10, 10, 0, 5), False), ((10, 10, 5, 0), False),
+    ],
+)  # fmt: skip
+def test_a_window_lies_within_the_image_and_has_pixels(
+    window: tuple[int, ...], ok: bool, tmp_path: Path
+) -> None:
+    image, rpc = write_image(tmp_path / "a.tif"), make_rpc()
+    col, row, width, height = window
+    if not ok:
+        with pytest.raises(ImageError, match="is not inside the image of 60 x 40"):
+            write_crop(rpc, image, tmp_path / "b.tif", window)
+        assert not (tmp_path / "b.tif").exists()
+        return
+    crop = write_crop(rpc, image, tmp_path / "b.tif", window)
+    np.testing.assert_array_equal(
+        pixels(tmp_path / "b.tif"), pixels(image)[:, row : row + height, col : col + width]
+    )
+    assert crop.off(rpc.crop(col, row)).max() < 1e-9
+    assert read_rpc(tmp_path / "b.tif") == crop
+
+
+def test_no_writer_replaces_a_file_unless_it_is_told_to(tmp_path: Path) -> None:
+    rpc, image = make_rpc(), write_image(tmp_path / "a.tif", dtype="uint8")
+    whole = replace(
+        rpc, image_offset=[950.0, 900.0], image_scale=[1010.0, 980.0], ground_offset=[5.4, 43.2, 167.0],
+        ground_scale=[0.0062, 0.0045, 143.0],
+    )  # fmt: skip
+    none = CorrectionGrid([0.0, 59.0], [0.0, 39.0], np.zeros((2, 2, 2)))
+    nodes = DirectGrid(
+        [0.0, 1.0], [0.0, 1.0], [0.0, 50.0], np.random.default_rng(0).uniform(5, 6, (2, 2, 2, 2))
+    )
+    path = tmp_path / "out"
+    for write in (
+        lambda **how: write_rpc(rpc, path, format="txt", **how),
+        lambda **how: write_rpc_vrt(rpc, image, path, **how),
+        lambda **how: write_rpc_copy(rpc, image, path, **how),
+        lambda **how: write_rpc_nitf(whole, image, path, **how),
+        lambda **how: write_crop(rpc, image, path, (0, 0, 5, 5), **how),
+        lambda **how: resample.write_resampled(rpc, none, image, path, **how),
+        lambda **how: write_correction(none, rpc, path, **how),
+        lambda **how: write_grid(nodes, path, **how),
+    ):
+        path.write_text("mine")
+        with pytest.raises(OutputError, match="exists"):
+            write()
+        assert path.read_text() == "mine"
+        write(overwrite=True)
+        assert path.read_bytes() != b"mine"
+
+
+def test_an_image_of_one_column_is_resampled(tmp_path: Path) -> None:
+    image = write_image(tmp_path / "a.tif", (1, 40, 1), dtype="uint8")
+    down = CorrectionGrid([0.0, 1.0], [0.0, 39.0], np.full((2, 2, 2), [0.0, 3.0]))
+    resample.write_resampled(make_rpc(), down, image, tmp_path / "b.tif")
+    np.testing.assert_array_equal(pixels(tmp_path / "b.tif")[0, :-3, 0], pixels(image)[0, 3:, 0])
+
+
+@pytest.mark.parametrize(("far", "ok"), [(4096, True), (4097, False)])
+def test_a_block_is_made_of_4096_pixels_a_side_at_most(
+    far: int, ok: bool, tmp_path: Path, monkeypatch
+) -> None:
+    """Of a row that is stretched: the last column of the block, 16 px around it and itself."""
+    monkeypatch.setattr(resample, "BLOCK", 16)
+    image = write_image(tmp_path / "a.tif", (1, 16, 9000), dtype="uint8")
+    cols, rows = np.array([0.0, 15.0]), np.array([0.0, 15.0])
+    shift = np.zeros((2, 2, 2))
+    shift[:, 1, 0] = far - 16 - 1.5 - 15.0  # column 15 is taken from there, column 0 from column 0
+    lacking = CorrectionGrid(cols, rows, shift)
+    with open_raster(image) as dataset, open_raster(image) as same:
+        if ok:
+            taken = []
+            monkeypatch.setattr(resample, "_stored", lambda values, *_: taken.append(values) or values)
+
+            class Out:
+                mask_flag_enums, colorinterp = same.mask_flag_enums, same.colorinterp
+
+                def write(self, *_: object, **__: object) -> None: ...
+
+            resample._fill(dataset, Out(), Window(0, 0, 16, 16), lacking)
+            source = dataset.read(1)
+            np.testing.assert_allclose(taken[0][:, 0], source[:, 0], atol=1e-6)
+        else:
+            with pytest.raises(ImageError, match="spreads a block over 4097 px is none"):
+                resample._fill(dataset, None, Window(0, 0, 16, 16), lacking)
+
+
+@pytest.mark.parametrize(
+    ("kind", "nodata", "given", "kept"),
+    [
+        ("uint8", 0, [0.4, 0.6, -3.0, 300.0], [1, 1, 1, 255]),
+        ("uint8", 255, [254.6, 254.4, 300.0, 1.0], [254, 254, 254, 1]),
+        ("int16", -7, [-7.2, -6.4, -8.0, 4e4], [-6, -6, -8, 32767]),
+        ("uint8", None, [0.4, 0.6, -3.0, 300.0], [0, 1, 0, 255]),
+        ("float32", -1.0, [-1.0, 0.25, 3e9, 7.0], [-1.0, 0.25, 3e9, 7.0]),
+    ],
+)
+def test_a_known_pixel_is_rounded_cut_and_never_nodata(kind, nodata, given, kept) -> None:
+    shown = np.array([True, True, True, True, False])
+    values = resample._stored(np.array([*given, 9.0]), shown, np.dtype(kind), nodata)
+    assert values.dtype == kind
+    assert values[:4].tolist() == np.array(kept, kind).tolist()
+    assert values[4] == (9.0 if nodata is None else nodata)
+
+
+# --- files beside an image -------------------------------------------------------------------------------------
+
+_ALOS_CELLS = [
+    "006500",
+    "03550",
+    "35.6812",
+    "139.7671",
+    "0500",
+    "006501",
+    "03551",
+    "0.3000",
+    "0.3500",
+    "0510",
+]
+ALOS = "".join(f"{cell:>{width}}" for cell, width in zip(_ALOS_CELLS, 2 * (6, 5, 8, 9, 5), strict=True))
+ALOS += "".join(f"{v:+.5f}E-{i}".rjust(12) for v in (1.25, 2.25, 3.25, 4.25) for i in [*range(10)] * 2)
+
+
+@pytest.mark.parametrize("name", ["IMG-01-SCENE.tif", "IMG-SCENE.tif"])
+def test_the_text_of_an_alos_scene_goes_before_the_tag(name: str, tmp_path: Path) -> None:
+    write_rpc_copy(make_rpc(), write_image(tmp_path / "plain.tif"), tmp_path / name)
+    (tmp_path / "RPC-SCENE.txt").write_text(ALOS)
+    source = read_rpc_source(tmp_path / name)
+    assert source.format == "alos"
+    assert source.notes == ("not used: the image's own RPC",)
+    assert [s.kind for s in shadows(tmp_path / name)] == ["alos"]
+
+
+@pytest.mark.parametrize(
+    ("image", "beside"),
+    [
+        ("abcdefg.tif", "RPCg.txt"),
+        ("abcd.tif", "RPCd.txt"),
+        ("abcde.tif", "RPC_e.XML"),
+        ("a_b_c_d.tif", "RPC_c.XML"),
+    ],
+)
+def test_short_names_have_their_files_too(image: str, beside: str, tmp_path: Path) -> None:
+    write_image(tmp_path / image)
+    (tmp_path / beside).write_text(ALOS if beside.endswith("txt") else dimap_v2(make_rpc()))
+    assert [s.path.name for s in sidecars(tmp_path / image)] == [beside]
+
+
+def test_beside_an_imd_only_maxar_s_own_files_go_before_the_tag(tmp_path: Path) -> None:
+    image = write_image(tmp_path / "IMG_x.tif")
+    (tmp_path / "IMG_x.IMD").write_text("x")
+    write_rpc(make_rpc(), tmp_path / "IMG_x.RPB")
+    write_rpc(make_rpc(), tmp_path / "IMG_x.XML")
+    write_rpc(make_rpc(), tmp_path / "IMG_x_RPC.TXT")
+    (tmp_path / "RPC_x.XML").write_text(dimap_v2(make_rpc()))
+    write_rpc(make_rpc(), tmp_path / "IMG_x.rpc", format="txt")
+    write_rpc(make_rpc(), tmp_path / "IMG_x.geom")
+    told = [(s.kind, s.before_tag) for s in sidecars(image)]
+    assert told == [
+        ("rpb", True), ("xml", True), ("txt", False), ("dimap", False), ("txt", False), ("geom", False),
+    ]  # fmt: skip
+    (tmp_path / "IMG_x.IMD").unlink()
+    assert [s.before_tag for s in sidecars(image)] == [True, True, True, True, True, False]
+
+
+def test_files_that_would_hide_an_rpc_are_told_with_it(tmp_path: Path) -> None:
+    rpc = make_rpc()
+    write_rpc_copy(rpc, write_image(tmp_path / "bare.tif"), tmp_path / "tagged.tif")
+    wanted = [tmp_path / n for n in ("TAGGED.rpb", "bare.RPB", "nothing.RPB", "tagged.tif")]
+    told = list(hidden_by([*wanted, tmp_path / "no folder" / "a.RPB"]))
+    assert told == [(wanted[0], tmp_path / "tagged.tif", rpc)]
+
+
+def test_metadata_of_a_physical_model_lie_beside_the_image(tmp_path: Path) -> None:
+    image = tmp_path / "IMG_scene_R1C1.TIF"
+    with pytest.raises(ImageError, match=r"beside it \(IMG_scene_R1C1\.xml or dim_scene_R1C1\.xml\)"):
+        metadata_beside(image)
+    for name in (
+        "DIM_scene.XML",
+        "dim_scene_R1C1.xml",
+        "img_SCENE_r1c1.XML",
+    ):  # each goes before those already there
+        (tmp_path / name).write_text("x")
+        assert metadata_beside(image) == tmp_path / name
+
+
+def test_the_origin_of_a_crop_has_a_step(tmp_path: Path) -> None:
+    """Steps of two pixels halve the camera's; a geotransform that is none of a crop is refused."""
+    write_rpc(make_rpc(), tmp_path / "crop.geom")
+    image = write_image(tmp_path / "crop.tif", transform=rasterio.Affine(2.0, 0.0, 100.0, 0.0, 4.0, 60.0))
+    assert read_rpc(image) == make_rpc().window(100.0, 60.0, 2.0, 4.0)
+    image = write_image(tmp_path / "crop.tif", transform=rasterio.Affine(1.0, 0.0, 0.0, 0.0, -1.0, 0.0))
+    assert read_rpc(image) == make_rpc()
+    image = write_image(tmp_path / "crop.tif", transform=rasterio.Affine(-1.0, 0.0, 5.0, 0.0, 1.0, 0.0))
+    with pytest.raises(RpcFormatError, match=r"no crop origin \(steps -1\.0, 1\.0\)"):
+        read_rpc(image)
+
+
+def test_a_folder_is_listed_again_when_it_changed_and_once_while_it_rests(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """A change within two seconds may not show in the folder's time: it is listed anew until then."""
+    listed: list[object] = []
+    scan = os.scandir
+    monkeypatch.setattr(formats_module.os, "scandir", lambda folder: listed.append(folder) or scan(folder))
+    now = time.time_ns()
+    for name in ("B.tif", "a.TIF"):
+        (tmp_path / name).touch()
+    for age, times in ((1.0, 2), (3.0, 1)):
+        os.utime(tmp_path, ns=(now, now - round(age * 1e9)))
+        listed.clear()
+        for _ in range(2):
+            monkeypatch.setattr(formats_module.time, "time_ns", lambda: now)
+            assert files_of(tmp_path) == {"b.tif": "B.tif", "a.tif": "a.TIF"}
+        assert len(listed) == times, age
+    assert files_of(tmp_path / "nothing") == {}
+
+
+def test_the_rpc_of_an_image_is_found_by_its_name_in_any_format(tmp_path: Path) -> None:
+    image = Path("elsewhere/Scene.tif")
+    with pytest.raises(InputError, match=r"no RPC of Scene\.tif there \(looked for Scene with \.vrt, \.tif"):
+        find_rpc(tmp_path, image)
+    for name in ("scene.geom", "scene_rpc.txt", "scene.vrt", "SCENE.TIF"):
+        (tmp_path / name).touch()
+        found = find_rpc(tmp_path, image)
+        assert found.name in ("scene.geom", "scene_rpc.txt", "scene.vrt", "SCENE.TIF")
+    assert found.name == "SCENE.TIF"
+
+
+# --- texts ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_geom_of_another_polynomial_is_refused() -> None:
+    text = FORMATS["geom"].write(make_rpc())
+    for other in ("A", ""):
+        with pytest.raises(RpcFormatError, match=f"polynomial_format '{other}', only B"):
+            parse(text.replace("polynomial_format:  B", f"polynomial_format:  {other}").encode(), "m")
+    silent = re.sub(r"polynomial_format:.*\n", "", text)
+    assert silent != text
+    assert parse(silent.encode(), "m")[0] == make_rpc()
+
+
+def test_a_yaml_of_two_images_or_without_numbers() -> None:
+    text = yaml(make_rpc())
+    with pytest.raises(RpcFormatError, match="several images"):
+        parse((text + text.replace("scene", "other")).encode(), "m")
+    unknown = re.sub(r"err_bias: .*", "err_bias: null", text)
+    unknown = re.sub(r"err_rand: .*", "err_rand: ~", unknown)
+    found, _ = parse(unknown.encode(), "m")
+    assert (found.err_bias, found.err_rand) == (None, None)
+    dashes = re.sub(
+        r"\[([^\]]*)\]", lambda m: "".join(f"\n        - {v.strip()}" for v in m[1].split(",")), text
+    )
+    assert parse(dashes.encode(), "m")[0] == make_rpc()
+
+
+def test_a_record_of_a_nitf_holds_nine_powers_of_ten_and_whole_pixels() -> None:
+    rpc = replace(make_rpc(), image_offset=[950.0, 900.0], image_scale=[1010.0, 980.0])
+    coeffs = rpc.coeffs.copy()
+    coeffs[2, 1:5] = [1.5e9, 1.5e-9, 1.5e-10, -2.5e-3]
+    record = nitf_record(replace(rpc, coeffs=coeffs))
+    first = 1 + 7 + 7 + 2 * 33
+    cells = [record[first + 12 * k : first + 12 * (k + 1)] for k in range(5)]
+    assert cells[1:] == ["+1.500000E+9", "+1.500000E-9", "+0.000000E+0", "-2.500000E-3"]
+    coeffs[2, 1] = 1.5e10
+    with pytest.raises(RpcFormatError, match=r"a coefficient of LINE_NUM_COEFF is 1\.5e\+10, beyond"):
+        nitf_record(replace(rpc, coeffs=coeffs))
+    for change, ok in (
+        ({"image_offset": [99999.0, 999999.0]}, True),
+        ({"image_offset": [100000.0, 0.0]}, False),
+        ({"image_offset": [-1.0, 0.0]}, False),
+        ({"ground_offset": [-179.0, -89.0, -9999.0]}, True),
+        ({"ground_offset": [5.0, 43.0, 10000.0]}, False),
+    ):
+        if ok:
+            assert len(nitf_record(replace(rpc, **change))) == 1041
+        else:
+            with pytest.raises(RpcFormatError, match="does not fit"):
+                nitf_record(replace(rpc, **change))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1.5", 1.5), ("+.5", 0.5), ("-2.", -2.0), ("1d3", 1000.0), ("1E-2 m", 0.01), ("7°", 7.0), ("7%", 7.0)],
+)
+def test_a_number_begins_its_text(text: str, value: float) -> None:
+    assert number(text, "a", "K") == value
+
+
+@pytest.mark.parametrize("text", ["", "x", "1x", "1,2", ".", "1e", "--1"])
+def test_what_is_no_number_is_refused_by_name(text: str) -> None:
+    with pytest.raises(RpcFormatError, match="a: K is not a number"):
+        number(text, "a", "K")
+    with pytest.raises(RpcFormatError, match="a: K is not finite"):
+        number("1e999", "a", "K")
+
+
+def test_lists_are_parted_by_blanks_and_commas() -> None:
+    assert numbers(" 1, 2  3,4,\n5 ,", "a", "K") == [1, 2, 3, 4, 5]
+
+
+def test_numbered_coefficients_are_gathered_from_their_first_index_on() -> None:
+    for first in (0, 1):
+        pairs = [(f"LINE_NUM_COEFF_{i + first}", float(i)) for i in reversed(range(20))]
+        assert collect_numbered([*pairs, ("LINE_OFF", 3.0)], "a", first=first) == {
+            "LINE_OFF": [3.0], "LINE_NUM_COEFF": [float(i) for i in range(20)],
+        }  # fmt: skip
+        with pytest.raises(RpcFormatError, match="LINE_NUM_COEFF has 20 coefficients, expected 20"):
+            collect_numbered(pairs, "a", first=1 - first)
+        with pytest.raises(RpcFormatError, match="LINE_NUM_COEFF has 19 coefficients"):
+            collect_numbered(pairs[1:], "a", first=first)
+        assert collect_numbered([*pairs, pairs[3]], "a", first=first)
+        with pytest.raises(RpcFormatError, match=r"given twice, 3\.0 and 4\.0"):
+            collect_numbered([("LINE_OFF", 3.0), ("LINE_OFF", 4.0)], "a", first=first)
+
+
+@pytest.mark.parametrize(
+    ("name", "row"), [("a_RPC.TXT", "txt"), ("A.rpb", "rpb"), ("a.JSON", "json"), ("a.doc", None)]
+)
+def test_the_end_of_a_name_tells_its_format(name: str, row: str | None) -> None:
+    found = row_of(name)
+    assert (found is None) if row is None else (found is FORMATS[row])
+
+
+def test_a_camera_is_written_as_the_name_of_its_place_says(tmp_path: Path) -> None:
+    image, rpc = write_image(tmp_path / "a.tif"), make_rpc()
+    write_camera(rpc, tmp_path / "partial", image, place=tmp_path / "b.RPB")
+    assert read_rpc_source(tmp_path / "partial").format == "rpb"
+    with pytest.raises(OutputError, match="exists"):
+        write_camera(rpc, tmp_path / "partial", image, place=tmp_path / "b.RPB")
+    write_camera(rpc, tmp_path / "partial", image, place=tmp_path / "b.geom", overwrite=True)
+    assert read_rpc_source(tmp_path / "partial").format == "geom"
+    write_camera(rpc, tmp_path / "c.vrt", image)
+    assert read_rpc(tmp_path / "c.vrt") == rpc
+    with pytest.raises(RpcFormatError, match="choose one of txt"):
+        write_camera(rpc, tmp_path / "b.doc", image)
+
+
+def test_a_json_may_say_null_for_what_is_not_known() -> None:
+    document = json.loads(FORMATS["json"].write(make_rpc()))
+    document["rpc"]["err_bias"] = None
+    assert parse(json.dumps(document).encode(), "m")[0] == make_rpc(err_bias=None)
+
+
+# --- grids ---------------------------------------------------------------------------------------------------------
+
+
+def correction() -> CorrectionGrid:
+    cols, rows = np.linspace(-0.5, 999.5, 6), np.linspace(-0.5, 799.5, 5)
+    shift = np.random.default_rng(0).normal(size=(5, 6, 2)).astype(np.float32)
+    return CorrectionGrid(cols, rows, shift)
+
+
+def test_a_correction_grid_reads_back_with_its_nodes_at_the_centres_of_its_pixels(tmp_path: Path) -> None:
+    path, rpc = tmp_path / "a_correction.tif", make_rpc()
+    write_correction(correction(), rpc, path)
+    found, lacking = read_correction(path)
+    assert found == rpc
+    np.testing.assert_allclose(lacking.cols, correction().cols, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(lacking.rows, correction().rows, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(lacking.shift, correction().shift)
+    with rasterio.open(path) as dataset:
+        assert dataset.descriptions == ("dcol", "drow")
+        # GDAL counts from the corner of the first pixel: node (-0.5, -0.5) is at (0, 0) there
+        assert dataset.xy(0, 0) == pytest.approx((0.0, 0.0))
+        assert dataset.xy(4, 5) == pytest.approx((1000.0, 800.0))
+
+
+@pytest.mark.parametrize(("off", "ok"), [(0.8e-6, True), (1.3e-6, False)])
+def test_nodes_are_even_to_a_millionth_of_a_step(off: float, ok: bool, tmp_path: Path) -> None:
+    cols = np.linspace(-0.5, 999.5, 6)
+    cols[2] += off * 200.0
+    grid_ = DirectGrid(
+        cols, [0.0, 1.0, 2.0], [0.0, 50.0, 100.0], np.random.default_rng(0).uniform(5, 6, (3, 3, 6, 2))
+    )
+    if ok:
+        write_grid(grid_, tmp_path / "a_grid.tif")
+        with rasterio.open(tmp_path / "a_grid.tif") as dataset:
+            assert dataset.count == 6
+            assert [dataset.tags()[f"ALTITUDE_B{k}"] for k in range(6)] == [
+                "0.0",
+                "0.0",
+                "50.0",
+                "50.0",
+                "100.0",
+                "100.0",
+            ]
+            np.testing.assert_array_equal(dataset.read(3), grid_.lonlat[1, ..., 0])
+            np.testing.assert_array_equal(dataset.read(6), grid_.lonlat[2, ..., 1])
+            assert dataset.transform[:6] == pytest.approx((200.0, 0.0, 0.0, 0.0, 1.0, 0.5))
+    else:
+        with pytest.raises(RpcError, match="not evenly spaced"):
+            write_grid(grid_, tmp_path / "a_grid.tif")
+
+
+# --- the light -----------------------------------------------------------------------------------------------------
+
+
+def test_the_sun_of_an_image_is_the_median_of_what_its_files_say(tmp_path: Path) -> None:
+    image = tmp_path / "IMG_x_R1C1.TIF"
+    assert light_of(str(image)) == Light()
+    (tmp_path / "DIM_x.XML").write_text(
+        "<IMAGING_DATE>2013-04-17</IMAGING_DATE><IMAGING_TIME>10:36:02.1Z</IMAGING_TIME>"
+        + "".join(f'<SUN_ELEVATION unit="deg">{e}</SUN_ELEVATION><SUN_AZIMUTH unit="deg">{a}</SUN_AZIMUTH>'
+                  for e, a in ((50.0, 140.0), (51.0, 150.0), (59.0, 141.0)))
+    )  # fmt: skip
+    assert light_of(str(image)) == Light(51.0, 141.0, "2013-04-17T10:36:02.1Z")
+    (tmp_path / "IMG_x_R1C1.IMD").write_text(
+        "meanSunEl = 33.5;\nmeanSunAz = 361.0;\nfirstLineTime = 2014-01-02T03:04:05Z;"
+    )
+    assert light_of(str(image)) == Light(33.5, 141.0, "2014-01-02T03:04:05Z")  # no azimuth is beyond a turn
+    (tmp_path / "IMG_x_R1C1.IMD").write_text("meanSunAz = -360;")
+    assert light_of(str(image)).azimuth == -360.0
+    assert light_of("https://host/IMG_x_R1C1.TIF") == Light()
+    assert light_of("") == Light()
+
+
+@pytest.mark.parametrize(("day", "stated"), [("1957-01-01", True), ("1956-12-31", False)])
+def test_no_image_was_taken_before_there_were_satellites(day: str, stated: bool, tmp_path: Path) -> None:
+    (tmp_path / "a.IMD").write_text(f"firstLineTime = {day}T00:00:00Z;")
+    assert light_of(str(tmp_path / "a.tif")).time == (f"{day}T00:00:00Z" if stated else None)
