@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -109,7 +110,10 @@ def take(path: str | os.PathLike[str], parts: Iterable[Input] = ()) -> Input:
         text = f"{path} {path.size} {path.tag}"
         return Input(str(path), path.size or 0, hashlib.sha256(text.encode()).hexdigest(), None)
     name = os.fspath(path)
-    with open(name, "rb", buffering=0) as file:  # noqa: PTH123
+    descriptor = os.open(name, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    with open(descriptor, "rb", buffering=0) as file:  # noqa: PTH123  (a pipe would wait, a device has no end)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise InputError(f"{name}: not a regular file")
         before = Stamp.of(os.fstat(file.fileno()))
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         after = Stamp.of(os.fstat(file.fileno()))

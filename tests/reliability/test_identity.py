@@ -191,3 +191,12 @@ def test_devices_are_compared_on_one_host_only() -> None:
         values = [1, 2, 3, 4]
         values[field] += 1
         assert not one.matches(identity.Stamp(*values, 5, "there"))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(tmp_path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="not a regular file"):
+        identity.take(tmp_path / "pipe")
+    with pytest.raises(InputError, match="not a regular file"):
+        identity.take("/dev/zero")
