@@ -175,8 +175,9 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
     with workspace.stage(REPORT):
         if can_render():
             workspace.write_text("report.html", report_html(now(), workspace.folder))
-        outputs = tuple(OutputEntry(name, sha) for name, sha in sorted(workspace.outputs.items()))
-    summary = replace(summary, outputs=outputs)
+        # the report shows times and may be made again: it is no result
+    results = sorted((name, sha) for name, sha in workspace.outputs.items() if name != "report.html")
+    summary = replace(summary, outputs=tuple(OutputEntry(name, sha) for name, sha in results))
     texts = {key: _json(value) for key, value in plain(summary).items()}
     texts["stages"] = _json(plain(now().stages))
     body = ",\n".join(f"{json.dumps(key)}: {text}" for key, text in texts.items())

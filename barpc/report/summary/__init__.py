@@ -188,7 +188,9 @@ class Summary(Record):
     inputs: tuple[InputEntry, ...] | None = said(
         "Every file that was read, as `barpc verify` asks", default=None
     )
-    outputs: tuple[OutputEntry, ...] | None = said("Every file that was written but this one", default=None)
+    outputs: tuple[OutputEntry, ...] | None = said(
+        "Every file that was written but this one and the report", default=None
+    )
 
     def __repr__(self) -> str:
         return f"Summary({self.kind} of {len(self.views)} views, {self.status}: {self.headline})"
