@@ -18,17 +18,9 @@ from barpc.report.summary import ViewEntry
 from barpc.report.tables import read_summary
 from barpc.rpcio import row_of
 from barpc.rpcio.grids import CORRECTION, GRID
-from barpc.workspace import own_files
 
-SAME, MOVED, AGAIN, CHANGED, MISSING, UNKNOWN = (
-    "same",
-    "moved",
-    "made again",
-    "changed",
-    "missing",
-    "not asked",
-)
-GOOD = (SAME, MOVED, AGAIN)
+SAME, MOVED, CHANGED, MISSING, UNKNOWN = "same", "moved", "changed", "missing", "not asked"
+GOOD = (SAME, MOVED)
 
 
 @dataclass(frozen=True)
@@ -76,11 +68,11 @@ def _inputs(summary: Summary, places: Iterable[Path]) -> Iterator[Finding]:
 
 
 def _outputs(summary: Summary, folder: Path) -> Iterator[Finding]:
-    own = own_files(folder)
     for one in summary.outputs or ():
         found = _digest(folder / one.file)
-        now = SAME if found == one.sha256 else MISSING if found is None else CHANGED
-        yield Finding("output", one.file, AGAIN if now == CHANGED and one.file in own else now)
+        yield Finding(
+            "output", one.file, SAME if found == one.sha256 else MISSING if found is None else CHANGED
+        )
 
 
 def _cameras(summary: Summary, folder: Path) -> Iterator[Finding]:
