@@ -189,7 +189,7 @@ def _assembled(found: list[_Point]) -> GroundPoints:
     points = list(first.values())
     names = tuple(point.name or f"gcp_{n}" for n, point in enumerate(points, 1))
     numbers = np.array([point.lonlatalt for point in points])
-    wrong = ~(np.abs(numbers) <= (_TURNS, 90.0, _FAR)).all(axis=1)  # NaN fails, too
+    wrong = ~(np.abs(numbers) <= (_TURNS, _TURNS, _FAR)).all(axis=1)  # NaN fails, too
     if wrong.any():
         raise InputError(
             f"GCP {names[int(wrong.argmax())]}: a coordinate is not finite, or no longitude and latitude in degrees; "

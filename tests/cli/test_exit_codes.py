@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 import barpc.cli
+from tests.pipeline.known import part
 from tests.reliability.conftest import assert_one_line, crops, hashes, pristine  # noqa: F401
 from tests.reliability.conftest import barpc as command
 
 CLI = Path(barpc.cli.__file__).parent
 CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]")
-SAMPLES = sorted((Path(__file__).parents[2] / "data_samples").glob("*.tif"))
 ESC = "\x1b[31mred\x1b]0;title\x07"
 
 
@@ -76,10 +76,12 @@ def test_a_fit_that_misses_its_tolerance_ends_with_3(pristine, ties, tmp_path): 
     assert_told(command(*given, tmp_path / "out", "--keep-going"), "not adjusted", "one RPC cannot hold")
 
 
-@pytest.mark.parametrize("fault", ["rejected", "stranger"])
+@pytest.mark.parametrize("fault", ["stranger", pytest.param("rejected", marks=pytest.mark.slow)])
 def test_control_points_that_do_not_count_end_with_3(fault, tmp_path):
-    control = json.loads((SAMPLES[0].parent / "gcps.geojson").read_text())
-    given = ("adjust", *SAMPLES, "--gcp", tmp_path / "gcps.geojson", "-o")
+    (tmp_path / "in").mkdir()
+    found = part(tmp_path / "in")
+    control = json.loads(found.gcps.read_text())
+    given = ("adjust", *found.images, "--gcp", tmp_path / "gcps.geojson", "-o")
     one = control["features"][0]
     if fault == "rejected":
         for feature in control["features"]:

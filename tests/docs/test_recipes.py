@@ -1,7 +1,7 @@
 """The commands of the manual run as they stand there.
 
 Blocks marked `bash` and `python` of a page are run in its order, in one folder that holds data_samples/; a later page
-finds what an earlier one left there, as a reader does.
+finds what an earlier one left there, as a reader does. Before a commit the first pages run, on a part of each image.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import pytest
 
 from barpc.cli import main
 from tests.docs.pages import DOCS, ROOT, blocks
+from tests.pipeline.known import part
 
 PAGES = [DOCS / "index.md", DOCS / "quickstart.md", *sorted((DOCS / "recipes").glob("*.md"))]
 GATE = "# ends with exit code 3"
@@ -36,6 +37,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     here = tmp_path_factory.mktemp("recipes")
     shutil.copytree(ROOT / "data_samples", here / "data_samples")
     return here
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """The same folder with a part of each image."""
+    shutil.copytree(ROOT / "data_samples", tmp_path / "data_samples")
+    part(tmp_path / "data_samples", side=200)
+    return tmp_path
 
 
 def run_line(line: str, codes: dict[str, int]) -> None:
@@ -58,9 +67,22 @@ def expanded(word: str) -> list[str]:
     return sorted(str(path) for path in Path().glob(word)) or [word] if "*" in word else [word]
 
 
+def test_the_first_pages_run_on_parts_of_the_images(small, monkeypatch):
+    monkeypatch.chdir(small)
+    codes: dict[str, int] = {}
+    for page in RUN[:2]:
+        run_page(page, codes)
+    assert len(codes) == 4
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=lambda page: str(page.relative_to(DOCS)))
 def test_the_commands_of_a_page_run_as_they_stand(page, folder, codes, monkeypatch):
     monkeypatch.chdir(folder)
+    run_page(page, codes)
+
+
+def run_page(page: Path, codes: dict[str, int]) -> None:
     found = blocks(page, "bash", "python")
     assert found, "a page of commands without any"
     for block in found:
@@ -72,7 +94,8 @@ def test_the_commands_of_a_page_run_as_they_stand(page, folder, codes, monkeypat
                 run_line(line, codes)
 
 
-def test_the_python_block_of_the_readme_runs_on_the_samples(folder, monkeypatch):
+def test_the_python_block_of_the_readme_runs_on_the_samples(small, monkeypatch):
+    folder = small
     monkeypatch.chdir(folder)
     for name, view in zip("abc", ("view_00", "view_01", "view_02"), strict=True):
         shutil.copy(folder / "data_samples" / f"{view}.tif", f"{name}.tif")

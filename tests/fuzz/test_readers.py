@@ -17,7 +17,9 @@ def test_a_sample_is_accepted_as_it_is(kind, tmp_path):
     assert check(kind, SAMPLES[kind].data(), prepared(kind, str(tmp_path)))
 
 
-@pytest.mark.parametrize("runs", [120, pytest.param(1200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "runs", [30, pytest.param(120, marks=pytest.mark.slow), pytest.param(1200, marks=pytest.mark.nightly)]
+)
 @pytest.mark.parametrize("kind", SAMPLES)
 def test_damage_is_a_value_or_one_error(kind, runs):
     runs = int(runs * SAMPLES[kind].share)
@@ -25,7 +27,7 @@ def test_damage_is_a_value_or_one_error(kind, runs):
 
 
 @pytest.mark.parametrize("kind", SAMPLES)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(data=st.binary(max_size=300) | st.text(max_size=200).map(lambda text: text.encode("utf-8", "replace")))
 @example(data=b"")
 @example(data=b"\xff\xfe\x00")

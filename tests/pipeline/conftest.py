@@ -1,4 +1,4 @@
-"""Real images through the whole tool, once a session."""
+"""Images through the whole tool, once a session: known ones, whole or a part of them, and real ones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.pipeline import AdjustResult, adjust
+from barpc.pipeline import AdjustResult, RunOptions, adjust
+from tests.pipeline.known import Known, part, whole
+
+
+@pytest.fixture(scope="session")
+def corner(tmp_path_factory) -> Known:
+    """A part of the repository's images: what is fast enough to be run many times."""
+    return part(tmp_path_factory.mktemp("corner"))
+
+
+@pytest.fixture(scope="session", params=["part", pytest.param("whole", marks=pytest.mark.slow)])
+def known(request) -> Known:
+    """Three images with truth: before a commit a part of them, else the whole, too."""
+    found: Known = request.getfixturevalue("corner") if request.param == "part" else whole()
+    return found
+
+
+@pytest.fixture(scope="session")
+def adjusted(known, tmp_path_factory) -> tuple[AdjustResult, Path]:
+    """The known images, adjusted with the defaults."""
+    out = tmp_path_factory.mktemp("known") / "adjusted"
+    return adjust(known.images, out), out
+
+
+@pytest.fixture(scope="session")
+def matched(known, tmp_path_factory) -> tuple[AdjustResult, Path]:
+    """The known images, matched."""
+    out = tmp_path_factory.mktemp("matched") / "ties"
+    return adjust(known.images, out, RunOptions(stop_after="matching")), out
 
 
 @pytest.fixture(scope="session")

@@ -21,9 +21,8 @@ from barpc.tie.epipolar import agreeing, frame, robust_spread
 from tests.pointio.test_foreign import binary
 
 from .conftest import check_points
-from .test_synthetic import SAMPLES
+from .known import SAMPLES as IMAGES
 
-IMAGES = sorted(SAMPLES.glob("*.tif"))
 NOISE = 0.4  # px a coordinate
 
 
@@ -47,6 +46,7 @@ def spread(views, tracks, i: int, j: int) -> float:
     return robust_spread(agreeing(first, frame(views[i], views[j], first).errors(second)[:, 1])[1])
 
 
+@pytest.mark.slow
 def test_noisy_matches_of_real_images_become_as_exact_as_our_own(shared_data, tmp_path) -> None:
     images = sorted((shared_data / "optical/phr_triplet_north").glob("*.tif"))
     ties = noisy(shared_data, tmp_path / "ties", ("img_01", "img_02"), ("img_02", "img_03"))
@@ -67,7 +67,9 @@ def test_noisy_matches_of_real_images_become_as_exact_as_our_own(shared_data, tm
 
 
 @pytest.mark.parametrize("read", [given_matches, given_tracks])
-@pytest.mark.parametrize(("far", "fails"), [(0.4, False), (0.6, True), (-1e4, True)])
+@pytest.mark.parametrize(
+    ("far", "fails"), [(0.4, False), (0.5, False), (0.6, True), (1.5, True), (-1e4, True)]
+)
 def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) -> None:
     """Those of the whole image where a crop is given; a pixel more is borne."""
     views = load_views(IMAGES).views
@@ -82,6 +84,7 @@ def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) 
         read([tmp_path / "m.csv"], views)
 
 
+@pytest.mark.slow
 def test_an_image_that_is_left_out_leaves_the_rest_of_the_matches(shared_data, tmp_path) -> None:
     """The stray image is the only one that the file ties: what is left is matched here."""
     stray = sorted((shared_data / "optical/phr_triplet_north").glob("*.tif"))[:2]
@@ -133,6 +136,7 @@ def match(a, b, prediction):
 """
 
 
+@pytest.mark.slow
 def test_a_matcher_by_name_works_in_worker_processes_with_the_same_bytes(tmp_path) -> None:
     (tmp_path / "mine.py").write_text(MODULE)
     written = []

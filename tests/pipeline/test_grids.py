@@ -163,10 +163,13 @@ def test_a_file_that_does_not_hold_what_was_written_ends_the_run(tmp_path, view,
         "write_correction",
         lambda grid, *given, **how: real(replace(grid, shift=-grid.shift), *given, **how),
     )
-    with pytest.raises(OutputError, match=r"a_correction\.tif: (gdal|barpc) reads it [01]\.\d+ px RMS off, not 0\.00\d+; is"):
+    with pytest.raises(
+        OutputError, match=r"a_correction\.tif: (gdal|barpc) reads it [01]\.\d+ px RMS off, not 0\.00\d+; is"
+    ):
         run_of(tmp_path / "out", (view, fit, camera))
 
 
+@pytest.mark.slow
 def test_a_run_that_dies_half_way_leaves_nothing_half_written(tmp_path, view, camera, fit, monkeypatch):
     def dying(*given, **how):
         raise KeyboardInterrupt
@@ -255,6 +258,7 @@ def block(tmp_path_factory):
     return write_block(folder, 3)[1], str(folder / "matches.npz")
 
 
+@pytest.mark.slow
 def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, tmp_path):
     images, matches = block
     options = RunOptions(matches=matches, matches_only=True, grids=True, tiles=128, resample=True)
@@ -291,6 +295,7 @@ def test_a_file_of_the_user_is_never_replaced(block, tmp_path):
     assert (out / f"{images[0].stem}{GRID}").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_with_grids_a_camera_that_no_rpc_holds_is_no_failure(block, tmp_path):
     """The image's RPC is given with a tolerance that no fit meets: refused without grids, and told with them."""
     images, matches = block
@@ -301,6 +306,7 @@ def test_with_grids_a_camera_that_no_rpc_holds_is_no_failure(block, tmp_path):
     assert {view.status for view in result.record.views}.isdisjoint({"failed"})
 
 
+@pytest.mark.slow
 def test_verbs_understand_grids(block, tmp_path):
     images, matches = block
     adjust(images, tmp_path / "a", RunOptions(matches=matches, matches_only=True, grids=True))
@@ -325,6 +331,7 @@ def test_verbs_understand_grids(block, tmp_path):
     assert said("fit", grid)[0] == 0
 
 
+@pytest.mark.slow
 def test_a_grid_is_the_camera_of_an_image_and_no_image(block, tmp_path):
     images, matches = block
     adjust(images, tmp_path / "a", RunOptions(matches=matches, matches_only=True, grids=True))

@@ -148,6 +148,7 @@ def test_several_cameras_are_each_their_own(block):
     assert not len(Several(sensors, of[:0]).project(ground[:0]))
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_in_writing_goes_on_after_the_fits(block, folder, tmp_path, monkeypatch):
     """The fits are kept, and the files are opened again whatever was kept."""
     counts: Counter[str] = Counter()

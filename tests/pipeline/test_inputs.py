@@ -2,42 +2,31 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 from barpc.errors import DisconnectedError, InputError
 from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline.inputs import only_new
 from barpc.pointio.matches import read_matches
 from barpc.rpcio import read_rpc
+from barpc.rpcio.tiff import put_tag
 from barpc.scene import Tracks
 
-from .test_synthetic import SAMPLES, errors_at_check_points
-
-IMAGES = sorted(SAMPLES.glob("*.tif"))
+from .known import SAMPLES, errors_at_check_points
 
 
-@pytest.fixture(scope="module")
-def truth():
-    return json.loads((SAMPLES / "truth.json").read_text())
-
-
-@pytest.fixture(scope="module")
-def matched(tmp_path_factory):
-    out = tmp_path_factory.mktemp("matched") / "ties"
-    return adjust(IMAGES, out, RunOptions(stop_after="matching")), out
-
-
-def test_tie_points_from_a_file_give_the_same_answer(matched, tmp_path):
+def test_tie_points_from_a_file_give_the_same_answer(known, matched, tmp_path):
     result, out = matched
     runs = []
     for name in ("matches.csv", "matches.npz"):
-        again = adjust(IMAGES, tmp_path / name, RunOptions(matches_only=True, matches=str(out / name)))
+        given = RunOptions(matches_only=True, matches=str(out / name), stop_after="adjustment")
+        again = adjust(known.images, tmp_path / name, given)
         np.testing.assert_array_equal(again.tracks.xy, result.tracks.xy)
         np.testing.assert_array_equal(again.tracks.sigma, result.tracks.sigma)
         runs.append(again.adjustment.params)
@@ -61,13 +50,13 @@ def test_asp_text_matches_hold_the_same_tie_points(matched):
     assert theirs <= ours
 
 
-def test_control_points_put_the_scene_in_its_place(matched, truth, tmp_path):
+def test_control_points_put_the_scene_in_its_place(known, matched, tmp_path):
     options = RunOptions(
-        matches_only=True, matches=str(matched[1] / "matches.npz"), gcp=(str(SAMPLES / "gcps.geojson"),)
+        matches_only=True, matches=str(matched[1] / "matches.npz"), gcp=(str(known.gcps),), pictures=False
     )
-    result = adjust(IMAGES, tmp_path / "out", options)
+    result = adjust(known.images, tmp_path / "out", options)
     rms, offset = errors_at_check_points(
-        [read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], truth
+        [read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], known.truth
     )
     sigma = np.array(result.summary["scene"]["sigma_enu_m"])
     assert rms <= 0.02
@@ -92,39 +81,63 @@ def test_one_image_and_control_points_are_enough(shared_data, tmp_path):
     assert "nan" not in " ".join(result.summary["verdict"])
 
 
-def test_control_points_of_other_images_are_refused_before_any_work(tmp_path):
-    text = (SAMPLES / "gcps.geojson").read_text().replace("view_0", "photo_")
+def test_control_points_of_other_images_are_refused_before_any_work(corner, tmp_path):
+    text = corner.gcps.read_text().replace("view_0", "photo_")
     (tmp_path / "gcps.geojson").write_text(text)
     with pytest.raises(InputError, match=r"gcps\.geojson"):
-        adjust(IMAGES, tmp_path / "out", RunOptions(gcp=(str(tmp_path / "gcps.geojson"),)))
+        adjust(corner.images, tmp_path / "out", RunOptions(gcp=(str(tmp_path / "gcps.geojson"),)))
     assert not (tmp_path / "out").exists()
 
 
-def test_a_stray_image_is_named_and_left_out_when_asked(shared_data, tmp_path):
-    stray = shared_data / "optical/phr_triplet_north/img_01.tif"
+def test_a_stray_image_is_named_and_left_out_when_asked(known, tmp_path):
+    stray = tmp_path / "img_01.tif"
+    elsewhere(known.images[0], stray)
     with pytest.raises(DisconnectedError) as caught:
-        adjust([*IMAGES, stray], tmp_path / "out")
+        adjust([*known.images, stray], tmp_path / "out", RunOptions(stop_after="matching"))
     assert caught.value.groups[1] == ("img_01",)
-    options = RunOptions(keep_going=True)
-    result = adjust([*IMAGES, stray], tmp_path / "out", options)
+    options = RunOptions(keep_going=True, overwrite=True, pictures=False)
+    result = adjust([*known.images, stray], tmp_path / "out", options)  # what was found is not found again
     assert [view.name for view in result.views] == ["view_00", "view_01", "view_02"]
     assert not result.passed
     assert result.summary["left_out"][0]["path"] == str(stray)
     assert not (tmp_path / "out/img_01.vrt").exists()
 
 
-def test_a_later_run_goes_on_from_an_earlier_block(matched, truth, tmp_path):
-    adjust(IMAGES[:2], tmp_path / "two")
-    joint = adjust(
-        IMAGES, tmp_path / "joint", RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"))
+def elsewhere(source: Path, target: Path) -> None:
+    """An image of a place far to the east."""
+    shutil.copy(source, target)
+    with rasterio.open(target, "r+") as image:
+        image.write(np.ascontiguousarray(image.read()[:, ::-1, ::-1]))
+    rpc = read_rpc(source)
+    put_tag(target, replace(rpc, ground_offset=rpc.ground_offset + [1.0, 0.0, 0.0]))
+
+
+@pytest.mark.slow
+def test_a_real_stray_image_is_left_out(shared_data, tmp_path):
+    stray = shared_data / "optical/phr_triplet_north/img_01.tif"
+    result = adjust([*SAMPLES, stray], tmp_path / "out", RunOptions(keep_going=True))
+    assert [view.name for view in result.views] == ["view_00", "view_01", "view_02"]
+    assert not result.passed
+    assert result.summary["left_out"][0]["path"] == str(stray)
+
+
+def test_a_later_run_goes_on_from_an_earlier_block(known, matched, tmp_path):
+    given = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), pictures=False)
+    two = tmp_path / "two.csv"
+    rows = (matched[1] / "matches.csv").read_text().splitlines(keepends=True)
+    two.write_text("".join(row for row in rows if not row.startswith("view_02")))
+    half = replace(given, matches=str(two), stop_after="adjustment")
+    adjust(known.images[:2], tmp_path / "two", half)
+    joint = adjust(known.images, tmp_path / "joint", replace(given, stop_after="adjustment"))
+    result = adjust(known.images, tmp_path / "three", replace(given, fixed_run=str(tmp_path / "two")))
+    rms, _ = errors_at_check_points(
+        [read_rpc(tmp_path / f"three/{v.name}.vrt") for v in result.views], known.truth
     )
-    result = adjust(IMAGES, tmp_path / "three", RunOptions(fixed_run=str(tmp_path / "two")))
-    rms, _ = errors_at_check_points([read_rpc(tmp_path / f"three/{v.name}.vrt") for v in result.views], truth)
     assert rms <= 0.03
     sigma = [np.sqrt(np.diag(run.adjustment.covariance.view(2))) for run in (joint, result)]
     np.testing.assert_allclose(sigma[1], sigma[0], rtol=0.2)
     with pytest.raises(InputError, match="prior of an adjusted block"):
-        adjust(IMAGES, tmp_path / "none", RunOptions(fixed_run=str(tmp_path)))
+        adjust(known.images, tmp_path / "none", RunOptions(fixed_run=str(tmp_path)))
 
 
 def test_what_the_earlier_block_knew_does_not_count_twice():
@@ -141,13 +154,17 @@ def test_what_the_earlier_block_knew_does_not_count_twice():
     assert new.sigma.tolist() == [0.2, 0.1, 1, 1]
 
 
-def test_a_second_pass_matches_with_the_adjusted_cameras(truth, tmp_path):
-    result = adjust(IMAGES, tmp_path / "out", RunOptions(num_passes=2))
+@pytest.mark.slow
+def test_a_second_pass_matches_with_the_adjusted_cameras(known, tmp_path):
+    images = known.images if known.whole else known.images[:2]
+    result = adjust(images, tmp_path / "out", RunOptions(num_passes=2, pictures=False))
+    truth = {**known.truth, "views": known.truth["views"][: len(images)]}
     rms, _ = errors_at_check_points([read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], truth)
     assert rms <= 0.02
     assert "tie points (pass 2)" in [stage["stage"] for stage in result.summary["stages"]]
 
 
+@pytest.mark.slow
 def test_a_dem_holds_heights_and_says_what_it_took(shared_data, tmp_path):
     source = shared_data / "optical/phr_ventoux"
     for path in source.glob("*_image.*"):
@@ -169,9 +186,10 @@ def test_a_dem_holds_heights_and_says_what_it_took(shared_data, tmp_path):
     assert abs(held.summary["pairs"][0]["epipolar_after"]["median"]) < 0.1
 
 
-def test_paths_with_spaces_and_accents_and_equal_stems(tmp_path):
+@pytest.mark.slow
+def test_paths_with_spaces_and_accents_and_equal_stems(corner, tmp_path):
     folders = [tmp_path / "été 1", tmp_path / "été 2"]
-    for folder, path in zip(folders, IMAGES, strict=False):
+    for folder, path in zip(folders, corner.images, strict=False):
         folder.mkdir()
         shutil.copy(path, folder / "scène.tif")
     result = adjust([folder / "scène.tif" for folder in folders], tmp_path / "out à moi")
@@ -181,12 +199,12 @@ def test_paths_with_spaces_and_accents_and_equal_stems(tmp_path):
         assert read_rpc(Path(tmp_path / "out à moi" / f"{name}.vrt")) is not None
 
 
-def test_check_points_are_measured_and_not_used(matched, tmp_path):
-    ties, known = str(matched[1] / "matches.npz"), (str(SAMPLES / "gcps.geojson"),)
-    free = adjust(IMAGES, tmp_path / "free", RunOptions(matches_only=True, matches=ties))
-    checked = adjust(
-        IMAGES, tmp_path / "checked", RunOptions(matches_only=True, matches=ties, check_points=known)
+def test_check_points_are_measured_and_not_used(known, matched, tmp_path):
+    given = RunOptions(
+        matches_only=True, matches=str(matched[1] / "matches.npz"), pictures=False, stop_after="adjustment"
     )
+    free = adjust(known.images, tmp_path / "free", given)
+    checked = adjust(known.images, tmp_path / "checked", replace(given, check_points=(str(known.gcps),)))
     np.testing.assert_array_equal(checked.adjustment.params, free.adjustment.params)
     points = checked.summary["check_points"]
     assert len(points) == 5

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -18,25 +17,60 @@ from barpc.fit import FitOptions
 from barpc.geodesy import ground_from_ecef
 from barpc.pipeline import AdjustResult, RunOptions, adjust
 from barpc.tie import TieOptions
-from tests.scenes.files import write_scene
-from tests.scenes.images import ImageOptions
+from tests.pipeline.known import part
 from tests.test_dem import write_dem, write_geoid
 
-Run = Callable[..., AdjustResult]
+SIDE = 160  # px of an image
+
+
+class Run:
+    """`run(name, gcp=...)`: the three images, matches of the first run unless others are asked for."""
+
+    def __init__(self, scene: Path, out: Path, shared: Run | None) -> None:
+        self.scene, self.out, self._shared = scene, out, shared
+        self._kept: dict[str, AdjustResult] = {}
+
+    def __call__(
+        self, out: str = "out", matches: str | None = "first/matches.csv", **options: Any
+    ) -> AdjustResult:
+        given = () if matches is None else str(self.scene / matches)
+        images = options.pop("given", sorted(self.scene.glob("*.tif")))
+        options = {"matches_only": matches is not None, "pictures": False, **options}
+        return adjust(images, self.out / out, RunOptions(matches=given, **options))
+
+    def once(self, name: str, *given: Any, **options: Any) -> AdjustResult:
+        """The same run for all tests of the module."""
+        assert self._shared is not None
+        kept = self._shared._kept
+        if name not in kept:
+            kept[name] = self._shared(name, *given, **options)
+        return kept[name]
+
+    @property
+    def plain(self) -> AdjustResult:
+        """The run without any option; its files: `folder`."""
+        return self.once("plain", pictures=True)
+
+    @property
+    def folder(self) -> Path:
+        """The files of the plain run."""
+        return Path(self.plain.run.out_dir)
+
+    @property
+    def matched(self) -> AdjustResult:
+        """The run that only matches."""
+        return self.once("matched", None, stop_after="matching")
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three small images, GCPs; a first run's matches; a flat DEM of 300 m and a geoid of 40 m."""
     folder = tmp_path_factory.mktemp("scene") / "in"
-    write_scene(folder, ImageOptions(size=(260, 260), seed=1, views=3, gcps=4))
-    images = sorted(folder.glob("*.tif"))
-    adjust(images, folder / "first", RunOptions(stop_after="matching"))
-    adjust(
-        images[:2],
-        folder / "earlier",
-        RunOptions(matches_only=True, matches=str(folder / "first/matches.csv")),
-    )
+    folder.mkdir()
+    images = part(folder, SIDE, 240, gcps=4).images
+    adjust(images, folder / "first", RunOptions(stop_after="matching", pictures=False))
+    first = RunOptions(matches_only=True, matches=str(folder / "first/matches.csv"), stop_after="adjustment")
+    adjust(images[:2], folder / "earlier", first)
     (folder / "dem").mkdir()
     heights = np.full((200, 200), 300.0, np.float32)
     write_dem(folder / "dem/a.tif", "EPSG:4326+5773", heights, transform=_around())
@@ -48,17 +82,14 @@ def _around() -> Any:
     return Affine(0.001, 0, 5.3, 0, -0.001, 43.4)
 
 
+@pytest.fixture(scope="module")
+def shared(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return Run(scene, tmp_path_factory.mktemp("shared"), None)
+
+
 @pytest.fixture
-def run(scene: Path, tmp_path: Path) -> Run:
-    """`run(gcp=...)`: the three images, matches of the first run unless others are asked for."""
-
-    def make(out: str = "out", matches: str | None = "first/matches.csv", **options: Any) -> AdjustResult:
-        given = () if matches is None else str(scene / matches)
-        images = options.pop("given", sorted(scene.glob("*.tif")))
-        options = {"matches_only": matches is not None, **options}
-        return adjust(images, tmp_path / out, RunOptions(matches=given, **options))
-
-    return make
+def run(scene: Path, tmp_path: Path, shared: Run) -> Run:
+    return Run(scene, tmp_path, shared)
 
 
 def _names(path: Path) -> set[str]:
@@ -66,31 +97,30 @@ def _names(path: Path) -> set[str]:
 
 
 def images(run: Run, out: Path, scene: Path) -> None:
-    for chosen, suffix in (("vrt", {".vrt"}), ("copy", {".tif"}), ("none", set())):
+    assert _names(run.folder) & {".vrt", ".tif"} == {".vrt"}
+    for chosen, suffix in (("copy", {".tif"}), ("none", set())):
         run(chosen, images=chosen)
         assert _names(out / chosen) & {".vrt", ".tif"} == suffix
 
 
 def pictures(run: Run, out: Path, scene: Path) -> None:
-    run("with")
-    run("without", pictures=False)
-    assert [(out / name / "pictures.json").exists() for name in ("with", "without")] == [True, False]
+    run("without")
+    assert [(folder / "pictures.json").exists() for folder in (run.folder, out / "without")] == [True, False]
     assert "data:image/jpeg" not in (out / "without/report.html").read_text()
 
 
 def grids(run: Run, out: Path, scene: Path) -> None:
-    run("where needed")
     run("always", grids=True)
-    written = {
-        name: {p.name[8:] for p in (out / name).glob("view_00_*.tif")} for name in ("where needed", "always")
-    }
-    assert written == {"where needed": set(), "always": {"grid.tif", "correction.tif"}}
+    needed, always = (
+        {p.name[8:] for p in folder.glob("view_00_*.tif")} for folder in (run.folder, out / "always")
+    )
+    assert (needed, always) == (set(), {"grid.tif", "correction.tif"})
 
 
 def tiles(run: Run, out: Path, scene: Path) -> None:
-    run("a", tiles=100)
+    run("a", tiles=64)
     names = sorted(p.name for p in (out / "a/view_00_tiles").iterdir())
-    assert len(names) == 9  # of an image of 260 px
+    assert len(names) == 4  # of an image of 160 px: the last half tile joins its neighbour
     assert all(name.endswith("_RPC.TXT") for name in names)
 
 
@@ -109,8 +139,8 @@ def rpc_formats(run: Run, out: Path, scene: Path) -> None:
 
 
 def num_passes(run: Run, out: Path, scene: Path) -> None:
-    one, two = (run(str(n), matches=None, num_passes=n) for n in (1, 2))
-    stages = [{stage["stage"] for stage in found.summary["stages"]} for found in (one, two)]
+    two = run("two", matches=None, num_passes=2, stop_after="adjustment")
+    stages = [{stage["stage"] for stage in found.summary["stages"]} for found in (run.plain, two)]
     assert stages[1] - stages[0] == {"tie points (pass 2)", "adjustment (pass 2)"}
 
 
@@ -121,8 +151,7 @@ def stop_after(run: Run, out: Path, scene: Path) -> None:
     run("a", stop_after="adjustment")
     assert (out / "a/block.npz").exists()
     assert not list((out / "a").glob("*.vrt"))
-    run("w")
-    assert list((out / "w").glob("*.vrt"))
+    assert list(run.folder.glob("*.vrt"))
 
 
 def keep_going(run: Run, out: Path, scene: Path) -> None:
@@ -130,7 +159,7 @@ def keep_going(run: Run, out: Path, scene: Path) -> None:
     given = [*sorted(scene.glob("*.tif")), out / "bad.tif"]
     with pytest.raises(Exception, match=r"bad\.tif"):
         run("a", given=given)
-    found = run("b", given=given, keep_going=True)
+    found = run("b", given=given, keep_going=True, stop_after="adjustment")
     assert [Path(row["path"]).name for row in found.summary["left_out"]] == ["bad.tif"]
     assert not found.passed
     hard = FitOptions(tolerance=1e-15)
@@ -141,10 +170,10 @@ def keep_going(run: Run, out: Path, scene: Path) -> None:
 
 
 def overwrite(run: Run, out: Path, scene: Path) -> None:
-    run("a")
+    run("a", stop_after="matching")
     with pytest.raises(OutputError):
         run("a")
-    run("a", overwrite=True)
+    run("a", overwrite=True, stop_after="matching")
 
 
 def matches(run: Run, out: Path, scene: Path) -> None:
@@ -161,7 +190,7 @@ def matches(run: Run, out: Path, scene: Path) -> None:
 def matches_only(run: Run, out: Path, scene: Path) -> None:
     rows = (scene / "first/matches.csv").read_text().splitlines()
     (scene / "fewer.csv").write_text("\n".join(rows[: len(rows) // 2]) + "\n")
-    few, many = run("a", "fewer.csv", stop_after="adjustment"), run("b", stop_after="adjustment")
+    few, many = run("a", "fewer.csv", stop_after="adjustment"), run.plain
     assert 0 < len(few.tracks) < len(many.tracks)
     assert len(few.run.matched) == 0
 
@@ -170,22 +199,21 @@ def overlap_list(run: Run, out: Path, scene: Path) -> None:
     (out / "pairs.txt").write_text("view_00 view_01\nview_01 view_02\n")
     listed = str(out / "pairs.txt")
     some = run("a", None, overlap_list=listed, stop_after="matching")
-    every = run("b", None, stop_after="matching")
-    assert (len(some.run.matched), len(every.run.matched)) == (2, 3)
+    assert (len(some.run.matched), len(run.matched.run.matched)) == (2, 3)
 
 
 def aoi(run: Run, out: Path, scene: Path) -> None:
-    every = run("a", None, stop_after="adjustment")
-    middle = np.median([view.sensor.ground_offset[:2] for view in every.run.views], axis=0)  # type: ignore[attr-defined]
+    every = run.matched
+    middle = every.run.views[0].sensor.localize(np.full(2, SIDE / 2.0), np.array(230.0))[:2]
     w, s, e, n = *(middle - [0.01, 0.01]), *(middle + [0.0, 0.01])
     ring = [[w, s], [e, s], [e, n], [w, n], [w, s]]
     (out / "a.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
-    half = run("b", None, aoi=str(out / "a.geojson"), stop_after="adjustment")
+    half = run("b", None, aoi=str(out / "a.geojson"), stop_after="matching")
     assert 0.2 < len(half.tracks) / len(every.tracks) < 0.8
 
 
 def gcp(run: Run, out: Path, scene: Path) -> None:
-    free, held = run("a"), run("b", gcp=(str(scene / "gcps.geojson"),))
+    free, held = run.plain, run("b", gcp=(str(scene / "gcps.geojson"),), stop_after="adjustment")
     assert len(held.summary["gcps"]) == 4
     assert free.summary["gcps"] == []
     sigmas = [found.summary["scene"]["sigma_enu_m"] for found in (held, free)]
@@ -193,14 +221,15 @@ def gcp(run: Run, out: Path, scene: Path) -> None:
 
 
 def check_points(run: Run, out: Path, scene: Path) -> None:
-    free, checked = run("a"), run("b", check_points=(str(scene / "gcps.geojson"),))
+    known = (str(scene / "gcps.geojson"),)
+    free, checked = run.plain, run("b", check_points=known, stop_after="adjustment")
     assert free.summary["check_points"] in (None, [], {})
     assert checked.summary["check_points"]
     np.testing.assert_array_equal(free.adjustment.params, checked.adjustment.params)
 
 
 def fixed_run(run: Run, out: Path, scene: Path) -> None:
-    free, going_on = run("a"), run("b", fixed_run=str(scene / "earlier"))
+    free, going_on = run.plain, run("b", fixed_run=str(scene / "earlier"), stop_after="adjustment")
     assert 0 < len(going_on.tracks) < len(free.tracks)
     np.testing.assert_allclose(going_on.adjustment.params, free.adjustment.params, atol=0.2)
 
@@ -210,47 +239,52 @@ def _height(found: AdjustResult) -> float:
     return float(np.median(ground_from_ecef(points[np.isfinite(points[:, 0])])[:, 2]))
 
 
+TIGHT = AdjustOptions(dem_for_all=True, dem_sigma=0.01, dem_bias_sigma=0.01)
+
+
+def _held(run: Run) -> AdjustResult:
+    """The scene held to the terrain's heights."""
+    given = {"dem": str(run.scene / "dem/a.tif"), "geoid": str(run.scene / "dem/g.gtx")}
+    return run.once("held", adjust=TIGHT, stop_after="adjustment", **given)
+
+
 def dem(run: Run, out: Path, scene: Path) -> None:
-    tight = AdjustOptions(dem_for_all=True, dem_sigma=0.01, dem_bias_sigma=0.01)
-    geoid = str(scene / "dem/g.gtx")
-    free = run("a", adjust=AdjustOptions())
-    held = run("b", adjust=tight, dem=str(scene / "dem/a.tif"), geoid=geoid)
-    assert abs(_height(held) - 340.0) < 0.2 * abs(_height(free) - 340.0)
+    held = _held(run)
+    assert abs(_height(held) - 340.0) < 0.2 * abs(_height(run.plain) - 340.0)
     with pytest.raises(InputError):
         run("c", dem=str(out / "nowhere.tif"))
     with pytest.raises(InputError, match="dem_for_all is given without dem"):
-        run("d", adjust=tight)
+        run("d", adjust=TIGHT)
 
 
 @pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
 def geoid(run: Run, out: Path, scene: Path) -> None:
-    tight = AdjustOptions(dem_for_all=True, dem_sigma=0.01, dem_bias_sigma=0.01)
-    dem = str(scene / "dem/a.tif")
-    with_geoid = run("a", adjust=tight, dem=dem, geoid=str(scene / "dem/g.gtx"))
+    with_geoid = _held(run)
     with pytest.warns(BarpcWarning, match="geoid"):
-        without = run("b", adjust=tight, dem=dem)
+        without = run("b", adjust=TIGHT, dem=str(scene / "dem/a.tif"), stop_after="adjustment")
     assert _height(with_geoid) - _height(without) == pytest.approx(40.0, abs=4.0)
     with pytest.raises(InputError, match="geoid is given without dem"):
         RunOptions(geoid="g.gtx")
 
 
+def _referred(run: Run, sigma: float | None) -> AdjustResult:
+    """With the terrain for a reference: it shows nothing of what the images show."""
+    dem, geoid = str(run.scene / "dem/a.tif"), str(run.scene / "dem/g.gtx")
+    given = {"dem": dem, "geoid": geoid, "reference": (dem,), "reference_sigma": sigma}
+    return run.once(f"reference {sigma}", stop_after="adjustment", **given)
+
+
 def reference(run: Run, out: Path, scene: Path) -> None:  # what it does to a block: test_reference
-    dem, geoid = str(scene / "dem/a.tif"), str(scene / "dem/g.gtx")
-    found = run("a", dem=dem, geoid=geoid, reference=(dem,))
+    found = _referred(run, None)
     assert found.summary["reference"]["used"] is False
     assert any("does not show" in reason for reason in found.summary["reasons"])
-    assert run("b", dem=dem, geoid=geoid).summary.get("reference") is None
+    assert _held(run).summary.get("reference") is None
     with pytest.raises(InputError, match="reference is given without dem"):
         RunOptions(reference=("r.tif",))
 
 
 def reference_sigma(run: Run, out: Path, scene: Path) -> None:
-    given = {"dem": str(scene / "dem/a.tif"), "geoid": str(scene / "dem/g.gtx")}
-    given["reference"] = (given["dem"],)
-    sigmas = [
-        run(name, **given, reference_sigma=size).summary["reference"]["sigma_m"]
-        for name, size in (("a", None), ("b", 7.0))
-    ]
+    sigmas = [_referred(run, size).summary["reference"]["sigma_m"] for size in (None, 7.0)]
     assert sigmas == [pytest.approx(0.25 * 111.0, rel=0.3), 7.0]  # a quarter of its pixel
     with pytest.raises(InputError, match="reference_sigma is given without reference"):
         RunOptions(reference_sigma=1.0)
@@ -258,8 +292,7 @@ def reference_sigma(run: Run, out: Path, scene: Path) -> None:
 
 def tie(run: Run, out: Path, scene: Path) -> None:
     few = run("a", None, stop_after="matching", tie=TieOptions(points_per_image=80))
-    many = run("b", None, stop_after="matching")
-    assert 0 < len(few.tracks) < 0.7 * len(many.tracks)
+    assert 0 < len(few.tracks) < 0.7 * len(run.matched.tracks)
 
 
 def adjust_(run: Run, out: Path, scene: Path) -> None:
@@ -307,7 +340,13 @@ def test_every_option_has_a_row() -> None:
     assert set(ROWS) == {field.name for field in fields(RunOptions)}
 
 
-@pytest.mark.parametrize("name", ROWS)
+ELSEWHERE = ("overlap_list", "aoi", "gcp", "check_points", "geoid", "num_passes")
+"""Options whose fast tests stand in test_pairs_and_area, test_inputs and tests/test_dem."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ELSEWHERE)) for name in ROWS]
+)
 def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene: Path) -> None:
     before = {path.name: path.read_bytes() for path in scene.iterdir() if path.is_file()}
     ROWS[name](run, tmp_path, scene)  # asserts what the option does

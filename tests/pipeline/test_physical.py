@@ -24,6 +24,7 @@ from barpc.sensor.geometry import triangulate
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.pushbroom import Light
 from barpc.simulate.orbit import Look
+from tests.lanes import rest_slow
 from tests.rpcio.conftest import make_rpc, write_image
 from tests.sensor.linescan_files import Flight, dimap, isd
 
@@ -42,7 +43,7 @@ def blank(path):
     return path
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(scope="module", params=rest_slow(KINDS))
 def folder(request, tmp_path_factory):
     """Three images without pixels of their own, their metadata beside them; one has a vendor's RPC, too."""
     path = tmp_path_factory.mktemp(request.param)

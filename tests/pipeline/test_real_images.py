@@ -16,6 +16,7 @@ from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor.corrected import ImageAffine, ImageCorrected
 from barpc.sensor.geometry import epipolar_offset, triangulate
+from tests.lanes import rest_slow
 
 from .conftest import check_points
 
@@ -28,6 +29,7 @@ def epipolar(rpc_a, rpc_b, points):
     return median, 1.4826 * np.median(np.abs(offset - median))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pair", "delivered"), list(zip(PAIRS, (0.69, 1.20, 0.53), strict=True)))
 def test_the_triplets_check_points_meet_within_three_hundredths_of_a_pixel(
     shared_data, triplet, pair, delivered
@@ -46,6 +48,7 @@ def test_the_triplets_check_points_meet_within_three_hundredths_of_a_pixel(
     assert spread <= 1.1 * noise["-".join(pair)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_points_of_another_detector_meet_without_a_bias(shared_data, triplet, pair):
     """The check points found by template matching lie 0.02 px off both these and the tool's own."""
@@ -88,6 +91,7 @@ SPOILT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SPOILT)
 def test_an_image_that_was_turned_or_resampled_is_met_all_the_same(shared_data, triplet, name):
     result, _ = triplet
@@ -107,6 +111,7 @@ def test_an_image_that_was_turned_or_resampled_is_met_all_the_same(shared_data, 
         assert np.abs(found.scene_shift).max() < 0.1
 
 
+@pytest.mark.slow
 def test_check_points_seen_in_three_images_are_met_to_a_tenth_of_a_pixel(shared_data, triplet):
     _, out = triplet
     second, third = (check_points(shared_data, "img_01", name) for name in ("img_02", "img_03"))
@@ -136,7 +141,9 @@ def test_check_points_seen_in_three_images_are_met_to_a_tenth_of_a_pixel(shared_
     assert np.sqrt(adjusted.mean()) <= 1.01 * np.sqrt((best.residuals**2).mean())
 
 
-@pytest.mark.parametrize(("which", "delivered"), [("ventoux", 4.8), ("ventoux_biased", 20.6)])
+@pytest.mark.parametrize(
+    ("which", "delivered"), [("ventoux_biased", 20.6), pytest.param("ventoux", 4.8, marks=pytest.mark.slow)]
+)
 def test_ventoux_with_little_overlap_is_met_within_five_hundredths_of_a_pixel(
     request, shared_data, which, delivered
 ):
@@ -150,7 +157,7 @@ def test_ventoux_with_little_overlap_is_met_within_five_hundredths_of_a_pixel(
     assert spread <= 1.1 * 0.184
 
 
-@pytest.mark.parametrize("which", ["triplet", "ventoux", "ventoux_biased"])
+@pytest.mark.parametrize("which", rest_slow(["ventoux_biased", "triplet", "ventoux"]))
 def test_the_files_hold_p_ba_to_a_millionth_of_a_pixel(request, which):
     result, out = request.getfixturevalue(which)
     for view, model in zip(result.run.views, result.adjustment.sensors, strict=True):
@@ -161,7 +168,7 @@ def test_the_files_hold_p_ba_to_a_millionth_of_a_pixel(request, which):
             assert np.abs(read_rpc(out / name).project(ground) - truth).max() <= 1e-6
 
 
-@pytest.mark.parametrize("which", ["triplet", "ventoux", "ventoux_biased"])
+@pytest.mark.parametrize("which", rest_slow(["ventoux_biased", "triplet", "ventoux"]))
 def test_the_images_are_not_shifted_as_a_set(request, which):
     result, _ = request.getfixturevalue(which)
     views, tracks = result.run.views, result.tracks
@@ -177,6 +184,7 @@ def test_the_images_are_not_shifted_as_a_set(request, which):
         assert np.abs(shift).max() > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["triplet", "ventoux"])
 def test_the_scene_stays_where_the_cameras_put_it(request, which):
     result, _ = request.getfixturevalue(which)
@@ -185,12 +193,14 @@ def test_the_scene_stays_where_the_cameras_put_it(request, which):
     assert min(scene["sigma_enu_m"]) > 1.0  # and says that this is all that is known
 
 
+@pytest.mark.slow
 def test_camera_centres_are_at_the_height_of_the_orbit(triplet):
     for view in triplet[0].summary["views"]:
         assert view["camera_center"]["method"] == "line"
         assert view["camera_center"]["altitude_m"] == pytest.approx(694e3, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_summary_is_plain_json_and_says_what_was_reached(triplet):
     result, out = triplet
     summary = json.loads((out / "summary.json").read_text(), parse_constant=lambda name: pytest.fail(name))
@@ -215,6 +225,7 @@ def test_the_summary_is_plain_json_and_says_what_was_reached(triplet):
     assert "scene" in summary["verdict"][2]
 
 
+@pytest.mark.slow
 def test_inputs_are_left_as_they_were(shared_data, triplet):
     for path in (shared_data / "optical/phr_triplet_north").iterdir():
         assert path.suffix == ".tif"

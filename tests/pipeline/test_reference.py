@@ -14,18 +14,18 @@ from barpc.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.pointio.ground import read_gcps
 from barpc.rpcio import read_rpc
-from tests.pipeline.test_synthetic import SAMPLES, errors_at_check_points
+from tests.pipeline.known import FOLDER, SAMPLES, errors_at_check_points
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
 
-IMAGES = sorted(SAMPLES.glob("*.tif"))
+IMAGES = SAMPLES
 DEM_BIAS = 2.0
 
 
 @pytest.fixture(scope="module")
 def truth():
-    return json.loads((SAMPLES / "truth.json").read_text())
+    return json.loads((FOLDER / "truth.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +63,7 @@ def place_of(out, result, truth) -> np.ndarray:
     return errors_at_check_points([read_rpc(out / f"{v.name}.vrt") for v in result.run.views], truth)[1]
 
 
+@pytest.mark.slow
 def test_the_scene_stands_where_the_reference_says(held, place, truth):
     error, sigma = place_of(place / "held", held, truth), np.array(held.summary["scene"]["sigma_enu_m"])
     assert np.hypot(*error[:2]) < 1.0
@@ -74,6 +75,7 @@ def test_the_scene_stands_where_the_reference_says(held, place, truth):
     assert (np.linalg.norm(delivered, axis=1) > 5.0).all()
 
 
+@pytest.mark.slow
 def test_the_run_says_what_the_reference_did(held, place):
     found = held.summary["reference"]
     assert found["used"]
@@ -87,6 +89,7 @@ def test_the_run_says_what_the_reference_did(held, place):
     assert len(points.view) == sum(view["num_points"] for view in found["views"])
 
 
+@pytest.mark.slow
 def test_its_points_can_be_read_as_gcps(held, place):
     points = read_gcps(place / "held/gcps.geojson", [view.name for view in held.run.views])
     image = np.array(
@@ -98,11 +101,13 @@ def test_its_points_can_be_read_as_gcps(held, place):
     assert np.median(np.linalg.norm(image - points.xy, axis=1)) < 8.0  # px, of 2 m pixels and single heights
 
 
+@pytest.mark.slow
 def test_a_stated_sigma_is_the_scene_s(options, tmp_path):
     run = adjust(IMAGES, tmp_path / "run", replace(options, reference_sigma=2.0))
     assert run.summary["scene"]["sigma_enu_m"][:2] == pytest.approx([2.0, 2.0], rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, capsys):
     alone = adjust(IMAGES, tmp_path / "alone", replace(options, reference=()))
     flags = [
@@ -124,6 +129,7 @@ def test_a_reference_of_another_place_moves_nothing(place, options, tmp_path, ca
         assert (tmp_path / "wrong" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_one_image_is_enough(options, truth, tmp_path):
     run = adjust(IMAGES[:1], tmp_path / "run", replace(options, matches=(), matches_only=False))
     points = [p for p in truth["check_points"] if run.run.views[0].name in p["image"]]

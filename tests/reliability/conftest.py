@@ -106,6 +106,22 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [crop(path, folder / path.name) for path in SAMPLES]
 
 
+@pytest.fixture(scope="session")
+def ran(pristine: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the first two crops in `in` and a finished run on them in `out`; never written to."""
+    folder = tmp_path_factory.mktemp("ran")
+    (folder / "in").mkdir()
+    images = [Path(shutil.copy(path, folder / "in")) for path in pristine[:2]]
+    assert barpc("adjust", *images, "-o", folder / "out", "--overwrite").code == 0
+    return folder
+
+
+@pytest.fixture
+def out(ran: Path, crops: list[Path], tmp_path: Path) -> Path:
+    """A finished run on `crops`, of one's own: what it kept is found again."""
+    return Path(shutil.copytree(ran / "out", tmp_path / "out"))
+
+
 @pytest.fixture
 def crops(pristine: list[Path], tmp_path: Path) -> list[Path]:
     """Two overlapping crops of one's own."""

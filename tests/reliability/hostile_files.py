@@ -15,7 +15,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 import rasterio
 
-SIDE = 300  # px; of the crops
+SIDE = 160  # px; of the crops
 
 
 @dataclass
@@ -32,8 +32,8 @@ class Trap:
         """A web map service as GDAL reads it."""
         return (
             f'<GDAL_WMS><Service name="TMS"><ServerUrl>{self.url}/${{z}}/${{x}}/${{y}}.png</ServerUrl></Service>'
-            "<DataWindow><UpperLeftX>0</UpperLeftX><UpperLeftY>0</UpperLeftY><LowerRightX>300</LowerRightX>"
-            "<LowerRightY>300</LowerRightY><TileLevel>0</TileLevel><SizeX>300</SizeX><SizeY>300</SizeY>"
+            "<DataWindow><UpperLeftX>0</UpperLeftX><UpperLeftY>0</UpperLeftY><LowerRightX>160</LowerRightX>"
+            "<LowerRightY>160</LowerRightY><TileLevel>0</TileLevel><SizeX>160</SizeX><SizeY>160</SizeY>"
             "</DataWindow><BandsCount>1</BandsCount></GDAL_WMS>"
         )
 
@@ -106,7 +106,7 @@ def mask(trap: Trap, inner: str, attributes: str = "") -> str:
 
 def group(trap: Trap, inner: str) -> str:
     return (
-        '<VRTDataset><Group name="/"><Dimension name="Y" size="300"/><Dimension name="X" size="300"/>'
+        '<VRTDataset><Group name="/"><Dimension name="Y" size="160"/><Dimension name="X" size="160"/>'
         '<Array name="a"><DataType>UInt16</DataType><DimensionRef ref="Y"/><DimensionRef ref="X"/>'
         f"{inner}</Array></Group></VRTDataset>"
     )
@@ -160,14 +160,14 @@ def boxes_of_a_jp2(trap: Trap) -> bytes:
 
 
 WARPED = (
-    '<VRTDataset rasterXSize="300" rasterYSize="300" subClass="VRTWarpedDataset"><VRTRasterBand dataType="UInt16" '
+    '<VRTDataset rasterXSize="160" rasterYSize="160" subClass="VRTWarpedDataset"><VRTRasterBand dataType="UInt16" '
     'band="1" subClass="VRTWarpedRasterBand"/><BlockXSize>128</BlockXSize><BlockYSize>128</BlockYSize>'
     "<GDALWarpOptions><ResampleAlg>NearestNeighbour</ResampleAlg><WorkingDataType>UInt16</WorkingDataType>"
     '<SourceDataset relativeToVRT="0">{}</SourceDataset><BandList><BandMapping src="1" dst="1"/></BandList>'
     "</GDALWarpOptions></VRTDataset>"
 )
 PROCESSED = (
-    '<VRTDataset rasterXSize="300" rasterYSize="300" subClass="VRTProcessedDataset"><Input><SourceFilename>{}'
+    '<VRTDataset rasterXSize="160" rasterYSize="160" subClass="VRTProcessedDataset"><Input><SourceFilename>{}'
     '</SourceFilename></Input><ProcessingSteps><Step name="a"><Algorithm>LocalScaleOffset</Algorithm></Step>'
     "</ProcessingSteps></VRTDataset>"
 )
@@ -196,7 +196,7 @@ CONTENTS: dict[str, Callable[[Trap], str | bytes]] = {
     ),
     "source, behind an instruction": lambda t: attribute(t, t.url).replace("<Simple", "<?x y='>'?><Simple"),
     "source, unquoted and unclosed": lambda t: (
-        attribute(t, t.url).replace('"300"', "300").replace("</VRTDataset>", "")
+        attribute(t, t.url).replace('"160"', "160").replace("</VRTDataset>", "")
     ),
     "source, a namespace": lambda t: (
         attribute(t, t.url)

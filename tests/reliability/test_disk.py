@@ -61,8 +61,11 @@ def as_jp2(path: Path) -> Path:
     return target
 
 
-@pytest.mark.parametrize("images", ["vrt", "copy", "converted"])
-def test_a_disk_that_is_full_at_any_point_is_told_in_one_line(crops, tmp_path, small_disk, images):
+@pytest.mark.parametrize(
+    ("images", "levels"),
+    [("vrt", 3), *(pytest.param(how, 9, marks=pytest.mark.slow) for how in ("vrt", "copy", "converted"))],
+)
+def test_a_disk_that_is_full_at_any_point_is_told_in_one_line(crops, tmp_path, small_disk, images, levels):
     if images == "converted":
         crops = [as_jp2(path) for path in crops]
     how = ("--images", "vrt" if images == "vrt" else "copy")
@@ -70,7 +73,7 @@ def test_a_disk_that_is_full_at_any_point_is_told_in_one_line(crops, tmp_path, s
     truth, most = outputs(tmp_path / "enough"), size_of(tmp_path / "enough")
     before = hashes(crops)
     refused = 0
-    for kib in np.unique(np.linspace(16, most + 64, 9).astype(int) // 4 * 4):
+    for kib in np.unique(np.linspace(16, most + 64, levels).astype(int) // 4 * 4):
         out = small_disk(int(kib)) / "out"
         said = barpc("adjust", *crops, "-o", out, *how)
         if said.code == 0:
@@ -80,7 +83,7 @@ def test_a_disk_that_is_full_at_any_point_is_told_in_one_line(crops, tmp_path, s
             assert not (out / "summary.json").exists()
             refused += 1
         assert hashes(crops) == before
-    assert refused >= 4
+    assert refused >= min(4, levels - 1)
 
 
 def names_and_pixels(folder: Path, names: dict[str, bytes]) -> dict[str, object]:
@@ -95,6 +98,7 @@ def names_and_pixels(folder: Path, names: dict[str, bytes]) -> dict[str, object]
     return found
 
 
+@pytest.mark.slow
 def test_a_run_that_met_a_full_disk_goes_on_when_there_is_room(crops, tmp_path, small_disk):
     assert barpc("adjust", *crops, "-o", tmp_path / "enough").code == 0
     disk = small_disk(size_of(tmp_path / "enough") // 2)
@@ -118,7 +122,7 @@ def test_other_verbs_notice_a_full_disk_too(crops, tmp_path, small_disk, verb):
     (disk / "filler").write_bytes(b"\1" * 8 * KIB)
     before = hashes(crops)
     said = {
-        "convert --window": lambda: barpc("convert", crops[0], disk / "crop.tif", "--window", 0, 0, 200, 200),
+        "convert --window": lambda: barpc("convert", crops[0], disk / "crop.tif", "--window", 0, 0, 120, 120),
         "convert": lambda: barpc("convert", crops[0], disk / "x_RPC.TXT"),
         "convert -o": lambda: barpc("convert", crops[0], "--rpc", crops[1], "-o", disk / "applied"),
     }[verb]()

@@ -444,7 +444,15 @@ def scene(crops, tmp_path) -> Scene:
     return Scene(tmp_path / "in", *crops)
 
 
-@pytest.mark.parametrize("name", FAULTS)
+AT_WORK = (  # told or borne after much work
+    "nine wrong tie points in ten", "an RPC that is wrong by 500 px", "images from nearly the same place",
+    "all views fixed", "nothing but noise",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in AT_WORK)) for name in FAULTS]
+)
 def test_a_fault_is_one_line_and_leaves_nothing(name, scene, tmp_path, monkeypatch):
     prepare, code, words = FAULTS[name]
     monkeypatch.chdir(scene.folder)

@@ -17,10 +17,12 @@ import pytest
 import rasterio
 
 from barpc.rpcio import read_rpc, write_rpc
+from tests.lanes import diagonal, rest_slow
 
 from .conftest import Said, barpc, hashes
 from .hostile_files import CONTENTS, Trap, served, write
 from .test_faults import dem
+from .trials import SIDE
 
 SECRET = "moon-landing-7391"
 IN_ACCESS, IN_OPEN, IN_DELETE_SELF, IN_MODIFY = 0x1, 0x20, 0x400, 0x2
@@ -33,8 +35,10 @@ def trap(tmp_path: Path) -> Iterator[Trap]:
     canary, raster = outside / "canary.txt", outside / "canary.tif"
     canary.write_text(SECRET)
     for path in (raster, outside / "good.tif"):
-        with rasterio.open(path, "w", driver="GTiff", width=300, height=300, count=1, dtype="uint16") as out:
-            out.write(np.full((1, 300, 300), 4242, np.uint16))
+        with rasterio.open(
+            path, "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="uint16"
+        ) as out:
+            out.write(np.full((1, SIDE, SIDE), 4242, np.uint16))
     with served(canary, raster) as found:
         libc = ctypes.CDLL(None, use_errno=True)
         watch = libc.inotify_init1(os.O_NONBLOCK) if hasattr(libc, "inotify_init1") else -1
@@ -171,7 +175,18 @@ HOSTILE: dict[str, Callable[[Trap, list[Path]], list[object]]] = {
 }
 
 
-@pytest.mark.parametrize("name", HOSTILE)
+WHOLE_RUN = (  # a run goes on to its end: two are enough before a commit
+    "a fetching VRT as overviews", "a web service as overviews", "a web service as mask", "another image as mask",
+    "overviews that are named elsewhere",
+    "overviews on the network", "overviews that are another image", "an XML sidecar that includes a file",
+    "an XML sidecar that fetches", "an XML sidecar that is a bomb", "a run folder that lists files elsewhere",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name in WHOLE_RUN[1:-1])) for name in HOSTILE],
+)
 def test_a_hostile_file_reaches_nothing(name, crops, tmp_path, trap, monkeypatch):
     monkeypatch.chdir(crops[0].parent)
     args = HOSTILE[name](trap, crops)
@@ -197,7 +212,7 @@ def assert_says_nothing_of_it(said: Said, out: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["view_01.tif", "view_01_RPC.TXT", "view_01.XML", "view_01.RPB", "view_01.geom"]
+    "name", rest_slow(["view_01.tif", "view_01_RPC.TXT", "view_01.XML", "view_01.RPB", "view_01.geom"], 2)
 )
 def test_a_link_to_a_secret_file_does_not_show_it(crops, tmp_path, trap, name):
     """Links are followed, as users expect; what is behind them is not repeated."""
@@ -210,8 +225,13 @@ def test_a_link_to_a_secret_file_does_not_show_it(crops, tmp_path, trap, name):
     assert trap.canary.read_text() == SECRET
 
 
-@pytest.mark.parametrize("verb", ["info", "check", "convert --window", "convert -o", "convert"])
-@pytest.mark.parametrize("name", ["a web service as overviews", "overviews on the network"])
+@pytest.mark.parametrize(
+    ("verb", "name"),
+    diagonal(
+        ["info", "check", "convert --window", "convert -o", "convert"],
+        ["a web service as overviews", "overviews on the network"],
+    ),
+)
 def test_no_verb_fetches_anything(crops, tmp_path, trap, verb, name):
     HOSTILE[name](trap, crops)
     more = {
@@ -259,7 +279,15 @@ def assert_silent(trap: Trap, said: Said, folder: Path) -> None:
     assert_says_nothing_of_it(said, folder)
 
 
-@pytest.mark.parametrize("name", CONTENTS)
+KINDS = (
+    "source, element", "source, attribute, without vsicurl", "a mask, attribute", "a web service",
+    "a TIFF with overviews elsewhere",
+)  # fmt: skip
+EVERY = [pytest.param(name, marks=[pytest.mark.slow] * (name not in KINDS)) for name in CONTENTS]
+"""All of `CONTENTS`; one of each kind before a commit."""
+
+
+@pytest.mark.parametrize("name", EVERY)
 def test_a_hostile_image_fetches_nothing(name, crops, tmp_path, trap):
     """As image, as the pixels of an RPC, and as source of a VRT; every verb that opens images."""
     write_rpc(read_rpc(crops[1]), crops[1].with_name("view_01_RPC.TXT"))
@@ -274,7 +302,7 @@ def test_a_hostile_image_fetches_nothing(name, crops, tmp_path, trap):
     assert hashes([tmp_path / "in", tmp_path / "outside"]) == before
 
 
-@pytest.mark.parametrize("name", CONTENTS)
+@pytest.mark.parametrize("name", EVERY)
 def test_a_hostile_dem_fetches_nothing(name, crops, tmp_path, trap):
     path = write(trap, name, crops[0].with_name("dem.tif"))
     trap.events()
@@ -311,7 +339,7 @@ def surrounded(trap: Trap, name: str, file: Path, suffixes: Sequence[str] = BESI
                 write(trap, name, file.with_name(stem + suffix))
 
 
-@pytest.mark.parametrize("name", CONTENTS)
+@pytest.mark.parametrize("name", EVERY)
 def test_a_hostile_file_beside_another_fetches_nothing(name, crops, tmp_path, trap, request):
     """Beside an image (of which the RPC is readable, else no pixel would be asked for), a DEM and an output."""
     surrounded(trap, name, crops[1], BESIDE[:8])
@@ -361,7 +389,8 @@ def test_gdal_on_its_own_fetches_what_these_files_name(trap, tmp_path):
     ):
         before = len(trap.requests)
         path = write(trap, name, tmp_path / "h.tif")
-        with rasterio.Env(GDAL_HTTP_TIMEOUT=2), contextlib.suppress(rasterio.errors.RasterioError):
+        fresh = rasterio.Env(GDAL_HTTP_TIMEOUT=2, CPL_VSIL_CURL_NON_CACHED=f"/vsicurl/{trap.url}")
+        with fresh, contextlib.suppress(rasterio.errors.RasterioError):
             with rasterio.open(path) as image:
                 image.read(1)
                 image.read_masks(1)

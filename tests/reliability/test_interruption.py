@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from barpc.workspace import Workspace
+from tests.lanes import rest_slow
 
 from .conftest import assert_one_line, barpc, hashes
 from .trials import SAMPLES, crop, outputs
@@ -32,7 +32,9 @@ def sweep(trials: int, seed: int) -> dict[str, object]:
 
 
 @posix
-@pytest.mark.parametrize("trials", [5, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "trials", [pytest.param(5, marks=pytest.mark.slow), pytest.param(50, marks=pytest.mark.nightly)]
+)
 def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(trials):
     found = sweep(trials, seed=trials)
     assert found["identical"] == trials
@@ -86,11 +88,15 @@ def working(pid: int) -> list[int]:
 def wide(tmp_path_factory) -> list[Path]:
     """Two larger crops: time enough to be interrupted."""
     folder = tmp_path_factory.mktemp("wide")
-    return [crop(path, folder / path.name, side=600, start=100) for path in SAMPLES[:2]]
+    return [crop(path, folder / path.name, side=360, start=300) for path in SAMPLES[:2]]
 
 
 @posix
-@pytest.mark.parametrize(("number", "jobs"), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 2)])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "jobs"),
+    [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 2)],
+)
 def test_an_interrupted_run_leaves_its_work_and_says_how_to_go_on(wide, tmp_path, number, jobs):
     command = ("adjust", *wide, "-o", tmp_path / "out", "-j", jobs)
     process = started(*command)
@@ -125,6 +131,7 @@ def wait_until_gone(pid: int) -> None:
 
 
 @posix
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="children are listed in /proc")
 def test_a_worker_that_dies_is_one_line_and_the_same_command_goes_on(wide, tmp_path):
     command = ("adjust", *wide, "-o", tmp_path / "out", "-j", 2)
@@ -142,6 +149,7 @@ def test_a_worker_that_dies_is_one_line_and_the_same_command_goes_on(wide, tmp_p
 
 
 @posix
+@pytest.mark.slow
 def test_workers_end_with_a_parent_that_was_killed(wide, tmp_path):
     process = started("adjust", *wide, "-o", tmp_path / "out", "-j", 2)
     wait_for(lambda: list(tmp_path.glob("out/.barpc/cache/*/*.npz")), process)
@@ -154,15 +162,6 @@ def test_workers_end_with_a_parent_that_was_killed(wide, tmp_path):
 
 
 # -- caches and folders -------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def truth(pristine, tmp_path_factory) -> dict[str, bytes]:
-    """What an undisturbed run of the first two crops gives."""
-    folder = tmp_path_factory.mktemp("truth")
-    images = [Path(shutil.copy(path, folder)) for path in pristine[:2]]
-    assert barpc("adjust", *images, "-o", folder / "out", "--overwrite").code == 0
-    return relative(outputs(folder / "out"), folder)
 
 
 def relative(found: dict[str, bytes], folder: Path) -> dict[str, bytes]:
@@ -184,53 +183,50 @@ def flipped(path: Path) -> None:
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize(
-    "damage", [cut_short, other_content, flipped, Path.unlink, lambda p: p.write_bytes(b"")]
-)
-def test_damaged_results_are_made_again(crops, tmp_path, truth, damage):
-    images = [Path(shutil.copy(path, tmp_path)) for path in crops]
-    assert barpc("adjust", *images, "-o", tmp_path / "out").code == 0
-    for path in tmp_path.glob("out/.barpc/cache/*/*.npz"):
+def emptied(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+@pytest.mark.parametrize("damage", rest_slow([flipped, cut_short, other_content, Path.unlink, emptied]))
+def test_damaged_results_are_made_again(crops, ran, out, tmp_path, damage):
+    kept = list(out.glob(".barpc/cache/*/*.npz"))
+    assert kept
+    for path in kept:
         damage(path)
-    assert barpc("adjust", *images, "-o", tmp_path / "out", "--overwrite").code == 0
-    assert relative(outputs(tmp_path / "out"), tmp_path) == truth
+    assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
+    assert relative(outputs(out), tmp_path) == relative(outputs(ran / "out"), ran)
 
 
-def test_results_of_another_version_are_not_used(crops, tmp_path, monkeypatch):
-    made = []
+def test_results_of_another_version_are_not_used(crops, out, monkeypatch):
+    made, kept = [], set(out.glob(".barpc/cache/*/*.npz"))
     store = Workspace.store
     monkeypatch.setattr(Workspace, "store", lambda *args: (made.append(args[1]), store(*args)))
-    assert barpc("adjust", *crops, "-o", tmp_path / "out").code == 0
-    first = len(made)
-    assert first > 0
-    assert barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite").code == 0
-    assert len(made) == first
+    assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
+    assert made == []
     monkeypatch.setattr("barpc.workspace.code_version", lambda: "another")
-    assert barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite").code == 0
-    assert len(made) == 2 * first
+    assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
+    assert made
+    assert len(set(out.glob(".barpc/cache/*/*.npz"))) == 2 * len(kept)
 
 
-def test_an_image_that_changed_is_worked_on_again_whatever_its_date(crops, tmp_path):
-    assert barpc("adjust", *crops, "-o", tmp_path / "out").code == 0
-    first = outputs(tmp_path / "out")["observations.csv"]
+def test_an_image_that_changed_is_worked_on_again_whatever_its_date(crops, out):
+    first = outputs(out)["observations.csv"]
     times = crops[0].stat()
     data = bytearray(crops[0].read_bytes())
     data[20000:60000] = bytes(40000)
     crops[0].write_bytes(data)
     os.utime(crops[0], ns=(times.st_atime_ns, times.st_mtime_ns))
-    assert barpc("adjust", *crops, "-o", tmp_path / "out", "--overwrite").code == 0
-    assert outputs(tmp_path / "out")["observations.csv"] != first
+    assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
+    assert outputs(out)["observations.csv"] != first
 
 
-@pytest.mark.parametrize("year", [1971, 2099])
-def test_a_clock_that_goes_wrong_changes_nothing(crops, tmp_path, truth, year):
-    images = [Path(shutil.copy(path, tmp_path)) for path in crops]
-    assert barpc("adjust", *images, "-o", tmp_path / "out").code == 0
+@pytest.mark.parametrize("year", rest_slow([1971, 2099]))
+def test_a_clock_that_goes_wrong_changes_nothing(crops, ran, out, tmp_path, year):
     then = (year - 1970) * 365.25 * 86400
-    for path in [*images, *tmp_path.rglob("out/**/*")]:
+    for path in [*crops, *out.rglob("*")]:
         os.utime(path, (then, then))
-    assert barpc("adjust", *images, "-o", tmp_path / "out", "--overwrite").code == 0
-    assert relative(outputs(tmp_path / "out"), tmp_path) == truth
+    assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
+    assert relative(outputs(out), tmp_path) == relative(outputs(ran / "out"), ran)
 
 
 def test_a_folder_in_use_is_left_alone(crops, tmp_path):
@@ -240,10 +236,9 @@ def test_a_folder_in_use_is_left_alone(crops, tmp_path):
         assert hashes([tmp_path]) == before
 
 
-def test_existing_results_are_left_alone(crops, tmp_path):
-    assert barpc("adjust", *crops, "-o", tmp_path / "out").code == 0
+def test_existing_results_are_left_alone(crops, out, tmp_path):
     before = hashes([tmp_path])
-    assert_one_line(barpc("adjust", *crops, "-o", tmp_path / "out"), 1, "--overwrite")
+    assert_one_line(barpc("adjust", *crops, "-o", out), 1, "--overwrite")
     assert hashes([tmp_path]) == before
 
 
@@ -267,42 +262,51 @@ def test_results_never_take_the_place_of_an_input(crops):
     assert hashes(crops) == before
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), OSError(24, "Too many open files")])
-def test_an_error_of_the_machine_is_one_line(crops, tmp_path, monkeypatch, error):
+@pytest.mark.parametrize(
+    "error", rest_slow([MemoryError(), RecursionError("deep"), OSError(24, "Too many open files")])
+)
+def test_an_error_of_the_machine_is_one_line(crops, out, monkeypatch, error):
     def fail(*_args, **_kwargs):
         raise error
 
     monkeypatch.setattr("barpc.pipeline.run.adjust_tracks", fail)
-    said = barpc("adjust", *crops, "-o", tmp_path / "out")
+    said = barpc("adjust", *crops, "-o", out, "--overwrite")
     assert said.code == 1
     assert len(said.err.strip().splitlines()) == 1
     assert said.err.startswith("barpc: ")
     assert "Traceback" not in said.err
     monkeypatch.undo()
-    assert barpc("adjust", *crops, "-o", tmp_path / "out").code == 0
+    assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
 
 
-def test_debug_shows_the_traceback_of_a_bug(crops, tmp_path, monkeypatch):
+def test_debug_shows_the_traceback_of_a_bug(crops, out, monkeypatch):
     def fail(*_args, **_kwargs):
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setattr("barpc.pipeline.run.adjust_tracks", fail)
-    said = barpc("--debug", "adjust", *crops, "-o", tmp_path / "out")
+    said = barpc("--debug", "adjust", *crops, "-o", out, "--overwrite")
     assert said.code == 1
     assert "Traceback" in said.err
     assert "report" in said.err.splitlines()[-1]
 
 
-def test_stages_are_told_with_seconds_and_memory(crops, tmp_path, caplog):
+@pytest.mark.parametrize(
+    ("whole", "share"),
+    [(False, 0.7), pytest.param(True, 0.95, marks=pytest.mark.slow)],
+    ids=["part", "whole"],
+)
+def test_stages_are_told_with_seconds_and_memory(crops, tmp_path, caplog, whole, share):
+    """What no stage has, the command line and the notes of the run's state, is a part of a small run."""
     start = time.process_time()
     with caplog.at_level("INFO"):
-        assert barpc("-v", "adjust", *crops, "-o", tmp_path / "out").code == 0
+        assert barpc("-v", "adjust", *(SAMPLES if whole else crops), "-o", tmp_path / "out").code == 0
     spent = time.process_time() - start
     summary = json.loads((tmp_path / "out/summary.json").read_text())
     names = [stage["stage"] for stage in summary["stages"]]
     told = "inputs, fingerprints, tie points, adjustment, fit, write, verify, block, summary, pictures, tables, report"
     assert names == told.split(", ")
-    assert 0.95 * spent < sum(stage["cpu_seconds"] for stage in summary["stages"]) <= spent
+    told = sum(stage["cpu_seconds"] for stage in summary["stages"])
+    assert share * spent < told <= spent + 0.0005 * len(names)  # of rounding
     for stage in summary["stages"]:
         assert stage["seconds"] >= 0
         assert stage["peak_memory_mb"] > 20

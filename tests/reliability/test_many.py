@@ -81,6 +81,7 @@ def test_images_without_number_are_read_with_few_open_files(tmp_path):
     print(told)
 
 
+@pytest.mark.slow
 def test_one_bad_image_of_many_is_named_and_left_out_when_asked(pristine, tmp_path):
     bad = tmp_path / "bad.tif"
     bad.write_text("hello")

@@ -13,9 +13,11 @@ import pytest
 import rasterio
 
 from barpc.rpcio import read_rpc, read_rpc_source, write_rpc
+from tests.lanes import diagonal
 
 from .conftest import Said, assert_one_line, barpc, hashes
-from .test_interruption import ROOT, posix
+from .test_interruption import ROOT, posix, relative
+from .trials import outputs
 
 OTHERS = ("summary.json", "pairs.csv", "report.html", "footprints.geojson", "view_00_RPC.TXT", "view_00.vrt")
 
@@ -66,7 +68,10 @@ def test_nor_beside_an_image_that_is_no_input(crops, tmp_path):
     assert_untouched(tmp_path, before, said, "out/view_00.tif", "give another -o")
 
 
-def test_a_folder_above_or_below_the_images_is_fine(crops, tmp_path):
+def test_a_folder_above_or_below_the_images_is_fine(crops, out, tmp_path):
+    shutil.copytree(out / ".barpc/cache", tmp_path / ".barpc/cache")  # what needs not be done again
+    shutil.copytree(out / ".barpc/cache", crops[0].parent / "below/out/.barpc/cache")
+    shutil.rmtree(out)
     before = hashes(crops)
     for out, more in ((crops[0].parent / "below/out", ()), (tmp_path, ("--overwrite",))):
         assert barpc("adjust", *crops, "-o", out, *more).code == 0
@@ -88,9 +93,11 @@ def test_a_user_s_file_is_never_replaced_and_refused_by_name(crops, tmp_path, na
 
 
 @pytest.mark.parametrize("verb", ["adjust", "match"])
-def test_a_file_that_was_edited_is_refused_and_all_others_are_as_they_were(crops, tmp_path, verb):
-    out = tmp_path / "out"
-    assert barpc(verb, *crops, "-o", out).code == 0
+def test_a_file_that_was_edited_is_refused_and_all_others_are_as_they_were(crops, out, tmp_path, verb):
+    if verb == "match":
+        kept = (tmp_path / "out").rename(tmp_path / "kept") / ".barpc/cache"
+        shutil.copytree(kept, out / ".barpc/cache")
+        assert barpc(verb, *crops, "-o", out).code == 0
     edited = out / {"adjust": "view_00_RPC.TXT", "match": "asp/view_00__view_01.txt"}[verb]
     edited.write_text(edited.read_text() + "\n")
     before = hashes([tmp_path])
@@ -101,9 +108,7 @@ def test_a_file_that_was_edited_is_refused_and_all_others_are_as_they_were(crops
     assert edited.is_file()
 
 
-def test_a_folder_of_a_release_without_hashes_is_left_as_it_is(crops, tmp_path):
-    out = tmp_path / "out"
-    assert barpc("adjust", *crops, "-o", out).code == 0
+def test_a_folder_of_a_release_without_hashes_is_left_as_it_is(crops, out, tmp_path):
     state = json.loads((out / ".barpc/state.json").read_text())
     (out / ".barpc/state.json").write_text(json.dumps({**state, "outputs": sorted(state["outputs"])}))
     before = hashes([tmp_path])
@@ -113,18 +118,14 @@ def test_a_folder_of_a_release_without_hashes_is_left_as_it_is(crops, tmp_path):
     assert hashes([tmp_path]) == before
 
 
-def test_a_prior_is_not_replaced_by_the_run_that_starts_from_it(crops, tmp_path):
-    out = tmp_path / "out"
-    assert barpc("adjust", *crops, "-o", out).code == 0
+def test_a_prior_is_not_replaced_by_the_run_that_starts_from_it(crops, out, tmp_path):
     before = hashes([tmp_path])
     said = barpc("adjust", *crops, "-o", out, "--fixed-run", out, "--overwrite")
     assert_one_line(said, 1, "block.npz", "input")
     assert hashes([tmp_path]) == before
 
 
-def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, tmp_path):
-    out = tmp_path / "out"
-    assert barpc("adjust", *crops, "-o", out).code == 0
+def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, out):
     assert barpc("report", out).code == 0
     assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
     (out / "report.html").write_text("mine")
@@ -135,8 +136,31 @@ def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, tmp_path):
     assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
 
 
+@pytest.mark.parametrize("number", [2, 9])
+def test_stopped_between_two_outputs_the_same_command_finishes(
+    crops, ran, out, tmp_path, monkeypatch, number
+):
+    rename, seen = Path.replace, []
+
+    def counted(path: Path, target: Path) -> Path:
+        seen.extend([target] * ("cache" not in Path(target).parts))
+        if len(seen) == number:
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", counted)
+    command = ("adjust", *crops, "-o", out, "--overwrite")
+    assert_one_line(barpc(*command), 130, "interrupted")
+    monkeypatch.undo()
+    assert len(seen) >= number
+    assert barpc(*command).code == 0
+    assert relative(outputs(out), tmp_path) == relative(outputs(ran / "out"), ran)
+
+
 @posix
-@pytest.mark.parametrize("step", [5, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "step", [pytest.param(5, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)]
+)
 def test_killed_between_any_two_outputs_the_same_command_finishes(step):
     """adjust in all formats, with copies, over a finished run; match, apply: the same bytes."""
     command = [sys.executable, "-m", "tests.reliability.trials", "--every-output", str(step)]
@@ -169,8 +193,9 @@ def test_a_converted_rpc_is_written_beside_its_image_and_another_one_only_when_t
     )
 
 
-@pytest.mark.parametrize("end", ["_RPC.TXT", ".RPB", ".geom"])
-@pytest.mark.parametrize("verb", ["convert", "fit", "convert --window"])
+@pytest.mark.parametrize(
+    ("verb", "end"), diagonal(["convert", "fit", "convert --window"], ["_RPC.TXT", ".RPB", ".geom"])
+)
 def test_the_vendor_s_file_of_an_input_is_never_replaced(crops, verb, end):
     vendor = crops[0].with_name(f"view_00{end}")
     write_rpc(read_rpc(crops[0]), vendor)

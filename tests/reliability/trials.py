@@ -33,12 +33,12 @@ from barpc.cli import main as barpc_main
 from barpc.workspace import code_version
 
 SAMPLES = sorted((Path(__file__).resolve().parents[2] / "data_samples").glob("*.tif"))
-SIDE = 300  # px of a crop: half a second a run
+SIDE = 160  # px of a crop: a third of a second a run
 ABOUT_THE_RUN = ("stages", "out_dir")
 """What summary.json tells about the run and not about its result; report.html shows the stages, too."""
 
 
-def crop(source: Path, target: Path, side: int = SIDE, start: int = 200) -> Path:
+def crop(source: Path, target: Path, side: int = SIDE, start: int = 300) -> Path:
     """A corner of a sample with its exact RPC."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
@@ -98,7 +98,7 @@ def sweep(trials: int, seed: int, jobs: int, folder: Path) -> dict[str, object]:
     before = [sha256(path.read_bytes()).digest() for path in images]
     out, log = folder / "out", folder / "log.txt"
     command = ["-q", "adjust", *map(str, images), "-o", str(out), "-j", str(jobs)]
-    command += ["--grids", "--tiles", "150", "--resample"]
+    command += ["--grids", "--tiles", "80", "--resample"]
     began = time.monotonic()
     code = finish(start(command, log))
     seconds = time.monotonic() - began

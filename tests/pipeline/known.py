@@ -1,0 +1,87 @@
+"""The images of the repository, whole or a part of them, with what is true of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barpc.geodesy import ecef_from_ground, enu_basis
+from barpc.sensor.geometry import triangulate
+from tests.reliability.trials import SAMPLES, crop
+
+FOLDER = SAMPLES[0].parent
+START, SIDE = 300, 288  # of a part
+
+
+@dataclass(frozen=True)
+class Known:
+    """Images, their truth as truth.json has it, and a file of GCPs."""
+
+    images: list[Path]
+    truth: dict[str, Any]
+    gcps: Path
+    whole: bool
+
+
+def whole() -> Known:
+    """The images as they lie in the repository."""
+    return Known(SAMPLES, json.loads((FOLDER / "truth.json").read_text()), FOLDER / "gcps.geojson", True)
+
+
+def part(folder: Path, side: int = SIDE, start: int = START, gcps: int = 5) -> Known:
+    """A window of each image: a run takes less than a second. Its first check points are its GCPs."""
+    images = [crop(path, folder / path.name, side=side, start=start) for path in SAMPLES]
+    truth = json.loads((FOLDER / "truth.json").read_text())
+    points = [_moved(point, start, side) for point in truth["check_points"]]
+    points = [point for point in points if len(point["image"]) == len(images)]
+    gcps = min(gcps, len(points))
+    (folder / "gcps.geojson").write_text(json.dumps(_features(points[:gcps])))
+    return Known(images, {**truth, "check_points": points[gcps:]}, folder / "gcps.geojson", False)
+
+
+def _moved(point: dict[str, Any], start: int, side: int) -> dict[str, Any]:
+    """A check point in the windows that show it."""
+    image = {name: [value - start for value in xy] for name, xy in point["image"].items()}
+    seen = {name: xy for name, xy in image.items() if all(0 <= value <= side - 1 for value in xy)}
+    return {"ground": point["ground"], "image": seen}
+
+
+def _features(points: list[dict[str, Any]]) -> dict[str, Any]:
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"filename": f"{name}.tif", "ji": xy, "id": f"gcp_{number:03d}"},
+            "geometry": {"type": "Point", "coordinates": point["ground"]},
+        }
+        for number, point in enumerate(points)
+        for name, xy in point["image"].items()
+    ]
+    return {"type": "FeatureCollection", "features": features}
+
+
+def exact(truth: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Ground (N, 3) and image points (N, views, 2) of the check points that every view sees."""
+    names = [view["name"] for view in truth["views"]]
+    points = [point for point in truth["check_points"] if set(names) <= set(point["image"])]
+    assert len(points) > (100 if len(truth["check_points"]) > 100 else 5)
+    ground = np.array([point["ground"] for point in points])
+    return ground, np.array([[point["image"][name] for name in names] for point in points])
+
+
+def errors_at_check_points(sensors: Any, truth: dict[str, Any]) -> tuple[float, np.ndarray]:
+    """RMS [px] of exact image points against their intersections, and the mean error (3,) of these [m, ENU].
+
+    Reprojecting an intersection removes what tie points cannot tell: where the scene is as a whole.
+    """
+    ground, image = exact(truth)
+    n, views = image.shape[:2]
+    result = triangulate(
+        sensors, np.tile(np.arange(views), n), np.repeat(np.arange(n), views), image.reshape(-1, 2), alt=250.0
+    )
+    assert result.ok.all()
+    offset = (result.points - ecef_from_ground(ground)).mean(axis=0)
+    return float(np.sqrt((result.residuals**2).mean())), enu_basis(ground.mean(axis=0)) @ offset

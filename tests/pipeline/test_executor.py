@@ -1,0 +1,389 @@
+"""Who works on the tasks: results in order, kept and found again, in batches, each error where it belongs."""
+
+from __future__ import annotations
+
+import os
+import time
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from barpc import __version__
+from barpc.errors import AdjustError, ImageError, OutputError
+from barpc.pipeline.executor import LARGE, CachingExecutor, Spilled, run_batch, worker_count
+from barpc.workspace import Workspace
+
+
+def square(number, _pad=None):
+    return {"square": np.array(float(number) ** 2)}
+
+
+def refuse(number):
+    if number == 3:
+        raise ImageError("three.tif: is damaged")
+    return float(number)
+
+
+def bug(number):
+    return 1 / number
+
+
+class Recording(ThreadPoolExecutor):
+    """A pool that writes down how many tasks came together."""
+
+    def __init__(self) -> None:
+        super().__init__(2)
+        self.batches: list[int] = []
+
+    def submit(self, fn, /, *args):
+        self.batches.append(len(args[1]))
+        return super().submit(fn, *args)
+
+
+def test_results_come_back_in_order_and_are_found_the_next_time(tmp_path):
+    for _ in range(2):
+        with Workspace(tmp_path / "run", overwrite=True) as workspace, Recording() as pool:
+            with CachingExecutor(workspace, {}, pool) as caching:
+                futures = [caching.submit(square, n) for n in range(40)]
+                assert [float(future.result()["square"]) for future in futures] == [n**2 for n in range(40)]
+    assert pool.batches == []
+
+
+def test_quick_tasks_travel_together(tmp_path):
+    with (
+        Workspace(tmp_path / "run") as workspace,
+        Recording() as pool,
+        CachingExecutor(workspace, {}, pool) as caching,
+    ):
+        futures = [caching.submit(square, n) for n in range(400)]
+        for future in futures:
+            future.result()
+    assert sum(pool.batches) == 400
+    assert max(pool.batches) > 10
+    assert len(pool.batches) < 100
+
+
+def test_an_error_goes_to_its_own_task_and_the_others_are_kept(tmp_path):
+    with (
+        Workspace(tmp_path / "run") as workspace,
+        Recording() as pool,
+        CachingExecutor(workspace, {}, pool) as caching,
+    ):
+        futures = [caching.submit(refuse, n) for n in range(30)]
+        with pytest.raises(ImageError, match="damaged"):
+            futures[3].result()
+        assert [future.result() for future in futures[4:]] == [float(n) for n in range(4, 30)]
+        assert len(list(workspace.cache.glob("refuse/*.npz"))) == 29
+
+
+def test_a_bug_in_a_worker_says_where(tmp_path):
+    with (
+        Workspace(tmp_path / "run") as workspace,
+        Recording() as pool,
+        CachingExecutor(workspace, {}, pool) as caching,
+    ):
+        with pytest.raises(ZeroDivisionError) as caught:
+            caching.submit(bug, 0).result()
+    assert any("in bug" in note for note in caught.value.__notes__)
+
+
+def test_a_pool_that_was_shut_down_is_an_error_of_every_task(tmp_path):
+    pool = Recording()
+    pool.shutdown()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        futures = [caching.submit(square, n) for n in range(3000)]
+        for future in futures:
+            with pytest.raises((RuntimeError, AdjustError)):
+                future.result()
+
+
+def test_a_full_disk_reaches_whoever_asks_for_the_result(tmp_path, monkeypatch):
+    def full(*_args):
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr(Workspace, "store", full)
+    with (
+        Workspace(tmp_path / "run") as workspace,
+        Recording() as pool,
+        CachingExecutor(workspace, {}, pool) as caching,
+    ):
+        with pytest.raises(OutputError, match="full"):
+            caching.submit(square, 2).result()
+
+
+def test_large_arrays_are_sent_as_paths_and_taken_away(tmp_path):
+    pad = np.arange(LARGE // 8 + 1.0)
+    sent = []
+
+    class Looking(ThreadPoolExecutor):
+        def submit(self, fn, /, *args):
+            sent.extend(args[1])
+            return super().submit(fn, *args)
+
+    with Workspace(tmp_path / "run") as workspace, Looking(2) as pool:
+        with CachingExecutor(workspace, {}, pool) as caching:
+            futures = [caching.submit(square, n, pad) for n in range(4)]
+            assert [float(future.result()["square"]) for future in futures] == [0, 1, 4, 9]
+            assert len(list(workspace.cache.glob("arrays/*.npz"))) == 1
+        assert not (workspace.cache / "arrays").exists()
+    assert all(isinstance(task, Spilled) for task in sent)
+    assert sum(array.nbytes for array in sent[0].small.values()) < 2000
+
+
+def test_a_cluster_may_grow():
+    class Client:
+        def nthreads(self):
+            return {"a": 1}
+
+    class Cluster:
+        _client = Client()
+
+    assert worker_count(Cluster()) == 32
+    assert worker_count(Recording()) == 2
+
+
+# --- its parts ---------------------------------------------------------------------------------------------
+
+
+class Later(Executor):
+    """A pool whose batches are done when one says so."""
+
+    _max_workers = 2
+
+    def __init__(self) -> None:
+        self.batches: list[tuple[Future, tuple]] = []
+
+    def submit(self, fn, /, *args):
+        future: Future = Future()
+        self.batches.append((future, args))
+        return future
+
+    def finish(self, number: int = 0, outcomes=None, spent: float = 0.0) -> None:
+        future, (fn, tasks, _version) = self.batches.pop(number)
+        made = [(0.0, fn(*task), None) for task in tasks] if outcomes is None else outcomes(fn, tasks)
+        future.set_result((made, spent))
+
+
+def test_workers_are_counted_by_their_pool() -> None:
+    assert worker_count(None) == os.cpu_count()
+    assert worker_count(ThreadPoolExecutor(3)) == 3
+
+    class Client:
+        def nthreads(self):
+            return {"a": 30, "b": 5}
+
+    assert worker_count(SimpleNamespace(_client=Client())) == 35  # type: ignore[arg-type]
+
+
+def test_three_batches_for_each_worker_are_in_flight_and_one_follows_another(tmp_path) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        futures = [caching.submit(square, n) for n in range(9)]
+        assert [len(args[1]) for _, args in pool.batches] == [1] * 6
+        pool.finish(2)
+        assert futures[2].result()["square"] == 4.0
+        assert len(pool.batches) == 6
+        while pool.batches:
+            pool.finish()
+        assert [float(future.result()["square"]) for future in futures] == [n**2 for n in range(9)]
+
+
+@pytest.mark.parametrize(("seconds", "most"), [(0.4, 1), (0.25, 2), (0.1, 5), (0.01, 9), (0.0, 9)])
+def test_a_batch_is_half_a_second_of_work_but_leaves_the_others_their_share(tmp_path, seconds, most) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        for n in range(66):  # six are sent at once; of sixty nine leave as many for each other place
+            caching.submit(square, n)
+        pool.finish(0, lambda fn, tasks: [(seconds, fn(*tasks[0]), None)])
+        assert len(pool.batches[-1][1][1]) == most
+        caching.shutdown()
+
+
+def test_the_time_of_a_task_is_a_running_mean(tmp_path) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        for n in range(200):
+            caching.submit(square, n)
+        for seconds, mean in ((0.4, 0.4), (0.2, 0.3), (0.1, 0.2)):
+            pool.finish(0, lambda fn, tasks, s=seconds: [(s, fn(*task), None) for task in tasks])
+            assert caching._seconds[square] == pytest.approx(mean)
+        caching.shutdown()
+
+
+def test_a_batch_is_of_one_function(tmp_path) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        for n in range(40):
+            caching.submit(square if n % 20 < 18 else refuse, n + 5)
+        caching._seconds[square] = caching._seconds[refuse] = 0.001
+        while pool.batches:
+            _, (fn, tasks, _) = pool.batches[0]
+            wanted = [n + 5 for n in range(40) if (fn is square) == (n % 20 < 18)]
+            assert {task[0] for task in tasks} <= set(wanted)
+            pool.finish()
+
+
+def test_cpu_seconds_of_workers_are_added_up(tmp_path) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        for n in range(3):
+            caching.submit(square, n)
+        for spent in (0.5, 0.25, 1.0):
+            pool.finish(0, spent=spent)
+        assert workspace.worker_seconds == 1.75
+
+
+def test_without_a_pool_a_task_is_done_when_its_result_is_asked_for_and_kept(tmp_path) -> None:
+    done: list[int] = []
+
+    def note(number):
+        done.append(number)
+        return float(number)
+
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as caching:
+        first, second = caching.submit(note, 1), caching.submit(note, 2)
+        assert done == []
+        assert (second.result(), first.result(), second.result()) == (2.0, 1.0, 2.0)
+        assert done == [2, 1]
+        assert caching.submit(note, 1).result() == 1.0
+        assert done == [2, 1]
+    with Workspace(tmp_path / "run", overwrite=True) as workspace:
+        with CachingExecutor(workspace, {}, keep=False) as caching:
+            assert caching.submit(note, 1).result() == 1.0
+    assert done == [2, 1, 1]
+    assert len(list(workspace.cache.glob("note/*.npz"))) == 2
+
+
+def test_tasks_take_positional_arguments_only(tmp_path) -> None:
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as caching:
+        with pytest.raises(TypeError, match="positional"):
+            caching.submit(square, number=2)
+
+
+def test_a_cancelled_task_is_not_done(tmp_path) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        futures = [caching.submit(square, n) for n in range(8)]
+        assert futures[7].cancel()
+        sent = []
+        while pool.batches:
+            sent += [task[0] for task in pool.batches[0][1][1]]
+            pool.finish()
+        assert sent == list(range(7))
+        assert caching._in_flight == 0
+
+
+def test_after_its_end_nothing_is_handed_out_or_kept(tmp_path) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace:
+        caching = CachingExecutor(workspace, {}, pool)
+        for n in range(9):
+            caching.submit(square, n)
+        pool.finish()
+        assert len(list(workspace.cache.glob("square/*.npz"))) == 1
+        caching.shutdown()
+        while pool.batches:
+            pool.finish()
+        assert len(list(workspace.cache.glob("square/*.npz"))) == 1
+
+
+@dataclass(frozen=True)
+class Pair:
+    first: object
+    second: object
+    worked_out: object = field(default=None, init=False)
+
+
+def test_a_key_is_of_contents_and_not_of_names(tmp_path) -> None:
+    with Workspace(tmp_path / "run") as workspace:
+        one, other = (CachingExecutor(workspace, {"a.tif": mark, "b.tif": "1"}) for mark in ("1", "2"))
+        assert one.key(square, ("a.tif",)) == one.key(square, ("b.tif",)) == other.key(square, ("b.tif",))
+        assert one.key(square, ("a.tif",)) != other.key(square, ("a.tif",))
+        assert one.key(square, ("c.tif",)) != one.key(square, ("d.tif",))
+        assert one.key(square, (1,)) != one.key(refuse, (1,))
+        nested = [("a.tif", 1), [("a.tif", 1)], Pair("a.tif", 1), ["a.tif", 2]]
+        keys = [one.key(square, (value,)) for value in nested]
+        assert len(set(keys)) == 4
+        assert [other.key(square, (value,)) for value in nested] != keys
+        again = [("b.tif", 1), [("b.tif", 1)], Pair("b.tif", 1), ["b.tif", 2]]
+        assert [one.key(square, (value,)) for value in again] == keys
+
+
+def test_arrays_count_by_values_type_and_shape(tmp_path) -> None:
+    with Workspace(tmp_path / "run") as workspace:
+        caching = CachingExecutor(workspace, {})
+        a = np.arange(6.0)
+        others = [a + 1, a.reshape(2, 3), a.reshape(3, 2), a.view(np.int64), a.astype(np.float32)]
+        keys = {caching.key(square, (array,)) for array in [a, *others]}
+        assert len(keys) == 6
+        assert caching.key(square, (a.copy(),)) in keys
+        assert caching.key(square, (np.asfortranarray(a.reshape(2, 3)),)) in keys
+
+
+def test_a_large_array_is_spilled_once_and_a_small_one_is_sent(tmp_path) -> None:
+    large, small = np.zeros(LARGE // 8), np.zeros(LARGE // 8 - 1)
+    with Workspace(tmp_path / "run") as workspace:
+        caching = CachingExecutor(workspace, {}, Later())
+        assert caching._spill((1, small)) == (1, small)
+        first, second = caching._spill((1, large)), caching._spill((2, large.copy()))
+        assert isinstance(first, Spilled)
+        assert isinstance(second, Spilled)
+        (place,) = first.large.values()
+        assert list(second.large.values()) == [place]
+        assert [path.stem for path in workspace.cache.glob("arrays/*.npz")] == [place.rpartition("/")[2]]
+        number, array = second.load()
+        assert number == 2
+        np.testing.assert_array_equal(array, large)
+        unknown = (object(), large)
+        assert caching._spill(unknown) is unknown
+        caching.shutdown()
+
+
+class KilledWorker(Exception):
+    """Of distributed, by its name."""
+
+
+@pytest.mark.parametrize("error", [BrokenExecutor("x"), CancelledError(), KilledWorker("x")])
+def test_a_lost_worker_is_said_in_words(tmp_path, error) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        task = caching.submit(square, 1)
+        pool.batches.pop()[0].set_exception(error)
+        with pytest.raises(AdjustError, match="a worker process died") as caught:
+            task.result()
+        assert caught.value.__cause__ is error
+
+
+def test_any_other_error_of_a_pool_is_itself(tmp_path) -> None:
+    pool, error = Later(), ValueError("of its own")
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        task = caching.submit(square, 1)
+        pool.batches.pop()[0].set_exception(error)
+        with pytest.raises(ValueError, match="of its own"):
+            task.result()
+
+
+def test_a_batch_gives_every_task_its_seconds_value_or_error() -> None:
+    def slow(number):
+        start = time.perf_counter()
+        while time.perf_counter() - start < 0.01:
+            pass
+        return refuse(number)
+
+    outcomes, spent = run_batch(slow, [(2,), (3,), (4,)], __version__)
+    assert [value for _, value, _ in outcomes] == [2.0, None, 4.0]
+    assert [type(error) for _, _, error in outcomes] == [type(None), ImageError, type(None)]
+    assert all(seconds >= 0.01 for seconds, _, _ in outcomes)
+    assert spent > 0.0
+    assert not getattr(outcomes[1][2], "__notes__", [])  # an error of barpc says enough
+
+
+def test_a_kept_result_that_cannot_be_read_is_made_again(tmp_path, monkeypatch, caplog) -> None:
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as caching:
+        caching.submit(square, 3).result()
+        monkeypatch.setattr(Workspace, "load", lambda *given: {"no": np.zeros(1)})
+        assert float(caching.submit(square, 3).result()["square"]) == 9.0
+    assert "a kept result is made again" in caplog.text

@@ -1,0 +1,242 @@
+"""What joins the stages of a run: which files are named, what is kept of a block, where heights come from."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rasterio import Affine
+
+from barpc.errors import BarpcWarning, FitError, InputError
+from barpc.fit import FitOptions, fit_rpc
+from barpc.options import AdjustOptions, RunOptions
+from barpc.pipeline import run as stages
+from barpc.pipeline.given import given_matches, given_tracks
+from barpc.pipeline.inputs import PRIOR, input_files, side_inputs, with_located
+from barpc.pipeline.outputs import output_names
+from barpc.report import Run
+from barpc.scene import Tracks, View
+from barpc.simulate import simulate_block
+from tests.rpcio.conftest import make_rpc
+from tests.test_dem import write_dem
+
+NONE = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
+
+
+def views(count: int = 3) -> tuple[View, ...]:
+    return tuple(View(f"v{n}", f"/x/v{n}.tif", (100, 80), make_rpc(), (0.0, 300.0)) for n in range(count))
+
+
+# --- inputs -----------------------------------------------------------------------------------------------
+
+
+def test_every_file_that_options_name_is_an_input() -> None:
+    given = RunOptions(
+        fixed_run="earlier", matches=("a.csv", "b.npz"), gcp=("g.csv",), check_points=("c.csv", "d.csv"),
+        dem="dem.tif", geoid="geoid.gtx", reference=("r.tif",), overlap_list="pairs.txt", aoi="area.json",
+    )  # fmt: skip
+    names = [
+        "a.csv",
+        "b.npz",
+        "g.csv",
+        "c.csv",
+        "d.csv",
+        "dem.tif",
+        "geoid.gtx",
+        "r.tif",
+        "pairs.txt",
+        "area.json",
+    ]
+    found = input_files(given)
+    assert found[0] == Path("earlier") / PRIOR
+    assert sorted(map(str, found[1:])) == sorted(names)
+    assert input_files(RunOptions()) == []
+
+
+def test_files_of_this_machine_stay_as_they_are_named() -> None:
+    given = RunOptions(dem="dem.tif", geoid="geoid.gtx", reference=("r.tif",))
+    assert with_located(given) == given
+    assert with_located(RunOptions()) == RunOptions()
+
+
+def test_a_terrain_covers_a_part_of_the_images_at_least(tmp_path) -> None:
+    """Of three images one is beyond it: that is borne; all beyond it are not."""
+    far = replace(make_rpc(), ground_offset=np.array([15.4, 43.2, 166.0]))
+    where = Affine(0.001, 0, 5.3, 0, -0.001, 43.3)
+    dem = write_dem(tmp_path / "d.tif", "EPSG:4979", np.full((200, 200), 200.0, np.float32), transform=where)
+    options = RunOptions(dem=str(dem))
+    here = views(1)[0]
+    there = View("far", "/x/far.tif", (100, 80), far, (0.0, 300.0))
+    assert side_inputs(options, [there, here])[0] is not None
+    with pytest.raises(InputError, match=r"holds no height at the images' place \(15\.\d+, 43\.\d+\)"):
+        side_inputs(options, [there])
+    assert side_inputs(RunOptions(), [there]) == (None, None)
+    with pytest.raises(InputError, match="dem_for_all is given without dem"):
+        side_inputs(RunOptions(adjust=AdjustOptions(dem_for_all=True)), [here])
+
+
+# --- given matches ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("read", [given_matches, given_tracks])
+@pytest.mark.parametrize(
+    ("col", "row", "inside"),
+    [
+        (-1.5, 5.0, True), (-1.6, 5.0, False), (5.0, -1.5, True), (5.0, -1.6, False),
+        (100.5, 5.0, True), (100.6, 5.0, False), (5.0, 80.5, True), (5.0, 80.6, False),
+        (90.0, 79.0, True), (79.0, 90.0, False),
+    ],
+)  # fmt: skip
+def test_points_lie_within_a_pixel_and_a_half_of_their_images(tmp_path, read, col, row, inside) -> None:
+    path = tmp_path / "m.csv"
+    path.write_text(f"image,col,row,track\nv0,{col},{row},0\nv1,9,9,0\nv0,1,2,1\nv1,3,4,1\n")
+    if inside:
+        assert read([path], views(2))
+        return
+    said = rf"m\.csv: 1 of 4 points lie outside their images, as \({col:g}, {row:g}\) in v0, 100 x 80 pixels"
+    with pytest.raises(InputError, match=said):
+        read([path], views(2))
+
+
+def test_matches_of_a_pair_are_the_same_whatever_the_order_of_the_file(tmp_path) -> None:
+    rows = [f"v{i},{n + 10 * i},{(7 * n + i) % 50},{n}" for n in range(12) for i in (0, 1, 2)]
+    found = []
+    for order in (rows, rows[::-1], rows[5:] + rows[:5]):
+        (tmp_path / "m.csv").write_text("\n".join(["image,col,row,track", *order]) + "\n")
+        matches = given_matches([tmp_path / "m.csv"], views())
+        assert set(matches) <= {(0, 1), (1, 2), (0, 2)}
+        found.append({pair: one.xy.tolist() for pair, one in matches.items()})
+        for (i, j), one in matches.items():
+            np.testing.assert_array_equal(
+                one.xy[:, 1, 0] - one.xy[:, 0, 0], np.full(len(one.xy), 10.0 * (j - i))
+            )
+            assert (one.score == 0).all()
+    assert found[0] == found[1] == found[2]
+
+
+# --- outputs ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("drawn", "pictures", "shown"), [(True, True, 2), (True, False, 1), (False, True, 0)]
+)
+def test_the_page_and_its_pictures_are_named_where_they_can_be_drawn(
+    tmp_path, monkeypatch, drawn, pictures, shown
+) -> None:
+    monkeypatch.setattr("barpc.pipeline.outputs.can_render", lambda: drawn)
+    names = output_names(views(), RunOptions(pictures=pictures), tmp_path)
+    assert len({"report.html", "pictures.json"} & set(names)) == shown
+    assert ("gcps.geojson" in output_names(views(), RunOptions(dem="d", reference=("r",)), tmp_path)) is True
+    assert "gcps.geojson" not in names
+    assert names[-1] == PRIOR
+
+
+# --- the run itself ---------------------------------------------------------------------------------------
+
+
+def test_a_run_without_some_of_its_views_keeps_what_belongs_to_the_others() -> None:
+    sources = tuple(SimpleNamespace(path=Path(f"{n}.RPB")) for n in range(3))
+    run = Run("adjust", views(), sources, NONE, left_out=(("/x/bad.tif", "bad"),))  # type: ignore[arg-type]
+    kept = stages._only(run, frozenset(["v0", "v2"]))
+    assert [view.name for view in kept.views] == ["v0", "v2"]
+    assert kept.sources == (sources[0], sources[2])
+    assert kept.left_out == (
+        ("/x/bad.tif", "bad"),
+        ("/x/v1.tif", "it shares no tie points with the largest group of images"),
+    )
+    assert (kept.adjustment, kept.reference) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("stated", "known", "used"), [(None, True, 5.0), (None, False, 20.0), (3.0, True, 3.0), (0.5, False, 0.5)]
+)
+def test_heights_of_a_reference_are_as_sure_as_what_they_count_from(monkeypatch, stated, known, used) -> None:
+    seen = {}
+    monkeypatch.setattr(stages, "register", lambda *given, **how: seen.update(how))
+    options = RunOptions(
+        dem="d.tif", reference=("r.tif",), reference_sigma=7.0,
+        adjust=AdjustOptions(dem_bias_sigma=stated, dem_sigma=4.0),
+    )  # fmt: skip
+    stages._registered(SimpleNamespace(views=views()), options, SimpleNamespace(known=known), None, None)  # type: ignore[arg-type]
+    assert seen["height_sigma"] == (4.0, used)
+    assert seen["sigma"] == 7.0
+
+
+def test_cameras_are_fitted_each_and_what_fails_says_why() -> None:
+    rpc = make_rpc()
+    cameras = [(rpc, (2000, 1900), (30.0, 300.0)), (rpc.crop(5, 6), (900, 800), (0.0, 200.0))]
+    options = FitOptions(grid=(6, 6, 4))
+    good = stages.fit_group(cameras, options, True)
+    assert [error for _, error, _ in good] == ["", ""]
+    for (fit, _, _), (model, size, alts) in zip(good, cameras, strict=True):
+        assert fit is not None
+        assert fit.rpc == fit_rpc(model, size, alts, options=options).rpc
+    hard = replace(options, tolerance=1e-15)
+    (fit, error, _), _ = stages.fit_group(cameras, hard, True)
+    assert fit is None
+    assert "1e-15" in error
+    (fit, error, warned), _ = stages.fit_group(cameras, hard, False)
+    assert fit is not None
+    assert (error, warned) == ("", ())
+
+
+def test_what_a_fit_warns_of_comes_back_from_its_worker_and_is_said_with_the_view(monkeypatch) -> None:
+    rpc, real = make_rpc(), stages.fit_rpc
+
+    def odd(*given, **how):
+        warnings.warn("odd", BarpcWarning, stacklevel=1)
+        return real(*given, **how)
+
+    monkeypatch.setattr(stages, "fit_rpc", odd)
+    block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.ones(3)), sensors=[rpc])
+    run = replace(Run("adjust", views(1), (), NONE), adjustment=block)  # type: ignore[arg-type]
+    with pytest.warns(BarpcWarning, match="^v0: odd$"):
+        stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), None, None)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "stated"),
+    [((3.0, 4.0, 99.0), np.sqrt(12.5)), ((0.0, 0.0, 1.0), None), ((np.nan, 1.0, 1.0), None)],
+)
+def test_a_new_rpc_states_the_error_of_the_scene_and_the_noise_of_the_old_one(sigma, stated) -> None:
+    rpc = make_rpc()
+    given = tuple(View(f"v{n}", f"/x/v{n}.tif", (900, 800), rpc, (0.0, 300.0)) for n in range(9))
+    block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.array(sigma)), sensors=[rpc] * 9)
+    told: list[tuple[str, int, int]] = []
+    run = replace(Run("adjust", given, (), NONE), adjustment=block)  # type: ignore[arg-type]
+    found = stages._fitted(
+        run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), None, lambda *now: told.append(now)
+    )
+    assert len(found.fits) == 9
+    for fit in found.fits:
+        assert fit.rpc.err_bias == (None if stated is None else pytest.approx(stated))
+        assert fit.rpc.err_rand == 0.7
+    assert told[-2:] == [("fit", 8, 9), ("fit", 9, 9)]
+    with pytest.raises(FitError, match="v0: "):
+        stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4), tolerance=1e-15)), None, None)
+
+
+def test_the_images_of_a_result_stand_in_the_order_given() -> None:
+    given = ["/x/v2.tif", "/x/v0.tif", "/x/gone.tif", "/x/v1.tif"]
+    assert [view.name for view in stages._as_given(views(), given, RunOptions())] == ["v2", "v0", "v1"]
+
+
+def test_a_camera_that_does_not_say_where_it_stands_is_told(caplog) -> None:
+    view = simulate_block(2, 4, seed=1, num_checks=0).views[0]
+    assert stages._center(view).method != "nominal"
+    assert "nominal" not in caplog.text
+
+
+def test_a_check_has_no_folder_to_make_a_report_of() -> None:
+    run = Run("check", views(), (), NONE)
+    result = stages.AdjustResult((), run, SimpleNamespace(status="good"))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="a check writes no files"):
+        result.report()
+    assert repr(result) == "AdjustResult(check: 0 views, 0 tie points, 0 observations, good)"
+    for length, shown in ((50, "/" * 50), (51, "..." + "/" * 47)):
+        wrote = stages.AdjustResult((), replace(run, out_dir="/" * length), result.record)
+        assert repr(wrote).endswith(f", in {shown})")

@@ -1,0 +1,313 @@
+"""Image files to views: what each must have, which altitudes count, and one image under two names."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.errors import ImageError, InputError, RpcError
+from barpc.pipeline import load_views, views
+from barpc.pipeline.views import image_path
+from barpc.rpcio import write_rpc
+from barpc.scene import View
+from barpc.sensor.rpc import RPC
+from tests.rpcio.conftest import make_rpc
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+WIDE, HIGH = 700, 90
+
+
+def placed(folder: Path, name: str, pixels: np.ndarray, shift: float = 0.0, **profile: object) -> Path:
+    """An image of these pixels, its RPC beside it."""
+    path, bands = folder / f"{name}.tif", pixels.reshape(-1, *pixels.shape[-2:])
+    shape = {
+        "count": len(bands),
+        "height": bands.shape[1],
+        "width": bands.shape[2],
+        "dtype": str(bands.dtype),
+    }
+    with rasterio.open(path, "w", "GTiff", **shape, **profile) as out:
+        out.write(bands)
+    write_rpc(make_rpc().crop(900 + shift, 900), folder / f"{name}_RPC.TXT")
+    return path
+
+
+def pixels_of(seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).integers(1, 60000, (HIGH, WIDE)).astype(np.uint16)
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> list[Path]:
+    return [placed(tmp_path, name, pixels_of(seed), seed) for seed, name in enumerate("ab")]
+
+
+# --- what an image must have ------------------------------------------------------------------------------
+
+
+def test_views_stand_in_the_order_of_their_names_with_size_date_and_camera(pair) -> None:
+    found = load_views(pair[::-1])
+    assert [view.name for view in found.views] == ["a", "b"]
+    assert [Path(view.path) for view in found.views] == pair
+    assert [source.path.name for source in found.sources] == ["a_RPC.TXT", "b_RPC.TXT"]
+    assert {view.size for view in found.views} == {(WIDE, HIGH)}
+    assert found.views[0].alt_range == pytest.approx((166.6667 - 142.8571, 166.6667 + 142.8571))
+    assert (found.left_out, found.worker_seconds) == ((), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("count", "least", "passes"), [(0, 1, False), (1, 2, False), (1, 1, True), (2, 2, True)]
+)
+def test_as_many_images_as_are_needed(pair, count, least, passes) -> None:
+    if passes:
+        assert len(load_views(pair[:count], min_views=least).views) == count
+        return
+    said = (
+        rf"{count} image\(s\) given \({'none' if not count else '.*a.tif'}\): at least {least} that overlap"
+    )
+    with pytest.raises(InputError, match=said):
+        load_views(pair[:count], min_views=least)
+
+
+def test_a_bad_file_is_left_out_while_enough_are_left(pair, tmp_path) -> None:
+    (tmp_path / "c.tif").write_text("no image")
+    given = [*pair, tmp_path / "c.tif"]
+    with pytest.raises(ImageError, match=r"c\.tif"):
+        load_views(given)
+    found = load_views(given, keep_going=True)
+    assert [path for path, _ in found.left_out] == [str(tmp_path / "c.tif")]
+    assert len(found.views) == len(found.sources) == 2
+    with pytest.raises(InputError, match="1 of 2 images can be used: at least 2 are needed"):
+        load_views(given[1:], keep_going=True)
+    assert len(load_views(given[1:], keep_going=True, min_views=1).views) == 1
+
+
+@pytest.mark.parametrize(("band", "passes"), [(0, False), (1, True), (2, True), (3, False)])
+def test_the_band_is_one_that_the_image_has(tmp_path, band, passes) -> None:
+    path = placed(tmp_path, "a", np.stack([pixels_of(1), pixels_of(2)]))
+    if passes:
+        assert len(load_views([path], min_views=1, band=band).views) == 1
+        return
+    with pytest.raises(ImageError, match=rf"a\.tif: has 2 band\(s\), no band {band}"):
+        load_views([path], min_views=1, band=band)
+
+
+def test_a_view_brings_its_own_camera_altitudes_and_date_and_its_size_is_that_of_the_file(pair) -> None:
+    given = View("x", str(pair[0]), (WIDE, HIGH), make_rpc(), (100.0, 400.0), "2020-01-02")
+    (found,) = load_views([given], min_views=1).views
+    assert (found.name, found.alt_range, found.date) == ("a", (100.0, 400.0), "2020-01-02")
+    assert found.sensor == given.sensor
+    with pytest.raises(
+        InputError, match=rf"is \({WIDE}, {HIGH}\) px large, but its view says \({WIDE}, 80\)"
+    ):
+        load_views([replace(given, size=(WIDE, 80))], min_views=1)
+
+
+@pytest.mark.parametrize(
+    ("stated", "used"),
+    [
+        ((0.0, 100.0), (0.0, 100.0)),
+        ((10.0, 90.0), (0.0, 100.0)),  # too narrow for an RPC
+        ((250.0, 250.0), (200.0, 300.0)),
+        ((-3000.0, 20000.0), (-1000.0, 9500.0)),
+        ((-3000.0, 40.0), (-1000.0, 40.0)),
+        ((9000.0, 12000.0), (9000.0, 9500.0)),
+        ((20000.0, 30000.0), (9450.0, 9550.0)),  # in space: the highest ground
+        ((-30000.0, -20000.0), (-1050.0, -950.0)),
+    ],
+)
+def test_altitudes_are_those_of_the_earth_and_a_hundred_metres_at_least(stated, used) -> None:
+    assert views._altitudes(SimpleNamespace(alt_range=stated)) == pytest.approx(used)  # type: ignore[arg-type]
+
+
+def test_an_rpc_that_does_not_reach_the_ground_is_named(pair) -> None:
+    rpc = make_rpc()
+    beyond = RPC(rpc.coeffs, [5.4, 43.2, 166.0], rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+    blind = SimpleNamespace(
+        localize=lambda image, alt: np.full((*np.shape(image)[:-1], 3), np.nan), project=beyond.project
+    )
+    with pytest.raises(RpcError, match=rf"does not reach the ground over the image \({WIDE} x {HIGH} px\)"):
+        load_views([View("a", str(pair[0]), (WIDE, HIGH), blind, (0.0, 300.0))], min_views=1)
+
+
+def test_the_file_of_an_image_is_absolute_and_without_its_choices(monkeypatch, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    for given in ("a.tif", "a.tif,band=2", Path("a.tif"), View("x", "a.tif", (2, 2), make_rpc(), (0.0, 1.0))):
+        assert image_path(given) == tmp_path / "a.tif"
+
+
+# --- once and not twice -----------------------------------------------------------------------------------
+
+
+def refused(paths: list[Path], what: str, **options) -> None:
+    for order in (paths, paths[::-1]):
+        with pytest.raises(InputError, match=rf"{what}.*; give each image once"):
+            load_views(order, **options)
+
+
+def test_a_file_under_two_names_is_one_image(pair, tmp_path) -> None:
+    os.link(pair[0], tmp_path / "c.tif")
+    write_rpc(make_rpc().crop(1, 2), tmp_path / "c_RPC.TXT")
+    refused([pair[0], tmp_path / "c.tif"], r"c\.tif: is the same file as .*a\.tif")
+    found = load_views([*pair, tmp_path / "c.tif"], keep_going=True)
+    assert [Path(path).name for path, _ in found.left_out] == ["c.tif"]
+    assert len(load_views([pair[0], tmp_path / "c.tif"], distinct=False).views) == 2
+
+
+def test_one_camera_of_images_of_one_size_is_one_image(tmp_path) -> None:
+    given = [placed(tmp_path, name, pixels_of(seed), 5) for seed, name in enumerate("ab")]
+    refused(given, r"b\.tif: is the same size and the same RPC as .*a\.tif")
+    smaller = placed(tmp_path, "c", pixels_of(3)[:-1], 5)
+    assert len(load_views([given[0], smaller]).views) == 2
+
+
+def test_the_same_pixels_under_another_rpc_are_one_image_in_any_layout(tmp_path) -> None:
+    first = placed(tmp_path, "a", pixels_of(), 1)
+    for number, how in enumerate(
+        [
+            {"compress": "deflate", "tiled": True, "blockxsize": 64, "blockysize": 32},
+            {"interleave": "pixel"},
+        ]
+    ):
+        twin = placed(tmp_path, f"b{number}", pixels_of(), 2 + number, **how)
+        refused([first, twin], r"b\d\.tif: shows the same pixels as .*a\.tif under another RPC")
+    real = placed(tmp_path, "c", pixels_of().astype(np.float32), 9)
+    refused([first, real], r"c\.tif: shows the same pixels as .*a\.tif under another RPC")
+
+
+def test_of_three_twins_the_first_is_kept(tmp_path) -> None:
+    given = [placed(tmp_path, name, pixels_of(), shift) for shift, name in enumerate("abc")]
+    found = load_views(given, keep_going=True, min_views=1)
+    assert [view.name for view in found.views] == ["a"]
+    assert [reason.split(": ")[1].split(" as ")[0] for _, reason in found.left_out] == [
+        "shows the same pixels"
+    ] * 2
+
+
+def test_one_pixel_makes_another_image_wherever_it_is(tmp_path) -> None:
+    """Outside of the sampled windows, too: then both are read whole, each once."""
+    first = placed(tmp_path, "a", pixels_of(), 1)
+    for number, (row, col) in enumerate([(0, 0), (HIGH - 1, WIDE - 1), (HIGH // 2, WIDE // 2), (1, 5)]):
+        changed = pixels_of()
+        changed[row, col] ^= 1
+        other = placed(tmp_path, f"b{number}", changed, 2 + number)
+        assert len(load_views([first, other]).views) == 2
+
+
+def test_images_alike_in_the_samples_are_read_whole_once_each_and_no_others(tmp_path, monkeypatch) -> None:
+    read: list[str] = []
+    whole = views._whole
+    monkeypatch.setattr(
+        views, "_whole", lambda image, band: (read.append(Path(image.name).stem), whole(image, band))[1]
+    )
+    given = []
+    for number in range(4):
+        changed = pixels_of()
+        changed[0, number] = 0  # a corner is in no sampled window
+        given.append(placed(tmp_path, f"v{number}", changed, number))
+    given.append(placed(tmp_path, "w", pixels_of(7), 9))
+    assert len(load_views(given).views) == 5
+    assert sorted(read) == ["v0", "v1", "v2", "v3"]
+
+
+def test_images_that_show_nothing_are_compared_with_none(tmp_path) -> None:
+    for value in (0, 700):
+        folder = tmp_path / str(value)
+        folder.mkdir()
+        blank = np.full((HIGH, WIDE), value, np.uint16)
+        assert len(load_views([placed(folder, name, blank, n) for n, name in enumerate("abc")]).views) == 3
+
+
+def test_the_band_that_is_matched_is_the_one_that_is_compared(tmp_path) -> None:
+    one, two, three = pixels_of(1), pixels_of(2), pixels_of(3)
+    given = [
+        placed(tmp_path, "a", np.stack([one, three]), 1),
+        placed(tmp_path, "b", np.stack([two, three]), 2),
+    ]
+    assert len(load_views(given).views) == 2
+    refused(given, "same pixels", band=2)
+
+
+def test_windows_lie_in_the_middle_and_at_the_quarters_and_inside_small_images() -> None:
+    boxes = [(w.col_off, w.row_off, w.width, w.height) for w in views._samples(1256, 416)]
+    assert boxes == [(500, 200, 256, 16), (250, 100, 256, 16), (750, 300, 256, 16)]
+    assert {(w.col_off, w.row_off, w.width, w.height) for w in views._samples(50, 9)} == {(0, 0, 50, 9)}
+    more = {(w.col_off, w.row_off) for w in views._samples(1256, 416, views._MORE)}
+    assert more == {(200 * x, 80 * y) for x in range(6) for y in range(6)}
+
+
+def test_an_image_is_hashed_in_whole_blocks_and_each_row_counts(tmp_path, monkeypatch) -> None:
+    path = placed(tmp_path, "a", pixels_of(), blockysize=8)
+    asked: list[tuple[float, float]] = []
+    digest = views._digest
+
+    def watched(image, band, windows):
+        asked.extend((w.row_off, w.height) for w in windows)
+        return digest(image, band, windows)
+
+    monkeypatch.setattr(views, "_digest", watched)
+    with views.open_raster(path) as image:
+        once = views._whole(image, 1)
+        monkeypatch.setattr(views, "_CHUNK", 20 * WIDE)
+        again = views._whole(image, 1)
+    assert once == again
+    assert asked[0] == (0, HIGH)
+    assert asked[1:] == [(0, 16), (16, 16), (32, 16), (48, 16), (64, 16), (80, 10)]
+
+
+def test_numbers_are_the_same_in_any_type() -> None:
+    row = np.array([[1, 2, 65535]])
+    of = views._numbers
+    for kind in (np.uint16, np.int32, np.float32, np.float64):
+        np.testing.assert_array_equal(of(row.astype(kind)), row.astype(np.float64))
+    assert of(np.array([-0.0])).tobytes() == np.array([0.0]).tobytes()
+    other = np.array([np.nan, -np.nan])
+    assert of(other)[0].tobytes() == of(other)[1].tobytes()
+    np.testing.assert_array_equal(of(np.array([1 + 2j, 3 - 1j], np.complex64)), [1.0, 2.0, 3.0, -1.0])
+
+
+def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(
+    pair, tmp_path, monkeypatch
+) -> None:
+    sizes: list[int] = []
+    real = views.read_group
+
+    def watched(given, *how):
+        sizes.append(len(given))
+        return real(given, *how)
+
+    monkeypatch.setattr(views, "read_group", watched)
+    monkeypatch.setattr(views, "_GROUP", 2)
+    third = placed(tmp_path, "c", pixels_of(5), 7)
+    told: list[tuple[str, int, int]] = []
+    load_views([*pair, third], progress=lambda *now: told.append(now))
+    assert sizes == [2, 1]
+    assert told == [("cameras", 2, 3), ("cameras", 3, 3)]
+
+    class Counting(ThreadPoolExecutor):
+        asked = 0
+
+        def submit(self, function, /, *given):
+            self.asked += 1
+            return super().submit(function, *given)
+
+    for many, asked in ((4, 0), (3, 2)):
+        monkeypatch.setattr(views, "_MANY", many)
+        with Counting(1) as pool:
+            load_views([*pair, third], executor=pool)
+        assert pool.asked == asked
+
+
+def test_a_copy_in_another_folder_is_found_whatever_its_name(pair, tmp_path) -> None:
+    (tmp_path / "far").mkdir()
+    copy = shutil.copy(pair[0], tmp_path / "far" / "z.tif")
+    write_rpc(make_rpc().crop(3, 4), tmp_path / "far" / "z_RPC.TXT")
+    refused([pair[0], Path(copy)], r"z\.tif: shows the same pixels as .*a\.tif")
