@@ -53,7 +53,7 @@ def _failure(view: ViewEntry, run: Run) -> str:
     if run.adjustment is not None and view.name in run.adjustment.left_out:
         return "not tied to the other images: its camera was left as it was"
     beyond = _follows_more(view) or getattr(run.options, "grids", False)  # grids hold what the RPC does not
-    if view.fit is not None and not beyond and not max(map(_known, view.fit.max_px)) <= tolerance:
+    if view.fit is not None and not beyond and not all(_known(v) <= tolerance for v in view.fit.max_px):
         return f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range"
     return ""
 

@@ -32,6 +32,8 @@ GIVEN = "given"
 _MALFORMED = (
     ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, shapely.GEOSException,
 )  # fmt: skip
+_MOST_CROSSED = 2000  # times that an outline is untangled: GEOS takes a second, of twice as many ten
+_TOGETHER = 64  # sides of an outline that are looked at together
 _WGS84 = ("CRS84", "4326", "4979")
 _WRAPPED = {"Feature": "geometry", "FeatureCollection": "features", "GeometryCollection": "geometries"}
 
@@ -73,7 +75,7 @@ def read_area(path: str | os.PathLike[str]) -> Area:
         crs = data.get("crs")  # before 2016 GeoJSON could name another reference system
         if crs is not None and not str(crs["properties"]["name"]).endswith(_WGS84):
             raise ValueError(f"its coordinates are in {crs['properties']['name']}")
-        polygons = [shapely.make_valid(polygon) for polygon in _polygons(data)]
+        polygons = [_valid(polygon) for polygon in _polygons(data)]
     except _MALFORMED as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"{path}: not an area of interest, GeoJSON polygons in degrees ({said})") from error
@@ -82,6 +84,22 @@ def read_area(path: str | os.PathLike[str]) -> Area:
     if not outline.area > 0:
         raise InputError(f"{path}: the area of interest holds no polygon of any extent")
     return Area(outline)
+
+
+def _valid(polygon: shapely.Polygon) -> shapely.Geometry:
+    """A polygon whose outline does not cross itself; ValueError where it does more often than can be untangled."""
+    if polygon.is_valid:
+        return polygon
+    rings = [np.asarray(ring.coords) for ring in (polygon.exterior, *polygon.interiors)]
+    sides: Any = shapely.linestrings(
+        np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
+    )
+    tree, crossed = shapely.STRtree(sides), 0
+    for first in range(0, len(sides), _TOGETHER):
+        crossed += tree.query(sides[first : first + _TOGETHER], predicate="crosses").shape[1]
+        if crossed > 2 * _MOST_CROSSED:  # each was found from both sides
+            raise ValueError(f"an outline crosses itself more than {_MOST_CROSSED} times")
+    return shapely.make_valid(polygon)
 
 
 def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:

@@ -19,6 +19,7 @@ from barpc.export.approx import Samples, factored, fit_affine, fit_projective, p
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import light_of
 from barpc.sensor.geometry import image_grid
+from tests.lanes import rest_slow
 
 
 def exported(run: Path, target: str, tmp_path: Path, **options: object) -> Path:
@@ -296,7 +297,9 @@ def test_altitudes_may_be_given(southern, tmp_path):
         export_run(southern, "nerfstudio", tmp_path / "x", alt_range=(5.0, 5.0))
 
 
-@pytest.mark.parametrize("target", list(TARGETS))
+@pytest.mark.parametrize(
+    "target", rest_slow(sorted(TARGETS, key=["s2p", "asp"].__contains__, reverse=True), 2)
+)
 def test_nothing_is_replaced_that_is_not_an_earlier_export(target, southern, tmp_path):
     southern = in_one_folder(southern, tmp_path)
     out = exported(southern, target, tmp_path)
@@ -417,3 +420,13 @@ def test_the_points_of_renderers_are_a_ply(southern, tmp_path):
     assert len(vertex) == len((southern / "residuals.csv").read_text().splitlines()) - 1
     assert vertex["red"].tolist() == [128] * len(vertex)
     assert "numpy" in sys.modules
+
+
+def test_an_export_of_another_name_and_altitudes_upside_down_are_refused(southern, tmp_path):
+    with pytest.raises(InputError, match="no export of that name; there are satnerf, "):
+        export_run(southern, "obj", tmp_path / "x")
+    for altitudes in ((5.0, 5.0), (6.0, 5.0)):
+        with pytest.raises(InputError, match="the lower one first"):
+            export_run(southern, "s2p", tmp_path / "x", alt_range=altitudes)
+    assert not (tmp_path / "x").exists()
+    assert export_run(southern, "s2p", tmp_path / "x") == [tmp_path / "x" / "config.json"]

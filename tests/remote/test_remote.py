@@ -158,7 +158,7 @@ def test_a_vrt_a_kept_result_and_a_text_open_nothing_even_where_the_host_is_allo
 
 
 def test_the_same_files_come_out_and_every_byte_is_asked_once(samples: Web, tmp_path: Path) -> None:
-    given, names = {"stop_after": "matching", "tie": TieOptions(keypoints_per_image=3000)}, NAMES[:2]
+    given, names = {"stop_after": "matching", "tie": TieOptions(keypoints_per_image=800)}, NAMES[:2]
     urls = [samples.url(name) for name in names]
     remote = barpc.adjust(urls, tmp_path / "a", RunOptions(allow_remote=(samples.host,), **given))  # type: ignore[arg-type]
     barpc.adjust([SAMPLES / name for name in names], tmp_path / "b", RunOptions(**given))  # type: ignore[arg-type]
@@ -410,10 +410,10 @@ def test_a_move_within_the_host_is_followed(samples: Web) -> None:
 @pytest.mark.parametrize("kind", ["GTiff", "JPEG", "PNG", "JP2OpenJPEG"])
 def test_no_pixels_are_made_of_a_file_whose_host_dies(server: Web, kind: str) -> None:
     """Some drivers fill what is missing, and none hears of an exception."""
-    pixels = np.random.default_rng(3).integers(0, 255, (1, 1500, 1500), np.uint8)
+    pixels = np.random.default_rng(3).integers(0, 255, (1, 800, 800), np.uint8)
     options = {"REVERSIBLE": "YES", "QUALITY": "100"} if kind.startswith("JP2") else {}
     with rasterio.open(
-        server.folder / "x", "w", driver=kind, width=1500, height=1500, count=1, dtype="uint8", **options
+        server.folder / "x", "w", driver=kind, width=800, height=800, count=1, dtype="uint8", **options
     ) as file:
         file.write(pixels)
     at = located(server.url("x"), (server.host,))

@@ -12,8 +12,11 @@ from click.testing import CliRunner
 
 from barpc.cli.main import cli
 from barpc.errors import InputError
-from barpc.report.compare import compare_runs
+from barpc.report.compare import _lines, _pairs, _view, compare_runs, flat_options
+from barpc.report.records import plain
 from barpc.rpcio import read_rpc, write_rpc
+
+from .made import a_pair, a_summary, a_view
 
 
 def test_a_run_does_not_differ_from_itself(block_run):
@@ -66,3 +69,62 @@ def test_the_verb_prints_tables_or_json(block_run, check_run):
     assert "error A [px]  error B [px]" in text.output
     found = CliRunner().invoke(cli, [*arguments, "--json"], standalone_mode=False)
     assert json.loads(found.output) == compare_runs(check_run.folder, block_run.folder)
+
+
+def rows(*found):
+    """Rows of views: name, errors, whole difference, without the shift."""
+    keys = ("name", "rmse", "rpc_difference_px", "rpc_difference_without_shift_px")
+    return [dict(zip(keys, row, strict=True)) for row in found]
+
+
+def test_what_is_said_of_two_runs():
+    views = rows(("A", (1.0, 0.1), 3.0, 0.5), ("B", (3.0, 0.3), 4.0, 0.25), ("C", (2.0, 0.2), None, None))
+    options = [{"option": "tie.band", "values": [1, None]}]
+    found = _lines({"views": views, "only_a": ["X", "Y"], "only_b": [], "options": options})
+    assert found == [
+        "3 images in both: their tie points agree to 2.000 px in A, 0.200 px in B.",
+        "Their RPCs differ by up to 4 px (B), by 0.5 px once the mean shift of each image is taken away.",
+        "In A alone: X, Y.",
+        "Option tie.band: 1 in A, None in B.",
+    ]
+    assert len(_lines({"views": views[2:], "only_a": [], "only_b": ["Z"], "options": []})) == 2
+
+
+def test_each_run_s_error_is_that_of_its_last_cameras(tmp_path):
+    views = (
+        a_view(rmse_before=2.0, rmse_after=None, num_observations=5),
+        a_view(rmse_before=3.0, rmse_after=0.2),
+    )
+    found = _view((tmp_path, tmp_path), views)
+    assert (found["rmse"], found["num_observations"]) == ([2.0, 0.2], [5, 100])
+    assert found["rpc_difference_px"] is found["rpc_difference_without_shift_px"] is None
+
+
+def test_pairs_in_both_are_set_side_by_side_with_their_last_offsets():
+    a = a_summary([], [a_pair("A", "B", 5, epipolar_after=None), a_pair("A", "C"), a_pair("B", "C", 8)])
+    b = a_summary([], [a_pair("B", "C", 9), a_pair("A", "B", 7)])
+    assert _pairs(a, b) == [
+        {"a": "A", "b": "B", "num_matches": [5, 7], "epipolar_rms": [0.4, 0.1]},
+        {"a": "B", "b": "C", "num_matches": [8, 9], "epipolar_rms": [0.1, 0.1]},
+    ]
+
+
+def test_options_of_one_run_alone_count_and_those_without_effect_do_not(tmp_path):
+    both = []
+    for name, options in (
+        ("a", {"x": 1, "deep": {"y": 2}, "overwrite": True}),
+        ("b", {"x": 1, "z": {}, "keep_going": 1}),
+    ):
+        summary = a_summary([a_view("A"), a_view(f"only {name}")], options=options)
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "summary.json").write_text(json.dumps(plain(summary)))
+        both.append(tmp_path / name)
+    found = compare_runs(*both)
+    assert found["options"] == [
+        {"option": "deep.y", "values": [2, None]},
+        {"option": "z", "values": [None, {}]},
+    ]
+    assert (found["only_a"], found["only_b"]) == (["only a"], ["only b"])
+    assert (found["a"], found["b"], found["versions"]) == (str(both[0]), str(both[1]), ["1", "1"])
+    assert [view["name"] for view in found["views"]] == ["A"]
+    assert flat_options({"a": {"b": {"c": 1}}, "d": {}}) == {"a.b.c": 1, "d": {}}

@@ -196,3 +196,59 @@ def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
     found = decisions(replace(older, scene=bare, options=None, control_test=None, gcps=(), pairs=()))
     assert [line.split()[0] for line in found] == ["Rotations", "No"]
     assert isinstance(record.pairs[0], PairEntry)
+
+
+def test_figures_that_decide_are_met_at_their_limits(record):
+    calm = with_views(
+        record, *[{"shared_px": 0.0, "smooth_px": 0.0, "smooth_p": 0.5, "prior_scale": 1.0}] * 9
+    )
+    assert "would be looked at" in said(with_views(calm, {"shared_px": 0.03}))
+    assert "would be looked at" not in said(with_views(calm, {"shared_px": 0.031}))
+    assert "share 0.000 px" in said(with_views(calm, {"smooth_px": 0.4, "smooth_p": 1e-4}))
+    assert "share 0.400 px" in said(with_views(calm, {"smooth_px": 0.4, "smooth_p": 0.99e-4}))
+    assert "none was widened" in said(with_views(calm, {"prior_scale": 1.005}), prior_ratio=1.0)
+    assert "those of 1 images were widened, 1.0 times" in said(
+        with_views(calm, {"prior_scale": 1.006}), prior_ratio=1.0
+    )
+    assert "none was widened" in said(with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0)
+    given = AskedEntry(image="B", smooth_px=None, smooth_p=None, shared_px=0.0, num_images=1)
+    unknown = said(calm, drift_degree=2, drift_asked=given)
+    assert "nan px that was smooth in B (F test: p unknown; below" in unknown
+    for p, words in ((1e-16, "p = 1e-16"), (0.99e-16, "p < 1e-16")):
+        assert words in said(calm, drift_degree=2, drift_asked=replace(given, smooth_p=p))
+
+
+def test_chance_is_said_to_put_none_below_a_tenth(record):
+    test = ControlTestEntry(200, 3.29, 2, 0.1, 4.5, "B", "P3")
+    assert "chance puts 0.1 (" in control_sentence(replace(record, control_test=test))
+    assert "chance puts none (" in control_sentence(
+        replace(record, control_test=replace(test, expected=0.099))
+    )
+
+
+def test_five_points_that_are_rejected_are_named(record):
+    wrong = tuple(replace(record.gcps[0], name=f"P{k}", status="rejected", used=False) for k in range(7))
+    assert (
+        "0 of 7 GCPs that are seen hold the block; the rest contradicts P0, P1, P2, P3, P4 and 2 more."
+        in said(replace(record, gcps=wrong))
+    )
+
+
+def test_splines_are_said_with_the_rows_between_the_knots_of_the_largest(record):
+    waving = with_views(
+        record,
+        {"jitter_px": 0.3, "jitter_rows": 400.0},
+        {"jitter_px": 0.1, "jitter_rows": 500.0},
+        {"detectors": (1.0,)},
+    )
+    text = said(waving)
+    assert "Splines with a knot every 400 rows follow jitter in 2 images, up to 0.30 px RMS" in text
+    assert "without them there was" not in text
+    assert "Detectors begin at up to 1 columns of 1 images." in text
+
+
+def test_an_affine_in_the_image_is_said_without_what_is_not_known(record):
+    views = with_views(record, *[{"held_out_px": None}] * 9)
+    text = said(views, in_space_px=0.4)
+    assert "leave 0.400 px of tie points that took no part." in text
+    assert "affine" not in text

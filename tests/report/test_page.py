@@ -20,6 +20,7 @@ from barpc.report import Run, charts, maps, page, records, summarize
 from barpc.report.summary import metres
 from barpc.report.tables import TABLES, Observations, RunFiles
 from barpc.scene import Tracks
+from tests.lanes import rest_slow
 from tests.report.conftest import run_of_block, written
 
 pytest.importorskip("jinja2")
@@ -161,7 +162,7 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
     )
 
 
-@pytest.mark.parametrize("num", [300, 1000])
+@pytest.mark.parametrize("num", rest_slow([300, 1000]))
 def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_run, monkeypatch, num):
     files = many_times(page.read_tables(block_run.record, block_run.folder), -(-num // 9))
     monkeypatch.setattr(page, "read_tables", lambda *_: files)

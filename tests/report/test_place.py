@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.geodesy import metres_per_unit
+from barpc.geodesy import ecef_from_ground, metres_per_unit
 from barpc.report import Run, maps
-from barpc.report.summary.place import ce90, clocks_in_image, ellipse, stated_ce90
+from barpc.report.summary.place import ce90, clocks_in_image, ellipse, shift_in_image, stated_ce90
 from barpc.report.tables import read_tables
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed, Timing
 from tests.sensor.s1_product import Product
+
+MODELS = ("rotation+translation", "rotation", "translation")
 
 
 @pytest.mark.parametrize("minor", [1.0, 0.8, 0.5, 0.21, 0.05, 0.0])
@@ -26,7 +28,46 @@ def test_nine_of_ten_points_lie_within_ce90(minor):
     assert ce90(0.0, 0.0) == 0.0
 
 
-@pytest.mark.parametrize("model", ["rotation+translation", "rotation", "translation"])
+@pytest.mark.parametrize("model", MODELS)
+def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
+    """Against differences of the whole camera, one unknown after the other, under a covariance of any shape."""
+    sensor, view = block_run.run.adjustment.sensors[2], block_run.run.views[2]
+    pixel, alt = (np.array(view.size) - 1) / 2, np.array(block_run.run.altitude)
+    middle = sensor.localize(pixel, alt)
+    distance = np.linalg.norm(ecef_from_ground(middle) - sensor.correction.center)
+    by_ground, by_image = [], []
+    for name in model.split("+"):
+        for step in np.eye(3) / (distance if name == "rotation" else 1.0):
+            ahead, behind = (
+                replace(
+                    sensor,
+                    correction=replace(
+                        sensor.correction, **{name: getattr(sensor.correction, name) + sign * step}
+                    ),
+                )
+                for sign in (0.5, -0.5)
+            )
+            off = ahead.localize(pixel, alt) - behind.localize(pixel, alt)
+            by_ground.append((off * metres_per_unit(middle))[:2])
+            by_image.append(ahead.project(middle) - behind.project(middle))
+    root = np.random.default_rng(4).normal(size=(6, 6))[: len(by_ground)] * [1.0, 0.2, 0.5, 2.0, 0.1, 0.7]
+    covariance = np.full((9, 9), 77.0)  # a drift's rows stand behind, and do not count in the middle row
+    covariance[: len(root), : len(root)] = root @ root.T
+    shift, sigma = shift_in_image(sensor, covariance, model, middle)
+    in_image = np.array(by_image).T @ root
+    assert sigma == pytest.approx(np.sqrt((in_image**2).sum(axis=1)), rel=2e-3)
+    assert shift == pytest.approx(pixel - sensor.sensor.project(middle), abs=1e-5)
+    found = ellipse(sensor, covariance, model, middle)
+    values, axes = np.linalg.eigh(np.array(by_ground).T @ root @ root.T @ np.array(by_ground))
+    assert [found.minor_m, found.major_m] == pytest.approx(np.sqrt(values), rel=2e-3)
+    azimuth = np.degrees(np.arctan2(*axes[:, 1])) % 180.0
+    assert abs((found.azimuth_deg - azimuth + 90.0) % 180.0 - 90.0) < 0.2
+    assert 0.0 <= found.azimuth_deg < 180.0
+    assert found.ce90_m == ce90(found.major_m, found.minor_m)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS)
 def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, model):
     run = block_run.run
     adjustment = adjust_tracks(run.views, run.tracks, AdjustOptions(model=model, drift=0))

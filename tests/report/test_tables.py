@@ -5,15 +5,33 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from barpc.errors import InputError
 from barpc.geodesy import ecef_from_ground, enu_basis
 from barpc.report import run as runs
 from barpc.report import summarize
+from barpc.report import tables as modules
 from barpc.report.records import plain
-from barpc.report.tables import OBSERVATIONS, RESIDUALS, TABLES, read_tables
+from barpc.report.tables import (
+    OBSERVATIONS,
+    RESIDUALS,
+    TABLES,
+    _cell,
+    _columns,
+    _floats,
+    _number,
+    _numbers,
+    _observations,
+    _outlines,
+    _pictures,
+    _points,
+    gcps_geojson,
+    read_tables,
+)
 
 
 def rows_of(path):
@@ -140,3 +158,215 @@ def test_names_with_commas_and_quotes_come_back(antimeridian_run):
 def test_a_check_leaves_the_columns_of_new_cameras_empty(check_run):
     _, rows = rows_of(check_run.folder / "observations.csv")
     assert {tuple(row[6:8]) for row in rows} == {("", "")}
+
+
+# --- read back --------------------------------------------------------------------------------------------
+
+HEAD, ROW = ",".join(OBSERVATIONS), "A,3,1.5,2.5,0.1,0.2,,,1"
+PLACES, PLACE = ",".join(RESIDUALS), "10,20,30,0.5,3,0.7,8"
+
+
+def test_observations_are_read_with_what_is_missing():
+    found = _observations(f"{HEAD}\nB,4,1,2,3,4,5,6,0\n{ROW}\n", ["A", "B"])
+    assert (found.view.tolist(), found.track.tolist(), found.used.tolist()) == ([1, 0], [4, 3], [False, True])
+    assert found.xy.tolist() == [[1, 2], [1.5, 2.5]]
+    assert found.before.tolist() == [[3, 4], [0.1, 0.2]]
+    assert found.after[0].tolist() == [5, 6]
+    assert np.isnan(found.after[1]).all()
+    assert len(_observations(f"{HEAD}\n", ["A"]).view) == 0
+
+
+def test_places_are_read_with_their_numbers():
+    points, tracks = _points(f"{PLACES}\n{PLACE}\n10,20,30,,3,,999999999999999999\n")
+    assert points[0].tolist() == [10, 20, 30, 0.5]
+    assert np.isnan(points[1, 3])
+    assert tracks.tolist() == [8, 999999999999999999]
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "A,3,,2.5,0.1,0.2,,,1",  # a place is missing
+        "A,-3,1.5,2.5,0.1,0.2,,,1",
+        "A,1234567890123456789,1.5,2.5,0.1,0.2,,,1",
+        "A,3,1.1e12,2.5,0.1,0.2,,,1",
+        "A,3,1.5,2.5,-1.1e12,0.2,,,1",
+        "A,3,inf,2.5,0.1,0.2,,,1",
+        "C,3,1.5,2.5,0.1,0.2,,,1",
+        "A,3,1.5,2.5,0.1,0.2,,1",
+        "A,x,1.5,2.5,0.1,0.2,,,1",
+    ],
+)
+def test_an_observation_that_cannot_be_is_refused(row):
+    _observations(f"{HEAD}\n{ROW}\n", ["A"])
+    with pytest.raises((ValueError, LookupError)):
+        _observations(f"{HEAD}\n{row}\n", ["A"])
+
+
+@pytest.mark.parametrize(
+    "place", [(540.0, 90.0), (-540.0, -90.0), (540.1, 0.0), (-540.1, 0.0), (0.0, 90.1), (0.0, -90.1)]
+)
+def test_a_place_is_on_the_earth_up_to_a_turn_and_a_half(place):
+    text = f"{PLACES}\n{place[0]},{place[1]},30,0.5,3,0.7,8\n"
+    ring = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], list(place), [0, 0]]]}
+    outline = json.dumps({"features": [{"geometry": ring}]})
+    if abs(place[0]) <= 540 and abs(place[1]) <= 90:
+        assert len(_points(text)[0]) == 1
+        assert len(_outlines(outline)[0][0]) == 4
+        return
+    with pytest.raises(ValueError, match="no longitude and latitude"):
+        _points(text)
+    with pytest.raises(ValueError, match="no longitude and latitude"):
+        _outlines(outline)
+
+
+def test_outlines_are_the_outer_rings():
+    square = [[0, 0], [1, 0], [1, 1], [0, 0]]
+    parts = [
+        {"type": "MultiPolygon", "coordinates": [[square, "hole"], [square]]},
+        {"type": "Polygon", "coordinates": [square]},
+        None,
+    ]
+    found = _outlines(json.dumps({"features": [{"geometry": part} for part in parts]}))
+    assert [len(rings) for rings in found] == [2, 1, 0]
+    assert found[1][0].tolist() == square
+    for ring in (square[:3], [[0, 0, 0]] * 4, [0, 0, 0, 0]):
+        with pytest.raises(ValueError, match="outline of shape"):
+            _outlines(json.dumps({"features": [{"geometry": {"type": "Polygon", "coordinates": [ring]}}]}))
+
+
+def test_a_table_with_other_columns_is_refused():
+    assert _columns("a,b\n1,2\n3,4\n", ("a", "b")) == [["1", "3"], ["2", "4"]]
+    assert _columns("a,b\n", ("a", "b")) == [[], []]
+    wrong = {
+        "a,c\n1,2\n": "columns are not a, b",
+        "a,b\n1,2,3\n": "rows of 3 cells",
+        "a,b\n1,2\n3\n": "shorter",
+    }
+    for text, said in wrong.items():
+        with pytest.raises(ValueError, match=said):
+            _columns(text, ("a", "b"))
+    assert _floats([["1", ""], ["", "1e12"]], 0)[1, 1] == 1e12
+    assert _numbers(["0", "12"]).tolist() == [0, 12]
+
+
+TIE = {"kind": "worst", "a": "A", "b": "B", "offset_px": [1.5, 0.5], "patches": ["QUJD", "QUJD", "QUJDQQ=="]}
+
+
+def test_pictures_are_jpegs_and_a_tie_point_has_one_patch_more_than_offsets():
+    found = _pictures(json.dumps({"quicklooks": {"A": "QUJD" * 100_000}, "ties": [TIE]}))
+    assert found.quicklooks["A"].startswith("QUJD")
+    assert (found.ties[0].kind, found.ties[0].a, found.ties[0].b, found.ties[0].offset_px) == (
+        "worst",
+        "A",
+        "B",
+        [1.5, 0.5],
+    )
+    wrong = [
+        {"patches": ["QUJD", "QUJD"]},
+        {"offset_px": [], "patches": ["QUJD"]},
+        {"kind": "best"},
+        {"patches": ["QUJD", "QUJD", "<b>"]},
+    ]
+    for change in wrong:
+        with pytest.raises((ValueError, KeyError)):
+            _pictures(json.dumps({"quicklooks": {}, "ties": [{**TIE, **change}]}))
+    for data in ("QUJD" * 100_000 + "Q", "QUJ", ""):
+        with pytest.raises(ValueError, match="picture that is none"):
+            _pictures(json.dumps({"quicklooks": {"A": data}, "ties": []}))
+
+
+def test_numbers_of_a_table():
+    assert (_number(None, 4), _number(float("nan"), 4, "null"), _number(1.23456, 4)) == ("", "null", "1.2346")
+    assert [_cell(value) for value in ("a,b", 7, 0.123456, None)] == ['"a,b"', "7", "0.12346", ""]
+
+
+def test_as_many_outlines_as_images_are_needed(block_run, tmp_path):
+    for name in TABLES:
+        (tmp_path / name).write_bytes((block_run.folder / name).read_bytes())
+    collection = json.loads((tmp_path / "footprints.geojson").read_text())
+    del collection["features"][0]
+    (tmp_path / "footprints.geojson").write_text(json.dumps(collection))
+    with pytest.raises(InputError, match="8 outlines of 9 images"):
+        read_tables(block_run.record, tmp_path)
+
+
+# --- written ----------------------------------------------------------------------------------------------
+
+
+def test_a_track_s_errors_are_those_of_what_counts_before_and_after(block_run):
+    run = block_run.run
+    header, rows = rows_of(block_run.folder / "residuals.csv")
+    for row in rows[:40]:
+        named = dict(zip(header, row, strict=True))
+        own = (run.tracks.point == int(named["track"])) & run.keep
+        for key, ties in (("mean_residual", run.ties_after), ("mean_residual_before", run.ties_before)):
+            assert float(named[key]) == pytest.approx(np.hypot(*ties.residuals[own].T).mean(), abs=6e-5)
+        assert int(named["num_observations"]) == own.sum()
+
+
+def test_a_check_s_errors_are_those_of_the_cameras_as_they_are(check_run):
+    header, rows = rows_of(check_run.folder / "residuals.csv")
+    first = dict(zip(header, rows[0], strict=True))
+    assert first["mean_residual"] == first["mean_residual_before"] != ""
+
+
+def test_an_observation_s_numbers_have_three_and_four_decimals(block_run, check_run):
+    for finished, filled in ((block_run, 6), (check_run, 4)):
+        _, rows = rows_of(finished.folder / "observations.csv")
+        digits = [len(cell.partition(".")[2]) for cell in rows[0][2:8]]
+        assert digits[:filled] == ([3, 3, 4, 4, 4, 4] if filled == 6 else [4, 4, 4, 4])
+
+
+def test_a_point_cloud_across_the_antimeridian_is_in_one_place(antimeridian_run):
+    data = (antimeridian_run.folder / "points.ply").read_bytes()
+    head, body = data.split(b"end_header\n", 1)
+    kind = np.dtype([("xyz", "<f8", 3), ("mean_residual", "<f4"), ("num_observations", "<i4")])
+    cloud = np.frombuffer(body, dtype=kind)
+    assert np.abs(cloud["xyz"]).max() < 30e3
+    _, rows = rows_of(antimeridian_run.folder / "residuals.csv")
+    assert cloud["mean_residual"] == pytest.approx(np.array([float(row[3]) for row in rows]), abs=1e-4)
+    assert cloud["num_observations"].tolist() == [int(row[4]) for row in rows]
+    assert b"property float mean_residual\nproperty int num_observations\n" in head + b"\n"
+
+
+def test_the_cloud_of_no_tie_point_is_empty(block_run, monkeypatch):
+    monkeypatch.setattr(modules, "_per_track", lambda _: np.zeros((0, 7)))
+    data = TABLES["points.ply"](block_run.run, block_run.record)
+    assert b"element vertex 0\n" in data
+    assert b"lon 0.000000000 lat 0.000000000 alt 0.0000" in data
+    assert data.endswith(b"end_header\n")
+
+
+def test_points_of_a_reference_are_written_as_control_is_read():
+    points = SimpleNamespace(
+        lonlatalt=np.array([[10.0, 20.0, 30.0], [1.0, 2.0, 3.0]]), sigma=np.array([[1.0, 1.0, 2.0]] * 2),
+        names=("P", "Q"),
+        xy=np.array([[1.00004, 2.0], [3.0, 4.0], [5.0, 6.0]]), point=np.array([0, 1, 1]), view=np.array([1, 0, 1]),
+    )  # fmt: skip
+    run = SimpleNamespace(
+        reference=SimpleNamespace(control=SimpleNamespace(points=points)),
+        adjustment=SimpleNamespace(reference_inlier=np.array([True, False, True])),
+        views=[SimpleNamespace(path="/a/x.tif"), SimpleNamespace(path="/b/y.tif")],
+    )
+    first, second = json.loads(gcps_geojson(run))["features"]
+    assert first["properties"] == {
+        "id": "P",
+        "filename": "y.tif",
+        "ji": [1.0, 2.0],
+        "sigma_m": [1.0, 1.0, 2.0],
+    }
+    assert first["geometry"] == {"type": "Point", "coordinates": [10.0, 20.0, 30.0]}
+    assert (second["properties"]["id"], second["properties"]["ji"]) == ("Q", [5.0, 6.0])
+
+
+def test_a_run_without_pixels_has_no_pictures(block_run, tmp_path):
+    for name in TABLES:
+        (tmp_path / name).write_bytes((block_run.folder / name).read_bytes())
+    found = read_tables(block_run.record, tmp_path).pictures
+    assert (found.quicklooks, found.ties) == ({}, ())
+    (tmp_path / "pictures.json").symlink_to(
+        tmp_path / "nowhere"
+    )  # a link to nothing is no file that is not there
+    with pytest.raises(InputError, match=r"pictures\.json"):
+        read_tables(block_run.record, tmp_path)

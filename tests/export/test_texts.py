@@ -1,0 +1,566 @@
+"""What stands in the files of each export, read with nothing but the standard library and numpy."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.errors import InputError
+from barpc.export import catalogue, neural, scene, stereo
+from barpc.export.approx import Samples
+from barpc.export.scene import Scene, link, pairs_of, read_scene
+from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.rpcio import read_rpc
+from barpc.rpcio.acquisition import Light
+from barpc.sensor.geometry import camera_center, image_grid
+
+OUT = Path("/elsewhere/out")
+
+
+@pytest.fixture(scope="module")
+def south(southern) -> Scene:
+    return read_scene(southern)
+
+
+@pytest.fixture(scope="module")
+def dateline(on_date_line) -> Scene:
+    return read_scene(on_date_line)
+
+
+def with_shot(of: Scene, **fields: Any) -> Scene:
+    """The scene with its first shot changed; fields of its entry by the names that it has."""
+    shot = of.shots[0]
+    entry = {key: value for key, value in fields.items() if hasattr(shot.entry, key)}
+    own = {key: value for key, value in fields.items() if key not in entry}
+    return replace(of, shots=(replace(shot, entry=replace(shot.entry, **entry), **own), *of.shots[1:]))
+
+
+# --- the scene --------------------------------------------------------------------------------------------
+
+
+def test_a_scene_holds_what_counts_of_its_run(south, southern):
+    lines = [line.split(",") for line in (southern / "observations.csv").read_text().splitlines()[1:]]
+    table = np.loadtxt(southern / "residuals.csv", delimiter=",", skiprows=1)
+    for shot in south.shots:
+        rows = [line for line in lines if line[0] == shot.name and line[8] == "1"]
+        assert south.tracks[shot.index].tolist() == [int(row[1]) for row in rows]
+        assert shot.xy == pytest.approx(np.array([[float(row[2]), float(row[3])] for row in rows]))
+        assert shot.size == (900, 700)
+    assert south.points == pytest.approx(table[:, :3])
+    used = [line for line in lines if line[8] == "1"]
+    left = np.array([[float(row[6]), float(row[7])] for row in used])
+    free = left.size - 3 * len({row[1] for row in used})
+    assert south.noise == pytest.approx(np.sqrt((left**2).sum() / free))
+
+
+def test_altitudes_reach_a_margin_beyond_all_but_half_a_per_cent(south):
+    low, high = np.percentile(south.points[:, 2], [0.5, 99.5])
+    margin = 20.0 + 0.1 * (high - low)
+    assert south.alt_range == (np.floor(low - margin), np.ceil(high + margin))
+    assert scene._altitudes(np.array([100.0, 100.0]), south.summary) == (80.0, 120.0)
+    wide = tuple(
+        replace(view, alt_range_m=(10.0 * k - 50, 10.0 * k + 500))
+        for k, view in enumerate(south.summary.views)
+    )
+    assert scene._altitudes(np.zeros(0), replace(south.summary, views=wide)) == (-50.0, 520.0)
+
+
+def test_the_origin_is_in_the_middle_of_the_tie_points(south, dateline):
+    for one in (south, dateline):
+        lon = one.points[:, 0] % 360.0
+        assert one.origin[0] % 360.0 == pytest.approx((lon.min() + lon.max()) / 2)
+        assert -180 <= one.origin[0] <= 180
+        assert one.origin[1] == np.median(one.points[:, 1])
+        assert one.origin[2] == sum(one.alt_range) / 2
+    none = replace(south, points=np.zeros((0, 3)))
+    assert none.origin[:2] == pytest.approx(south.origin[:2], abs=2e-3)  # of its outlines
+
+
+def test_the_world_is_metres_east_north_up(south):
+    at = south.origin + np.array([[0, 0, 0], [1e-4, 0, 0], [0, 1e-4, 0], [0, 0, 50.0]])
+    found = south.world(at)
+    degree = metres_per_unit(south.origin)
+    assert found == pytest.approx(
+        np.array([[0, 0, 0], [degree[0] * 1e-4, 0, 0], [0, degree[1] * 1e-4, 0], [0, 0, 50.0]]), abs=1e-3
+    )
+    matrix = south.world_to_ecef
+    assert found @ matrix[:3, :3].T + matrix[:3, 3] == pytest.approx(ecef_from_ground(at), abs=1e-6)
+    assert matrix[3].tolist() == [0, 0, 0, 1]
+
+
+def test_a_view_is_what_a_pinhole_starts_from(south):
+    shot = south.shots[1]
+    view = south.view_of(shot)
+    assert view["pixel"].tolist() == [449.5, 349.5]
+    ground = shot.rpc.localize(view["pixel"], np.array(south.origin[2]))
+    assert view["at"] == pytest.approx(south.world(ground[None])[0])
+    center = camera_center(shot.rpc, shot.size, south.alt_range).ecef
+    assert view["far"] == pytest.approx(np.linalg.norm(center - ecef_from_ground(ground)))
+    degree, steps = metres_per_unit(ground), np.eye(3) * 0.5
+    local = enu_basis(ground) @ enu_basis(south.origin).T
+    for axis, step in enumerate(steps @ local.T):  # half a metre along the axes of the world
+        both = [shot.rpc.project(ground + sign * step / degree) for sign in (1.0, -1.0)]
+        assert view["rows"][:, axis] == pytest.approx(both[0] - both[1], abs=1e-5)
+    away = enu_basis(south.origin) @ (center - ecef_from_ground(ground))
+    assert view["sight"] == pytest.approx(away / np.linalg.norm(away), abs=2e-2)
+
+
+def test_samples_lie_on_a_grid_over_image_and_altitudes(south):
+    shot = south.shots[0]
+    for checked, nodes in ((False, (11, 5)), (True, (21, 9))):
+        found = south.samples(shot, checked=checked)
+        image, alt = image_grid(shot.size, south.alt_range, nodes)
+        assert found.image == pytest.approx(image)
+        assert found.world == pytest.approx(south.world(shot.rpc.localize(image, alt)))
+    assert len(south.samples(shot).image) == 11 * 11 * 5
+    with pytest.raises(InputError, match="sees no ground"):
+
+        class Blind:
+            def localize(self, image, alt):
+                return np.where(np.arange(len(image))[:, None] < 11, 1.0, np.nan) * np.ones(3)
+
+        south.samples(replace(shot, rpc=Blind()))
+
+
+def test_files_are_named_relative_to_where_they_are_named(tmp_path):
+    assert link("https://a.org/b/x.tif", OUT) == "https://a.org/b/x.tif"
+    assert link("/elsewhere/images/x.tif", OUT) == "../images/x.tif"
+    assert link("/elsewhere/out/x.tif", OUT) == "x.tif"
+
+
+def test_images_of_one_folder_go_by_their_names_and_others_relative(south):
+    assert [name.rpartition("/")[2] for name in south.file_names(OUT)] == [
+        "north.tif",
+        "same.tif",
+        "same.tif",
+    ]
+    assert all(name.startswith("../") for name in south.file_names(OUT))
+    one = replace(south, shots=tuple(replace(shot, file=f"/a/{k}.tif") for k, shot in enumerate(south.shots)))
+    assert one.file_names(OUT) == ["0.tif", "1.tif", "2.tif"]
+
+
+def test_pairs_for_stereo_have_an_angle_between_two_and_fifty_degrees(south):
+    def pairs(*angles):
+        names = [("A", "B"), ("A", "C"), ("B", "C"), ("B", "D")]
+        of = [
+            replace(south.summary.pairs[0], a=a, b=b, convergence_deg=angle)
+            for (a, b), angle in zip(names, angles, strict=False)
+        ]
+        return pairs_of(replace(south, summary=replace(south.summary, pairs=tuple(of))))
+
+    assert pairs(2.0, 50.0, 1.9, 50.1) == [("A", "B"), ("A", "C")]
+    assert pairs(1.0, None) == [("A", "B"), ("A", "C")]  # better than none
+
+
+def test_the_run_s_raster_with_the_rpc_in_it_goes_before_the_image(southern, south, tmp_path):
+    view = replace(south.summary.views[0], outputs={"x": {}})
+    names = [f"{view.name}{end}" for row in scene.CARRIERS.values() for end in row.suffixes]
+    for name in names:
+        (tmp_path / name).write_text("x")
+    assert scene._carrier(tmp_path, view) is None  # the run says nothing of it
+    for name in names:
+        assert scene._carrier(tmp_path, replace(view, outputs={name: {}})) == tmp_path / name
+        (tmp_path / name).unlink()
+        assert scene._carrier(tmp_path, replace(view, outputs={name: {}})) is None
+    (tmp_path.parent / "outside.vrt").write_text("x")
+    (tmp_path / names[0]).symlink_to(tmp_path.parent / "outside.vrt")
+    assert scene._carrier(tmp_path, replace(view, outputs={names[0]: {}})) is None
+
+
+def test_places_of_numbers_in_a_list():
+    at, found = scene._places(np.array([2, 5, 9]), np.array([5, 9, 1, 10, 2]))
+    assert found.tolist() == [True, True, False, False, True]
+    assert at[found].tolist() == [1, 2, 0]
+    assert scene._places(np.zeros(0, int), np.array([1]))[1].tolist() == [False]
+
+
+# --- for renderers ----------------------------------------------------------------------------------------
+
+
+def test_a_record_of_sat_nerf(south):
+    files = neural.satnerf(south, OUT)
+    shot = south.shots[0]
+    one = json.loads(files[f"{shot.name}.json"])
+    assert (one["height"], one["width"], one["min_alt"], one["max_alt"]) == (700, 900, *south.alt_range)
+    assert one["img"] == south.file_names(OUT)[0]
+    assert (one["sun_elevation"], one["sun_azimuth"], one["acquisition_date"]) == (
+        52.25,
+        150.5,
+        "2013-04-17T10:32:15.5Z",
+    )
+    middle = shot.rpc.localize(np.array([449.5, 349.5]), np.array(south.origin[2]))
+    assert one["geojson"]["center"] == pytest.approx(middle[:2])
+    assert one["geojson"]["type"] == "Polygon"
+    assert one["keypoints"]["2d_coordinates"] == pytest.approx(shot.xy)
+    assert one["keypoints"]["pts3d_indices"] == shot.index.tolist()
+    top = ecef_from_ground(shot.rpc.localize(shot.xy, np.full(len(shot.xy), south.alt_range[1])))
+    points = np.load(io.BytesIO(files["pts3d.npy"]))
+    assert points == pytest.approx(ecef_from_ground(south.points))
+    assert one["keypoints"]["depths"] == pytest.approx(np.linalg.norm(top - points[shot.index], axis=1))
+    names = [f"{shot.name}.json" for shot in south.shots]
+    assert (files["train.txt"].decode(), files["test.txt"].decode()) == ("\n".join(names), names[-1])
+    rpc = read_rpc_of(one["rpc"])
+    assert rpc.off(shot.rpc).max() < 1e-6
+
+
+def read_rpc_of(found: dict[str, Any]):
+    """The RPC of a dictionary in the names of rpcm, by way of a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "x.json"
+        path.write_text(json.dumps({"rpc": found}))
+        return read_rpc(path)
+
+
+def test_the_frame_of_eogs_is_a_unit_ball_of_utm_metres(south, dateline):
+    for of in (south, dateline):
+        frame = neural._Utm(of)
+        corners = np.concatenate([frame.metres(neural._grid(of, shot, (2, 2))[0]) for shot in of.shots])
+        assert len(corners) == 3 * 8
+        assert frame.center == pytest.approx([*corners[:, :2].mean(axis=0), of.alt_range[0]])
+        away = (corners - frame.center) / frame.scale
+        assert np.linalg.norm(away, axis=1).max() == pytest.approx(1.0)
+        model = frame.models(of, of.shots[0])["model"]
+        assert model["min_world"] == pytest.approx(away.min(axis=0))
+        assert model["max_world"] == pytest.approx(away.max(axis=0))
+        assert (model["scale"], model["n"], model["l"]) == (frame.scale, frame.zone, frame.band)
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "zone", "band", "crs"),
+    [
+        (-180.0, 0.0, 1, "N", "EPSG:32601"), (-174.1, -0.1, 1, "M", "EPSG:32701"), (-173.9, 71.9, 2, "W", "EPSG:32602"),
+        (179.9, 72.0, 60, "X", "EPSG:32660"), (180.0, 84.0, 1, "X", "EPSG:32601"), (3.0, -80.0, 31, "C", "EPSG:32731"),
+        (3.0, -89.0, 31, "C", "EPSG:32731"), (3.0, 89.0, 31, "X", "EPSG:32631"), (2.0, 48.9, 31, "U", "EPSG:32631"),
+    ],
+)  # fmt: skip
+def test_a_utm_zone_has_its_number_and_letter(monkeypatch, lon, lat, zone, band, crs):
+    monkeypatch.setattr(neural, "_grid", lambda *_: (np.array([[lon, lat, 0.0], [lon, lat, 9.0]]), None))
+    monkeypatch.setattr(neural._Utm, "metres", lambda _, ground: ground)
+    of = type("Made", (), {"origin": np.array([lon, lat, 0.0]), "shots": [0], "alt_range": (0.0, 9.0)})()
+    frame = neural._Utm(of)
+    assert (frame.zone, frame.band, frame._crs) == (zone, band, crs)
+
+
+def test_an_affine_camera_of_eogs_goes_from_minus_one_to_one_over_the_image(south):
+    shot, frame = south.shots[2], neural._Utm(south)
+    found = frame.models(south, shot)
+    linear, shift = found["model"]["coef_"], found["model"]["intercept_"]
+    ground, image = neural._grid(south, shot, (21, 9))
+    assert len(image) == 21 * 21 * 9
+    seen = (frame.metres(ground) - frame.center) / frame.scale @ linear.T + shift
+    off = (seen[:, :2] + 1.0) / 2.0 * [900, 700] - 0.5 - image
+    assert found["affine_error_px"] == pytest.approx(np.hypot(*off.T).max(), rel=1e-6)
+    assert found["affine_error_px"] < 0.3
+    assert np.abs(off.mean(axis=0)).max() < 1e-6
+    assert seen[:, 2] == pytest.approx(ground[:, 2], abs=1e-6)
+    assert found["sun_model"] is None  # nothing says where the sun stood
+
+
+def test_the_sun_sees_a_point_and_its_shadow_in_one_place(south):
+    frame = neural._Utm(south)
+    shot = replace(south.shots[0], light=Light(52.25, 150.5, None))
+    found = frame.models(south, shot)
+    linear, sun = found["model"]["coef_"], found["sun_model"]
+    up, around = np.radians([52.25, 150.5])
+    ray = np.array([np.sin(around) * np.cos(up), np.cos(around) * np.cos(up), np.sin(up)])
+    assert np.cross(sun["sun_dir_ecef"], ray) == pytest.approx(np.zeros(3), abs=1e-9)
+    assert (linear @ sun["sun_dir_ecef"])[2] == pytest.approx(1.0)
+    assert (sun["coef_"] @ ray)[:2] == pytest.approx([0, 0], abs=1e-9)
+    assert sun["coef_"] == pytest.approx(sun["camera_to_sun"] @ linear)
+    assert sun["camera_to_sun"][2].tolist() == [0, 0, 1]
+    assert sun["intercept_"] == pytest.approx(found["model"]["intercept_"])
+    for light in (Light(None, 150.5, None), Light(52.25, None, None)):
+        assert frame.models(south, replace(shot, light=light))["sun_model"] is None
+
+
+def test_a_cloud_of_renderers_is_float_and_grey(south):
+    head, body = neural._cloud(south).split(b"end_header\n", 1)
+    kind = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    cloud = np.frombuffer(body, dtype=kind)
+    assert cloud["xyz"] == pytest.approx(south.world(south.points), abs=1e-2)
+    assert set(cloud["rgb"].ravel().tolist()) == {128}
+    lines = head.decode().splitlines()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", f"element vertex {len(south.points)}"]
+    assert [line.split()[1:] for line in lines[3:]] == [["float", axis] for axis in "xyz"] + [
+        ["uchar", c] for c in ("red", "green", "blue")
+    ]
+
+
+def test_a_camera_that_no_pinhole_comes_near_is_refused(south, monkeypatch):
+    good = neural.fit_pinhole(south.samples(south.shots[0]), **south.view_of(south.shots[0]))
+    for wrong in (
+        replace(good, focal=good.focal * [1, -1]),
+        replace(good, translation=good.translation * np.nan),
+    ):
+        monkeypatch.setattr(neural, "fit_pinhole", lambda *_, found=wrong, **__: found)
+        with pytest.raises(InputError, match="mirrored, or no pinhole"):
+            neural.pinhole_of(south, south.shots[0])
+
+
+@pytest.fixture(scope="module")
+def model(south) -> tuple[Scene, dict[str, list[str]], dict[str, Any]]:
+    """COLMAP's texts of the scene, its lines by file."""
+    of = replace(
+        south, shots=tuple(replace(shot, file=f"/images/{k}.tif") for k, shot in enumerate(south.shots))
+    )
+    files = neural.colmap(of, OUT)
+    assert set(files) == {"cameras.txt", "images.txt", "points3D.txt", "world.json"}
+    return (
+        of,
+        {name: data.decode().split("\n")[:-1] for name, data in files.items()},
+        json.loads(files["world.json"]),
+    )
+
+
+def turned(quaternion: list[float]) -> np.ndarray:
+    w, x, y, z = quaternion
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def test_colmap_s_texts_hold_the_scene(model):
+    of, texts, about = model
+    points = {}
+    world = of.world(of.points)
+    for line in texts["points3D.txt"]:
+        number, *rest = line.split()
+        points[int(number)] = np.array(rest[:3], float)
+        assert rest[3:6] == ["128"] * 3
+        assert points[int(number)] == pytest.approx(world[int(number) - 1])
+    assert list(points) == sorted(points)
+    errors: dict[int, list[float]] = {number: [] for number in points}
+    for k, shot in enumerate(of.shots):
+        number, kind, width, height, *numbers = texts["cameras.txt"][k].split()
+        assert (number, kind, width, height) == (str(k + 1), "PINHOLE", "900", "700")
+        fx, fy, cx, cy = map(float, numbers)
+        head = texts["images.txt"][2 * k].split()
+        assert (head[0], head[8], head[9]) == (str(k + 1), str(k + 1), f"{k}.tif")
+        assert float(head[1]) >= 0
+        rotation, move = turned([float(word) for word in head[1:5]]), np.array(head[5:8], float)
+        places = np.array(texts["images.txt"][2 * k + 1].split(), float).reshape(-1, 3)
+        assert places[:, :2] == pytest.approx(shot.xy + 0.5)
+        assert places[:, 2].astype(int).tolist() == (shot.index + 1).tolist()
+        seen = np.array([points[int(n)] for n in places[:, 2]]) @ rotation.T + move
+        off = np.hypot(*(seen[:, :2] / seen[:, 2:] * [fx, fy] + [cx, cy] - places[:, :2]).T)
+        assert np.median(off) < 0.4
+        for n, error in zip(places[:, 2].astype(int), off, strict=True):
+            errors[n].append(error)
+    for line in texts["points3D.txt"]:
+        words = line.split()
+        assert float(words[7]) == pytest.approx(np.mean(errors[int(words[0])]), abs=1e-6)
+        track = [(int(a) - 1, int(b)) for a, b in zip(words[8::2], words[9::2], strict=True)]
+        assert [of.shots[image].index[place] + 1 for image, place in track] == [int(words[0])] * len(track)
+        assert len(track) == len(errors[int(words[0])]) >= 2
+    assert list(about["pinhole_error_px"]) == ["0.tif", "1.tif", "2.tif"]
+    assert all(0 < error < 0.5 for error in about["pinhole_error_px"].values())
+    assert np.array(about["world_to_ecef"]) == pytest.approx(of.world_to_ecef)
+    assert about["alt_range"] == list(of.alt_range)
+    assert about["images"] == {f"{k}.tif": f"../../images/{k}.tif" for k in range(3)}
+
+
+# --- for stereo -------------------------------------------------------------------------------------------
+
+
+def test_stereo_pipelines_get_images_and_cameras(south, southern):
+    carried = with_shot(south, carrier=southern / "a.vrt")
+    config = json.loads(stereo.s2p(carried, southern)["config.json"])
+    assert (config["out_dir"], config["full_img"]) == ("s2p_out", True)
+    assert config["images"][0]["img"] == "a.vrt"  # the run's raster goes before the image
+    assert config["images"][1]["img"] == link(south.shots[1].file, southern)
+    assert read_rpc_of(config["images"][1]["rpc"]).off(south.shots[1].rpc).max() < 1e-6
+    files = stereo.asp(carried, southern)
+    names = [shot.name for shot in south.shots]
+    assert files["cameras.txt"].decode() == "".join(f"{name}.xml\n" for name in names)
+    assert files["images.txt"].decode().split("\n")[:2] == ["a.vrt", link(south.shots[1].file, southern)]
+    assert files["images.txt"].endswith(b"\n")
+    assert set(files) == {*(f"{name}.xml" for name in names), "cameras.txt", "images.txt"}
+    for end, made in (("xml", files), ("geom", stereo.cars(south, southern))):
+        path = southern.parent / f"check.{end}"
+        path.write_bytes(made[f"{names[0]}.{end}"])
+        assert read_rpc(path).off(south.shots[0].rpc).max() < 1e-5
+
+
+def test_the_yaml_of_cars(south):
+    lines = stereo.cars(south, OUT)["inputs.yaml"].decode().splitlines()
+    first = south.shots[0]
+    assert lines[:2] == ['"input":', '  "sensors":']
+    at = lines.index(f'    "{first.name}":')
+    assert lines[at + 1 : at + 5] == [
+        f'      "image": {json.dumps(link(first.file, OUT), ensure_ascii=False)}',
+        '      "geomodel":',
+        f'        "path": "{first.name}.geom"',
+        '        "model_type": "RPC"',
+    ]
+    at = lines.index('  "pairing":')
+    pairs = [json.loads(line.strip().removeprefix("- ")) for line in lines[at + 1 : -2]]
+    assert [tuple(pair) for pair in pairs] == list(pairs_of(south))
+    assert all(line.startswith("    - [") for line in lines[at + 1 : -2])
+    assert lines[-2:] == ['"output":', '  "directory": "cars_out"']
+    assert stereo.yaml({"a": {}, "b": [], "c": 1, "é": {"x": None}}) == [
+        '"a": {}',
+        '"b": []',
+        '"c": 1',
+        '"é":',
+        '  "x": null',
+    ]
+
+
+# --- for catalogues ---------------------------------------------------------------------------------------
+
+
+def test_a_stac_item_says_where_when_and_how(south, southern):
+    name = south.shots[0].name
+    item = json.loads(catalogue.stac(south, OUT)[f"{name}.json"])
+    assert (item["type"], item["stac_version"], item["id"], item["links"]) == ("Feature", "1.1.0", name, [])
+    assert item["stac_extensions"][0] == "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
+    ring = np.array(item["geometry"]["coordinates"][0])
+    assert item["bbox"] == pytest.approx(
+        [ring[:, 0].min(), ring[:, 1].min(), ring[:, 0].max(), ring[:, 1].max()]
+    )
+    found, view = item["properties"], south.shots[0].entry
+    assert (found["datetime"], found["proj:shape"], found["proj:code"]) == (
+        "2013-04-17T10:32:15.5Z",
+        [700, 900],
+        None,
+    )
+    assert "start_datetime" not in found
+    assert (found["gsd"], found["view:incidence_angle"], found["view:azimuth"]) == (
+        view.gsd_m,
+        view.incidence_deg,
+        view.azimuth_deg,
+    )
+    assert (found["view:sun_azimuth"], found["view:sun_elevation"]) == (150.5, 52.25)
+    assert found["processing:software"] == {"barpc": south.summary.barpc}
+    assert item["assets"]["image"] == {"href": link(south.shots[0].file, OUT), "roles": ["source"]}
+    (output,) = view.outputs
+    assert item["assets"][output]["href"] == link(southern / output, OUT)
+
+
+def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
+    unknown = json.loads(catalogue.stac(south, OUT)[f"{south.shots[1].name}.json"])["properties"]
+    assert unknown["datetime"] is None
+    assert (unknown["start_datetime"], unknown["end_datetime"]) == (
+        "1957-10-04T00:00:00Z",
+        "9999-12-31T23:59:59Z",
+    )
+    assert "view:sun_azimuth" not in unknown
+    day = with_shot(south, light=Light(None, None, "2020-01-02"))
+    name = south.shots[0].name
+    assert (
+        json.loads(catalogue.stac(day, OUT)[f"{name}.json"])["properties"]["datetime"]
+        == "2020-01-02T00:00:00Z"
+    )
+    west, south_lat, east, north = json.loads(
+        catalogue.stac(dateline, OUT)[f"{dateline.shots[0].name}.json"]
+    )["bbox"]
+    assert 179 < west < 180
+    assert -180 < east < -179
+    assert south_lat < -16.8 < north
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "role"),
+    [
+        ("a.TIF", "image/tiff; application=geotiff", "data"), ("a.vrt", "application/xml", "data"),
+        ("a.xml", "application/xml", "metadata"), ("a.json", "application/json", "metadata"),
+        ("a.ntf", "application/vnd.nitf", "data"), ("a_RPC.TXT", "text/plain", "metadata"),
+    ],
+)  # fmt: skip
+def test_a_file_of_a_run_has_its_kind(name, kind, role):
+    assert catalogue._asset(Path("/elsewhere") / name, OUT) == {
+        "href": f"../{name}",
+        "type": kind,
+        "roles": [role],
+    }
+
+
+def test_a_point_s_covariance_is_the_inverse_of_what_its_rays_tell(south):
+    found = catalogue._covariances(south)
+    steps = np.eye(3) * 0.5
+    for point in (0, 7, 40):
+        ground = south.points[point]
+        normal = np.zeros((3, 3))
+        for shot in south.shots:
+            if point in shot.index:
+                at = ecef_from_ground(ground)
+                moved = [
+                    ground_from_ecef(at + sign * steps @ enu_basis(south.origin)) for sign in (1.0, -1.0)
+                ]
+                rows = (shot.rpc.project(moved[0]) - shot.rpc.project(moved[1])).T
+                normal += rows.T @ rows
+        assert found[point] == pytest.approx(south.noise**2 * np.linalg.inv(normal), rel=1e-3, abs=1e-9)
+
+
+def test_a_point_that_one_image_shows_is_not_known(south):
+    alone = replace(south, shots=south.shots[:1])
+    assert np.isnan(catalogue._covariances(alone)).all()
+    files = catalogue.points(alone, OUT)
+    assert files["points.csv"].decode().splitlines()[2].endswith(",,,,,,")
+
+
+def test_points_are_written_with_their_covariance(south):
+    files = catalogue.points(south, OUT)
+    comment, header, *rows = files["points.csv"].decode().splitlines()
+    place = ", ".join(f"{value:.4g}" for value in south.summary.scene.sigma_enu_m)
+    assert comment == (
+        f"# covariance [m2] of the intersection alone; noise {south.noise:.4g} px; the scene's own place east, north, "
+        f"up is known to [m]: {place}"
+    )
+    assert header == "track,lon,lat,alt,var_ee,var_en,var_eu,var_nn,var_nu,var_uu"
+    covariance = catalogue._covariances(south)
+    table = np.array([row.split(",") for row in rows], float)
+    assert table[:, 0].astype(int).tolist() == south.tracks.tolist()
+    assert np.abs(table[:, 1:3] - south.points[:, :2]).max() < 1e-9
+    assert np.abs(table[:, 3] - south.points[:, 2]).max() < 1e-4
+    columns = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    values = np.array([covariance[:, i, j] for i, j in columns]).T
+    assert table[:, 4:] == pytest.approx(values, rel=1e-5)
+    head, body = files["points.ply"].split(b"end_header\n", 1)
+    kind = np.dtype([("xyz", "<f8", 3), ("track", "<i4"), ("var", "<f4", 6)])
+    cloud = np.frombuffer(body, dtype=kind)
+    assert cloud["xyz"] == pytest.approx(south.world(south.points))
+    assert cloud["track"].tolist() == south.tracks.tolist()
+    assert cloud["var"] == pytest.approx(values, rel=1e-6)
+    lines = head.decode().splitlines()
+    assert lines[2] == f"comment {comment[2:]}"
+    lon, lat, alt = south.origin
+    assert (
+        lines[3]
+        == f"comment x east, y north, z up [m] of lon {lon:.9f} lat {lat:.9f} alt {alt:.4f} (WGS84, ellipsoid)"
+    )
+    assert lines[4] == f"element vertex {len(south.points)}"
+    assert [line.split()[1:] for line in lines[5:]] == [
+        *(["double", axis] for axis in "xyz"), ["int", "track"], *(["float", name] for name in header.split(",")[4:]),
+    ]  # fmt: skip
+    unknown = catalogue.points(replace(south, summary=replace(south.summary, scene=None)), OUT)["points.csv"]
+    assert unknown.decode().splitlines()[0].endswith("is known to [m]: unknown")
+    assert isinstance(south.samples(south.shots[0]), Samples)
+
+
+@pytest.mark.parametrize(
+    ("tracks", "noise"),
+    [([0, 0, 1, 1], 1.0), ([0, 0, 0, 0], np.sqrt(8 * 0.25 / 5)), ([0, 0, 1, 2], np.nan)],
+)
+def test_noise_is_what_is_left_over_the_observations_that_points_did_not_take(tracks, noise):
+    after = np.full((5, 2), 0.5)
+    after[4] = np.nan
+    observed = SimpleNamespace(after=after, track=np.array([*tracks, tracks[-1]]))
+    found = scene._noise(SimpleNamespace(observations=observed), np.arange(5))
+    np.testing.assert_allclose(found, noise)
+
+
+def test_nothing_is_known_of_noise_without_observations_to_spare():
+    observed = SimpleNamespace(after=np.full((3, 2), 0.5), track=np.array([0, 0, 1]))
+    assert np.isnan(scene._noise(SimpleNamespace(observations=observed), np.arange(3)))
+    assert np.isnan(scene._noise(SimpleNamespace(observations=observed), np.zeros(0, int)))

@@ -1,0 +1,522 @@
+"""Maps: every outline, line, dot, ellipse and arrow stands where the ground or the image has it."""
+
+from __future__ import annotations
+
+import math
+import re
+from itertools import chain
+
+import numpy as np
+import pytest
+
+from barpc.report import charts, maps
+from barpc.report.maps import Plane, cells_of, ground_map, place_map, residual_panels
+from barpc.report.summary import CheckPointEntry, EllipseEntry
+from barpc.report.tables import Pictures
+
+from .made import (
+    Drawing,
+    a_correction,
+    a_gcp,
+    a_pair,
+    a_square,
+    a_summary,
+    a_view,
+    corners,
+    files_of,
+    seen,
+)
+
+LON, LAT = 111319.491, 110574.276  # m of a degree at the equator, WGS84
+
+
+def drawn_of(parts) -> Drawing:
+    return Drawing(f"<svg>{''.join(parts)}</svg>")
+
+
+def plane(height: float = 300.0, unit: float = 100.0) -> Plane:
+    return Plane(10.0, 0.0, np.array([unit, 2 * unit]), height, unit / LON)
+
+
+# --- the plane --------------------------------------------------------------------------------------------
+
+
+def test_a_place_stands_east_to_the_right_and_north_up():
+    found = plane()(np.array([[10.0, 0.0], [11.0, 0.5], [9.5, -0.25], [370.5, 0.0]]))
+    assert found.tolist() == [[210, 150], [310, 50], [160, 200], [260, 150]]
+
+
+def test_the_map_of_a_wide_scene_fills_the_sheet_from_side_to_side():
+    found = maps._plane_of(np.array([[10.0, -0.1], [10.4, 0.1], [370.2, 0.0]]))
+    assert (found.lon, found.lat) == pytest.approx((10.2, 0.0))
+    assert found.unit[0] * 0.4 == pytest.approx(420 - 2 * 34)
+    assert found.scale == pytest.approx(352 / (0.4 * LON), rel=1e-6)
+    assert found.unit[1] / found.unit[0] == pytest.approx(LAT / LON, rel=1e-6)
+    assert found.height == pytest.approx(0.2 * found.unit[1] + 92)
+
+
+def test_the_map_of_a_tall_scene_is_420_units_tall_and_of_one_place_a_metre_wide():
+    tall = maps._plane_of(np.array([[10.0, -1.0], [10.4, 1.0]]))
+    assert tall.height == pytest.approx(420 + 92)
+    assert tall.unit[1] * 2.0 == pytest.approx(420)
+    one = maps._plane_of(np.array([[10.0, 1.0]]))
+    assert one.scale == pytest.approx(352)
+    assert one.height == pytest.approx(352 + 92)
+
+
+def test_a_scene_across_the_antimeridian_is_not_round_the_earth():
+    found = maps._plane_of(np.array([[179.9, 0.0], [-179.9, 0.1]]))
+    assert found.lon % 360 == pytest.approx(180.0)
+    assert found.unit[0] * 0.2 == pytest.approx(352)
+
+
+def test_the_graticule_says_round_degrees_and_the_scale_bar_a_round_length():
+    lines, texts = maps._graticule(plane(unit=120.0))  # 420 units are 3.5 degrees, 390 km
+    drawn = drawn_of([*lines, *texts])
+    assert drawn.lines("grid") == [
+        (90, 4, 90, 276), (210, 4, 210, 276), (330, 4, 330, 276), (4, 150, 416, 150), (4, 30, 416, 30),
+    ]  # fmt: skip
+    assert drawn.texts("degrees") == [
+        ("9° E", 90, 272, "middle"), ("10° E", 210, 272, "middle"), ("11° E", 330, 272, "middle"),
+        ("0°", 4, 147, "start"), ("0.5° N", 4, 27, "start"),
+    ]  # fmt: skip
+    length = 100000 * 120 / LON
+    assert drawn.rects("scalebar") == [pytest.approx((416 - length, 285, length, 4), abs=0.011)]
+    assert drawn.texts("tick") == [
+        ("100 km", pytest.approx(416 - length - 6, abs=0.006), 291, "end"),
+        ("north is up", 4, 291, "start"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("metres", "words"),
+    [(900.0, "500 m"), (990.0, "500 m"), (1090.0, "1 km"), (4e3, "4 km"), (2.5, "2 m"), (7e5, "500 km")],
+)
+def test_a_short_scale_bar_is_in_metres(metres, words):
+    """`metres`: in 110 units."""
+    wide = Plane(0.0, 0.0, np.array([110 / metres * LON] * 2), 300.0, 110.0 / metres)
+    assert words in [text for text, *_ in drawn_of(maps._graticule(wide)[1]).texts("tick")]
+
+
+def test_no_number_of_the_graticule_stands_at_the_sheet_s_edge():
+    for lon, lat in ((10.0, 0.0), (10.3, 0.13), (179.9, -33.3), *((k / 7.0, k / 9.0) for k in range(14))):
+        found = Plane(lon, lat, np.array([77.0, 91.0]), 300.0, 77.0 / LON)
+        drawn = drawn_of([*chain(*maps._graticule(found))])
+        across = [line for line in drawn.lines("grid") if line[0] == line[2]]
+        down = [line for line in drawn.lines("grid") if line[1] == line[3]]
+        assert all(50 < x < 376 for x, *_ in across)
+        assert all(16 < y < 256 for _, y, *_ in down)
+        step = np.diff([x for x, *_ in across])
+        assert len(across) >= 2
+        assert across[0][0] - step[0] < 51
+        assert across[-1][0] + step[0] > 375
+        assert len(down) >= 1
+
+
+@pytest.mark.parametrize(
+    ("lon", "words"), [(180.0, "180° W"), (181.0, "179° W"), (179.0, "179° E"), (-1.0, "1° W")]
+)
+def test_degrees_are_east_or_west_of_greenwich(lon, words):
+    found = Plane(lon, 0.0, np.array([130.0, 130.0]), 300.0, 1e-3)
+    assert words in [text for text, *_ in drawn_of(maps._graticule(found)[1]).texts("degrees")]
+
+
+# --- images on the ground ---------------------------------------------------------------------------------
+
+
+def scene():
+    """Two images over each other, and one a tenth of a degree to the east."""
+    views = [a_view("A", num_observations=5), a_view("B", status="weak"), a_view("C", status="failed")]
+    outlines = [a_square(10.0, 0.0), a_square(10.001, 0.001), a_square(10.1, 0.0)]
+    pairs = [a_pair("A", "B", 900), a_pair("A", "C", 30), a_pair("B", "C", 70)]
+    return views, outlines, pairs
+
+
+def test_the_ground_map_has_outlines_dots_lines_and_points():
+    views, outlines, pairs = scene()
+    known = CheckPointEntry("Q", 10.05, -0.01, 0.0, (None, None, None), ())
+    summary = a_summary(views, pairs, gcps=(a_gcp("P", 10.05, 0.005),), check_points=(known,))
+    points = [(10.0, 0.0, 5.0, 0.1), (10.1, 0.005, 5.0, 0.1)]
+    drawn = Drawing(ground_map(files_of(summary, outlines, points)))
+    at = maps._plane_of(np.concatenate([*[*chain(*outlines)], np.array(points)[:, :2]]))
+    assert drawn.box == (420, pytest.approx(at.height, abs=0.006))
+    for status, outline in zip(("adjusted", "weak", "failed"), outlines, strict=True):
+        (found,) = drawn.points(f"outline {status}")
+        assert np.array(found) == pytest.approx(at(outline[0][:-1]), abs=0.006)
+    assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["0", "1", "2"]
+    assert drawn.titles("outline adjusted") == ["A: 5 tie points"]
+    (dots,) = drawn.all("path", "point")
+    assert np.array(corners(dots.get("d"))) == pytest.approx(at(np.array(points)[:, :2]), abs=0.06)
+    assert drawn.titles("tie") == ["1-2 - 3: 100 matches"]  # of all pairs between the stacks; none within one
+    middle = (at(outlines[0][0][:-1]).mean(axis=0), at(outlines[2][0][:-1]).mean(axis=0))
+    assert drawn.lines("tie") == [pytest.approx(np.concatenate(middle), abs=0.006)]
+    assert drawn.texts("stack") == [
+        ("1-2", pytest.approx(middle[0][0], abs=0.006), pytest.approx(middle[0][1] + 4, abs=0.006), "middle"),
+        ("3", pytest.approx(middle[1][0], abs=0.006), pytest.approx(middle[1][1] + 4, abs=0.006), "middle"),
+    ]
+    x, y = at(np.array([10.05, 0.005]))
+    assert np.array(drawn.points("gcps")[0]) == pytest.approx(
+        np.array([(x, y - 6), (x + 5, y + 4), (x - 5, y + 4)]), abs=0.006
+    )
+    x, y = at(np.array([10.05, -0.01]))
+    assert np.array(drawn.points("check_points")[0]) == pytest.approx(
+        np.array([(x, y + 6), (x + 5, y - 4), (x - 5, y - 4)]), abs=0.006
+    )
+    assert (drawn.titles("gcps"), drawn.titles("check_points")) == (["P"], ["Q"])
+    assert drawn.described == "3 outlines, 3 pairs, 1 GCPs, 1 check points."
+    assert drawn.root.get("class") is None
+
+
+def test_a_point_outside_of_all_images_is_on_the_map_too():
+    views, outlines, _ = scene()
+    drawn = Drawing(ground_map(files_of(a_summary(views, gcps=(a_gcp("P", 10.3, 0.0),)), outlines)))
+    assert max(x for x, _ in drawn.points("gcps")[0]) < 420
+    assert drawn.points("point") == [[(0.0, 0.0)]]  # no tie point, and a path all the same
+
+
+def test_of_many_tie_points_and_images_some_are_drawn(monkeypatch):
+    views, outlines, _ = scene()
+    points = [(10.0 + 1e-6 * k, 0.0, 0.0, 0.0) for k in range(1501)]
+    assert len(Drawing(ground_map(files_of(a_summary(views), outlines, points))).points("point")[0]) == 751
+    assert (
+        len(Drawing(ground_map(files_of(a_summary(views), outlines, points[:1500]))).points("point")[0])
+        == 1500
+    )
+    monkeypatch.setattr(maps, "MAX_DRAWN", 2)
+    drawn = Drawing(ground_map(files_of(a_summary(views), outlines)))
+    assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["0", "2"]
+
+
+@pytest.mark.parametrize(
+    ("num", "many", "named"), [(30, False, True), (31, True, True), (100, True, True), (101, True, False)]
+)
+def test_a_map_of_many_stacks_has_thinner_lines_and_fewer_numbers(num, many, named):
+    views = [a_view(f"V{k}") for k in range(num)]
+    outlines = [a_square(10.0 + 0.4 * (k % 11), 0.4 * (k // 11)) for k in range(num)]
+    drawn = Drawing(ground_map(files_of(a_summary(views), outlines)))
+    assert drawn.root.get("class") == ("many" if many else None)
+    assert bool(drawn.texts("stack")) == named
+
+
+def test_lines_between_images_grow_with_the_root_of_their_matches(monkeypatch):
+    links = [((0, 0), (1, 1), 25, "a - b"), ((2, 0), (3, 1), 100, "c - d"), ((4, 0), (5, 1), 4, "e - f")]
+    drawn = drawn_of(maps._ties(links, (0.6, 2.4), (0.2, 0.7)))
+    assert drawn.titles() == [
+        "e - f: 4 matches",
+        "a - b: 25 matches",
+        "c - d: 100 matches",
+    ]  # the strongest on top
+    found = drawn.of("line", "tie", "x1", "y1", "x2", "y2", "stroke-width", "stroke-opacity")
+    assert found == [(4, 0, 5, 1, 1.08, 0.34), (0, 0, 1, 1, 1.8, 0.55), (2, 0, 3, 1, 3.0, 0.9)]
+    monkeypatch.setattr(maps, "_MOST_LINKS", 2)
+    assert drawn_of(maps._ties(links, (0.6, 2.4), (0.2, 0.7))).titles()[0] == "a - b: 25 matches"
+    assert maps._ties([], (0.6, 2.4), (0.2, 0.7)) == []
+
+
+@pytest.mark.parametrize(
+    ("views", "text"),
+    [
+        ([0], "1"), ([0, 1], "1-2"), ([0, 1, 2, 5], "1-3, 6"), ([0, 2, 4, 6], "1, 3, 5, 7"),
+        ([0, 2, 4, 6, 8], "1, 3, 5 …"), ([3, 4, 6], "4-5, 7"),
+    ],
+)  # fmt: skip
+def test_a_stack_is_called_by_the_numbers_of_its_images(views, text):
+    assert maps.Stack(views, np.zeros(2)).text == text
+
+
+def test_images_nearer_than_26_units_are_one_stack_whatever_cell_they_lie_in():
+    middles = [(100.0, 100.0), (125.9, 100.0), (126.1, 100.0), (100.0, 126.1), (300.0, 20.0), (318.0, 38.0)]
+    at = plane()
+    outlines = [[np.array([[10 + (x - 210) / 100, (150 - y) / 200]] * 4)] for x, y in middles]
+    found = maps._stacks(at, outlines)
+    assert [stack.views for stack in found] == [[0, 1], [2], [3], [4, 5]]
+    assert np.array([stack.place for stack in found]) == pytest.approx(
+        np.array([middles[k] for k in (0, 2, 3, 4)])
+    )
+    assert maps._stacks(at, [[], outlines[0]])[0].views == [1]  # an image that shows no ground has none
+
+
+def test_of_two_stacks_as_near_the_earlier_takes_an_image():
+    outlines = [[np.array([[10 + (x - 210) / 100, 0.0]] * 4)] for x in (100.0, 140.0, 120.0)]
+    assert [stack.views for stack in maps._stacks(plane(), outlines)] == [[0, 2], [1]]
+
+
+@pytest.mark.parametrize(
+    ("dx", "dy", "num", "shown"),
+    [
+        (7.3, 0.0, 2, True), (7.1, 0.0, 2, False), (0.0, 14.1, 2, True), (0.0, 13.9, 2, False),
+        (7.3, 0.0, 31, False), (21.3, 0.0, 31, True), (0.0, 28.1, 31, True), (0.0, 27.9, 31, False),
+    ],
+)  # fmt: skip
+def test_numbers_do_not_stand_on_each_other_and_farther_apart_where_there_are_many(dx, dy, num, shown):
+    places = [np.zeros(2), np.array([dx, dy]), *(np.array([1000.0 * k, 500.0]) for k in range(1, num - 1))]
+    stacks = [maps.Stack([0], place) for place in places]
+    assert len(maps._stack_names(stacks)) == num - (not shown)
+
+
+# --- error ellipses ---------------------------------------------------------------------------------------
+
+
+def known(name: str, major: float | None, minor: float = 1.0, ce90: float = 5.0, **fields):
+    ellipse = None if major is None else EllipseEntry(major, minor, 30.0, ce90)
+    return a_view(name, correction=a_correction(ellipse=ellipse), **fields)
+
+
+def shapes_of(svg: str):
+    names = "".join(rf' {name}="([\d.]+)"' for name in ("cx", "cy", "rx", "ry"))
+    pattern = rf'<ellipse{names} transform="rotate\(([-\d.]+) ([\d.]+) ([\d.]+)\)"'
+    return [tuple(map(float, found)) for found in re.findall(pattern, svg)]
+
+
+def test_an_ellipse_has_its_axes_its_direction_and_its_words():
+    views = [known("A", 4.0, 2.0, 7.0), known("B", 3.0, 1.0, 9.0, stated_ce90_m=2 * 2.146), known("C", 1.0)]
+    _, outlines, _ = scene()
+    svg, words = place_map(files_of(a_summary(views), outlines))
+    drawn, at = Drawing(svg), maps._plane_of(np.concatenate([*chain(*outlines)]))
+    times = float(re.search(r"([\d.e+]+) times as large", words)[1])
+    scale = times * at.scale
+    assert 34.0 / 2.5 < 3.0 * scale <= 34.0  # the largest that fits of 1, 2, 5
+    assert math.log10(times) % 1 == pytest.approx(
+        min((0, 0.30103, 0.69897), key=lambda v: abs(v - math.log10(times) % 1)), abs=1e-4
+    )
+    (b, c) = shapes_of(svg)  # of A and B the one with the larger CE90
+    x, y = at(outlines[0][0][:-1]).mean(axis=0)
+    assert b == pytest.approx((x, y, 3.0 * scale, 1.0 * scale, -60.0, x, y), abs=0.006)
+    assert c[2:4] == pytest.approx((scale, scale), abs=0.006)
+    assert drawn.of("circle", "ellipse stated", "cx", "cy", "r") == [
+        pytest.approx((x, y, 2.0 * scale), abs=0.006)
+    ]
+    assert drawn.titles("ellipse") == [
+        "B: 3.0 m by 1.0 m, CE90 9.0 m, stated 4.3 m",
+        "C: 1.0 m by 1.0 m, CE90 5.0 m",
+    ]
+    assert words == (
+        f"One sigma of the place on the ground of an image's middle, {times:g} times as large as the map; dashed "
+        "circles: as stated with the camera delivered. Of images that lie over each other the one with the largest."
+    )
+    for found, outline in zip(drawn.points("faint"), outlines, strict=True):
+        assert np.array(found) == pytest.approx(at(outline[0][:-1]), abs=0.006)
+    room = min(34.0, 0.5 * float(np.linalg.norm(at(np.array([0.1, 0.0])) - at(np.array([0.0, 0.0])))))
+    assert drawn.texts("stack")[0] == (
+        "1-2",
+        pytest.approx(x, abs=0.006),
+        pytest.approx(y - room - 8 + 4, abs=0.006),
+        "middle",
+    )
+
+
+def test_an_ellipse_alone_has_twice_the_room_and_a_map_may_be_to_scale():
+    at = maps._plane_of(a_square(10.0, 0.0)[0])
+    for major in (68.0 / at.scale, 68.1 / at.scale):
+        svg, words = place_map(files_of(a_summary([known("A", major)]), [a_square(10.0, 0.0)]))
+        fits = major * at.scale < 68.05
+        assert ("to scale as the map" in words) == fits
+        assert ("0.5 times as large" in words) == (not fits)
+        assert shapes_of(svg)[0][2] == pytest.approx(68.0 if fits else 34.05, abs=0.01)
+    assert "Of images" not in words
+    assert "dashed" not in words
+
+
+def test_near_images_have_ellipses_of_half_their_distance():
+    outlines = [a_square(10.0, 0.0), a_square(10.03, 0.0), a_square(10.06, 0.0), a_square(10.2, 0.0)]
+    at = maps._plane_of(np.concatenate([*chain(*outlines)]))
+    views = [known(name, 1.0) for name in "ABCD"]
+    _svg, words = place_map(files_of(a_summary(views), outlines))
+    times = float(re.search(r"([\d.e+]+) times as large", words)[1])
+    half = 0.5 * 0.03 * at.unit[0]
+    assert half / 2.5 < times * at.scale <= half < 34
+
+
+def test_what_is_stated_may_be_the_largest_and_what_is_not_known_is_not_drawn():
+    stated = known("A", 1.0, stated_ce90_m=100 * 2.146)
+    svg, _ = place_map(files_of(a_summary([stated]), [a_square(10.0, 0.0)]))
+    radius = Drawing(svg).of("circle", "ellipse stated", "r")[0][0]
+    assert 68 / 2.5 < radius <= 68
+    for views in ([known("A", None)], [a_view("A")], [known("A", 0.0, 0.0)]):
+        assert place_map(files_of(a_summary(views), [a_square(10.0, 0.0)])) is None
+    assert place_map(files_of(a_summary([known("A", 1.0)]))) is None  # no outline
+    _, words = place_map(
+        files_of(a_summary([known("A", 1.0), known("B", None)]), [a_square(10.0, 0.0), a_square(10.5, 0.0)])
+    )
+    assert words.endswith("the one with the largest.")
+
+
+def test_more_than_thirty_stacks_have_ellipses_without_numbers():
+    outlines = [a_square(10.0 + 0.4 * (k % 8), 0.4 * (k // 8)) for k in range(31)]
+    for num in (30, 31):
+        svg, _ = place_map(files_of(a_summary([known(f"V{k}", 1.0) for k in range(num)]), outlines[:num]))
+        assert bool(Drawing(svg).texts("stack")) == (num == 30)
+        assert len(shapes_of(svg)) == num
+
+
+# --- residuals over an image ------------------------------------------------------------------------------
+
+
+def test_a_cell_has_the_rms_and_the_mean_of_its_residuals():
+    xy = np.array([[10.0, 10.0], [20.0, 20.0], [799.0, 399.0]])
+    found = cells_of(xy, np.array([[3.0, 4.0], [1.0, 0.0], [0.0, -2.0]]), (800, 400))
+    assert found.rms[0, 0] == pytest.approx(math.sqrt(13))
+    assert found.rms[7, 7] == 2.0
+    assert found.mean[0, 0] == pytest.approx([2.0, 2.0])
+    assert np.isfinite(found.rms).sum() == 2
+    assert found.share == 0.0
+    assert cells_of(np.zeros((0, 2)), np.zeros((0, 2)), (800, 400)).share == 0.0
+
+
+@pytest.mark.parametrize(
+    ("num", "mean", "marked"), [(9, 10.0, False), (10, 10.0, True), (16, 0.74, False), (16, 0.76, True)]
+)
+def test_a_mean_of_ten_or_more_above_three_times_its_error_is_systematic(num, mean, marked):
+    """Scatter of one pixel: of sixteen, the mean is known to a quarter."""
+    residuals = np.column_stack([np.full(num, mean), np.where(np.arange(num) % 2, 1.0, -1.0)])
+    if num % 2:
+        residuals[-1, 1] = 0.0
+    found = cells_of(np.full((num, 2), 10.0), residuals, (800, 800))
+    assert bool(found.systematic[0, 0]) == marked
+    assert found.systematic.sum() == marked
+    assert found.share == float(marked)
+
+
+def panels(rows, views, when="after", looks=None):
+    return residual_panels(views, seen(rows), when, looks or {})
+
+
+def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
+    views = [a_view("A", size=(900, 450)), a_view("B", size=(900, 450))]
+    pushed = [(0, k, (60.0 + k % 2, 60.0), (0.0, 0.0), (0.3, 0.02 * (-1) ** k), True) for k in range(40)]
+    one = [
+        (1, 99, (899.5, 449.5), (0.0, 0.0), (0.0, 0.6), True),
+        (1, 98, (5.0, 5.0), (0, 0), (9.0, 9.0), False),
+    ]
+    charts_of, shares, key = panels([*pushed, *one], views)
+    longest = float(np.quantile([math.hypot(0.3, 0.02)] * 40 + [0.6], 0.95))
+    assert (
+        key
+        == f"A thin line of a 15th of a panel's width is {longest:.2g} px; bold arrows are drawn twice as long."
+    )
+    assert shares == [1.0, 0.0]
+    assert [caption for _, caption in charts_of] == ["1 A: 100 % systematic", "2 B: 0 % systematic"]
+    first, second = (Drawing(svg) for svg, _ in charts_of)
+    assert first.box == (180, 90)
+    assert first.rects("empty") == [(0, 0, 180, 90)]
+    (heat,) = first.rects("heat")
+    assert heat == (0, 11.25, 22.5, 11.25)
+    opacity = 0.06 + 0.5 * min(math.hypot(0.3, 0.02) / (2 * longest), 1.0)
+    assert float(first.all("rect", "heat")[0].get("fill-opacity")) == pytest.approx(opacity, abs=0.006)
+    vectors = first.all("path", "vector")[0].get("d")
+    x, y, u, v = map(float, re.match(r"M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)", vectors).groups())
+    assert (x, y) == pytest.approx((60.5 / 5, 60.5 / 5), abs=0.051)
+    assert (u - x, v - y) == pytest.approx((0.3 * 12 / longest, 0.02 * 12 / longest), abs=0.11)
+    assert vectors.count("M") == 40
+    shaft, barbs = first.points("mean")
+    length = 0.3 * 24 / longest
+    assert np.array(shaft) == pytest.approx(
+        np.array([(11.25 - length / 2, 16.875), (11.25 + length / 2, 16.875)]), abs=0.006
+    )
+    assert barbs[1] == pytest.approx((11.25 + length / 2, 16.88), abs=0.006)
+    assert first.described == "40 residuals are drawn; 100 % systematic."
+    assert first.root.get("data-v") == "0"
+    assert first.root[0].text == "Residuals over A"
+    assert second.rects("heat") == [(157.5, 78.75, 22.5, 11.25)]
+    assert float(second.all("rect", "heat")[0].get("fill-opacity")) == pytest.approx(
+        0.06 + 0.5 * 0.6 / (2 * longest), abs=0.006
+    )
+    assert not second.all("path", "mean")
+
+
+@pytest.mark.parametrize(
+    ("size", "tall"), [((100, 100), 180), ((1000, 100), 72), ((100, 1000), 450), ((400, 200), 90)]
+)
+def test_a_panel_has_the_shape_of_its_image_within_reason(size, tall):
+    charts_of, _, _ = panels([], [a_view(size=size)])
+    drawn = Drawing(charts_of[0][0])
+    assert drawn.box == (180, tall)
+    assert charts_of[0][1] == "1 A: no tie points"
+    assert drawn.all("path", "vector")[0].get("d") == "M0 0"
+
+
+def test_a_very_large_error_is_no_darker_than_dark_and_its_arrow_no_longer_than_a_cell():
+    rows = [(0, k, (50.0, 50.0), (0, 0), (0.1, 0.0), True) for k in range(200)]
+    rows += [(0, k, (950.0, 950.0), (0, 0), (3.0, 4.0), True) for k in range(200, 210)]
+    drawn = Drawing(panels(rows, [a_view(size=(1000, 1000))])[0][0][0])
+    opacities = [float(e.get("fill-opacity")) for e in drawn.all("rect", "heat")]
+    assert opacities == [0.31, 0.56]
+    small, _head, large, barbs = drawn.points("mean")
+    assert math.dist(*large) == pytest.approx(24.0, abs=0.02)
+    assert np.subtract(large[1], large[0]) == pytest.approx((14.4, 19.2), abs=0.02)
+    assert math.dist(*small) == pytest.approx(24.0, abs=0.02)
+    tip, along = np.array(large[1]), np.array([3.0, 4.0])
+    across = np.array([-4.0, 3.0]) * 0.6
+    assert np.array(barbs) == pytest.approx(
+        np.array([tip - along + across, tip, tip - along - across]), abs=0.011
+    )
+
+
+def test_a_short_arrow_has_a_short_head():
+    drawn = drawn_of([maps._arrow(np.array([50.0, 50.0]), np.array([0.0, 4.0]))])
+    shaft, barbs = drawn.points("mean")
+    assert shaft == [(50, 48), (50, 52)]
+    assert barbs == [(48.8, 50), (50, 52), (51.2, 50)]
+    nothing = drawn_of([maps._arrow(np.array([50.0, 50.0]), np.zeros(2))])
+    assert nothing.points("mean")[0] == [(50, 50), (50, 50)]
+
+
+def test_of_many_residuals_every_few_th_is_drawn_and_of_many_images_the_most_systematic(monkeypatch):
+    rows = [(0, k, (50.0, 50.0), (0, 0), (0.1 * (-1) ** k, 0.0), True) for k in range(301)]
+    assert Drawing(panels(rows, [a_view()])[0][0][0]).described.startswith("151 ")
+    assert Drawing(panels(rows[:300], [a_view()])[0][0][0]).described.startswith("300 ")
+    views = [a_view(f"V{k}") for k in range(24)]
+    assert Drawing(panels(rows[:250], views)[0][0][0]).described.startswith("250 ")
+    assert Drawing(panels(rows[:251], views)[0][0][0]).described.startswith("126 ")
+    many = [a_view(f"V{k}") for k in range(61)]
+    pushed = [(60, k, (50.0, 50.0), (0, 0), (0.1, 0.0), True) for k in range(20)]
+    found, shares, key = panels([*rows[:101], *pushed], many)
+    assert Drawing(found[0][0]).described.startswith("51 ")  # a hundred an image of sixty
+    assert len(found) == 60
+    assert found[-1][1].startswith("61 V60: 100 %")
+    assert len(shares) == 61
+    assert key.endswith(" The 60 of 61 images with the largest systematic part are shown.")
+    assert "images with" not in panels(rows, many[:60])[2]
+
+
+def test_before_and_after_are_two_and_what_is_not_known_or_used_is_left_out():
+    rows = [(0, 0, (5, 5), (1.0, 0.0), (np.nan, np.nan), True), (0, 1, (5, 5), (3.0, 0.0), (0.5, 0.0), True)]
+    before, after = panels(rows, [a_view()], "before"), panels(rows, [a_view()], "after")
+    assert Drawing(before[0][0][0]).described.startswith("2 residuals")
+    assert Drawing(after[0][0][0]).described.startswith("1 residuals")
+    assert Drawing(before[0][0][0]).root.get("aria-labelledby") == "panel-before0-t panel-before0-d"
+    assert "is 0.5 px" in after[2]
+    assert "is 2.9 px" in before[2]
+    assert "is 1 px" in panels([(0, 1, (5, 5), (0, 0), (0.0, 0.0), True)], [a_view()])[2]
+
+
+def test_a_quick_look_lies_under_its_residuals():
+    rows = [(0, 0, (5, 5), (0, 0), (1.0, 0.0), True)]
+    svg = panels(rows, [a_view("A"), a_view("B")], looks={"A": "QUJD"})[0][0][0]
+    assert (
+        svg.index("</desc>")
+        < svg.index('<image href="data:image/jpeg;base64,QUJD"')
+        < svg.index('class="empty"')
+    )
+    assert 'width="100%" height="100%" preserveAspectRatio="none"/>' in svg
+    assert "<image" not in panels(rows, [a_view("A"), a_view("B")], looks={"A": "QUJD"})[0][1][0]
+    assert isinstance(Pictures({}, ()).quicklooks, dict)
+    assert charts.WIDTH == 420
+
+
+@pytest.mark.parametrize(
+    ("x", "shown"), [(50.5, True), (49.5, False), (375.5, True), (376.5, False), (410.0, False)]
+)
+def test_a_meridian_has_room_for_its_number(x, shown):
+    found = Plane(10.0 - (x - 210) / 200, 0.25, np.array([200.0, 200.0]), 300.0, 1e-3)
+    lines = drawn_of(chain(*maps._graticule(found))).lines("grid")
+    assert (any(line[0] == pytest.approx(x, abs=0.006) and line[0] == line[2] for line in lines)) == shown
+
+
+@pytest.mark.parametrize(
+    ("y", "shown"), [(16.5, True), (15.5, False), (255.5, True), (256.5, False), (270.0, False)]
+)
+def test_a_parallel_has_room_for_its_number(y, shown):
+    found = Plane(10.25, (y - 150) / 200, np.array([200.0, 200.0]), 300.0, 1e-3)
+    lines = drawn_of(chain(*maps._graticule(found))).lines("grid")
+    assert (any(line[1] == pytest.approx(y, abs=0.006) and line[1] == line[3] for line in lines)) == shown

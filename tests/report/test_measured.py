@@ -1,0 +1,361 @@
+"""What is measured of views, pairs and known points: against figures by hand, with cameras that are simple."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from barpc.ba.smooth import SmoothTest
+from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.report import Run
+from barpc.report import run as runs
+from barpc.report.decisions import decisions
+from barpc.report.run import ControlResidual, PairTies, pair_ties, triangulate_tracks
+from barpc.report.summary import cell_numbers, measure
+from barpc.report.summary.ground import GcpEntry, measure_control, measure_gcps, measure_reference
+from barpc.report.summary.place import ce90
+from barpc.report.summary.scene import _asked
+from barpc.report.summary.views import _in_image, rmse_by_view
+from barpc.scene import Tracks
+from barpc.sensor.geometry import epipolar_offset
+from barpc.sensor.splined import RowSpline
+from barpc.tie.reference import Registration, ViewMatch
+
+from .made import a_gcp
+
+
+def tracks_of(*rows: tuple[int, int, float, float], sigma: float = 0.1) -> Tracks:
+    """Rows of point, view, col, row."""
+    point, view, col, row = (np.array(column) for column in zip(*rows, strict=True))
+    return Tracks(view, point, np.column_stack([col, row]), np.full(len(rows), sigma))
+
+
+# --- tie points -------------------------------------------------------------------------------------------
+
+
+def test_pairs_have_the_observations_of_the_tracks_that_both_see():
+    tracks = tracks_of(
+        (0, 0, 1, 1), (0, 1, 2, 2), (0, 2, 3, 3), (1, 1, 4, 4), (1, 2, 5, 5), (2, 0, 6, 6), (2, 2, 7, 7)
+    )
+    found = {ties.views: (ties.a.tolist(), ties.b.tolist()) for ties in pair_ties(tracks)}
+    assert found == {(0, 1): ([0], [1]), (0, 2): ([0, 5], [2, 6]), (1, 2): ([1, 3], [2, 4])}
+    assert list(found) == sorted(found)
+    keep = np.array([1, 1, 0, 1, 1, 1, 1], bool)
+    found = {ties.views: (ties.a.tolist(), ties.b.tolist()) for ties in pair_ties(tracks, keep)}
+    assert found == {(0, 1): ([0], [1]), (0, 2): ([5], [6]), (1, 2): ([3], [4])}
+    none = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+    assert pair_ties(none) == []
+
+
+def copies(shift=(12.0, -7.0), num=20, others=0, off=0.0):
+    """The copies of two views whose matches have one shift, but for `others` of them."""
+    xy = np.random.default_rng(2).uniform(0, 500, (num, 2))
+    second = xy + shift + off
+    second[:others] += 3.3
+    tracks = Tracks(
+        np.tile([0, 1], num),
+        np.repeat(np.arange(num), 2),
+        np.stack([xy, second], 1).reshape(-1, 2),
+        np.ones(2 * num),
+    )
+    views = tuple(SimpleNamespace(name=name) for name in "AB")
+    return Run("check", views, (), tracks).copies  # type: ignore[arg-type]
+
+
+def test_a_copy_is_an_image_whose_matches_have_one_whole_shift():
+    assert copies() == {"A": "B, moved by 12 columns and -7 rows", "B": "A, moved by -12 columns and 7 rows"}
+    assert copies(shift=(0.0, 0.0)) == {
+        "A": "B, moved by 0 columns and 0 rows",
+        "B": "A, moved by 0 columns and 0 rows",
+    }
+    assert copies(off=0.04)
+    assert not copies(off=0.06)
+    assert copies(off=-0.04)
+    assert not copies(num=19)
+    assert copies(others=2)  # nine of ten
+    assert not copies(others=3)
+    assert (runs.WHOLE, runs.MOST, runs.LEAST) == (0.05, 0.9, 20)
+
+
+def test_a_pair_s_shift_is_that_of_the_second_minus_the_first():
+    tracks = tracks_of(*((k // 2, k % 2, 10.0 * k + 3.0 * (k % 2), 1.0) for k in range(40)))
+    index = np.arange(0, 40, 2)
+    assert runs._whole_shift(PairTies((0, 1), index, index + 1), tracks).tolist() == [13.0, 0.0]
+
+
+def test_errors_of_a_view_are_the_root_of_the_mean_square_distance():
+    residuals = np.array([[3.0, 4.0], [0.0, 0.0], [np.nan, 1.0], [1.0, 0.0]])
+    found = rmse_by_view(residuals, np.array([0, 0, 0, 2]), 3)
+    np.testing.assert_allclose(found, [np.sqrt(12.5), np.nan, 1.0])
+
+
+def test_cells_are_counted_by_rows_from_the_corner_of_the_first_pixel():
+    xy = np.array([[-0.5, -0.5], [99.4, 0.0], [99.6, 0.0], [0.0, 49.6], [799.4, 399.4], [900.0, -90.0]])
+    assert cell_numbers(xy, (800, 400)).tolist() == [0, 0, 1, 8, 63, 7]
+    sizes = np.array([[800, 400], [80, 40]])
+    assert cell_numbers(np.array([[150.0, 60.0], [15.0, 6.0]]), sizes).tolist() == [9, 9]
+
+
+@pytest.mark.parametrize("minor", [0.0, 0.2, 0.5, 0.9, 1.0])
+def test_the_circle_of_ninety_per_cent_is_that_of_an_integral(minor):
+    """The integral over the angle of what lies within a radius, in closed form along the radius."""
+    radius, angle = ce90(1.0, minor), (np.arange(20000) + 0.5) / 20000 * np.pi
+    if not minor:
+        assert radius == pytest.approx(norm.ppf(0.95), abs=2e-5)
+        return
+    inverse = np.cos(angle) ** 2 + (np.sin(angle) / minor) ** 2
+    inside = np.mean((1.0 - np.exp(-0.5 * radius**2 * inverse)) / (inverse * minor))
+    assert inside == pytest.approx(0.9, abs=1e-5)
+    assert ce90(3.0, 3.0 * minor) == pytest.approx(3.0 * radius)
+
+
+def test_a_track_is_intersected_from_what_counts_and_the_rest_is_measured_against_it(block_run):
+    run = block_run.run
+    tracks = run.tracks
+    keep = run.keep.copy()
+    first = np.flatnonzero(tracks.point == tracks.point[0])
+    xy = tracks.xy.copy()
+    xy[first[0]] += [30.0, -40.0]
+    keep[first] = True
+    keep[first[0]] = len(first) < 3
+    found = triangulate_tracks(replace(tracks, xy=xy), run.after, run.altitude, keep)
+    assert found.points.shape == (tracks.num_points, 3)
+    lone = np.bincount(tracks.point[keep], minlength=tracks.num_points) < 2
+    assert np.isnan(found.points[lone]).all()
+    if not keep[first[0]]:
+        assert np.hypot(*found.residuals[first[0]]) == pytest.approx(50.0, abs=3.0)
+
+
+def test_the_tables_hold_every_so_many_th_track(monkeypatch, block_run):
+    run = replace(block_run.run)
+    usable = np.flatnonzero(np.isfinite(run.ground).all(axis=1))
+    assert runs.MAX_TRACKS == 200_000
+    for most, step in ((len(usable), 1), (len(usable) - 1, 2), (len(usable) // 2 - 1, 3)):
+        monkeypatch.setattr(runs, "MAX_TRACKS", most)
+        assert run.written_tracks.tolist() == usable[::step].tolist()
+
+
+def test_a_summary_counts_tie_points_by_the_views_that_see_them(check_run):
+    tracks = tracks_of(
+        *((p, v, 10.0 * p, 5.0) for p, views in enumerate([(0, 1), (0, 1, 2), (1, 2), (0, 2)]) for v in views)
+    )
+    run = Run("check", check_run.views, (), tracks)
+    found = measure(run)
+    assert found.tracks.by_length == {"2": 3, "3": 1}
+    assert (found.tracks.num_tracks, found.tracks.num_observations) == (4, 9)
+    assert found.tables.num_usable_tracks == np.isfinite(run.ground).all(axis=1).sum()
+    assert found.tables.complete
+    assert [view.tie_coverage for view in found.views[:4]] == [1 / 64, 1 / 64, 1 / 64, 0.0]
+    assert [view.num_observations for view in found.views[:4]] == [3, 3, 3, 0]
+    assert found.scene is found.control_test is found.reference is None
+
+
+# --- pairs ------------------------------------------------------------------------------------------------
+
+
+def test_the_offset_of_a_pair_is_measured_on_a_thousand_matches_evenly(block_run, monkeypatch):
+    from barpc.report.summary import pairs
+
+    assert pairs.MAX_PER_PAIR == 1000
+    run = block_run.run
+    ties = max(run.pairs, key=lambda one: len(one.a))
+    monkeypatch.setattr(pairs, "MAX_PER_PAIR", 40)
+    found = pairs._pair_offsets(run, run.after, run.ground[:, 2])[run.pairs.index(ties)]
+    picks = np.linspace(0, len(ties.a) - 1, 40).astype(int)
+    i, j = ties.views
+    a, b = run.tracks.xy[ties.a[picks]], run.tracks.xy[ties.b[picks]]
+    offset, _ = epipolar_offset(run.after[i], run.after[j], a, b, 0.0, steps=20)
+    assert found.count == 40
+    assert found.median == pytest.approx(np.median(offset), abs=1e-7)
+    assert found.spread == pytest.approx(1.4826 * np.median(np.abs(offset - np.median(offset))), rel=1e-5)
+    assert found.rms == pytest.approx(np.sqrt(np.mean(offset**2)), rel=1e-5)
+
+
+# --- known points -----------------------------------------------------------------------------------------
+
+
+def test_worst_gcps_are_those_not_used_then_those_of_the_largest_w():
+    points = [a_gcp(f"P{k}", 0, 0, w=float(k)) for k in range(25)]
+    assert [point.name for point in GcpEntry.worst(points)] == [f"P{k}" for k in range(5, 25)]
+    points[2] = a_gcp("P2", 0, 0, w=None, used=False)
+    assert [point.name for point in GcpEntry.worst(points)] == ["P2", *(f"P{k}" for k in range(6, 25))]
+    assert GcpEntry.worst(points[:3]) == points[:3]
+
+
+def test_a_gcp_is_seen_where_it_is_and_its_residual_is_carried_into_the_images(block_run):
+    run = block_run.run
+    points, tested = run.gcps, run.adjustment.control
+    for g, entry in enumerate(measure_gcps(run)):
+        views = points.view[points.point == g]
+        assert entry.images == tuple(run.views[v].name for v in views)
+        assert (entry.lon, entry.lat, entry.alt_m) == tuple(points.lonlatalt[g])
+        assert entry.sigma_m == points.sigma[g].tolist()
+        assert (entry.w, entry.redundancy) == (tested.w[g], tested.redundancy[g])
+        at = points.lonlatalt[g]
+        moved = ground_from_ecef(ecef_from_ground(at) + enu_basis(at).T @ tested.residual[g])
+        moves = [np.hypot(*(run.after[v].project(moved) - run.after[v].project(at))) for v in views]
+        assert entry.residual_px == pytest.approx(np.sqrt(np.mean(np.square(moves))), rel=1e-6)
+
+
+def test_a_gcp_that_no_image_shows_is_not_seen_and_one_rejected_is_not_used(block_run):
+    run = block_run.run
+    keep = run.gcps.point != 2
+    gcps = replace(
+        run.gcps,
+        view=run.gcps.view[keep],
+        point=run.gcps.point[keep],
+        xy=run.gcps.xy[keep],
+        xy_sigma=run.gcps.xy_sigma[keep],
+    )
+    tested = run.adjustment.control
+    control = replace(tested, used=np.arange(6) != 1, w=np.where(np.arange(6) == 3, 9.0, 1.0))
+    found = measure_gcps(
+        replace(
+            run,
+            gcps=gcps,
+            adjustment=replace(run.adjustment, control=control, gcp_w=run.adjustment.gcp_w[keep]),
+        )
+    )
+    assert [entry.status for entry in found] == [
+        "used",
+        "rejected",
+        "not seen",
+        "contradicts",
+        "used",
+        "used",
+    ]
+    assert [entry.used for entry in found] == [True, False, False, True, True, True]
+    assert found[2].images == ()
+    assert np.isnan(found[2].residual_px)
+    before = measure_gcps(replace(run, adjustment=None, fits=()))
+    assert {entry.status for entry in before} == {"used"}
+    assert all(np.isnan(entry.residual_px) and entry.w is None for entry in before)
+    assert measure_gcps(replace(run, gcps=None)) == ()
+
+
+def control_run(*tests: tuple[int, str, float]) -> Any:
+    return SimpleNamespace(
+        control_tests=[ControlResidual(*test) for test in tests],
+        views=[SimpleNamespace(name=n) for n in "ABC"],
+    )
+
+
+def test_the_residuals_of_control_beyond_what_chance_allows_are_counted():
+    found = measure_control(control_run((0, "P", 3.29), (2, "Q", 3.3), (1, "R", 1.0)))
+    assert (found.num, found.critical, found.num_beyond, found.largest_w) == (3, 3.29, 1, 3.3)
+    assert (found.image, found.point) == ("C", "Q")
+    inside = 1.0 - 2.0 * norm.sf(3.29)
+    assert found.expected == pytest.approx(3 * (1.0 - inside**2), rel=1e-9)
+    assert measure_control(control_run()) is None
+
+
+def test_residuals_that_could_not_be_tested_are_none_and_a_reference_s_points_are_control_too():
+    gcps = SimpleNamespace(view=np.array([0, 1]), point=np.array([0, 0]), names=("P",))
+    points = SimpleNamespace(view=np.array([2]), point=np.array([1]), names=("x", "R"))
+    adjustment = SimpleNamespace(gcp_w=np.array([1.5, np.nan]), reference_w=np.array([2.5]))
+    run = Run("adjust", (), (), None, adjustment=adjustment, gcps=gcps)
+    assert run.control_tests == [ControlResidual(0, "P", 1.5)]
+    reference = SimpleNamespace(control=SimpleNamespace(points=points))
+    run = Run("adjust", (), (), None, adjustment=adjustment, gcps=gcps, reference=reference)
+    assert run.control_tests == [ControlResidual(0, "P", 1.5), ControlResidual(2, "R", 2.5)]
+    assert Run("check", (), (), None, gcps=gcps).control_tests == []
+
+
+def test_a_reference_is_said_to_hold_the_points_that_were_kept():
+    points = SimpleNamespace(view=np.array([0, 0, 2, 0]), point=np.array([0, 1, 1, 2]))
+    matches = (
+        ViewMatch("A", 9.0, (1.0, -2.0), 50, 30, 3, 0.4),
+        ViewMatch("B", 2.0, (7.0, 7.0), 40),
+        ViewMatch("C", 8.0, (0.5, 0.0), 9, 8, 1, 0.3),
+    )
+    found = Registration(SimpleNamespace(points=points), matches, 0.5, 1.25)
+    adjustment = SimpleNamespace(reference_inlier=np.array([True, True, True, False]))
+    run = SimpleNamespace(reference=found, adjustment=adjustment, views=[0, 0, 0])
+    entry = measure_reference(run)
+    assert (entry.used, entry.step_m, entry.sigma_m, entry.num_points) == (True, 0.5, 1.25, 2)
+    assert [view.num_points for view in entry.views] == [2, 0, 1]
+    assert [view.offset_en_m for view in entry.views] == [(1.0, -2.0), None, (0.5, 0.0)]
+    first = entry.views[0]
+    assert (first.name, first.peak, first.num_tried, first.num_passed, first.scatter_m) == (
+        "A",
+        9.0,
+        50,
+        30,
+        0.4,
+    )
+    unused = measure_reference(
+        SimpleNamespace(reference=replace(found, control=None), adjustment=adjustment, views=[0, 0, 0])
+    )
+    assert (unused.used, unused.num_points, [view.num_points for view in unused.views]) == (
+        False,
+        0,
+        [0, 0, 0],
+    )
+    assert not measure_reference(SimpleNamespace(reference=found, adjustment=None, views=[0, 0, 0])).used
+    assert measure_reference(SimpleNamespace(reference=None, adjustment=adjustment)) is None
+
+
+def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_run):
+    run = replace(block_run.run, gcps=None, check_points=block_run.run.gcps)
+    points = run.check_points
+    for sensors, changed in ((run.after, run), (run.before, replace(run, adjustment=None, fits=()))):
+        entries = measure(changed).check_points
+        assert [entry.name for entry in entries] == list(points.names)
+        for g, entry in enumerate(entries):
+            rows = np.flatnonzero(points.point == g)
+            assert [seen.view for seen in entry.observations] == [
+                run.views[points.view[k]].name for k in rows
+            ]
+            for k, seen in zip(rows, entry.observations, strict=True):
+                off = sensors[points.view[k]].project(points.lonlatalt[g]) - points.xy[k]
+                assert seen.residual_px == pytest.approx(off, abs=1e-9)
+    assert measure(block_run.run).check_points == ()
+
+
+# --- what was left, and decided by ------------------------------------------------------------------------
+
+
+def test_what_asked_for_more_is_the_image_with_the_largest_part_that_is_no_chance():
+    test = SmoothTest(
+        np.array([0.9, 0.4, 0.3]), np.array([1e-3, 1e-9, 1e-5]), np.zeros(3), np.array([0.1, 0.0, 0.35])
+    )
+    adjustment = SimpleNamespace(asked={"drift": test}, names=("A", "B", "C"))
+    found = _asked(adjustment, "drift")
+    assert (found.image, found.smooth_px, found.smooth_p, found.shared_px, found.num_images) == (
+        "B",
+        0.4,
+        1e-9,
+        0.0,
+        2,
+    )
+    more = replace(test, shared=np.array([0.5, 0.0, 0.35]))
+    assert _asked(SimpleNamespace(asked={"drift": more}, names=("A", "B", "C")), "drift").image == "A"
+    at = replace(test, significance=np.array([1e-4, 0.99e-4, 1.0]))
+    assert _asked(SimpleNamespace(asked={"drift": at}, names=("A", "B", "C")), "drift").num_images == 1
+    assert _asked(adjustment, "jitter") is None
+
+
+def test_decisions_end_with_the_test_of_control(block_run):
+    assert decisions(block_run.record)[-1].startswith(("None of", "1 of", "2 of"))
+
+
+def test_what_follows_in_the_image_is_the_rms_over_its_rows_and_of_its_steps():
+    """A spline that is a straight line, from -3 px in the first row to 3 px in the last: over the root of three."""
+    line = np.array([-9.0, -3.0, 3.0, 9.0])[:, None] * [0.6, 0.8]
+    assert _in_image(None) == {}
+    plain = _in_image(RowSpline(line, 500.0, 400.0))
+    assert set(plain) == {"jitter_px", "jitter_rows"}
+    assert plain["jitter_px"] == pytest.approx(3.0 / np.sqrt(3.0), rel=3e-3)
+    assert plain["jitter_rows"] == 800.0
+    steps = np.array([[0.0, 0.0], [3.0, 4.0], [0.0, -1.0]])
+    both = _in_image(RowSpline(line, 500.0, 400.0, np.array([99.5, 199.5]), steps))
+    assert both["jitter_px"] == plain["jitter_px"]  # the steps are no part of it
+    assert both["detector_px"] == pytest.approx(np.sqrt(26.0 / 3.0))
+    assert both["detectors"] == (100.0, 200.0)
+    alone = _in_image(RowSpline(np.zeros((0, 2)), 0.0, 1.0, np.array([9.5]), steps[:2]))
+    assert set(alone) == {"detector_px", "detectors"}

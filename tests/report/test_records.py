@@ -1,0 +1,276 @@
+"""Records: read, written, their schema, and the cells that their values become."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import pytest
+
+from barpc.report import records
+from barpc.report.records import (
+    Cell,
+    Column,
+    Number,
+    Record,
+    Table,
+    cell_of,
+    column_of,
+    plain,
+    said,
+    schema_of,
+    table,
+    value_of,
+)
+from barpc.report.summary import (
+    SCHEMA,
+    OffsetEntry,
+    PairEntry,
+    ViewEntry,
+    listed,
+    median,
+    metres,
+    published_schema,
+)
+from barpc.report.summary.pairs import medians
+from barpc.report.summary.words import Count, Share, Side, largest, percent
+
+from .made import a_correction, a_pair, a_view
+
+
+class Part(Record):
+    """A part."""
+
+    size: Number = said("How large", "m", "size", ".1f")
+    both: tuple[float, float] | None = said("Two", "px", ("one", "other"), ".2f", adjusted=True, default=None)
+
+
+class Whole(Record):
+    """A whole."""
+
+    OWN: ClassVar = {"twice": Column("twice", lambda row: 2 * row.num, ".0f")}
+
+    num: int = said("How many", head="num")
+    part: Part | None = said("A part")
+    more: tuple[Part, ...] = said("Parts", default=())
+
+
+WHOLE = Whole(3, Part(1.5, (0.25, -1.0)), (Part(None),))
+PLAIN = {"num": 3, "part": {"size": 1.5, "both": [0.25, -1.0]}, "more": [{"size": None}]}
+
+
+def test_a_record_is_written_without_what_is_optional_and_not_there():
+    assert plain(WHOLE) == PLAIN
+    assert plain(Whole(3, None)) == {"num": 3, "part": None, "more": []}
+
+
+def test_a_record_comes_back_from_its_file_and_passes_over_what_it_does_not_know():
+    assert Whole.read({**PLAIN, "new": 1}) == WHOLE
+    assert Whole.read({"num": 3, "part": None}) == Whole(3, None)
+
+
+def test_what_is_not_finite_is_null_and_arrays_are_lists():
+    value = {
+        1: float("nan"),
+        "b": np.array([[1.0, np.inf]]),
+        "c": np.float64("nan"),
+        "d": np.int32(4),
+        "e": (True, "x"),
+    }
+    assert plain(value) == {"1": None, "b": [[1.0, None]], "c": None, "d": 4, "e": [True, "x"]}
+    assert plain(float("-inf")) is None
+    assert plain(Part) == str(Part)
+
+    @dataclass
+    class Other:
+        shown: int | None = None
+        _hidden: int = 1
+
+    assert plain(Other()) == {"shown": None}  # of no record all fields are kept
+
+
+def test_the_schema_of_a_type():
+    assert schema_of(int) == {"type": "integer"}
+    assert schema_of(Number) == {"type": ["number", "null"]}
+    assert schema_of(Literal["a", "b"]) == {"enum": ["a", "b"]}
+    assert schema_of(tuple[int, str]) == {
+        "type": "array",
+        "minItems": 2,
+        "maxItems": 2,
+        "items": {"type": "integer"},
+    }
+    assert schema_of(tuple[int, ...]) == {"type": "array", "items": {"type": "integer"}}
+    assert schema_of(Any) == {}
+    assert schema_of(tuple[float, ...] | None)["type"] == ["array", "null"]
+    assert schema_of(float | tuple[float, ...] | tuple[str, ...] | None) == {
+        "anyOf": [
+            {"type": ["number", "null"]},
+            {"type": "array", "items": {"type": "number"}},
+            {"type": "array", "items": {"type": "string"}},
+        ]
+    }
+    assert Whole.json_schema()["required"] == ["num", "part"]
+    assert Whole.json_schema()["additionalProperties"] is False
+    assert Part.json_schema()["properties"]["size"] == {
+        "type": ["number", "null"],
+        "description": "How large [m].",
+    }
+
+
+def described(schema: Any) -> Iterator[str]:
+    """Every description in a schema."""
+    if isinstance(schema, dict):
+        if isinstance(schema.get("description"), str):
+            yield schema["description"]
+        for part in schema.values():
+            yield from described(part)
+    elif isinstance(schema, list):
+        for part in schema:
+            yield from described(part)
+
+
+UNITS = {"px", "m", "deg", "MB", "m above the ellipsoid", "px/px", "urad", "ms"}
+
+
+def test_what_is_said_of_a_value_ends_with_its_unit():
+    texts = list(described(published_schema()))
+    assert len(texts) > 100
+    for text in texts[1:]:
+        words, unit = re.fullmatch(r"(.*?)(?: \[([^\]]*)\])?\.", text).groups()
+        assert unit is None or unit in UNITS, text
+        assert words not in UNITS, text
+
+
+def test_the_version_of_the_file_is_two():
+    assert SCHEMA == 2
+    assert published_schema()["properties"]["schema"]["const"] == 2
+
+
+def test_columns_are_fields_parts_and_own_ones():
+    found = table("k", "c", [WHOLE, Whole(4, None)], Whole, "num twice part.size part.both")
+    assert found.columns == ["num", "twice", "size [m]", "one [px]", "other [px]"]
+    assert found.texts[1:] == [["3", "6", "1.5", "0.25", "-1.00"], ["4", "8", "-", "-", "-"]]
+    assert table("k", "c", [WHOLE], Whole, "num part.both", adjusted=False).columns == ["num"]
+    assert not found.folded
+    assert column_of(Whole, "part.both").adjusted
+    assert value_of(Whole(1, None), "part.size") is None
+    assert value_of(WHOLE, "part.size") == 1.5
+
+
+@pytest.mark.parametrize(
+    ("value", "form", "cell"),
+    [
+        (None, "", Cell("-", "-", "name")),
+        (None, ".1f", Cell("-", 1e300)),
+        ((None, 1.0), ".1f", Cell("-", 1e300)),
+        ("x", ".1f", Cell("x", "x", "name")),
+        ((1.0, -2.25), ".1f", Cell("1.0, -2.2", 2.25)),
+        (0.0, ".3f", Cell("0", 0.0)),
+        (1.23456789, ".1f", Cell("1.2", 1.23457)),
+        (7, "", Cell("7", 7.0)),
+        (Cell("a", 1.0), ".1f", Cell("a", 1.0)),
+    ],
+)
+def test_a_value_as_a_cell(value, form, cell):
+    assert cell_of(value, form) == cell
+
+
+def test_a_table_shows_so_many_rows_and_says_what_is_missing(monkeypatch):
+    assert records.MAX_TABLE_ROWS == 400
+    monkeypatch.setattr(records, "MAX_TABLE_ROWS", 2)
+    rows = [[Cell(name, name, "name"), Cell("1", 1.0)] for name in "abc"]
+    whole, cut = Table("k", "words", ["x", "y"], rows[:2]), Table("k", "words", ["x", "y"], rows)
+    assert (len(whole.shown), whole.heading) == (2, "words")
+    assert (len(cut.shown), cut.heading) == (2, "words; the first 2 of 3, all in the files beside this page")
+    assert cut.kinds == ["text", "number"]
+    assert Table("k", "words", ["x", "y"], []).kinds == ["text", "text"]
+    numbered = whole.numbered([Cell("1", 1.0), Cell("2", 2.0)])
+    assert numbered.texts == [["#", "x", "y"], ["1", "a", "1"], ["2", "b", "1"]]
+
+
+# --- words ------------------------------------------------------------------------------------------------
+
+
+def test_small_words():
+    assert largest([1.0, 3.0, 2.0]) == 3.0
+    assert largest([1.0, None]) is None
+    assert largest([]) is largest(None) is None
+    assert listed(list("abc"), 3) == "a, b, c"
+    assert listed(list("abcd"), 3) == "a, b, c and 1 more"
+    assert listed([str(k) for k in range(12)]).endswith("9 and 2 more")
+    assert median([None, 3.0, float("inf"), 1.0]) == 2.0
+    assert np.isnan(median([None]))
+    assert percent(0.25) == 25.0
+    assert percent(None) is None
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1.0, "1.0 m"),
+        (0.999, "99.9 cm"),
+        (0.01, "1.0 cm"),
+        (0.00999, "10.0 mm"),
+        (0.0001, "0.1 mm"),
+        (-3.0, "-3.0 m"),
+        (0.001, "1.0 mm"),
+    ],
+)
+def test_lengths_change_their_unit_at_one(value, text):
+    assert metres(value) == text
+
+
+def test_a_median_is_that_of_each_group():
+    group = np.array([2, 0, 2, 2, 0, 2, 4])
+    found = medians(np.array([9.0, 1.0, 1.0, 3.0, 2.0, 5.0, 7.0]), group, 6)
+    np.testing.assert_equal(found, [1.5, np.nan, 4.0, np.nan, 7.0, np.nan])
+
+
+# --- columns of images and pairs --------------------------------------------------------------------------
+
+
+def test_a_pair_shows_its_offsets_as_they_were_before_and_after():
+    pair = a_pair(epipolar_before=OffsetEntry(-0.3, 0.2, 0.4, 9), epipolar_after=None, beaten=("x", "y"))
+    assert pair.offset_rms == (0.4, None)
+    assert a_pair(epipolar_before=None).offset_rms == (None, 0.1)
+    cells = table("k", "c", [pair], PairEntry, "pair before after beaten").rows[0]
+    assert [cell.text for cell in cells] == ["A - B", "-0.300 ± 0.200", "-", "x; y"]
+    assert [cell.key for cell in cells][1:3] == [0.3, 1e300]
+
+
+def test_an_image_shows_shares_in_percent():
+    view = a_view(num_observations=30, num_rejected=10, tie_coverage=0.5, correction=a_correction())
+    cells = table("k", "c", [view], ViewEntry, "verdict rejected covered").rows[0]
+    assert [(cell.text, cell.key) for cell in cells] == [("adjusted", 0), ("25.0", 25.0), ("50", 50.0)]
+    none = table(
+        "k", "c", [a_view(num_observations=0)], ViewEntry, "rejected kilometres largest fitted about"
+    ).rows[0]
+    assert [cell.text for cell in none] == ["-"] * 5
+    every = f"{ViewEntry.PAGE} {ViewEntry.TERMINAL}"
+    checked = table("k", "c", [view], ViewEntry, every, adjusted=False).columns
+    assert not {"RPC fit [px]", "after [px]", "shift col, row [px]"} & set(checked)
+    assert "RPC fit [px]" in table("k", "c", [view], ViewEntry, every).columns
+    pairs = table("k", "c", [a_pair()], PairEntry, PairEntry.PAGE, adjusted=False).columns
+    assert "before [px]" in pairs
+    assert "after [px]" not in pairs
+
+
+def test_a_table_is_numbered_row_by_row():
+    with pytest.raises(ValueError, match="zip"):
+        Table("k", "words", ["x"], [[Cell("a", "a", "name")]]).numbered([Cell("1", 1.0), Cell("2", 2.0)])
+
+
+def test_what_numbers_a_file_may_hold():
+    assert schema_of(Count) == {"type": "integer", "minimum": 0}
+    assert schema_of(Side) == {"type": "integer", "minimum": 1}
+    assert schema_of(Share) == {"type": "number", "minimum": 0, "maximum": 1}
+    schema = published_schema()["properties"]
+    gcp, view = (schema[name]["items"]["properties"] for name in ("gcps", "views"))
+    assert (gcp["lon"]["minimum"], gcp["lon"]["maximum"]) == (-540, 540)
+    assert (gcp["lat"]["minimum"], gcp["lat"]["maximum"]) == (-90, 90)
+    assert (schema["views"]["minItems"], view["name"]["minLength"]) == (1, 1)
+    motion = schema["scene"]["properties"]["weakest_modes"]["items"]["properties"]["motion_m"]
+    assert (motion["minItems"], motion["maxItems"]) == (7, 7)

@@ -1,0 +1,431 @@
+"""The page's questions: when each is asked, what is answered, and the bars, charts and tables that show it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.report import charts, page
+from barpc.report.page import _which
+from barpc.report.summary import (
+    CenterEntry,
+    CheckPointEntry,
+    DatumEntry,
+    EllipseEntry,
+    FitEntry,
+    ModeEntry,
+    ReferenceEntry,
+    ReferenceViewEntry,
+    SceneEntry,
+    SeenEntry,
+    StageEntry,
+    TablesEntry,
+    TracksEntry,
+)
+from barpc.report.tables import Pictures, TiePatches
+
+from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, seen
+
+VIEWS = [a_view("A"), a_view("B"), a_view("C")]
+
+
+def asked(name: str, views=VIEWS, pairs=(), outlines=(), observed=None, pictures=None, **fields):
+    """The section that one of the page's functions makes."""
+    files = files_of(a_summary(views, pairs, **fields), outlines, observed=observed, pictures=pictures)
+    return getattr(page, f"_{name}")(files)
+
+
+def texts(table) -> list[list[str]]:
+    return [[cell.text for cell in row] for row in table.rows]
+
+
+def test_images_without_reservation_are_counted():
+    section = asked("images")
+    assert section.answer == "3 of 3 without reservation."
+    (table,) = section.tables
+    assert table.columns[:3] == ["#", "image", "verdict"]
+    assert [row[0].text for row in table.rows] == ["1", "2", "3"]
+    doubted = asked("images", [VIEWS[0], a_view("B", status="weak", advice="look")])
+    assert (
+        doubted.answer
+        == "1 of 2 without reservation. What to do about the others stands in the verdict above."
+    )
+    check = asked("images", [a_view(status="consistent", rmse_after=None)], kind="check")
+    assert check.answer == "1 of 1 without reservation."
+    assert "after [px]" not in check.tables[0].columns
+    assert "after [px]" in table.columns
+
+
+def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
+    view = a_view(
+        "A", num_observations=60, num_rejected=20, tie_coverage=0.254, rmse_before=1.2345, rmse_after=0.1,
+        held_out_px=0.12, correction=a_correction(), gsd_m=0.512, incidence_deg=12.34, status="doubtful",
+    )  # fmt: skip
+    (table,) = asked("images", [view]).tables
+    assert texts(table) == [
+        [
+            "1",
+            "A",
+            "doubtful",
+            "60",
+            "25.0",
+            "25",
+            "1.234",
+            "0.100",
+            "0.120",
+            "+1.00, -2.00",
+            "0.51",
+            "12.3",
+            "-",
+        ]
+    ]
+    assert [cell.key for cell in table.rows[0]][2:6] == [4, 60, 25.0, 25.4]
+    assert table.rows[0][2].kind == "status doubtful"
+    (nothing,) = asked("images", [a_view(num_observations=0, num_rejected=0)]).tables
+    assert nothing.rows[0][4].text == "-"
+
+
+def test_a_map_needs_an_outline_and_a_matrix_three_images_and_a_pair():
+    pair = a_pair()
+    outlines = [a_square(10.0, 0.0)] * 3
+    assert asked("map").charts == []
+    assert len(asked("map", outlines=outlines).charts) == 1
+    assert [words.split()[0] for _, words in asked("map", pairs=[pair], outlines=outlines).charts] == [
+        "Outlines",
+        "Every",
+    ]
+    assert len(asked("map", VIEWS[:2], [pair], outlines[:2]).charts) == 1
+    assert len(asked("map", pairs=[pair]).charts) == 1
+    plain = asked("map", outlines=outlines).charts[0][1]
+    assert plain.endswith("a stronger line stands for more matches.")
+    gcps = asked("map", outlines=outlines, gcps=(a_gcp("P", 10.0, 0.0),)).charts[0][1]
+    assert gcps == f"{plain} Triangles are GCPs, those on their tip check points."
+
+
+@pytest.mark.parametrize(("most", "charts_shown", "cut"), [(3, 2, False), (2, 1, True)])
+def test_of_too_many_images_there_is_no_matrix_and_the_map_says_so(monkeypatch, most, charts_shown, cut):
+    monkeypatch.setattr(charts, "MAX_DRAWN", most)
+    found = asked("map", pairs=[a_pair()], outlines=[a_square(10.0, 0.0)] * 3).charts
+    assert len(found) == charts_shown
+    said = "At most 2 of 3 outlines are drawn, evenly taken, and no matrix; "
+    said += "all are in footprints.geojson and pairs.csv."
+    assert found[0][1].endswith(said) == cut
+
+
+def test_how_images_hang_together():
+    def answer(pairs, num=4):
+        return asked("map", [a_view(name) for name in "ABCD"[:num]], pairs).answer
+
+    ring = [a_pair("A", "B"), a_pair("B", "C"), a_pair("C", "D"), a_pair("A", "D")]
+    assert answer(ring) == "All images hang together."
+    assert answer(ring[:3]) == "All images hang together. Tied to one other image only: A, D."
+    assert answer(ring[:1]) == "By tie points they fall into 3 groups. Tied to one other image only: A, B."
+    assert answer(ring[:1], 2) == "All images hang together."
+    assert answer([]) == "By tie points they fall into 4 groups."
+
+
+def test_bars_say_how_many_images_see_a_tie_point():
+    bars = asked("map", tracks=TracksEntry(9, 9, {"2": 8, "3": 0, "5": 2})).bars
+    assert bars == [("Tie points in 2 images", "8", 100.0), ("Tie points in 5 images", "2", 25.0)]
+
+
+def two_norms(*rows):
+    """Observations of image A whose errors before and after are given."""
+    return seen([(0, k, (5, 5), (b, 0.0), (0.0, a), used) for k, (b, a, used) in enumerate(rows)])
+
+
+def test_errors_are_told_by_their_medians():
+    observed = two_norms((1.0, 0.1, True), (3.0, 0.3, True), (2.0, 0.2, True), (99.0, 99.0, False))
+    section = asked("errors", observed=observed)
+    assert section.question == "Did the adjustment help?"
+    assert section.answer.startswith("The median reprojection error went from 2.000 px to 0.200 px. These")
+    assert [words for _, words in section.charts] == [
+        "All observations that count; each curve is drawn to its own peak.",
+        "All images.",
+    ]
+    check = asked("errors", observed=two_norms((1.0, np.nan, True), (3.0, np.nan, True)), kind="check")
+    assert check.question == "How large are the errors?"
+    assert check.answer == "Half of the observations lie within 2.000 px of where their cameras put them."
+    assert asked("errors", observed=two_norms((0.0, 0.0, True))) is None
+    assert asked("errors", observed=two_norms((0.0, 1.0, True))) is not None
+    assert asked("errors", observed=two_norms((1.0, 1.0, False))) is None
+
+
+def test_of_many_rows_it_is_said_which_are_shown():
+    assert _which([0] * 24, "pairs", "offset") == "All pairs."
+    assert _which([0] * 25, "pairs", "offset") == "The 24 of 25 pairs with the largest offset."
+
+
+def pushed(view: int, cells: int, of: int):
+    """Ten residuals in each of some cells of a row of an image, in so many of which they point one way."""
+    rows = []
+    for cell in range(of):
+        for k in range(10):
+            to = (1.0 + 0.01 * k, 0.0) if cell < cells else ((-1.0) ** k, 0.0)
+            rows.append((view, k, (1000 / 8 * (cell + 0.5), 10.0), to, to, True))
+    return rows
+
+
+def test_residuals_are_random_unless_most_cells_of_an_image_point_one_way():
+    calm = asked("randomness", observed=seen([*pushed(0, 1, 2), *pushed(1, 0, 2)]))
+    assert calm.answer.startswith(
+        "Mostly: in no image do residuals point the same way in more than half of the cells. A cell"
+    )
+    assert len(calm.panels) == 3
+    assert [words.split(".")[0] for words, _ in calm.folds] == ["Before the adjustment"]
+    assert len(calm.folds[0][1]) == 3
+    told = asked("randomness", observed=seen([*pushed(0, 1, 2), *pushed(1, 2, 3)]))
+    assert told.answer.startswith(
+        "Not in B: in most of their cells the residuals point the same way. Small ones are usual"
+    )
+    check = asked("randomness", observed=seen(pushed(1, 2, 3)), kind="check")
+    assert "Small ones" not in check.answer
+    assert check.folds == []
+    assert 'id="panel-before0-t"' in check.panels[0][0]
+    assert 'id="panel-after0-t"' in calm.panels[0][0]
+    assert asked("randomness", observed=seen([])) is None
+
+
+def test_tie_points_in_pixels_are_the_worst_and_some_at_random():
+    ties = [TiePatches(kind, "A", "B", [0.5, 0.1], ["", "", ""]) for kind in ("worst", "worst", "random")]
+    section = asked("ties", pictures=Pictures({}, ties))
+    assert section.answer.startswith("The 2 with the largest residuals, then 1 at random. Point")
+    assert asked("ties") is None
+
+
+def test_pairs_are_told_by_the_worst_offset_and_the_best_heights():
+    pairs = [
+        a_pair("A", "B", height_m_per_px=1.4),
+        a_pair("A", "C", convergence_deg=0.9, base_to_height=0.02, height_m_per_px=0.712),
+        a_pair("B", "C", convergence_deg=1.0, height_m_per_px=None),
+    ]
+    section = asked("pairs", pairs=pairs)
+    assert section.answer == (
+        "The epipolar offset, which no height explains, is 0.100 px (RMS) in the worst pair; stereo matching along "
+        "epipolar lines wants it well below 0.5 px. Heights come best from A - C: the rays meet under 0.9 degrees (B/H "
+        "0.02), so one pixel of parallax is 71.2 cm of height. 1 of 3 pairs meet under less than one degree and say "
+        "next to nothing about heights."
+    )
+    assert [row[0].text for row in section.tables[0].rows] == ["1-2", "1-3", "2-3"]
+    assert [row[0].key for row in section.tables[0].rows] == pytest.approx([1.000002, 1.000003, 2.000003])
+    assert texts(section.tables[0])[0][1:] == [
+        "A - B",
+        "100",
+        "-",
+        "-",
+        "-",
+        "20.0",
+        "0.35",
+        "1.4",
+        "+0.300 ± 0.200",
+        "+0.000 ± 0.100",
+    ]
+    assert section.charts[0][1] == "All pairs. Numbers are those of the images."
+    assert section.charts[1][1].endswith("images look too different.")
+    assert asked("pairs") is None
+
+
+def test_pairs_without_an_angle_say_nothing_of_heights():
+    parallel = asked("pairs", pairs=[a_pair(height_m_per_px=None)])
+    assert parallel.answer.endswith(" No pair says anything about heights: all rays are parallel.")
+    for field in ("convergence_deg", "base_to_height"):
+        unknown = asked("pairs", pairs=[a_pair(**{field: None})])
+        assert len(unknown.charts) == 1
+        assert unknown.answer.endswith("below 0.5 px.")
+
+
+@pytest.mark.parametrize(("num", "cut"), [(300, False), (301, True)])
+def test_of_more_pairs_than_dots_some_are_left_out(num, cut):
+    section = asked("pairs", pairs=[a_pair()] * num)
+    assert section.charts[1][1].endswith(f" Of {num} pairs some are left out, evenly.") == cut
+
+
+def test_corrections_are_told_by_the_farthest_move_and_the_worst_sigma():
+    ellipse = EllipseEntry(3.0, 1.0, 45.0, 5.0)
+    views = [
+        a_view("A", correction=a_correction(center_shift_px=(3.0, -4.0), angle_urad=2.0)),
+        a_view(
+            "B",
+            correction=a_correction(center_sigma_px=(0.6, 0.8), ellipse=ellipse),
+            camera_center=CenterEntry((0, 0, 0), 694e3, "line"),
+        ),
+    ]
+    section = asked("corrections", views)
+    assert section.answer.startswith(
+        "Up to 5.00 px in the middle of an image. The adjustment itself predicts this to be known to 1 px (one"
+    )
+    assert section.answer.endswith("the scene's own place, which no tie point can tell.")
+    assert [table.key for table in section.tables] == ["corrections", "places"]
+    assert texts(section.tables[0])[0] == ["A", "+3.000 ± 0.10", "-4.000 ± 0.10", "2.00", "-", "-", "-"]
+    assert texts(section.tables[0])[1][-2:] == ["694", "line"]
+    assert [cell.key for cell in section.tables[0].rows[0]][1:3] == [3.0, -4.0]
+    assert texts(section.tables[1])[1] == ["B", "3.00", "1.00", "45", "5.00", "-"]
+    assert len(section.charts) == 1  # no outlines, no map
+    assert section.half
+    placed = asked("corrections", views, outlines=[a_square(10.0, 0.0)] * 2)
+    assert len(placed.charts) == 2
+    held = asked("corrections", views, gcps=(a_gcp("P", 0.0, 0.0),))
+    assert "no tie point can tell" not in held.answer
+    assert [table.key for table in asked("corrections", views[:1]).tables] == ["corrections"]
+    assert asked("corrections", [views[0], a_view("B")]) is None
+    clocks = asked("corrections", [a_view("A", correction=a_correction(range_m=1.0, azimuth_ms=0.5))])
+    assert clocks.tables[0].columns[-2:] == ["range [m]", "azimuth [ms]"]
+    assert texts(clocks.tables[0])[0][-2:] == ["+1.000", "+0.5000"]
+
+
+def a_scene(**fields) -> SceneEntry:
+    usual = {
+        "shift_enu_m": (0.0, 0.0, 0.0), "sigma_enu_m": (1.0, 1.0, 1.0), "radius_m": 9.0, "weakest_modes": (),
+        "noise": 1.0, "drift_degree": 1, "drift_sigma_m": (), "prior_ratio": None, "cost_history": (),
+        "num_held_in_height": 0, "gcp_residuals_enu_m": (), "solver": "done",
+    }  # fmt: skip
+    return SceneEntry(**{**usual, **fields})
+
+
+def a_mode(sigma: float | None, words: str) -> ModeEntry:
+    return ModeEntry(sigma, "up", (0.0,) * 7, words)
+
+
+def test_what_the_images_cannot_tell_has_bars_of_the_weakest():
+    scene = a_scene(
+        weakest_modes=(
+            a_mode(4.0, "all heights"),
+            a_mode(0.5, "the scene"),
+            a_mode(None, "x"),
+            a_mode(0.0, "y"),
+        )
+    )
+    section = asked("gauge", scene=scene)
+    assert section.bars == [("All heights", "4.0 m", 100.0), ("The scene", "50.0 cm", 12.5)]
+    assert section.answer.endswith(" Ground control points (--gcp) are what helps where it matters.")
+    assert "held in height" not in section.answer
+    assert section.tables == []
+    assert section.half
+    assert (
+        " 7 tie points seen under too small an angle were held in height."
+        in asked("gauge", scene=a_scene(num_held_in_height=7)).answer
+    )
+    assert asked("gauge") is None
+
+
+@pytest.mark.parametrize(("used", "helped"), [(True, True), (False, False)])
+def test_a_reference_that_is_used_helps_as_control_does(used, helped):
+    row = ReferenceViewEntry("A", 9.0, (1.0, -2.0), 50, 30, 20, 0.5)
+    section = asked("gauge", scene=a_scene(), reference=ReferenceEntry(used, 0.5, 1.0, 20, (row,)))
+    assert ("--gcp" not in section.answer) == helped
+    assert texts(section.tables[-1]) == [["A", "9.0", "+1.00", "-2.00", "50", "30", "20", "0.50"]]
+    assert "--gcp" not in asked("gauge", scene=a_scene(), gcps=(a_gcp("P", 0.0, 0.0),)).answer
+
+
+def test_what_holds_the_scene_and_the_control_in_each_image_are_tables():
+    datum = DatumEntry("up", 2.0, 0.996, 0.0, 0.0, 0.004, 0.0, None)
+    views = [a_view("A", control_w=2.5, control_w_point="P"), a_view("B")]
+    section = asked("gauge", views, scene=a_scene(datum=(datum,)), gcps=(a_gcp("P", 0.0, 0.0),))
+    assert [table.key for table in section.tables] == ["datum", "gcps", "control"]
+    assert texts(section.tables[0]) == [["up", "2.00", "100"]]
+    assert texts(section.tables[2]) == [["A", "2.5", "P"]]
+    assert section.tables[2].folded
+
+
+def test_columns_of_what_tells_half_a_percent_of_any_motion_are_shown():
+    some = DatumEntry("up", 2.0, 0.995, 0.0, 0.0, 0.005, 0.0, None)
+    none = replace(some, part="east", gcps=0.0049, cameras=None)
+    assert DatumEntry.columns([none]) == "part sigma_m"
+    assert DatumEntry.columns([none, some]) == "part sigma_m cameras gcps"
+    assert DatumEntry.columns([replace(some, reference=1.0)]).endswith("gcps reference")
+
+
+def a_check(name: str, miss, *seen_in) -> CheckPointEntry:
+    return CheckPointEntry(
+        name, 0.0, 0.0, 0.0, miss, tuple(SeenEntry(f"V{k}", px) for k, px in enumerate(seen_in))
+    )
+
+
+def test_check_points_are_met_to_an_rms():
+    points = (
+        a_check("P", (3.0, 0.0, -0.4), (3.0, 4.0), (None, 1.0)),
+        a_check("Q", (None, 1.0, 1.0), (0.0, 0.0)),
+        a_check("R", (4.0, 0.0, 0.3)),
+    )
+    section = asked("check_points", check_points=points)
+    assert section.answer == (
+        "3 check points, which the adjustment did not see, are met to 3.54 px in the images and 3.5 m, 0.0 mm, 35.4 cm "
+        "east, north, up on the ground (RMS)."
+    )
+    assert texts(section.tables[0]) == [
+        ["P", "1", "5.000", "+3.000", "0", "-0.400"], ["Q", "1", "0", "-", "+1.000", "+1.000"],
+        ["R", "0", "-", "+4.000", "0", "+0.300"],
+    ]  # fmt: skip
+    nothing = asked("check_points", check_points=(a_check("R", (None, None, None)),))
+    assert "are met to nothing: no camera sees them (RMS)." in nothing.answer
+    assert asked("check_points") is None
+
+
+def test_files_are_held_to_what_their_readers_found():
+    fit = FitEntry((1e-3, 2e-3), (4e-3, 3e-3), 0.9, 1e-5, 1.0, "lstsq", 500)
+    outputs = {"A_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}, "A.json": {"barpc": 0.0}}
+    section = asked("files", [a_view("A", fit=fit, outputs=outputs), a_view("B", fit=fit)])
+    assert section.answer.startswith("Yes, to 4.0e-03 px at worst, on check points")
+    fits, files = section.tables
+    assert texts(fits)[0] == ["A", "1.0e-03, 2.0e-03", "4.0e-03", "0.900", "1.0e-05", "100", "500", "lstsq"]
+    assert files.columns == ["file", "gdal [px]", "rpcm [px]", "barpc [px]"]
+    assert texts(files) == [["A_RPC.TXT", "1.0e-09", "cannot read it", "-"], ["A.json", "-", "-", "0"]]
+    assert [cell.key for cell in files.rows[0][1:]] == [1e-9, 1e301, 1e300]
+    assert asked("files", [a_view("A")]) is None
+    partly = asked("files", [a_view("A", fit=fit, outputs=outputs), a_view("B")])
+    assert partly.answer.startswith("Not known for every image.")
+    assert [table.key for table in partly.tables] == ["files"]
+    unknown = asked("files", [a_view("A", fit=replace(fit, max_px=(None, 0.1)))])
+    assert unknown.answer.startswith("Not known")
+
+
+def test_how_it_was_made_has_bars_of_its_stages():
+    stages = tuple(
+        StageEntry(name, s, s, 100.4)
+        for name, s in (("matching", 8.0), ("adjustment", 2.0), ("report", 99.0))
+    )
+    section = asked("run", stages=stages, options={"tie": {"band": 1}, "dem": None})
+    assert section.answer == "3 images, 5 tie points, 12 observations, 10.0 s."
+    assert section.bars == [("matching", "8.00 s", 100.0), ("adjustment", "2.00 s", 25.0)]
+    assert texts(section.tables[0])[1] == ["adjustment", "2.00", "2.00", "100"]
+    assert texts(section.tables[1]) == [["tie.band", "1"], ["dem", "None"]]
+    assert all(table.folded for table in section.tables)
+    some = asked("run", tables=TablesEntry(900, 300, complete=False))
+    assert (
+        some.answer
+        == "3 images, 5 tie points, 12 observations. Tables and charts hold 300 tie points, evenly taken."
+    )
+    nought = asked("run", stages=(StageEntry("x", 0.0, 0.0, 0.0),))
+    assert nought.bars == [("x", "0.00 s", 0.0)]
+
+
+def test_decisions_have_a_table_of_images_where_cameras_were_adjusted():
+    section = asked("decisions", scene=a_scene(model="rotation"))
+    assert [table.key for table in section.tables] == ["decided"]
+    assert asked("decisions", kind="check") is None
+    again = asked("decisions", pairs=[a_pair(tied_by="x", beaten=("y",))], kind="check")
+    assert [table.key for table in again.tables] == ["again"]
+
+
+@pytest.mark.parametrize(("num", "known"), [(400, True), (401, False)])
+def test_the_script_knows_the_images_that_are_drawn(monkeypatch, num, known):
+    pytest.importorskip("jinja2")
+    files = files_of(a_summary([a_view(f"<V{k}") for k in range(num)]))
+    monkeypatch.setattr(page, "read_tables", lambda *_: files)
+    monkeypatch.setattr(page, "SECTIONS", ())
+    html = page.report_html(files.summary, "")
+    assert ('["\\u003cV399",100]' in html) == known
+    assert ('"views":[]' in html) == (not known)
+
+
+@pytest.mark.parametrize(("num", "more"), [(200, False), (201, True)])
+def test_a_verdict_of_two_hundred_sentences_is_shown_whole(monkeypatch, num, more):
+    pytest.importorskip("jinja2")
+    files = files_of(a_summary(VIEWS, verdict=tuple(f"s{k}." for k in range(num))))
+    monkeypatch.setattr(page, "read_tables", lambda *_: files)
+    monkeypatch.setattr(page, "SECTIONS", ())
+    html = page.report_html(files.summary, "")
+    assert "<li>s199.</li>" in html
+    assert ("And 1 more; all are in summary.json." in html) == more

@@ -1,0 +1,511 @@
+"""The sentences of a verdict, each on both sides of what decides it, with its figures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba.consensus import TwoGroups
+from barpc.ba.ground import TerrainTest
+from barpc.ba.smooth import SmoothTest
+from barpc.ba.snooping import ControlTest
+from barpc.report import verdict as verdicts
+from barpc.report.summary import FitEntry
+from barpc.report.verdict import block_verdict, view_status
+from barpc.tie.reference import PEAK, Registration, ViewMatch
+
+from .made import a_correction, a_view
+
+NAMES = ("A", "B", "C")
+NO_NUMBER = float("nan")
+
+
+def adjusted(**fields: Any) -> Any:
+    """An adjustment of three images that nothing is to be said of."""
+    usual = {
+        "left_out": (), "names": NAMES, "noise": 1.0, "in_space_rms": None, "two_groups": (), "control": None,
+        "prior": SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=()),
+        "smooth": SmoothTest(np.zeros(3), np.ones(3), np.full(3, NO_NUMBER), np.zeros(3)),
+        "held_out_noise": np.ones(3), "held_out_rms": np.full(3, 0.2), "held": np.zeros(9, bool), "terrain": None,
+        "options": SimpleNamespace(drift=None, fixed=(), dem_for_all=False, min_convergence=1.0, dem_sigma=2.0),
+        "gauge": SimpleNamespace(shift=np.array([1.0, -2.0, 3.0]), sigma=np.array([1.0, 2.0, 0.5]) * 10,
+                                 motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0])),
+        "cameras": SimpleNamespace(unknowns=SimpleNamespace(drift=1)),
+    }  # fmt: skip
+    return SimpleNamespace(**{**usual, **fields})
+
+
+def run_of(adjustment: Any = None, kind: str = "adjust", **fields: Any) -> Any:
+    usual = {
+        "kind": kind, "adjustment": adjustment or adjusted(), "options": SimpleNamespace(), "reference": None,
+        "copies": {}, "number": {name: k for k, name in enumerate(NAMES)}, "gcps": None, "check_points": None,
+        "left_out": (), "after": None, "tracks": [0] * 9, "views": tuple(SimpleNamespace(name=name) for name in NAMES),
+    }  # fmt: skip
+    return SimpleNamespace(**{**usual, **fields})
+
+
+def views(**fields: Any) -> list[Any]:
+    return [a_view(name, **fields) for name in NAMES]
+
+
+def said(run: Any, of: Any = None) -> list[str]:
+    return block_verdict(run, of or views())["lines"]
+
+
+# --- an image ---------------------------------------------------------------------------------------------
+
+
+def test_the_figures_that_decide():
+    found = (verdicts.GOOD_RMSE, verdicts.FEW_OBSERVATIONS, verdicts.ENOUGH_GCPS, verdicts.MANY_REJECTED)
+    assert found == (0.5, 30, 3, 0.3)
+    found = (verdicts.SMOOTH_LEFT, verdicts.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.MOVED)
+    assert found == (0.06, 2.0, 2.5, 3.0)
+
+
+def test_an_image_of_which_all_is_well_has_no_advice():
+    assert view_status(a_view(), run_of()) == {"status": "adjusted", "advice": ""}
+
+
+@pytest.mark.parametrize(
+    ("fields", "status"),
+    [
+        ({"rmse_after": 0.5}, "adjusted"),
+        ({"rmse_after": 0.51}, "doubtful"),
+        ({"rmse_after": None}, "doubtful"),
+        ({"rmse_after": 0.2, "rmse_before": 9.0}, "adjusted"),
+        ({"num_observations": 30}, "adjusted"),
+        ({"num_observations": 29}, "weak"),
+        ({"num_observations": 29, "num_gcps": 2}, "weak"),
+        ({"num_observations": 29, "num_gcps": 3}, "adjusted"),
+        ({"num_observations": 0, "num_gcps": 3, "rmse_after": None}, "adjusted"),  # nothing to be doubted
+        ({"num_observations": 70, "num_rejected": 30}, "adjusted"),
+        ({"num_observations": 70, "num_rejected": 31}, "doubtful"),
+    ],
+)
+def test_an_image_is_judged_at_its_limits(fields, status):
+    assert view_status(a_view(**fields), run_of())["status"] == status
+
+
+def test_what_is_advised_has_its_figures():
+    def advice(run=None, **fields):
+        return view_status(a_view(**fields), run or run_of())["advice"]
+
+    assert advice(num_observations=5) == "only 5 tie points: check overlap, clouds and dates"
+    assert advice(num_observations=0) == "no tie points: check overlap, clouds and dates"
+    assert advice(rmse_after=0.72).startswith("tie points are left with 0.72 px: look for wrong matches")
+    lost = advice(num_observations=60, num_rejected=40)
+    assert lost.startswith("40 % of its tie points were rejected")
+    check = run_of(kind="check", adjustment=None)
+    assert advice(check, rmse_before=0.72) == "tie points disagree by 0.72 px: adjust the cameras"
+    assert advice(check, rmse_before=0.5, rmse_after=9.0) == ""
+    assert advice(run_of(kind="match"), rmse_before=9.0, rmse_after=9.0, num_rejected=999) == ""
+    assert advice(run_of(kind="match"), num_observations=5).startswith("only 5")
+    copies = {"A": "B, moved by 1 columns and 2 rows"}
+    assert (
+        advice(run_of(copies=copies))
+        == "shows the same pixels as B, moved by 1 columns and 2 rows: give each image once"
+    )
+    assert view_status(a_view("B"), run_of(copies=copies))["advice"] == ""
+    outside = run_of(adjusted(left_out=("A",)))
+    assert view_status(a_view("A"), outside)["status"] == "failed"
+    assert view_status(a_view("B"), outside)["status"] == "adjusted"
+
+
+def test_few_tie_points_do_where_a_reference_holds_the_very_image():
+    def status(points: int, name: str = "A") -> str:
+        found = Registration(None, (ViewMatch(name, 9.0, (0.0, 0.0), points=points),), 1.0, 1.0)
+        return view_status(a_view(num_observations=3), run_of(reference=found))["status"]
+
+    assert (status(4), status(0), status(4, "B")) == ("adjusted", "weak", "weak")
+
+
+def a_fit(largest: float | None, rmse: float = 0.0) -> FitEntry:
+    return FitEntry((rmse, 0.0), (0.0, largest), 0.5, 0.0, 1.0, "lstsq", 9)
+
+
+@pytest.mark.parametrize(
+    ("largest", "options", "status"),
+    [
+        (0.01, {}, "adjusted"),
+        (0.011, {}, "failed"),
+        (None, {}, "failed"),
+        (0.011, {"grids": True}, "adjusted"),
+    ],
+)
+def test_an_rpc_is_to_hold_its_camera_to_the_tolerance(largest, options, status):
+    run = run_of(options=SimpleNamespace(fit=SimpleNamespace(tolerance=0.01), **options))
+    found = view_status(a_view(fit=a_fit(largest)), run)
+    assert found["status"] == status
+    if status == "failed":
+        assert (
+            found["advice"]
+            == "one RPC cannot hold the corrected camera to 0.01 px: lower --drift or the range"
+        )
+    assert view_status(a_view(fit=a_fit(9.0)), run_of())["status"] == "adjusted"  # no tolerance was given
+
+
+@pytest.mark.parametrize("more", ["jitter_px", "detector_px"])
+@pytest.mark.parametrize(
+    ("left", "options", "doubted"),
+    [
+        (0.06, {}, False),
+        (0.07, {}, True),
+        (0.07, {"grids": True}, False),
+        (0.07, {"tiles": 512}, False),
+        (0.07, {"resample": True}, False),
+    ],
+)
+def test_a_camera_that_follows_jitter_needs_more_than_one_rpc(more, left, options, doubted):
+    run = run_of(options=SimpleNamespace(fit=SimpleNamespace(tolerance=0.01), **options))
+    waving = a_view(fit=a_fit(0.25, left), correction=a_correction(**{more: 0.3}))
+    found = view_status(waving, run)
+    assert found["status"] == ("doubtful" if doubted else "adjusted")
+    assert (f"leaves {left:.2f} px (RMS; 0.25 px at most): use its grids" in found["advice"]) == doubted
+    assert view_status(replace(waving, fit=None), run)["advice"] == ""
+    calm = replace(waving, correction=a_correction(**{more: 0.0}))
+    assert view_status(calm, run)["advice"].startswith(
+        "one RPC cannot hold" if not options.get("grids") else ""
+    )
+
+
+def test_an_rpc_that_is_far_off_beside_the_others_is_asked_about():
+    def advice(odd: list[int], name: str = "A") -> str:
+        marked = np.isin(np.arange(3), odd)
+        prior = SimpleNamespace(odd=marked, scale=np.array([7.0, 8.0, 9.0]), drift_sigma=())
+        return view_status(a_view(name), run_of(adjusted(prior=prior)))["advice"]
+
+    assert advice([0]) == (
+        "its RPC is 7 times farther off than stated, beside the other images: check that it belongs to this image"
+    )
+    assert "(or that of A, C: the tie points cannot tell)" in advice([0, 1, 2], "B")
+    assert "is 8 times" in advice([0, 1, 2], "B")
+    assert advice([0], "B") == ""
+
+
+@pytest.mark.parametrize(
+    ("rms", "p", "shared", "by_row", "drift", "words"),
+    [
+        (0.06, 1e-9, 0.06, 0.9, None, ""),
+        (0.07, 1e-3, 0.0, 0.9, None, ""),
+        (0.07, 1e-9, 0.0, 0.51, None, "an error of 0.07 px that changes along the rows is left: attitude jitter"),
+        (0.07, 1e-9, 0.0, 0.5, 1, "an error of 0.07 px that changes over the image is left: attitude jitter"),
+        (0.07, 1e-9, 0.12, 0.9, 0, "an error of 0.12 px that changes along the rows is left: a drift was not"),
+        (0.01, 1.0, 0.08, NO_NUMBER, None, "an error of 0.08 px that changes over the image is left: attitude"),
+    ],
+)  # fmt: skip
+def test_what_is_smooth_and_is_left_is_said(rms, p, shared, by_row, drift, words):
+    others = np.array([9.0, 9.0])
+    smooth = SmoothTest(*(np.append([value], others) for value in (rms, p, by_row, shared)))
+    options = SimpleNamespace(drift=drift)
+    found = view_status(a_view(), run_of(adjusted(smooth=smooth, options=options)))["advice"]
+    assert found.startswith(words) if words else found == ""
+
+
+# --- the block --------------------------------------------------------------------------------------------
+
+
+def reasons(adjustment: Any = None, **fields: Any) -> list[str]:
+    return block_verdict(run_of(adjustment, **fields), views())["reasons"]
+
+
+def test_headlines_count_one_and_many():
+    def headline(statuses: list[str], kind: str = "adjust", **fields: Any) -> str:
+        of = [
+            a_view(name, status=status, advice="x" * (status != "adjusted"))
+            for name, status in zip(NAMES, statuses, strict=True)
+        ]
+        return block_verdict(run_of(kind=kind, **fields), of)["headline"]
+
+    well = ["adjusted"] * 3
+    assert headline(well) == "All 3 images are adjusted."
+    assert headline(["weak", "adjusted", "adjusted"]) == "1 needs a look (of 3)."
+    assert headline(["weak", "doubtful", "adjusted"]) == "2 need a look (of 3)."
+    assert headline(["failed", "doubtful", "adjusted"]) == "1 image is not adjusted, 1 needs a look (of 3)."
+    assert headline(["failed", "failed", "adjusted"]) == "2 images are not adjusted (of 3)."
+    assert headline(well, left_out=(("x", "y"),)) == "1 image is not adjusted (of 4)."
+    check = {"kind": "check", "left_out": (("x", "y"), ("z", "y")), "adjustment": None}
+    assert headline(well, **check) == "2 images are not usable (of 5)."
+    noisy = adjusted(noise=2.6)
+    assert headline(well, adjustment=noisy) == "All 3 images are adjusted; the block needs a look."
+    assert headline(["weak", *well[1:]], adjustment=noisy) == "1 needs a look (of 3); the block needs a look."
+    assert headline(well, kind="check", adjustment=None) == "The cameras of all 3 images agree."
+
+
+@pytest.mark.parametrize(
+    ("scales", "said_of"), [((2.0, 9.0, 9.0), False), ((2.1, 9.0, 9.0), True), ((), False)]
+)
+def test_priors_are_doubted_where_every_camera_s_was_widened(scales, said_of):
+    prior = SimpleNamespace(odd=np.zeros(3, bool), scale=np.array(scales), drift_sigma=())
+    found = reasons(adjusted(prior=prior))
+    assert bool(found) == said_of
+    if said_of:
+        assert found[0].startswith("The cameras are 2.1 times farther off than stated")
+
+
+@pytest.mark.parametrize(("noise", "said_of"), [(2.5, False), (2.6, True)])
+def test_tie_points_that_scatter_are_said_to(noise, said_of):
+    found = reasons(adjusted(noise=noise))
+    assert bool(found) == said_of
+    if said_of:
+        assert found[0].startswith("Tie points scatter 2.6 times as much as stated")
+    assert not reasons(adjusted(noise=9.0), tracks=[], gcps=None)
+
+
+def test_an_affine_in_the_image_says_what_it_was_better_than():
+    gauge = adjusted().gauge
+    found = reasons(adjusted(in_space_rms=0.95, held_out_rms=np.array([0.1, 0.3, 0.2]), gauge=gauge))
+    (line,) = found
+    assert line.startswith(
+        "Rotations and translations leave 0.950 px of tie points that took no part; an affine in each"
+    )
+    assert "leaves 0.200 px and was taken" in line
+    assert line.endswith("Its tilts are known to 40.0 cm, 5.0 m (east, north) only.")
+
+
+def test_two_groups_are_not_said_again_of_an_odd_image():
+    groups = (TwoGroups((0, 2), 0.31, 0.42),)
+    (line,) = reasons(adjusted(two_groups=groups))
+    assert line.startswith("Tie points of A and C fall into two groups, 31 % lying 0.42 px from the others")
+    for odd in ([1, 0, 0], [0, 0, 1]):
+        prior = SimpleNamespace(odd=np.array(odd, bool), scale=np.ones(3), drift_sigma=())
+        assert reasons(adjusted(two_groups=groups, prior=prior)) == []
+    prior = SimpleNamespace(odd=np.array([0, 1, 0], bool), scale=np.ones(3), drift_sigma=())
+    assert len(reasons(adjusted(two_groups=groups, prior=prior))) == 1
+
+
+def moved(by: float, **fields: Any) -> Any:
+    shift, sigma = np.array([0.0, -by, 0.1]), np.array([0.0, 2.0, 1.0])
+    return adjusted(gauge=SimpleNamespace(shift=shift, sigma=sigma, motion_sigma=np.ones(7)), **fields)
+
+
+def test_a_scene_that_moved_far_is_said_to_where_nothing_but_the_cameras_holds_it():
+    assert reasons(moved(6.0)) == []
+    (line,) = reasons(moved(6.1))
+    assert line.startswith("The scene moved by +0.00 m east, -6.10 m north, +0.10 m up, more than 3 standard")
+    assert reasons(moved(6.1), options=SimpleNamespace(dem="x")) == []
+    assert reasons(moved(6.1), options=SimpleNamespace(fixed_run="x")) == []
+    assert len(reasons(moved(6.1), options=SimpleNamespace(dem=None, fixed_run=None))) == 1
+    fixed = SimpleNamespace(drift=None, fixed=("A",), dem_for_all=False, min_convergence=1.0, dem_sigma=2.0)
+    assert reasons(moved(6.1, options=fixed)) == []
+    for used, num in ((True, 0), (False, 1)):
+        test = ControlTest(np.array([used]), np.zeros((1, 3)), np.zeros(1), np.ones(1))
+        found = [line for line in reasons(moved(6.1, control=test)) if line.startswith("The scene moved")]
+        assert len(found) == num
+
+
+def control(**fields: Any) -> ControlTest:
+    usual = {
+        "used": np.ones(3, bool),
+        "residual": np.zeros((3, 3)),
+        "w": np.ones(3),
+        "redundancy": np.full(3, 0.5),
+    }
+    return ControlTest(**{**usual, **fields})
+
+
+def gcps(num: int = 3, view=(0, 1, 2, 0), point=(0, 1, 2, 1), left_out=()) -> Any:
+    names = [f"P{k}" for k in range(num)]
+    return SimpleNamespace(names=names, view=np.array(view), point=np.array(point), left_out=left_out)
+
+
+def test_control_that_is_wrong_is_named_with_how_far_it_is_off():
+    residual, w = np.array([[3.0, 4.0, 0.0], [0, 0, 0], [0, 0, 0.02]]), np.array([6.0, 1.0, 4.5])
+    found = reasons(
+        adjusted(control=control(residual=residual, w=w, used=np.array([False, True, True]))), gcps=gcps()
+    )
+    assert found == [
+        "1 GCP rejected, contradicted by the rest: check coordinates, axes and image positions: P0 (5.0 m, w = 6.0).",
+        "1 GCP off by more than 4 standard deviations, used all the same: the stated accuracies are too good, or more "
+        "than one is wrong: P2 (2.0 cm, w = 4.5).",
+    ]
+    two = reasons(
+        adjusted(control=control(used=np.zeros(3, bool), w=np.array([9.0, np.nan, 9.0]))), gcps=gcps()
+    )
+    assert two[0].startswith("3 GCPs rejected")
+    assert "P1 (too few images show it to tell by how much)" in two[0]
+
+
+def test_control_that_scatters_is_said_to_unless_one_is_named():
+    (line,) = reasons(adjusted(control=control(fits=False, scatter=2.34)), gcps=gcps())
+    assert line.startswith("3 GCPs scatter 2.3 times as much as stated")
+    named = reasons(
+        adjusted(control=control(fits=False, scatter=2.34, w=np.array([1.0, 4.5, 1.0]))), gcps=gcps()
+    )
+    assert [text.split()[1:3] for text in named] == [["GCP", "off"]]
+    assert reasons(adjusted(control=control()), gcps=gcps()) == []
+    assert reasons(adjusted(), gcps=gcps(left_out=("a: no such image",))) == ["a: no such image."]
+
+
+def test_a_reference_that_shows_something_else_is_of_no_use():
+    matches = tuple(ViewMatch(name, peak, (0.0, 0.0)) for name, peak in (("A", 3.2), ("B", 5.1)))
+    (line,) = reasons(reference=Registration(None, matches, 1.0, 1.0))
+    assert f"(its highest peak stands out by 5.1 standard deviations, {PEAK:g} are needed)" in line
+    (line,) = reasons(reference=Registration(None, (), 1.0, 1.0))
+    assert "by 0.0 standard" in line
+    of_use = (ViewMatch("A", 9.0, (0.0, 0.0), tried=9, points=4),)
+    assert reasons(reference=Registration(SimpleNamespace(), of_use, 1.0, 1.0)) == []
+
+
+# --- what was reached -------------------------------------------------------------------------------------
+
+
+def test_what_tie_points_agree_to_is_the_median_over_the_images():
+    of = [
+        a_view(name, rmse_before=b, rmse_after=a)
+        for name, b, a in (("A", 1.0, 0.3), ("B", 5.0, 0.1), ("C", 2.0, 0.2))
+    ]
+    lines = said(run_of(), of)
+    assert lines[0] == "Tie points of 3 images agree to 0.200 px (before: 2.000 px)."
+    assert "The scene as a whole moved by +1.00 m east, -2.00 m north, +3.00 m up." in lines
+    assert (
+        lines[-1]
+        == "Without ground control its place is known to 10.0 m, 20.0 m, 5.0 m (east, north, up; one sigma) only."
+    )
+    assert len(lines) == 3
+    without = said(run_of(tracks=[]), of)
+    assert without[0] == "There are no tie points: the cameras are held by control alone."
+    assert not any("moved by" in line for line in without)
+    assert any("moved by" in line for line in said(run_of(tracks=[], gcps=gcps()), of))
+    check = block_verdict(run_of(kind="check"), of)["lines"]
+    assert check == ["Tie points of 3 images agree to 2.000 px as the cameras are."]
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "words"), [((0.12, 3.0), "12.0 cm, 3.0 m"), ((), None), ((0.12, NO_NUMBER), None)]
+)
+def test_a_drift_is_said_with_what_is_known_of_it(sigmas, words):
+    prior = SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=sigmas)
+    found = [line for line in said(run_of(adjusted(prior=prior))) if line.startswith("Rotations")]
+    expected = f"Rotations change along the rows (drift of degree 1; {words} at the first and last row)."
+    assert found == ([expected] if words else [])
+
+
+def test_jitter_is_said_of_five_images_by_name_and_of_more_with_dots():
+    def lines(num: int, **fields: Any) -> list[str]:
+        waving = [
+            a_view(f"V{k}", correction=a_correction(jitter_px=0.1 * (k + 1), jitter_rows=100.0 * (k + 1)))
+            for k in range(num)
+        ]
+        return said(run_of(), [a_view("W"), a_view("X", correction=a_correction(**fields)), *waving])
+
+    start = "Jitter along the rows is followed by splines, a knot every"
+    assert f"{start} 200 rows: 0.10, 0.20, 0.30 px RMS. Tie" in " ".join(lines(3))
+    assert f"{start} 300 rows: 0.10, 0.20, 0.30, 0.40, 0.50 px RMS. Tie" in " ".join(lines(5))
+    assert "0.40, 0.50 px RMS, .... Tie" in " ".join(lines(6))
+    assert start not in " ".join(lines(0))
+    steps = lines(0, detectors=(5.0, 9.0), detector_px=0.25)
+    assert "Detectors begin at up to 2 columns of an image, 0.25 px RMS apart." in steps
+    assert "Detectors begin at up to 1 column of an image, 0.25 px RMS apart." in lines(
+        0, detectors=(5.0,), detector_px=0.25
+    )
+
+
+def test_the_clocks_of_radars_are_said():
+    radar = a_correction(range_m=1.5, azimuth_ms=-0.25, timing_sigma=(0.1, 0.02))
+    lines = said(run_of(), [a_view("A"), a_view("B", correction=radar)])
+    assert (
+        "Radar images are corrected by their clocks: B: range +1.50 ± 0.10 m, azimuth -0.250 ± 0.020 ms."
+        in lines
+    )
+    lines = said(run_of(), [a_view(f"B{k}", correction=radar) for k in range(7)])
+    assert any(line.endswith("ms and 2 more.") for line in lines)
+
+
+def test_control_is_said_to_hold_the_place_and_when_nothing_checks_it():
+    def lines(test=None, points=None, of=None) -> str:
+        return "\n".join(said(run_of(adjusted(control=test), gcps=points or gcps()), of))
+
+    assert "With 3 GCPs its place is known to 10.0 m, 20.0 m, 5.0 m (east, north, up; one sigma)." in lines(
+        control()
+    )
+    assert "With 1 GCP its place" in lines(control(used=np.array([True, False, False])))
+    assert (
+        "With 0 GCPs its place is known to 10.0 m, 20.0 m, 5.0 m (east, north, up; one sigma) only."
+        in lines(control(used=np.zeros(3, bool)))
+    )
+    assert "With 2 GCPs" in lines(None, gcps(view=(0, 1), point=(0, 2)))  # those that are seen
+    assert "With 2 GCPs" in lines(control(), gcps(view=(0, 1), point=(0, 2)))
+    blind = control(redundancy=np.full(3, 0.05))
+    assert "Nothing checks them: an error in a GCP would not show." in lines(blind)
+    assert "Nothing checks it:" in lines(
+        control(redundancy=np.full(3, 0.05), used=np.array([False, True, False]))
+    )
+    assert "Nothing checks" not in lines(control())
+    assert "Nothing checks" not in lines(control(redundancy=np.full(3, 0.05), fits=False))
+    assert "Nothing checks" not in lines(control(redundancy=np.full(3, 0.05), used=np.zeros(3, bool)))
+    alone = gcps(view=(1, 1, 1), point=(0, 1, 2))
+    assert "They are seen in B alone, which says nothing along its lines of sight." in lines(control(), alone)
+    assert "alone" not in lines(control())
+    assert "alone" not in lines(control(used=np.zeros(3, bool)), alone)
+    assert "alone" not in lines(control(), alone, [a_view("B")])
+
+
+def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
+    def lines(held=30, known=20, total=40, offset=2.0, spread=3.0, bias=0.5, **fields: Any) -> list[str]:
+        terrain = TerrainTest(held, known, total, offset, spread, bias)
+        return said(run_of(adjusted(terrain=terrain, **fields)))[-2:]
+
+    assert lines() == [
+        "The DEM holds 30 of 40 tie points, each to 2.0 m and all together to 50.0 cm.",
+        "It has a height for 50 % of the tie points; they lie +2.0 m above it (median; spread 3.0 m).",
+    ]
+    assert lines(known=0)[1] == "It has a height for 0 % of the tie points."
+    assert lines(known=0, total=0, held=0)[1] == "It has a height for 0 % of the tie points."
+    held = "The DEM holds 0 of 40 tie points: "
+    assert lines(held=0)[0] == f"{held}all rays meet under more than 1 degree; --dem-for-all holds the scene."
+    options = {"drift": None, "fixed": (), "dem_for_all": False, "min_convergence": 2.5, "dem_sigma": 2.0}
+    assert "more than 2.5 degrees;" in lines(held=0, options=SimpleNamespace(**options))[0]
+    nowhere = f"{held}it has no height where it is needed."
+    assert lines(held=0, options=SimpleNamespace(**{**options, "dem_for_all": True}))[0] == nowhere
+    terrain = TerrainTest(0, 20, 40, 2.0, 3.0, 0.5)
+    assert said(run_of(adjusted(terrain=terrain, held=np.array([False, True]))))[-2] == nowhere
+
+
+def test_a_reference_is_said_to_hold_what_and_how_far_off_the_cameras_were():
+    def lines(*matches: ViewMatch) -> str:
+        return "\n".join(said(run_of(reference=Registration(SimpleNamespace(), matches, 0.5, 1.0))))
+
+    one = ViewMatch("A", 9.5, (3.0, -4.0), tried=50, points=20)
+    two = ViewMatch("B", 8.25, (0.0, 1.0), tried=30, points=10)
+    none = ViewMatch("C", 2.0, (0.0, 0.0), tried=99, points=0)
+    text = lines(one, two, none)
+    assert (
+        "Reference: 30 of 80 points matched at 50.0 cm in 2 images, peak 8.2 or more; as delivered they "
+        "were off by 5.0 m (A), 1.0 m (B)." in text
+    )
+    assert "The reference holds no point of C." in text
+    assert "So its place is known to 10.0 m, 20.0 m, 5.0 m (east, north, up; one sigma)." in text
+    assert "holds no point" not in lines(one, two)
+    assert "in 1 image," in lines(one)
+    many = lines(*(ViewMatch(f"V{k}", 9.0, (3.0, 4.0), tried=1, points=1) for k in range(7)))
+    assert "5.0 m (V4) and 2 more." in many
+    useless = said(run_of(reference=Registration(None, (none,), 0.5, 1.0)))
+    assert any(line.startswith("Without ground control") and line.endswith("only.") for line in useless)
+    with_gcps = said(
+        run_of(
+            adjusted(control=control()),
+            gcps=gcps(),
+            reference=Registration(SimpleNamespace(), (one,), 0.5, 1.0),
+        )
+    )
+    assert any(line.startswith("With 3 GCPs") for line in with_gcps)
+
+
+def test_the_order_of_reasons_is_what_failed_then_what_needs_a_look_then_files_block_and_points():
+    of = [a_view("A", status="weak", advice="a"), a_view("B", status="failed", advice="b"), a_view("C")]
+    run = run_of(adjusted(noise=3.0), left_out=(("f.tif", "no RPC"),), check_points=gcps(left_out=("p",)))
+    found = block_verdict(run, of)
+    assert [reason.split()[0] for reason in found["reasons"]] == ["B:", "A:", "f.tif", "Tie", "p."]
+    assert found["lines"][-5:] == found["reasons"]
+    assert found["status"] == "bad"
+
+
+def test_tie_points_alone_are_counted():
+    tracks = type("Ties", (), {"num_points": 7, "__len__": lambda _: 19})()
+    found = block_verdict(run_of(kind="match", tracks=tracks), views())
+    assert found["lines"] == ["7 tie points of 3 images, 19 observations."]
+    assert found["headline"] == "All 3 images are tied together."
