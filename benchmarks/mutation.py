@@ -54,6 +54,7 @@ ARITHMETIC = {
     ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"), ast.FloorDiv: ("//", "/"),
     ast.Mod: ("%", "*"), ast.Pow: ("**", "*"), ast.BitAnd: ("&", "|"), ast.BitOr: ("|", "&"),
 }  # fmt: skip
+CHECKED = "strict"  # of a zip: what it checks holds, and so does without
 NO_CODE = {"annotation", "returns", "decorator_list", "type_params", "msg"}
 SILENT = (
     b"_LOG.",
@@ -127,6 +128,8 @@ class Places:
         if isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom | ast.Assert):
             return
         if isinstance(node, ast.stmt | ast.Call) and self.raw.startswith(SILENT, self._span(node)[0]):
+            return
+        if isinstance(node, ast.keyword) and node.arg == CHECKED:
             return
         yield from getattr(self, f"_{type(node).__name__.lower()}", lambda _: ())(node)
         for name, value in ast.iter_fields(node):

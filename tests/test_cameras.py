@@ -25,6 +25,7 @@ from barpc.geodesy import (
 )
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor import SensorModel
+from barpc.sensor.geometry import altitude_range
 from tests.rpcio.conftest import make_rpc, write_image
 from tests.sensor.conftest import MODELS
 from tests.sensor.terrasar_files import Terrasar
@@ -235,6 +236,7 @@ class Own:
         return self.inner.localize(image, alt)
 
 
+@pytest.mark.slow
 def test_views_with_one_s_own_model_are_adjusted_as_files_are(tmp_path):
     from barpc.pipeline import load_views
 
@@ -252,3 +254,30 @@ def test_views_with_one_s_own_model_are_adjusted_as_files_are(tmp_path):
     wrong = replace(own[0], size=(3, 4))
     with pytest.raises(InputError, match="view says"):
         barpc.check([wrong, own[1]])
+
+
+def test_a_physical_model_is_for_the_altitudes_of_the_rpc_beside_it_or_for_all_ground_on_earth(tmp_path):
+    assert cameras._stated_altitudes(tmp_path / "DIM_A.XML") == (-500.0, 9000.0)
+    rpc = make_rpc()
+    write_rpc(rpc, tmp_path / "other.RPB")
+    (tmp_path / "other.RPB").rename(tmp_path / "RPC_A.XML")
+    assert cameras._stated_altitudes(tmp_path / "DIM_A.XML") == altitude_range(rpc)
+
+
+@pytest.mark.parametrize(
+    ("text", "taken"),
+    [
+        ("-10000:100000", True),
+        ("-10001:0", False),
+        ("0:100001", False),
+        ("5:5", False),
+        ("6:5", False),
+        ("0:1:2", False),
+    ],
+)
+def test_altitudes_are_an_interval_that_ground_may_lie_in(text, taken):
+    if taken:
+        assert cameras._interval(text) == (-1e4, 1e5)
+    else:
+        with pytest.raises(ValueError):
+            cameras._interval(text)

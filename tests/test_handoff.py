@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from barpc.errors import OutputError
-from barpc.handoff import CONSUMERS, TOLERANCE, control_grid, difference, unverified, verify
+from barpc.handoff import (
+    CONSUMERS,
+    TOLERANCE,
+    control_grid,
+    difference,
+    refuse_hiding,
+    unverified,
+    verify,
+)
 from barpc.rpcio import (
     CARRIERS,
     WRITABLE,
@@ -21,6 +29,7 @@ from barpc.rpcio import (
     write_rpc_copy,
 )
 from barpc.sensor.rpc import RPC
+from barpc.workspace import Workspace
 from tests.rpcio.conftest import make_rpc, write_image
 
 SIZE, ALTITUDES = (2000, 1900), (30.0, 300.0)
@@ -226,3 +235,45 @@ def test_orthority_counts_as_barpc_does(monkeypatch, tmp_path):
     np.testing.assert_array_equal(found, rpc.project(ground))
     assert ((str(tmp_path / "a.tif"),),) in model.asked
     assert ("a.tif",) in model.asked
+
+
+# --- what would be read in place of an image's RPC ------------------------------------------------------------
+
+
+def with_own_camera(path: Path) -> Path:
+    """An image that holds an RPC."""
+    plain = write_image(path.with_name("plain.tif"))
+    write_rpc_copy(make_rpc(), plain, path, overwrite=True)
+    plain.unlink()
+    return path
+
+
+def test_a_file_that_would_hide_an_image_s_own_rpc_is_refused(tmp_path):
+    image = with_own_camera(tmp_path / "scene.tif")
+    with pytest.raises(
+        OutputError, match=r"scene_RPC\.TXT: would be read in place of the RPC of .*scene\.tif"
+    ):
+        refuse_hiding(tmp_path, ["scene_RPC.TXT"], [])
+    with pytest.raises(OutputError, match="of the input"):
+        refuse_hiding(tmp_path, ["scene_RPC.TXT"], [image])
+    refuse_hiding(tmp_path, ["other_RPC.TXT"], [image])
+    refuse_hiding(tmp_path / "nowhere", ["scene_RPC.TXT"], [image])
+
+
+def test_what_is_there_already_hides_no_more_than_it_did_but_from_inputs(tmp_path):
+    image = with_own_camera(tmp_path / "scene.tif")
+    write_rpc(make_rpc(), tmp_path / "scene_RPC.TXT")
+    refuse_hiding(tmp_path, ["scene_RPC.TXT"], [])
+    with pytest.raises(OutputError, match="of the input"):
+        refuse_hiding(tmp_path, ["scene_RPC.TXT"], [image])
+
+
+def test_an_image_that_a_run_wrote_may_be_written_over_with_its_rpc(tmp_path):
+    made = with_own_camera(tmp_path / "scene.tif")
+    with Workspace(tmp_path / "run") as run, run.output("scene.tif") as path:
+        path.write_bytes(made.read_bytes())
+    refuse_hiding(tmp_path / "run", ["scene_RPC.TXT"], [])
+    with (tmp_path / "run/scene.tif").open("ab") as file:
+        file.write(b"edited")
+    with pytest.raises(OutputError, match="in place of the RPC"):
+        refuse_hiding(tmp_path / "run", ["scene_RPC.TXT"], [])

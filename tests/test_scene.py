@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.scene import GroundPoints, Tracks, View, connected_groups
+from barpc.scene import (
+    GroundPoints,
+    Reference,
+    Tracks,
+    View,
+    connected_groups,
+    connected_labels,
+    middle_altitude,
+)
 
 from .sensor.conftest import make_rpc
 
@@ -68,3 +76,103 @@ def test_ground_points_refuse_an_observation_of_no_point():
 def test_connected_groups_are_largest_first():
     assert connected_groups(6, [(4, 5), (0, 2), (2, 3)]) == [[0, 2, 3], [4, 5], [1]]
     assert connected_groups(0, []) == []
+
+
+# --- at the bounds, and in words -----------------------------------------------------------------------------
+
+
+def test_the_smallest_size_and_an_interval_of_one_altitude_are_enough():
+    view = View("a", "", (1, 1), make_rpc(), (7.0, 7.0))
+    assert view.altitude == 7.0
+    assert View("a", "", (3, 4), make_rpc(), (-10.0, 30.0)).altitude == 10.0
+    for size, interval in (((1, 0), (0.0, 1.0)), ((1, 1), (0.0, np.nan)), ((1, 1), (-np.inf, 1.0))):
+        with pytest.raises(InputError):
+            View("a", "", size, make_rpc(), interval)
+
+
+def test_what_a_record_says_of_itself():
+    view = View("a", "", (30, 40), make_rpc(), (-10.0, 30.0))
+    assert repr(view) == "View('a', 30 x 40 px, RPC for -10 to 30 m)"
+    assert "RPC for -10 to 30 m, 2020-02-03)" in repr(
+        View("a", "", (3, 4), make_rpc(), (-10.0, 30.0), "2020-02-03")
+    )
+    assert repr(make_tracks()) == "Tracks(2 tie points, 5 observations in 3 views, to 0.2 px)"
+    assert repr(GroundPoints.none()) == "GroundPoints(0 points, no observations)"
+
+
+@pytest.mark.parametrize(("view", "point"), [([0, 1], [0, -1]), ([-1, 1], [0, 0])])
+def test_negative_indices_are_refused(view, point):
+    with pytest.raises(InputError, match="negative"):
+        Tracks(view, point, np.zeros((2, 2)), np.ones(2))
+
+
+def ground_points(sigma: float = 0.5, xy_sigma: float = 0.3, point: int = 1) -> GroundPoints:
+    place = [[5.0, 43.0, 100.0], [5.1, 43.1, 200.0], [5.2, 43.2, 300.0]]
+    return GroundPoints(
+        ("a", "b", "c"), place, np.full((3, 3), sigma), [0, 2, point, 2], [1, 0, 3, 2],
+        np.arange(8.0).reshape(4, 2), np.full(4, xy_sigma), ("stranger",), ("left",),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("which", ["sigma", "xy_sigma"])
+@pytest.mark.parametrize(
+    ("sigma", "taken"),
+    [(1e-6, True), (0.9e-6, False), (1e9, True), (1.1e9, False), (0.0, False), (np.nan, False)],
+)
+def test_sigmas_of_ground_points_have_squares_that_can_be_reckoned_with(which, sigma, taken):
+    if taken:
+        assert len(ground_points(**{which: sigma}).names) == 3
+    else:
+        with pytest.raises(InputError, match="sigmas positive, from 1e-06 to 1e\\+09"):
+            ground_points(**{which: sigma})
+
+
+@pytest.mark.parametrize(("point", "taken"), [(0, True), (2, True), (3, False), (-1, False)])
+def test_an_observation_is_of_a_point_that_is_there(point, taken):
+    if taken:
+        assert ground_points(point=point).point[2] == point
+    else:
+        with pytest.raises(InputError, match="does not exist"):
+            ground_points(point=point)
+
+
+def test_selected_ground_points_keep_their_own_observations():
+    kept = ground_points().select(np.array([True, False, True]))
+    assert kept.names == ("a", "c")
+    assert kept.lonlatalt[:, 2].tolist() == [100.0, 300.0]
+    assert kept.point.tolist() == [0, 1, 1]
+    assert kept.view.tolist() == [1, 0, 2]
+    assert kept.xy.tolist() == [[0, 1], [2, 3], [6, 7]]
+    assert (kept.strangers, kept.left_out) == (("stranger",), ("left",))
+    nobody = ground_points().select(np.zeros(3, dtype=bool))
+    assert (nobody.names, len(nobody.view)) == ((), 0)
+
+
+def test_a_reference_has_a_positive_bias():
+    for bias in ([1.0, 1.0, 0.0], [1.0, -1.0, 1.0]):
+        with pytest.raises(InputError, match="positive"):
+            Reference(ground_points(), bias, [[0.0, 0.0]])
+    assert np.isnan(Reference(ground_points(), [1, 2, 3], [[np.nan, np.nan], [1, 2]]).offset[0]).all()
+
+
+def test_the_middle_altitude_of_views_is_the_mean_of_theirs():
+    views = [View("a", "", (3, 4), make_rpc(), alts) for alts in ((0.0, 100.0), (200.0, 500.0))]
+    assert middle_altitude(views) == 200.0
+
+
+def test_labels_are_numbered_by_the_first_node():
+    assert connected_labels(5, [(3, 1), (4, 0)]).tolist() == [0, 1, 2, 1, 0]
+    assert connected_labels(3, []).tolist() == [0, 1, 2]
+    assert connected_groups(5, [(0, 1), (2, 3)]) == [[0, 1], [2, 3], [4]]
+    assert connected_groups(5, [(3, 4), (4, 2)]) == [[2, 3, 4], [0], [1]]
+
+
+def test_selecting_keeps_tracks_of_two_and_closes_up_their_numbers():
+    tracks = Tracks(
+        [0, 1, 0, 1, 1, 2], [0, 0, 1, 1, 2, 2], np.arange(12.0).reshape(6, 2), np.arange(1.0, 7.0)
+    )
+    kept = tracks.select(np.array([True, False, True, True, True, True]))
+    assert kept.point.tolist() == [0, 0, 1, 1]
+    assert kept.view.tolist() == [0, 1, 1, 2]
+    assert kept.sigma.tolist() == [3.0, 4.0, 5.0, 6.0]
+    assert kept.xy[0].tolist() == [4.0, 5.0]

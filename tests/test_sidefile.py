@@ -33,6 +33,7 @@ from barpc.sidefile import (
     read_text,
 )
 from tests.fuzz.samples import SAMPLES
+from tests.lanes import diagonal
 
 SMALL = Kind("a list of names", 100)
 READERS: dict[str, Callable[[Path], object]] = {
@@ -165,10 +166,10 @@ def sniff_and_read(name: str, text: str) -> None:
     row.read(text, "x", ReadOptions())
 
 
-@pytest.mark.parametrize(
-    "prefix", ["", "LINE_OFF: ", "lineNumCoef = (", "rpc info = {", "<?xml ", "line_num_coeff: ["]
-)
-@pytest.mark.parametrize("fill", FILLS)
+PREFIXES = ["", "LINE_OFF: ", "lineNumCoef = (", "rpc info = {", "<?xml ", "line_num_coeff: ["]
+
+
+@pytest.mark.parametrize(("fill", "prefix"), diagonal(FILLS, PREFIXES, mark=pytest.mark.nightly))
 def test_sniffers_and_readers_take_time_in_proportion_to_the_text(fill, prefix):
     small, large = (prefix + FILLS[fill] * n for n in (10_000, 40_000))
     for name in FORMATS:
@@ -195,9 +196,12 @@ def test_the_largest_rpc_file_that_is_read_ends_in_sensible_time(fill):
 
 
 @pytest.mark.parametrize(
-    "kind", [kind for kind in SAMPLES if not kind.startswith(("rpc", "dem", "state", "grid"))]
+    ("kind", "fill"),
+    diagonal(
+        [kind for kind in SAMPLES if not kind.startswith(("rpc", "dem", "state", "grid"))],
+        ["\n", " ", "7", "(", "[", ","],
+    ),
 )
-@pytest.mark.parametrize("fill", ["\n", " ", "7", "(", "[", ","])
 def test_readers_take_time_in_proportion_to_the_file(kind, fill, tmp_path):
     sample = SAMPLES[kind]
     sample.beside(tmp_path)

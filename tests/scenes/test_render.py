@@ -9,6 +9,7 @@ import pytest
 
 from barpc.errors import InputError
 from barpc.simulate.orbit import Look, fly, looks
+from tests.lanes import rest_slow
 from tests.scenes.render import Radiometry, expose, render
 from tests.scenes.terrain import Grid, Plane, Ray, make_terrain
 from tests.scenes.texture import Date, Surface, make_surfaces
@@ -25,7 +26,14 @@ def surface() -> Surface:
     return make_surfaces(rng, terrain, 0.25, [Date()])[0]
 
 
-@pytest.fixture(scope="module", params=[0, 1, 2], ids=["aft", "nadir", "fore"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(0, id="aft"),
+        pytest.param(1, id="nadir", marks=pytest.mark.slow),
+        pytest.param(2, id="fore", marks=pytest.mark.slow),
+    ],
+)
 def sensor(request):
     return fly(TARGET, looks(3)[request.param], SIZE, 0.5)
 
@@ -51,10 +59,11 @@ def cast(sensor, terrain, image, step=0.02):
     return found
 
 
-def test_altitudes_are_those_of_brute_force_ray_casting(sensor, surface):
+@pytest.mark.parametrize("count", [100, pytest.param(300, marks=pytest.mark.nightly)])
+def test_altitudes_are_those_of_brute_force_ray_casting(sensor, surface, count):
     """Where the tracer and 2 cm steps along the exact line of sight differ, it is on an edge of a building."""
     rng = np.random.default_rng(0)
-    image = np.stack([rng.integers(0, n, 300) for n in SIZE], axis=1).astype(float)
+    image = np.stack([rng.integers(0, n, count) for n in SIZE], axis=1).astype(float)
     rendered = render(sensor, SIZE, surface, samples=1).altitude[
         image[:, 1].astype(int), image[:, 0].astype(int)
     ]
@@ -104,7 +113,7 @@ def _spots(terrain, seed):
     return grid, np.concatenate([places, alt[:, None]], axis=1)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", rest_slow([1, 2]))
 def test_spots_stand_where_the_exact_camera_puts_them_within_a_hundredth_of_a_pixel(sensor, surface, seed):
     """Centroids of rendered spots against the projection of their centres: the rendering's own error."""
     flat = replace(surface.terrain.relief, values=np.full_like(surface.terrain.relief.values, 231.5))

@@ -24,6 +24,7 @@ def test_the_samples_stay_small():
     assert sum(path.stat().st_size for path in SAMPLES.iterdir()) < 6e6
 
 
+@pytest.mark.slow
 def test_the_samples_carry_the_cameras_that_the_command_makes(scene):
     """To 1e-6 px: another processor may round the last digit of a cosine differently."""
     truth = json.loads((SAMPLES / "truth.json").read_text())
@@ -34,6 +35,7 @@ def test_the_samples_carry_the_cameras_that_the_command_makes(scene):
         assert np.allclose(view["rotation"], shot.correction.rotation, rtol=1e-12, atol=0)
 
 
+@pytest.mark.slow
 def test_the_samples_have_the_pixels_that_the_command_renders(scene):
     numbers = scene.picture(1).numbers.astype(int)
     with rasterio.open(SAMPLES / "view_01.tif") as dataset:

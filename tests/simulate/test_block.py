@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from barpc.errors import InputError
-from barpc.geodesy import ecef_from_ground
+from barpc.geodesy import ecef_from_ground, metres_per_unit
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
-from barpc.simulate import recentred, simulate_block
+from barpc.simulate import BlockOptions, _Grid, _turned, fly, recentred, simulate_block
+from barpc.simulate.orbit import looks
 
 
 @pytest.fixture(scope="module")
@@ -125,3 +126,137 @@ def test_a_thousand_views_are_simulated():
     block = simulate_block(1000, 20000)
     assert len(block.views) == 1000
     assert block.tracks.num_points == 20000
+
+
+# --- pieces -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("num_views", "per_site", "columns", "rows"),
+    [
+        (1, 3, 1, 1),
+        (3, 3, 1, 1),
+        (4, 3, 2, 1),
+        (12, 3, 2, 2),
+        (13, 3, 3, 2),
+        (27, 3, 3, 3),
+        (28, 3, 4, 3),
+        (5, 1, 3, 2),
+    ],
+)  # fmt: skip
+def test_sites_stand_on_a_grid_as_square_as_can_be(num_views, per_site, columns, rows):
+    grid = _Grid.square(num_views, BlockOptions(per_site=per_site), 5.0, 43.0)
+    assert (grid.columns, grid.rows) == (columns, rows)
+
+
+def test_neighbouring_sites_are_an_image_less_the_overlap_apart():
+    options = BlockOptions(size=(4000, 3000), overlap=0.25, gsd=0.5)
+    grid = _Grid.square(12, options, 5.0, 43.0)
+    metres = metres_per_unit(np.array([5.0, 43.0, 0.0]))[:2]
+    assert np.array(grid.step) * metres == pytest.approx([0.75 * 2000, 0.75 * 1500])
+    lon, lat = grid.lonlat([0, 1, 0.5], [0, 1, 0.5])
+    assert lon == pytest.approx([5.0 - 0.5 * grid.step[0], 5.0 + 0.5 * grid.step[0], 5.0])
+    assert lat == pytest.approx(
+        [43.0 + 0.5 * grid.step[1], 43.0 - 0.5 * grid.step[1], 43.0]
+    )  # rows run south
+    lon, _ = _Grid(2, 1, 180.0, 0.0, (0.2, 0.1)).lonlat(0, [0, 1])
+    assert lon == pytest.approx([179.9, -179.9])
+
+
+def test_a_block_ends_before_the_pole():
+    step = _Grid.square(1, BlockOptions(), 0.0, 84.9).step[1]
+    for lat, sign in ((85.0 - 0.5 * step - 1e-3, 1), (85.0 - 0.5 * step - 1e-3, -1)):
+        assert _Grid.square(1, BlockOptions(), 0.0, sign * lat).rows == 1
+        with pytest.raises(InputError, match="beyond 85"):
+            _Grid.square(1, BlockOptions(), 0.0, sign * (lat + 2e-3))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"num_views": 0}, {"num_tracks": -1}, {"num_checks": -1}, {"num_gcps": -1}], ids=str
+)
+def test_counts_are_not_negative_and_there_is_a_view(wrong):
+    with pytest.raises(InputError, match="at least one view"):
+        simulate_block(**wrong)
+
+
+def test_ground_control_is_exact_on_the_ground_and_noisy_in_the_images(block):
+    gcps = block.gcps
+    assert gcps.names[0] == "gcp_000"
+    assert (gcps.sigma == 0.1).all()
+    assert (gcps.xy_sigma == 0.2).all()
+    error = np.concatenate(
+        [
+            gcps.xy[rows] - sensor.project(gcps.lonlatalt[gcps.point[rows]])
+            for i, sensor in enumerate(exact(block))
+            for rows in [gcps.view == i]
+        ]
+    )
+    assert 0.1 < error.std() < 0.3
+    assert np.abs(error).max() < 1.0  # no outliers
+
+
+def test_points_lie_at_all_altitudes_that_were_asked_for_and_all_over_the_block():
+    block = simulate_block(12, 1500, seed=1, alt_range=(100.0, 300.0), noise=0.0)
+    alt = block.truth.ground[:, 2]
+    assert 100.0 <= alt.min() < 105.0
+    assert 295.0 < alt.max() <= 300.0
+    assert (block.tracks.sigma == 0.1).all()
+    assert not block.truth.outlier.any()
+    for i, view in enumerate(block.views):
+        xy = block.tracks.xy[block.tracks.view == i] / (np.array(view.size) - 1.0)
+        assert len(xy) > 100
+        assert xy.min() >= 0.0
+        assert xy.max() <= 1.0
+        assert (xy.min(axis=0) < 0.1).all()
+        assert (xy.max(axis=0) > 0.9).all()
+    assert [view.name for view in block.views[:2]] == ["view_0000", "view_0001"]
+
+
+def test_fewer_observations_are_made_where_less_is_visible():
+    lengths = [
+        np.bincount(simulate_block(9, 400, seed=2, visible=share).tracks.point).mean() for share in (1.0, 0.6)
+    ]
+    assert lengths[1] < 0.85 * lengths[0]
+
+
+@pytest.mark.parametrize(
+    ("field", "taken", "refused"),
+    [
+        ("per_site", [1], [0]), ("size", [(64, 64), (64, 900)], [(63, 64), (900, 63)]), ("gsd", [0.01], [0.0, -1.0]),
+        ("overlap", [0.0, 0.5], [-0.01, 0.51]), ("visible", [0.0, 1.0], [-0.01, 1.01]),
+        ("outliers", [0.0, 1.0], [-0.01, 1.01]), ("alt_range", [(0.0, 0.1)], [(5.0, 5.0), (6.0, 5.0)]),
+    ],
+)  # fmt: skip
+def test_the_layout_of_a_block_is_taken_up_to_its_bounds(field, taken, refused):
+    for value in taken:
+        assert getattr(BlockOptions(**{field: value}), field) == value
+    for value in refused:
+        with pytest.raises(InputError, match="block: "):
+            BlockOptions(**{field: value})
+
+
+def test_a_block_may_have_no_tracks():
+    block = simulate_block(3, 0, num_checks=5)
+    assert block.tracks.num_points == 0
+    assert block.truth.check.num_points == 5
+    assert simulate_block(3, 5, num_checks=0).truth.check.num_points == 0
+
+
+def test_a_camera_turned_about_the_earth_s_axis_is_elsewhere_in_longitude_only(block):
+    rpc = block.views[0].sensor
+    turned = _turned(rpc, 178.0)
+    assert turned.ground_offset - rpc.ground_offset == pytest.approx([178.0 - 360.0, 0.0, 0.0])
+    ground = block.truth.ground[:20]
+    np.testing.assert_allclose(turned.project(ground + [178.0, 0.0, 0.0]), rpc.project(ground), atol=1e-6)
+
+
+def test_corrections_turn_about_where_the_satellite_is_in_the_middle_of_the_image():
+    options = BlockOptions(per_site=2, size=(3000, 9000), alt_range=(100.0, 300.0))
+    block = simulate_block(4, 50, lon=20.0, lat=10.0, per_site=2, size=(3000, 9000), alt_range=(100.0, 300.0))
+    grid = _Grid.square(4, options, 20.0, 10.0)
+    for number, correction in enumerate(block.truth.corrections):
+        lon, lat = grid.lonlat(*divmod(number // 2, grid.columns))
+        flown = fly(np.array([lon, lat, 200.0]), looks(2)[number % 2], options.size, options.gsd)
+        assert np.linalg.norm(correction.center - flown.position(4499.5)) < 1.0
+    low, high = block.views[0].alt_range
+    assert (low, high) == pytest.approx((100.0 - 70.0, 300.0 + 70.0))  # a tenth of 200 m, and 50 m

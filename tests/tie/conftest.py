@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,9 @@ from barpc.sensor.geometry import altitude_range
 from barpc.sensor.rpc import RPC
 from barpc.tie import TieResult, find_tracks
 from tests.scenes import ImageOptions, Scene
+
+SIDES = [300, pytest.param(600, marks=pytest.mark.slow)]
+"""Rows and columns of a rendered scene: a quarter of the ground before a commit, all of it in the slower lanes."""
 
 
 def write_image(path: Path, data: np.ndarray, **profile: object) -> Path:
@@ -81,6 +85,11 @@ class Rendered:
             step = ndimage.maximum_filter(filled, 3) - ndimage.minimum_filter(filled, 3) > 3.0
             self.altitude.append(np.where(step, np.nan, altitude))
 
+    @cached_property
+    def tied(self) -> TieResult:
+        """Its tie points as anybody finds them."""
+        return find_tracks(self.views)
+
     def errors(self, first: int, second: int, xy_first: np.ndarray, xy_second: np.ndarray) -> np.ndarray:
         """True place in the second view minus the measured one (M, 2) [px], where the truth is known."""
         errors = self.place(first, second, xy_first) - xy_second
@@ -113,3 +122,9 @@ def render(tmp_path_factory) -> Callable[..., Rendered]:
         return made[key]
 
     return make
+
+
+@pytest.fixture(scope="session")
+def scene(render) -> Rendered:
+    """Two views of a little ground."""
+    return render(views=2, size=(300, 300))

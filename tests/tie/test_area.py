@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from barpc.errors import DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.raster import open_raster
-from barpc.scene import View
+from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
 from barpc.tie import TieOptions, features, find_tracks, read_area, select_pairs
-from barpc.tie.pairs import Footprints, shared_tiles
+from barpc.tie.pairs import Area, Footprints, shared_tiles
 from barpc.tie.raster import tiles
 from tests.constants import chosen
 
-from .conftest import write_image
+from .conftest import Rendered, write_image
 from .test_pairs import METRE, camera
 from .test_pairs import views as views_of
 
@@ -162,10 +162,20 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 @given(JSON)
 def test_any_json_is_an_area_or_one_line(tmp_path_factory, data) -> None:
-    path = tmp_path_factory.getbasetemp() / "any.json"
+    _area_or_one_line(tmp_path_factory.getbasetemp() / "any.json", data)
+
+
+@pytest.mark.slow
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(JSON)
+def test_much_json_is_an_area_or_one_line(tmp_path_factory, data) -> None:
+    _area_or_one_line(tmp_path_factory.getbasetemp() / "any.json", data)
+
+
+def _area_or_one_line(path: Path, data: object) -> None:
     try:
         area, said = read_area(written(path, data)), ""
     except InputError as error:
@@ -248,6 +258,25 @@ def in_blocks(view: View, folder: Path) -> View:
     return replace(view, path=str(write_image(path, pixels, tiled=True, blockxsize=64, blockysize=64)))
 
 
+def all_inside(scene: Rendered, tracks: Tracks, everywhere: Tracks, area: Area) -> None:
+    """Tracks are those of a scene that lie in an area."""
+    sensors = [view.sensor for view in scene.views]
+    ground, whole = (
+        ground_from_ecef(triangulate(sensors, t.view, t.point, t.xy).points) for t in (tracks, everywhere)
+    )
+    assert area.contains(ground[:, :2]).all()
+    expected = area.contains(whole[:, :2]).sum()
+    assert expected > 50
+    assert tracks.num_points >= 0.9 * expected
+
+
+def test_all_tie_points_lie_in_the_area(render, tmp_path) -> None:
+    scene = render(views=2, size=(300, 300))
+    area = read_area(written(tmp_path / "a.json", corner(scene, 0.5)))
+    all_inside(scene, find_tracks(scene.views, area=area).tracks, scene.tied.tracks, area)
+
+
+@pytest.mark.slow
 def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(
     render, tmp_path, monkeypatch
 ) -> None:
@@ -266,19 +295,11 @@ def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(
     limited = len(read)
     everywhere = find_tracks(views, options)
     assert limited < 0.7 * (len(read) - limited)
-    tracks = result.tracks
-    sensors = [view.sensor for view in scene.views]
-    ground = ground_from_ecef(triangulate(sensors, tracks.view, tracks.point, tracks.xy).points)
-    assert area.contains(ground[:, :2]).all()
-    of_all = everywhere.tracks
-    whole = ground_from_ecef(triangulate(sensors, of_all.view, of_all.point, of_all.xy).points)
-    expected = area.contains(whole[:, :2]).sum()
-    assert expected > 50
-    assert tracks.num_points >= 0.9 * expected
+    all_inside(scene, result.tracks, everywhere.tracks, area)
 
 
 def test_an_area_without_tie_points_is_said(render, tmp_path) -> None:
-    scene = render(views=2)
-    area = read_area(written(tmp_path / "a.json", corner(scene, 0.002)))
+    scene = render(views=2, size=(300, 300))
+    area = read_area(written(tmp_path / "a.json", corner(scene, 0.004)))
     with pytest.raises(TiePointError, match=r"none of [0-9]+ tie points lies in the area of interest"):
         find_tracks(scene.views, area=area)

@@ -7,13 +7,25 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.tie.channels import channels, correlation, find, margin
+from barpc.tie.channels import (
+    COARSE,
+    FINE,
+    Found,
+    _registered,
+    _shifted,
+    channels,
+    correlation,
+    find,
+    joined,
+    margin,
+)
 
+SIZE = 256
 SHIFT = np.array([3.3, -2.6])
 HALF, SEARCH = 16, 10
 
 
-def texture(seed: int, size: int = 320) -> np.ndarray:
+def texture(seed: int, size: int = SIZE) -> np.ndarray:
     rng = np.random.default_rng(seed)
     parts = [rng.normal(size=(size, size)).astype(np.float32) for _ in range(2)]
     return 10 * cv2.GaussianBlur(parts[0], (0, 0), 1.5) + 40 * cv2.GaussianBlur(parts[1], (0, 0), 6)
@@ -23,7 +35,7 @@ def moved(picture: np.ndarray) -> np.ndarray:
     return ndimage.shift(picture, SHIFT[::-1], order=5, mode="grid-wrap")
 
 
-def places(size: int = 320) -> np.ndarray:
+def places(size: int = SIZE) -> np.ndarray:
     edge = margin(HALF, SEARCH)
     axis = np.arange(edge, size - edge, 8)
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
@@ -36,9 +48,11 @@ def seen(picture: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     "date",
     [
-        pytest.param(lambda grey: grey, id="same"),
-        pytest.param(lambda grey: 500 - 3 * grey, id="inverted"),
-        pytest.param(lambda grey: np.where(np.indices(grey.shape)[1] > 160, -grey, 0.2 * grey), id="partly"),
+        pytest.param(lambda grey: grey, id="same", marks=pytest.mark.slow),
+        pytest.param(lambda grey: 500 - 3 * grey, id="inverted", marks=pytest.mark.slow),
+        pytest.param(
+            lambda grey: np.where(np.indices(grey.shape)[1] > SIZE // 2, -grey, 0.2 * grey), id="partly"
+        ),
     ],
 )
 def test_a_shift_is_found_whatever_the_grey_values(date):
@@ -67,13 +81,13 @@ def test_beyond_the_search_nothing_is_found():
 
 
 def test_where_half_is_missing_the_rest_is_found_and_the_hole_is_not():
-    picture, valid = texture(1), np.ones((320, 320), dtype=bool)
-    valid[:, :160] = False
+    picture, valid = texture(1), np.ones((SIZE, SIZE), dtype=bool)
+    valid[:, : SIZE // 2] = False
     at = places()
     found = find(seen(picture), channels(moved(picture), valid), at, HALF, SEARCH)
     passed = found.passed(0.1)
-    assert not passed[at[:, 0] < 160 - HALF].any()
-    assert passed[at[:, 0] > 160 + HALF + SEARCH + 6].mean() > 0.95
+    assert not passed[at[:, 0] < SIZE // 2 - HALF].any()
+    assert passed[at[:, 0] > SIZE // 2 + HALF + SEARCH + 6].mean() > 0.95
 
 
 def test_the_correlation_is_the_coefficient_written_out():
@@ -91,3 +105,137 @@ def test_nothing_is_zeros():
     empty = channels(np.zeros((64, 64), np.float32), np.ones((64, 64), dtype=bool))
     assert not empty.any()
     assert not correlation(empty[None, :, :9, :9], empty[None]).any()
+
+
+# --- pieces -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("slope", "direction"),
+    [
+        ((2.0, 0.0), (1, 0)),
+        ((-2.0, 0.0), (1, 0)),
+        ((0.0, 5.0), (-1, 0)),
+        ((3.0, 3.0), (0, 1)),
+        ((-3.0, 3.0), (0, -1)),
+    ],
+)
+def test_a_channel_is_twice_the_angle_of_the_gradient_less_a_third_for_noise(slope, direction):
+    """Of an even slope: what is as strong as the median keeps 1 / (1 + 1/2)."""
+    row, col = np.mgrid[:60, :80].astype(np.float32)
+    found = channels(slope[0] * col + slope[1] * row, np.ones((60, 80), dtype=bool))
+    inner = found[:, 8:-8, 8:-8]
+    np.testing.assert_allclose(inner[0], direction[0] / 1.5, atol=1e-3)
+    np.testing.assert_allclose(inner[1], direction[1] / 1.5, atol=1e-3)
+
+
+def test_weak_gradients_say_less_than_the_median_and_strong_ones_more():
+    col = np.indices((60, 120))[1].astype(np.float32)
+    picture = np.where(col < 70, 3.0 * col, 210.0 + np.maximum(col - 70, 0) * 0.3)
+    found = channels(picture, np.ones((60, 120), dtype=bool))
+    assert found[0, 30, 30] == pytest.approx(1 / 1.5, abs=0.01)  # more than half of the picture is so
+    assert found[0, 30, 100] == pytest.approx(0.1 / 0.6, abs=0.01)
+
+
+def test_six_pixels_beside_what_is_not_valid_say_nothing_and_the_next_does():
+    valid = np.ones((61, 81), dtype=bool)
+    valid[30, 40] = False
+    picture = texture(1, 81)[:61].copy()
+    whole = channels(picture, np.ones_like(valid))
+    picture[30, 40] = 1e4
+    found = channels(picture, valid)
+    near = np.zeros_like(valid)
+    near[24:37, 34:47] = True
+    np.testing.assert_array_equal(np.abs(found).sum(axis=0) == 0, near)
+    np.testing.assert_allclose(found[:, 20, 20], whole[:, 20, 20], atol=0.02)
+    assert np.abs(found[:, :, :6]).sum() > 0  # the picture's own edge is none
+
+
+def test_blurs_are_those_asked_for():
+    picture = texture(1, 120)
+    sharp, soft = (channels(picture, np.ones((120, 120), bool), (s, s)) for s in (0.7, 3.0))
+    assert np.abs(np.diff(sharp, axis=2)).mean() > 1.5 * np.abs(np.diff(soft, axis=2)).mean()
+    first, second = (channels(picture, np.ones((120, 120), bool), blurs) for blurs in (COARSE, FINE))
+    assert np.abs(first - second).max() > 0.05
+    np.testing.assert_array_equal(first, seen(picture))
+
+
+def test_where_little_is_a_correlation_is_of_a_fiftieth_of_the_template_at_least():
+    template = np.ones((1, 1, 3, 3), np.float32)
+    area = np.zeros((1, 1, 3, 5), np.float32)
+    area[0, 0, 1, 1] = 0.3  # 0.09 of energy beside 0.02 * 9
+    expected = 0.3 / np.sqrt(0.18 * 9)
+    np.testing.assert_allclose(correlation(template, area)[0, 0], [expected, expected, 0.0], atol=1e-6)
+    area[0, 0, 1, 1] = 0.5  # 0.25: more
+    expected = 0.5 / np.sqrt(0.25 * 9)
+    np.testing.assert_allclose(correlation(template, area)[0, 0], [expected, expected, 0.0], atol=1e-6)
+
+
+def test_what_passes_beats_its_decoy_by_the_margin_comes_back_and_is_a_picture():
+    score = np.array([0.5, 0.5, 0.5, 0.5, 0.5])
+    found = Found(
+        np.zeros((5, 2)),
+        score,
+        np.array([0.39, 0.41, 0.39, 0.39, 0.45]),
+        np.array([0.0, 0.0, 1.1, 1.0, 0.0]),
+        np.array([True, True, True, True, False]),
+    )
+    assert found.passed(0.1).tolist() == [True, False, False, True, False]
+    assert found.passed(0.1, 1.5).tolist() == [True, False, True, True, False]
+    assert found.passed().tolist() == [True, True, False, True, False]
+    both = joined([found, found])
+    np.testing.assert_array_equal(both.decoy, np.tile(found.decoy, 2))
+    assert both.shift.shape == (10, 2)
+
+
+def test_nothing_that_is_looked_at_lies_beyond_the_margin():
+    """The decoy's far end: the template, three searches, and what is between."""
+    edge = margin(8, 4)
+    assert edge == 8 + 12 + 8
+    picture = seen(texture(1, 2 * edge + 1))
+    corner = np.array([[edge, edge]])
+    whole = find(picture, picture, corner, 8, 4)
+    np.testing.assert_allclose(whole.shift, 0.0, atol=0.02)
+    assert whole.score[0] == pytest.approx(1.0, abs=1e-5)
+    assert whole.back[0] == 0.0
+    assert whole.known.all()
+
+
+@pytest.mark.parametrize("shift", [(3, -2), (-4, 1), (0, 4)])
+def test_whole_pixels_are_found_to_either_side_on_either_decoys_side(shift):
+    """Points in turn have their decoys to the right and to the left; a place on the search's edge is no peak."""
+    picture = texture(1, 140)
+    there = np.roll(picture, shift[::-1], axis=(0, 1))
+    at = np.array([[60, 60], [75, 60], [60, 77], [81, 70]])
+    found = find(seen(picture), seen(there), at, 10, 5)
+    np.testing.assert_allclose(found.shift, np.tile(shift, (4, 1)), atol=0.01)
+    assert found.passed(0.1).all()
+    assert (found.decoy < 0.7).all()
+    edge = find(seen(picture), seen(there), at, 10, max(map(abs, shift)))
+    assert not edge.known.any()
+
+
+def test_a_slope_and_a_bend_are_moved_exactly_by_a_part_of_a_pixel():
+    """Cubic convolution keeps polynomials of second order."""
+    x = np.arange(12.0)
+    values = np.stack([0.3 * x**2 - x + 2, 0.1 * x**2 + 3 * x])[:, None, None, :].astype(np.float32)
+    shift = np.array([0.37, -0.8])
+    found = _shifted(np.tile(values, (1, 2, 3, 1)), shift, 3)
+    assert found.shape == (2, 2, 3, 8)
+    t = x[2:-2] + shift[:, None]
+    expected = np.stack([0.3 * t[0] ** 2 - t[0] + 2, 0.1 * t[1] ** 2 + 3 * t[1]])
+    np.testing.assert_allclose(found[:, 0, 0], expected, atol=1e-4)
+    turned = _shifted(np.moveaxis(np.tile(values, (1, 2, 3, 1)), 3, 2), shift, 2)
+    np.testing.assert_allclose(turned[:, 0, :, 0], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("shift", "still"), [((0.4, -0.3), True), ((-0.85, 0.6), True), ((1.6, 0.0), False)])
+def test_least_squares_ends_within_a_pixel_or_says_that_it_did_not(shift, still):
+    picture = texture(2, 80)
+    one = seen(picture)[None, :, 20:61, 20:61]
+    other = seen(ndimage.shift(picture, shift[::-1], order=5, mode="grid-wrap"))[None, :, 18:63, 18:63]
+    found, ended = _registered(one, other)
+    assert ended.tolist() == [still]
+    if still:
+        np.testing.assert_allclose(found[0], shift, atol=0.03)
+    assert (np.abs(found) <= 1.0).all()

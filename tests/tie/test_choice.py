@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from barpc.tie.features import KeypointFiles
 from barpc.tie.matcher import NO_MATCHES
 from barpc.tie.matching import PairReport
 from barpc.tie.pairs import Pair, possible_pairs
+from tests.lanes import diagonal, rest_slow
 from tests.scenes.dates import Years
 
 from .test_pairs import METRE, camera, views
@@ -38,7 +40,7 @@ def joined(num: int, links: list[tuple[int, int]], i: int, j: int) -> bool:
 # --- paths --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", rest_slow(range(12), keep=4))
 def test_twice_tied_are_views_that_no_single_link_parts(seed: int) -> None:
     rng = np.random.default_rng(seed)
     num = int(rng.integers(2, 10))
@@ -56,7 +58,7 @@ def test_two_links_between_the_same_parts_are_two_paths() -> None:
     assert twice_tied(3, []) == [0, 1, 2]
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", rest_slow(range(8), keep=3))
 def test_two_forests_keep_two_paths_wherever_there_are_two(seed: int) -> None:
     rng = np.random.default_rng(seed)
     num = 9
@@ -102,8 +104,7 @@ def by_overlap_and_angle(pairs: list[Pair], num: int, neighbours: int) -> set[tu
     return chosen
 
 
-@pytest.mark.parametrize("neighbours", [1, 3, 8])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("neighbours", "seed"), diagonal([1, 3, 8], range(4)))
 def test_without_dates_overlap_and_angle_choose(seed: int, neighbours: int) -> None:
     pairs = pairs_of(np.random.default_rng(seed), 24, 180)
     found = {pair.views for pair in best_pairs(pairs, 24, neighbours)}
@@ -192,10 +193,16 @@ class Looks:
         trials = tracks._Trials(
             row, self._options, None, None, {}, None, {"executor": None, "progress": None}
         )
-        trials.run(possible_pairs(row, self._options), False)
+        trials.run(pairs_in_a_row(len(row), self._options.neighbours), False)
         every = sorted(trials.tried)
         assert sorted(pair for some in self.tried for pair in some) == every  # none twice
         return every, [pair for pair, (_, _, report) in sorted(trials.tried.items()) if report.status == "ok"]
+
+
+@cache
+def pairs_in_a_row(count: int, neighbours: int) -> list[Pair]:
+    """Dates do not change where views lie."""
+    return possible_pairs(dated(count, {}), TieOptions(neighbours=neighbours))
 
 
 PLACE = np.random.default_rng(7).permutation(40)
@@ -221,7 +228,13 @@ def test_the_one_chain_through_forty_dates_is_found_at_once(monkeypatch) -> None
 
 
 @pytest.mark.parametrize(
-    "said", [{}, dict.fromkeys(range(40), "2020-01-01")], ids=["no dates", "all one date"]
+    "said",
+    rest_slow(
+        [
+            pytest.param({}, id="no dates"),
+            pytest.param(dict.fromkeys(range(40), "2020-01-01"), id="all one date"),
+        ]
+    ),
 )
 def test_what_fails_is_replaced_though_no_date_tells(monkeypatch, said) -> None:
     """Two partners in the year are alike: overlap and angle find few of these pairs."""
@@ -300,6 +313,7 @@ def chain(tmp_path_factory):
     return years, sorted(folder.glob("*.tif"))
 
 
+@pytest.mark.slow
 def test_a_chain_of_seasons_is_found_where_overlap_and_angle_miss_it(chain, tmp_path) -> None:
     years, images = chain
     options = RunOptions(tie=TieOptions(neighbours=1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,8 +12,8 @@ import pytest
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, detect
-from barpc.tie.features import quota
-from barpc.tie.raster import tiles
+from barpc.tie.features import KeypointFiles, Share, _an_octave_up, detect_tile, quota
+from barpc.tie.raster import survey, tiles
 from barpc.workspace import Workspace
 from tests.constants import chosen
 
@@ -79,6 +80,13 @@ def test_keypoints_stay_away_from_nodata(tmp_path, texture) -> None:
     assert not inside.any()
 
 
+def test_keypoints_stay_as_far_from_every_border_as_they_reach_and_no_farther(tmp_path, texture) -> None:
+    found = detect([view(write_image(tmp_path / "a.tif", texture))])[0]
+    for away in (*found.xy.T, *([499, 399] - found.xy).T):
+        assert (away + 1.0 > np.maximum(3.0, found.scale)).all()
+        assert (away < 8.0).sum() > 3
+
+
 @pytest.mark.parametrize("wide", [True, False])
 def test_keypoints_stay_away_from_nodata_at_the_far_end_of_a_strip(tmp_path, texture, wide: bool) -> None:
     """A hole of ten pixels by a hundred beyond the length of the other side, in a strip across and in one along."""
@@ -103,8 +111,9 @@ def test_an_image_without_content_has_no_keypoints(tmp_path, data: np.ndarray) -
 
 
 def test_views_of_one_name_keep_their_own_keypoints(tmp_path, texture) -> None:
-    one = view(write_image(tmp_path / "a.tif", texture))
-    other = replace(one, path=str(write_image(tmp_path / "b.tif", np.flipud(texture).copy())))
+    part = np.ascontiguousarray(texture[:200, :200])
+    one = view(write_image(tmp_path / "a.tif", part), (200, 200))
+    other = replace(one, path=str(write_image(tmp_path / "b.tif", np.flipud(part).copy())))
     alone = [detect([v])[0] for v in (one, other)]
     for found, expected in zip(detect([one, other]), alone, strict=True):
         np.testing.assert_array_equal(found.xy, expected.xy)
@@ -118,3 +127,73 @@ def test_keypoints_are_kept_for_a_later_pass_with_another_camera(tmp_path, textu
         for sensor in (None, "corrected"):
             detect([replace(first, sensor=sensor)], options, executor=executor)
             assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles(first.size, options))
+
+
+# --- how many, and how closely an image is looked at ---------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("keypoints", "points", "tile", "zoom"),
+    [
+        (31_990, 10_000, 512, 2), (32_010, 10_000, 512, 1),  # 2000e-6 a pixel
+        (1990, 10_000, 512, 4), (2010, 10_000, 512, 2),  # 125e-6
+        (90_000, 6398, 512, 2), (90_000, 6402, 512, 1),  # five keypoints for a tie point
+        (1990, 10_000, 999, 4), (1990, 10_000, 1000, 2),  # an image of more than four tiles a side
+        (1990, 10_000, 2000, 1),
+    ],
+)  # fmt: skip
+def test_an_image_is_looked_at_as_closely_as_the_keypoints_wanted_ask_for(
+    keypoints, points, tile, zoom
+) -> None:
+    options = TieOptions(keypoints_per_image=keypoints, points_per_image=points, tile=tile)
+    share = Share.of((4000, 4000), options)
+    assert share.zoom == zoom
+    assert share.density == keypoints / 16e6
+    assert Share.of((4000, 40_000), replace(options, keypoints_per_image=10 * keypoints)).zoom in (zoom, 1, 2)
+
+
+def test_a_box_may_hold_a_fifth_more_than_its_share() -> None:
+    assert Share(0.001).most((7, 9, 100, 50)) == 6
+    assert Share(0.001).most((7, 9, 100, 51)) == 7
+
+
+@pytest.mark.parametrize(("side", "cell"), [(10.0, 64), (95.0, 64), (97.0, 128), (159.0, 128), (161.0, 192)])
+def test_cells_hold_about_eight_keypoints_and_are_whole_multiples(side, cell) -> None:
+    assert Share(8.0 / side**2).cell == cell
+
+
+def test_the_strongest_of_files_are_the_same_share_of_every_tile() -> None:
+    files = KeypointFiles(None, ((0, 0, 9, 9),) * 4, ("a",) * 4, (100, 50, 1, 0))  # type: ignore[arg-type]
+    assert files.strongest(30).counts == (20, 10, 1, 0)
+    assert files.strongest(151).counts == files.strongest(1000).counts == (100, 50, 1, 0)
+    assert len(KeypointFiles(None).strongest(5)) == 0  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("octave", "up"),
+    [
+        (0x0001FF, 0x000000),
+        (0x0003FF, 0x000000),
+        (0x000100, 0x000001),
+        (0x000305, 0x000006),
+        (0x7A0402, 0x7A0103),
+    ],
+)
+def test_a_keypoint_is_described_an_octave_up(octave, up) -> None:
+    assert _an_octave_up(SimpleNamespace(octave=octave)).octave == up
+
+
+@pytest.mark.parametrize("zoom", [1, 2, 4])
+def test_a_spot_is_found_where_it_stands_however_closely_it_is_looked_at(tmp_path, zoom) -> None:
+    row, col = np.mgrid[:400, :480]
+    spots = np.array([[101.3, 80.6], [240.0, 200.5], [120.4, 310.9]])
+    picture = sum(np.exp(-0.5 * ((col - x) ** 2 + (row - y) ** 2) / (4.0 * zoom) ** 2) for x, y in spots)
+    path = write_image(tmp_path / "a.tif", (100 + 2000 * np.asarray(picture)).astype(np.uint16))
+    known = survey(path)
+    assert known is not None
+    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, Share(0.1, zoom), TieOptions())
+    near = np.abs(found.xy[:, None] - spots).max(axis=2)
+    assert (near.min(axis=0) < 0.3 * zoom).all()  # a quarter of it is OpenCV's own
+    scale = found.scale[near.argmin(axis=0)]
+    np.testing.assert_allclose(scale, scale.mean(), rtol=0.2)
+    assert 6.0 * zoom < scale.mean() < 16.0 * zoom

@@ -14,6 +14,7 @@ from barpc.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import Matches, TieOptions, common_tracks, find_tracks
 from barpc.tie.tracks import pair_counts
+from tests.lanes import rest_slow
 
 from .conftest import Rendered, write_image
 
@@ -27,13 +28,14 @@ def true_matches(
     made = {}
     for pair in pairs:
         rng = np.random.default_rng(pair[0])
-        first = rng.uniform(30, 569, (4 * count, 2))
+        side = scene.scene.options.size[0]
+        first = rng.uniform(30, side - 31, (4 * count, 2))
         numbers = np.arange(len(first))
         xy = np.stack([first, scene.place(*pair, first)], axis=1)
-        rows = np.flatnonzero(((xy > 30) & (xy < 569)).all(axis=(1, 2)))[:count]
+        rows = np.flatnonzero(((xy > 30) & (xy < side - 31)).all(axis=(1, 2)))[:count]
         xy = xy[rows] + rng.normal(0, noise, (len(rows), 2, 2))
         wrong = rng.random(len(xy)) < false
-        xy[wrong, 1] = rng.uniform(30, 569, (wrong.sum(), 2))
+        xy[wrong, 1] = rng.uniform(30, side - 31, (wrong.sum(), 2))
         index = -1 - np.stack([numbers[rows], numbers[rows] + 10_000 * (1 + sum(pair))], axis=1)
         made[pair] = Matches(xy, np.zeros(len(xy)), index)
     return made
@@ -43,9 +45,14 @@ def typical(scene: Rendered, tracks: Tracks, i: int, j: int) -> float:
     return 1.4826 * np.median(np.abs(scene.errors(i, j, *common_tracks(tracks, i, j))), axis=0).max()
 
 
-@pytest.mark.parametrize(("noise", "false"), [(0.3, 0.0), (0.5, 0.0), (0.4, 0.6)])
-def test_half_a_pixel_becomes_a_tenth_and_false_matches_go(render, noise: float, false: float) -> None:
-    scene = render(views=3)
+@pytest.mark.parametrize("side", [300, pytest.param(600, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("noise", "false"), rest_slow(pytest.param(*row) for row in ((0.4, 0.6), (0.3, 0.0), (0.5, 0.0)))
+)
+def test_half_a_pixel_becomes_a_tenth_and_false_matches_go(
+    render, noise: float, false: float, side: int
+) -> None:
+    scene = render(views=3, size=(side, side))
     given = true_matches(scene, *PAIRS, noise=noise, false=false)
     result = find_tracks(scene.views, given=given)
     assert result.keypoints == (0, 0, 0)  # nothing else is looked for
@@ -61,7 +68,7 @@ def test_half_a_pixel_becomes_a_tenth_and_false_matches_go(render, noise: float,
 
 
 def test_false_matches_alone_are_refused_and_said(render, caplog) -> None:
-    scene = render(views=2)
+    scene = render(views=2, size=(300, 300))
     with pytest.raises(Exception, match=r"(no common offset|too few matches).* \(500 and 500"):
         find_tracks(scene.views, given=true_matches(scene, (0, 1), false=1.0))
     assert "the matches given are not used" in caplog.text
@@ -70,7 +77,7 @@ def test_false_matches_alone_are_refused_and_said(render, caplog) -> None:
 
 
 def test_pairs_that_are_not_given_are_matched_and_points_in_common_are_one_track(render) -> None:
-    scene = render(views=3)
+    scene = render(views=3, size=(300, 300))
     result = find_tracks(scene.views, given=true_matches(scene, (0, 1), (0, 2)))
     assert [report.keypoints[0] == 500 for report in result.pairs] == [True, True, False]
     assert result.pairs[2].verified > 500
@@ -81,7 +88,7 @@ def test_pairs_that_are_not_given_are_matched_and_points_in_common_are_one_track
 
 
 def test_a_camera_that_is_wrong_by_hundreds_of_pixels_does_not_refuse_them(render) -> None:
-    scene = render(views=2)
+    scene = render(views=2, size=(300, 300))
     first, second = scene.views
     moved = replace(second, sensor=second.sensor.crop(-300.0, -200.0))
     result = find_tracks([first, moved], given=true_matches(scene, (0, 1)))
@@ -92,7 +99,7 @@ def test_a_camera_that_is_wrong_by_hundreds_of_pixels_does_not_refuse_them(rende
 
 def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
     """No patch has the grey values of its other; edges are where they were."""
-    scene = render(views=3)
+    scene = render(views=3, size=(300, 300))
     first, second, third = scene.views
     with open_raster(second.path) as image:
         path = write_image(tmp_path / "negative.tif", 4000 - image.read(1).clip(0, 3999))
@@ -108,13 +115,13 @@ def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
 
 
 def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, caplog) -> None:
-    """Of the second image an eighth is left, the rest says nothing: places stay true, and each counts once."""
-    scene = render(views=2)
+    """Of the second image three sixteenths are left, the rest says nothing: places stay true, and each counts once."""
+    scene = render(views=2, size=(300, 300))
     first, second = scene.views
     with open_raster(second.path) as image:
         pixels = image.read(1)
     noise = np.random.default_rng(3).integers(100, 3000, pixels.shape).astype(pixels.dtype)
-    noise[:, :75] = pixels[:, :75]
+    noise[:, :56] = pixels[:, :56]
     path = write_image(tmp_path / "noise.tif", noise)
     given = true_matches(scene, (0, 1), noise=0.3, false=0.2)
     with caplog.at_level(logging.WARNING):
@@ -134,7 +141,7 @@ def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, c
 
 
 def test_given_pairs_connect_what_the_cameras_say_is_apart(render) -> None:
-    scene = render(views=2)
+    scene = render(views=2, size=(300, 300))
     options = TieOptions(angles=(50.0, 60.0))
     with pytest.raises(DisconnectedError, match="no overlap"):
         find_tracks(scene.views, options)

@@ -47,22 +47,19 @@ def pair() -> tuple[Keypoints, Keypoints, Frame]:
 
 
 def brute(a: Keypoints, b: Keypoints, where: Frame) -> dict[tuple[int, int], tuple[float, float]]:
-    """Mutual best pairs: (distance, ambiguity), one pair of points after the other."""
+    """Mutual best pairs: (distance, ambiguity), one point after the other."""
     unit = [k.descriptors / np.linalg.norm(k.descriptors.astype(float), axis=1)[:, None] for k in (a, b)]
     likeness = np.full((len(a), len(b)), -np.inf)
     for i in range(len(a)):
         sight = LINEAR @ [np.cos(a.angle[i]), np.sin(a.angle[i])]
         expected = np.arctan2(sight[1], sight[0])
-        for j in range(len(b)):
-            du = b.xy[j, 0] - where.along[i]
-            dw = b.xy[j, 1] - where.across[i] - where.slope[i] * du
-            turn = np.angle(np.exp(1j * (b.angle[j] - expected)))
-            zoom = np.log(b.scale[j] / a.scale[i]) - 0.5 * np.log(np.linalg.det(LINEAR))
-            if (
-                where.before[i] <= du <= where.after[i] and abs(dw) <= ACROSS
-                and abs(turn) <= np.radians(30) and abs(zoom) <= np.log(1.8)
-            ):  # fmt: skip
-                likeness[i, j] = unit[0][i] @ unit[1][j]
+        du = b.xy[:, 0] - where.along[i]
+        dw = b.xy[:, 1] - where.across[i] - where.slope[i] * du
+        turn = np.angle(np.exp(1j * (b.angle - expected)))
+        zoom = np.log(b.scale / a.scale[i]) - 0.5 * np.log(np.linalg.det(LINEAR))
+        near = (where.before[i] <= du) & (du <= where.after[i]) & (np.abs(dw) <= ACROSS)
+        for j in np.flatnonzero(near & (np.abs(turn) <= np.radians(30)) & (np.abs(zoom) <= np.log(1.8))):
+            likeness[i, j] = unit[0][i] @ unit[1][j]
     found = {}
     for i in range(len(a)):
         j = int(likeness[i].argmax())

@@ -14,18 +14,26 @@ import pytest
 from barpc.errors import InputError, TiePointError
 from barpc.options import TieOptions, read_options
 from barpc.pipeline import RunOptions, adjust
-from barpc.tie import common_tracks, find_tracks
-from barpc.tie.hook import hook_files, hooked
+from barpc.scene import View
+from barpc.tie import Matches, common_tracks, find_tracks
+from barpc.tie.epipolar import Frame
+from barpc.tie.hook import Hook, hook_files, hooked
+from barpc.tie.matcher import Prediction
 from barpc.tie.matching import MATCHERS, matcher_named
+from tests.lanes import rest_slow
 
 ROOT = Path(__file__).parents[2]
 TEXT = '''
 import cv2, numpy as np
 from barpc.raster import open_raster
-calls = []
+calls, known = [], []
 def match(a, b, prediction):
     """SIFT of both images, matched everywhere."""
     calls.append(a.name)
+    if not known:
+        known.append(everywhere(a, b))
+    return known[0]
+def everywhere(a, b):
     found = []
     for view in (a, b):
         with open_raster(view.path) as image:
@@ -60,9 +68,9 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     sys.modules.pop("users_matcher", None)
 
 
-@pytest.mark.parametrize("returns", ["xy", "xy, np.array([m.distance for m in pairs])"])
+@pytest.mark.parametrize("returns", rest_slow(["xy, np.array([m.distance for m in pairs])", "xy"]))
 def test_a_function_is_a_matcher_with_and_without_scores(render, module, returns: str) -> None:
-    scene = render(views=2)
+    scene = render(views=2, size=(300, 300))
     options = TieOptions(matcher=f"{module(returns)}:match")
     result = find_tracks(scene.views, options)
     assert result.keypoints == (0, 0)
@@ -91,7 +99,7 @@ def test_a_function_is_a_matcher_with_and_without_scores(render, module, returns
 def test_what_is_wrong_with_it_is_said_in_one_line(render, module, name: str, error: type, says: str) -> None:
     module()
     with pytest.raises(error, match=says) as caught:
-        find_tracks(render(views=2).views, TieOptions(matcher=name))
+        find_tracks(render(views=2, size=(300, 300)).views, TieOptions(matcher=name))
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -122,11 +130,12 @@ def test_rows_of_the_table_and_classes_are_what_they_are(module) -> None:
     assert [path.name for path in hook_files(f"{module()}:match")] == ["users_matcher.py"]
 
 
+@pytest.mark.slow
 def test_a_changed_module_is_run_again_an_unchanged_one_not(
     render, module, tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    views = render(views=2).views
+    views = render(views=2, size=(300, 300)).views
     options = RunOptions(tie=TieOptions(matcher=f"{module()}:match"), stop_after="matching", overwrite=True)
     counts = []
     for returns in ("xy", "xy", "xy[::2]"):
@@ -138,6 +147,45 @@ def test_a_changed_module_is_run_again_an_unchanged_one_not(
     assert counts[0][0] > 0
     assert counts[1] == (0, counts[0][1])
     assert 0.4 < counts[2][1] / counts[0][1] < 0.6
+
+
+def everywhere(xy: np.ndarray) -> Frame:
+    """Predictions of a place in B that is that of A, ten pixels along the rows either way."""
+    x, y = xy.T
+    zero, ten = np.zeros(len(xy)), np.full(len(xy), 10.0)
+    return Frame(np.array([1.0, 0.0]), x, y, zero, -ten, ten, np.eye(2))
+
+
+def test_what_a_function_finds_counts_in_the_band_and_on_the_images() -> None:
+    prediction = Prediction(everywhere, 2.0, list)
+    first, second = (View(name, "", (100, 50), None, (0.0, 1.0)) for name in "ab")  # type: ignore[arg-type]
+    rows = [
+        ((20, 20), (29.9, 21.0), True), ((20, 20), (30.1, 21.0), False), ((20, 20), (10.1, 18.1), True),
+        ((20, 20), (20, 17.9), False), ((-0.4, 5), (0, 5), True), ((-0.6, 5), (0, 5), False),
+        ((99.4, 49.4), (99, 49), True), ((99.6, 49), (99, 49), False), ((99, 49), (99, 49.6), False),
+        ((99, 49.6), (99, 49), False), ((5, 5), (-0.6, 5), False), ((5, 0), (5, -0.4), True),
+    ]  # fmt: skip
+    xy = np.array([[a, b] for a, b, _ in rows], dtype=float)
+    found = Hook("m:f", lambda *_: xy).match(first, second, prediction)
+    inside = np.array([good for *_, good in rows])
+    np.testing.assert_array_equal(found.xy, xy[inside])
+    np.testing.assert_allclose(found.score, np.abs(xy[inside, 1, 1] - xy[inside, 0, 1]) / 2.0)
+    for given in ((xy, np.arange(12.0)), Matches.of_places(xy, np.arange(12.0))):
+        scored = Hook("m:f", lambda *_, given=given: given).match(first, second, prediction)
+        assert scored.score.tolist() == np.flatnonzero(inside).tolist()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [np.zeros((3, 2)), np.zeros((3, 2, 3)), np.zeros((3, 3, 2)), (np.zeros((3, 2, 2)), np.zeros(2)),
+     (np.zeros((3, 2, 2)), np.zeros((3, 1))), np.full((3, 2, 2), np.inf), (np.zeros((3, 2, 2)), np.full(3, np.nan))],
+)  # fmt: skip
+def test_no_other_shape_and_nothing_that_is_not_finite_is_taken(given) -> None:
+    first, second = (View(name, "", (100, 50), None, (0.0, 1.0)) for name in "ab")  # type: ignore[arg-type]
+    with pytest.raises(
+        TiePointError, match=r"matcher m:f, a - b: ValueError: (places \(M, 2, 2\)|a place or score)"
+    ):
+        Hook("m:f", lambda *_: given).match(first, second, Prediction(everywhere, 2.0, list))
 
 
 # -- the example --------------------------------------------------------------------------------------
@@ -191,6 +239,7 @@ def frames(xy: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return np.concatenate([scale * np.eye(2), xy[..., None]], axis=3)
 
 
+@pytest.mark.slow
 def test_the_example_of_the_manual_runs_with_what_has_kornias_interface(render, monkeypatch) -> None:
     feature = types.ModuleType("kornia.feature")
     feature.DISK, feature.LightGlueMatcher, feature.laf_from_center_scale_ori = Disk, LightGlueMatcher, frames
@@ -203,7 +252,7 @@ def test_the_example_of_the_manual_runs_with_what_has_kornias_interface(render, 
         monkeypatch.setitem(sys.modules, name, stand_in)
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     monkeypatch.delitem(sys.modules, "lightglue_matcher", raising=False)
-    scene = render(views=2)
+    scene = render(views=2, size=(400, 400))
     result = find_tracks(scene.views, TieOptions(matcher="lightglue_matcher:match", tile=400))
     assert result.tracks.num_points > 400
     ((places, unlike),) = sys.modules["lightglue_matcher"]._pairs.values()

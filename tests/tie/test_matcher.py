@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 from typing import ClassVar
 
 import cv2
@@ -15,6 +16,7 @@ from barpc.tie.epipolar import frame
 from barpc.tie.matcher import Prediction
 from barpc.tie.matching import MATCHERS
 from barpc.tie.raster import levelled, read_pixels
+from tests.lanes import rest_slow
 
 HALF = 8
 STEP = 12
@@ -74,7 +76,7 @@ class Guessing(Correlated):
 
     def match(self, a, b, prediction: Prediction) -> Matches:
         rng = np.random.default_rng(0)
-        points = rng.uniform(50, 550, (2000, 2)).round()
+        points = rng.uniform(30, np.array(a.size) - 30, (2000, 2)).round()
         where = prediction.at(points)
         along = rng.uniform(where.before, where.after)
         aside = rng.uniform(-1, 1, len(points)) * prediction.half_width
@@ -82,23 +84,26 @@ class Guessing(Correlated):
         return Matches.of_places(xy, rng.uniform(0, 1, len(points)))
 
 
-@pytest.fixture(params=[Correlated, Everywhere])
+@pytest.fixture(params=rest_slow([Correlated, Everywhere]))
 def matcher(request, monkeypatch) -> str:
     monkeypatch.setitem(MATCHERS, "another", request.param)
     return "another"
 
 
-def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(render, matcher) -> None:
-    scene = render(views=3)
+@pytest.mark.parametrize(("number", "side"), [(2, 300), pytest.param(3, 600, marks=pytest.mark.slow)])
+def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(
+    render, matcher, number: int, side: int
+) -> None:
+    scene, share = render(views=number, size=(side, side)), (side / 600) ** 2
     result = find_tracks(scene.views, TieOptions(matcher=matcher))
     tracks = result.tracks
-    assert result.keypoints == (0, 0, 0)
+    assert result.keypoints == (0,) * number
     assert all(report.status == "ok" and report.control_share <= 0.01 for report in result.pairs)
-    assert (np.bincount(tracks.point) == 3).sum() > 200
-    for i, j in ((0, 1), (0, 2), (1, 2)):
+    assert (np.bincount(tracks.point) == number).sum() > 200 * share
+    for i, j in combinations(range(number), 2):
         first, second = common_tracks(tracks, i, j)
         errors = scene.errors(i, j, first, second)
-        assert len(first) > 300
+        assert len(first) > 300 * share
         assert 1.4826 * np.median(np.abs(errors), axis=0).max() <= 0.06
         assert (np.abs(errors).max(axis=1) > 1.0).mean() <= 0.02
 
@@ -106,12 +111,12 @@ def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(render, matcher) 
 def test_a_matcher_that_guesses_is_not_believed(render, monkeypatch) -> None:
     monkeypatch.setitem(MATCHERS, "another", Guessing)
     with pytest.raises(TiePointError, match=r"no common offset|too few matches"):
-        find_tracks(render(views=2).views, TieOptions(matcher="another"))
+        find_tracks(render(views=2, size=(300, 300)).views, TieOptions(matcher="another"))
 
 
 def test_a_place_along_the_line_has_no_error_across_it(render) -> None:
-    first, second = render(views=2).views
-    xy = np.random.default_rng(0).uniform(0, 599, (50, 2))
+    first, second = render(views=2, size=(300, 300)).views
+    xy = np.random.default_rng(0).uniform(0, 299, (50, 2))
     where, along = frame(first, second, xy), np.linspace(-30, 30, 50)
     np.testing.assert_allclose(where.errors(where.place(along)), np.stack([along, 0 * along], 1), atol=1e-9)
     np.testing.assert_allclose(

@@ -52,10 +52,11 @@ def test_pairs_do_not_depend_on_where_longitudes_wrap(lon: float) -> None:
     assert pair.overlap == pytest.approx(0.8, abs=0.01)
 
 
-def test_a_thousand_views_get_their_best_partners_and_not_all_pairs() -> None:
-    grid = [camera(400 * METRE * (k % 40), 400 * METRE * (k // 40)) for k in range(1000)]
+@pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_thousand_views_get_their_best_partners_and_not_all_pairs(count: int) -> None:
+    grid = [camera(400 * METRE * (k % 40), 400 * METRE * (k // 40)) for k in range(count)]
     pairs = select_pairs(views(*grid), TieOptions(neighbours=3))
-    assert 999 <= len(pairs) < 4000
+    assert count - 1 <= len(pairs) < 4 * count
     assert all(p.views[0] < p.views[1] for p in pairs)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from scipy import ndimage
 
 from barpc.dem import Dem
 from barpc.errors import InputError
@@ -17,10 +18,12 @@ from barpc.pipeline.views import load_views
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
-from barpc.tie.reference import PEAK, register
+from barpc.tie.reference import PEAK, _affine, peak, register
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
+
+from .conftest import write_image
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
 GSD = 2.0
@@ -72,6 +75,7 @@ def shifted(view: View, px: tuple[float, float]) -> View:
     return replace(view, sensor=replace(sensor, image_offset=sensor.image_offset + px))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("px", [(0.0, 0.0), (120.0, -90.0)])
 def test_the_camera_is_off_by_what_was_done_to_it(px, views, reference, dem, truth):
     view = shifted(views[0], px)
@@ -98,6 +102,7 @@ def read_rpc_of(truth, name: str) -> RPC:
     return RPC(**{key: np.array(value) for key, value in record.items()})
 
 
+@pytest.mark.slow
 def test_a_reference_that_lies_off_moves_what_it_finds(views, scene, season, dem, reference, truth, tmp_path):
     there = str(write_reference(tmp_path / "ref.tif", scene, season, GSD, shift=(6.0, -4.0)))
     first, second = (register(views, [path], dem, sigma=5.0) for path in (reference, there))
@@ -106,6 +111,7 @@ def test_a_reference_that_lies_off_moves_what_it_finds(views, scene, season, dem
     assert second.control.bias[:2] == pytest.approx([5.0, 5.0])
 
 
+@pytest.mark.slow
 def test_other_places_and_no_texture_are_refused(views, scene, season, dem, tmp_path):
     mirrored = Grid(season.origin, season.step, np.ascontiguousarray(season.values[:, ::-1]))
     plain = Grid(season.origin, season.step, np.full_like(season.values, 0.3))
@@ -117,6 +123,7 @@ def test_other_places_and_no_texture_are_refused(views, scene, season, dem, tmp_
         assert found.views[0].points == 0
 
 
+@pytest.mark.slow
 def test_a_reference_that_does_not_reach_the_image_is_no_error(views, scene, season, dem, tmp_path):
     path = str(write_reference(tmp_path / "far.tif", scene, season, GSD, shift=(5000.0, 0.0)))
     found = register(views, [path], dem)
@@ -124,6 +131,7 @@ def test_a_reference_that_does_not_reach_the_image_is_no_error(views, scene, sea
     assert found.views[0].peak == 0.0
 
 
+@pytest.mark.slow
 def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
     with rasterio.open(reference) as file:
         pixels, profile, place = file.read(1), file.profile, file.transform
@@ -144,7 +152,183 @@ def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
     assert east.lonlatalt[:, 0].min() > whole.control.points.lonlatalt[:, 0].min() + 1e-3
 
 
-def test_a_raster_without_a_place_is_refused(views, dem):
+def test_a_raster_without_a_place_is_refused(views):
     with pytest.raises(InputError, match="no place on the ground"):
-        register(views, [views[0].path], dem)
+        register(views, [views[0].path], flat)
     assert read_rpc(views[0].path) is not None
+
+
+# --- a plain of texture, whose truth is a formula ------------------------------------------------------------
+
+SIDE, WIDE, LEVEL = 180, 460, 40.0
+DEGREES = 2.0 / 111_000.0  # a pixel of the reference, about two metres on either axis
+
+
+def flat(lon, lat):
+    return np.full(np.shape(lon), LEVEL)
+
+
+def camera(lean: float, east: float = 0.0) -> RPC:
+    """Of 180 pixels of 2.09 m about the origin; `lean` px for a hundred metres."""
+    coeffs, half = np.zeros((4, 20)), np.full(2, (SIDE - 1) / 2)
+    coeffs[1::2, 0] = 1.0
+    coeffs[0, 1], coeffs[2, 2], coeffs[0, 3] = 1.0, -1.0, lean / half[0]
+    span = 187.0 / 111_000.0
+    return RPC(coeffs, np.array([east / 111_000.0, 0.0, 100.0]), np.array([span, span, 100.0]), half, half)
+
+
+def ground(seed: int) -> np.ndarray:
+    """Grey values of the plain on the reference's grid."""
+    rng = np.random.default_rng(seed)
+    fine, coarse = (ndimage.gaussian_filter(rng.normal(size=(WIDE, WIDE)), s) for s in (1.5, 6.0))
+    return 1500 + 250 * fine / fine.std() + 250 * coarse / coarse.std()
+
+
+def plain(path: Path, grey: np.ndarray, left: int = 0) -> str:
+    """A reference of the plain, from a column of the whole one on."""
+    corner = rasterio.Affine(DEGREES, 0, (left - WIDE / 2) * DEGREES, 0, -DEGREES, WIDE / 2 * DEGREES)
+    with rasterio.open(
+        path, "w", "GTiff", grey.shape[1], grey.shape[0], 1, dtype="uint16", crs="EPSG:4326",
+        transform=corner, nodata=0,
+    ) as file:  # fmt: skip
+        file.write(grey.astype(np.uint16), 1)
+    return str(path)
+
+
+def taken(path: Path, grey: np.ndarray, sensor: RPC) -> View:
+    """What a camera sees of the plain."""
+    image = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2).astype(float)
+    lon, lat, _ = sensor.localize(image, np.full(len(image), LEVEL)).T
+    place = [WIDE / 2 - 0.5 - lat / DEGREES, WIDE / 2 - 0.5 + lon / DEGREES]
+    pixels = ndimage.map_coordinates(grey, place, order=3).reshape(SIDE, SIDE)
+    write_image(path, pixels.clip(1, 4000).astype(np.uint16))
+    return View(path.stem, str(path), (SIDE, SIDE), sensor, (0.0, 200.0))
+
+
+@pytest.fixture(scope="module")
+def plains(tmp_path_factory):
+    """Two views of a plain, the first sees it as it is; its reference, with dark and bright turned over."""
+    folder, grey = tmp_path_factory.mktemp("plain"), ground(1)
+    seen = [taken(folder / f"{k}.tif", grey, camera(12.0 * k)) for k in range(2)]
+    return seen, grey, plain(folder / "ref.tif", 3000 - grey), folder
+
+
+def wrong(view: View, px: tuple[float, float]) -> tuple[View, np.ndarray]:
+    """A view whose camera is wrong by pixels, and how far off it shows the ground, east, north [m]."""
+    there = shifted(view, px)
+    place = np.array([[0.0, 0.0, LEVEL]])
+    off = (there.sensor.localize(view.sensor.project(place), np.array([LEVEL])) - place) * metres_per_unit(
+        place
+    )
+    return there, off[0, :2]
+
+
+def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
+    seen, _, reference, _ = plains
+    (first, one), (second, two) = wrong(seen[0], (20.0, -11.0)), wrong(seen[1], (-7.5, 4.25))
+    assert one == pytest.approx([-41.7, -23.0], abs=0.5)  # of 2.08 m; rows run south
+    found = register([first, second], [reference], flat, height_sigma=(7.0, 3.0))
+    for match, off in zip(found.views, (one, two), strict=True):
+        assert match.offset == pytest.approx(off, abs=0.2)
+        assert match.peak > 3 * PEAK
+        assert 0.75 * match.tried < match.passed <= match.tried
+        assert 0.9 * match.passed < match.points <= match.passed
+        assert 0.0 < match.scatter < 0.15
+    assert 370 < found.views[0].tried < 430  # eight pixels apart, but for the margins
+    assert found.step == pytest.approx(2.08, abs=0.03)
+    assert found.sigma == pytest.approx(0.25 * 2.0, abs=0.01)
+    points = found.control.points
+    assert points.sigma == pytest.approx(
+        np.tile([0.1 * found.step, 0.1 * found.step, 7.0], (len(points.lonlatalt), 1))
+    )
+    assert found.control.bias == pytest.approx([found.sigma, found.sigma, 3.0])
+    assert np.array(found.control.offset) == pytest.approx(np.array([m.offset for m in found.views]))
+    assert np.unique(points.point).tolist() == list(range(len(points.lonlatalt)))  # none is not seen
+    assert len(points.lonlatalt) < 0.7 * len(points.point)  # most are seen by both
+    for k, view in enumerate(seen):
+        own = points.view == k
+        error = points.xy[own] - view.sensor.project(points.lonlatalt[points.point[own]])
+        assert np.sqrt((error**2).mean()) < 0.1
+        stated = points.xy_sigma[own]
+        assert stated == pytest.approx(np.full_like(stated, found.views[k].scatter / 2.08), rel=0.02)
+
+
+def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(plains):
+    seen, grey, _, folder = plains
+    other, far = plain(folder / "other.tif", ground(2)), plain(folder / "far.tif", grey, left=3000)
+    for path in (other, far):
+        found = register(seen[:1], [path], flat)
+        assert found.control is None
+        assert found.views[0].peak < PEAK - 1.0
+        assert (found.views[0].tried, found.views[0].points) == (0, 0)
+    halves = [
+        plain(folder / "w.tif", grey[:, : WIDE // 2]),
+        plain(folder / "e.tif", grey[:, WIDE // 2 :], WIDE // 2),
+    ]
+    mixed = register(seen[:1], [far, *halves], flat, sigma=5.0)
+    assert 150 < mixed.views[0].points < 260
+    assert mixed.views[0].offset == pytest.approx([0.0, 0.0], abs=0.1)
+    east = mixed.control.points.lonlatalt[:, 0] / DEGREES
+    assert (east.min() < -60) & (east.max() > 60)
+    assert np.abs(east).min() > 16  # none of them beside the edge between the files
+    assert mixed.sigma == 5.0
+    assert mixed.control.bias == pytest.approx([5.0, 5.0, 5.0])
+    assert mixed.control.points.sigma[0] == pytest.approx([0.1 * mixed.step, 0.1 * mixed.step, 10.0])
+
+
+# --- pieces -------------------------------------------------------------------------------------------------
+
+
+def test_the_peak_of_all_votes_is_told_in_robust_standard_deviations_from_the_middle():
+    rng = np.random.default_rng(0)
+    votes = [rng.normal(0, 0.1, (9, 9)).astype(np.float32) for _ in range(3)]
+    for vote in votes:
+        vote[2, 7] += 1.0
+    z, at = peak([votes[0], None, *votes[1:]])
+    total = np.sum(votes, axis=0)
+    away = np.abs(total - np.median(total))
+    assert z == pytest.approx((total.max() - np.median(total)) / (1.4826 * np.median(away)), rel=1e-5)
+    assert at.tolist() == [3.0, -2.0]  # right of the middle, above it
+    for nothing in ([], [None], [np.full((5, 5), 0.3, np.float32)]):
+        assert peak(nothing)[0] == 0.0
+    assert peak([None])[1].tolist() == [0.0, 0.0]
+
+
+def shifts(agree: int, others: int):
+    """Places on a square, shifts that an affine makes, and some that are anywhere."""
+    rng = np.random.default_rng(agree)
+    local = rng.uniform(-100, 100, (agree + others, 2))
+    true = np.array([4.0, -3.0]) + local @ np.array([[0.01, -0.02], [0.005, 0.01]])
+    shift = true + rng.normal(0, 0.1, true.shape)
+    shift[agree:] += rng.choice([-1.0, 1.0], (others, 2)) * rng.uniform(15, 60, (others, 2))
+    return local, shift, true
+
+
+@pytest.mark.parametrize(("agree", "others"), [(200, 0), (60, 100), (12, 3)])
+def test_most_shifts_lie_about_one_affine(agree, others):
+    local, shift, true = shifts(agree, others)
+    fitted, keep, scatter = _affine(local, shift, np.ones(len(local), dtype=bool), 2.0)
+    assert not keep[agree:].any()
+    assert keep.sum() >= min(agree, max(12, 0.9 * agree))
+    np.testing.assert_allclose(fitted[keep], true[keep], atol=0.15)
+    if agree > 12:
+        assert 0.05 < scatter < 0.13
+        left = np.abs(shift - fitted)[:, 0]
+        assert scatter == pytest.approx(1.4826 * np.median(left[keep]), rel=1e-3)
+
+
+def test_fewer_than_twelve_that_agree_are_none():
+    local, shift, _ = shifts(40, 0)
+    for count in (11, 12):
+        passed = np.arange(40) < count
+        assert (_affine(local, shift, passed, 2.0) is None) == (count < 12)
+    local, shift, _ = shifts(11, 60)
+    assert _affine(local, shift, np.ones(len(local), dtype=bool), 2.0) is None
+
+
+def test_shifts_without_any_scatter_are_good_to_a_thirtieth_of_a_pixel():
+    local, _, true = shifts(50, 0)
+    fitted, keep, scatter = _affine(local, true, np.ones(50, dtype=bool), 2.0)
+    assert keep.all()
+    assert scatter == pytest.approx(1.4826 * 0.02 * 2.0)
+    np.testing.assert_allclose(fitted, true, atol=1e-9)

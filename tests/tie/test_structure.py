@@ -10,14 +10,15 @@ import pytest
 from barpc.errors import TiePointError
 from barpc.scene import View
 from barpc.tie import Matches, PairReport, TieOptions, common_tracks, find_tracks, matching, select_pairs
-from barpc.tie.epipolar import robust_affine
+from barpc.tie.epipolar import Frame, robust_affine
 from barpc.tie.features import join
-from barpc.tie.matcher import NO_MATCHES
+from barpc.tie.matcher import NO_MATCHES, Prediction
 from barpc.tie.matching import STRUCTURE, _altitudes, _better, _match_within, _within, match_pair
 from barpc.tie.raster import read_pixels
-from barpc.tie.structure import register_places
+from barpc.tie.structure import Tile, _lattice, _resolution, _Search, register_places
 from tests.scenes.season import SEASONS, disguised
 from tests.tie.conftest import write_image
+from tests.tie.test_pairs import camera, views
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +36,7 @@ def tied(winter):
     return find_tracks(winter)
 
 
+@pytest.mark.slow
 def test_what_keypoints_find_too_little_of_is_tied_by_structure(render, winter, tied) -> None:
     report = tied.pairs[0]
     assert report.matcher == STRUCTURE
@@ -50,11 +52,13 @@ def test_what_keypoints_find_too_little_of_is_tied_by_structure(render, winter, 
     assert 0.05 < tied.tracks.sigma.mean() < 0.2  # half of the variance at either end
 
 
+@pytest.mark.slow
 def test_the_same_images_give_the_same_bytes(winter) -> None:
     one, two = (find_tracks(winter, TieOptions(matcher=STRUCTURE)).tracks for _ in range(2))
     assert one.xy.tobytes() == two.xy.tobytes()
 
 
+@pytest.mark.slow
 def test_another_place_is_refused(render, winter) -> None:
     other = render(views=2, seed=5).views[1]
     with pytest.raises(TiePointError, match=r"no common offset|too few matches"):
@@ -63,6 +67,7 @@ def test_another_place_is_refused(render, winter) -> None:
         )
 
 
+@pytest.mark.slow
 def test_as_delivered_it_is_a_tenth_of_a_pixel_off(render) -> None:
     scene = render(views=2)
     found = find_tracks(scene.views, TieOptions(matcher=STRUCTURE))
@@ -74,12 +79,17 @@ def test_as_delivered_it_is_a_tenth_of_a_pixel_off(render) -> None:
     assert found.keypoints == (0, 0)
 
 
-def test_a_patch_is_registered_where_the_truth_says(render) -> None:
-    scene = render(views=2)
+@pytest.mark.parametrize(
+    ("side", "axis", "most"),
+    [
+        (300, np.arange(50.0, 250.0, 20.0), (0.25, 0.3)),
+        pytest.param(600, np.arange(100.0, 500.0, 40.0), (0.15, 0.25), marks=pytest.mark.slow),
+    ],
+)
+def test_a_patch_is_registered_where_the_truth_says(render, side, axis, most) -> None:
+    scene = render(views=2, size=(side, side))
     a, b = scene.views
-    at = np.stack(np.meshgrid(np.arange(100.0, 500.0, 40.0), np.arange(100.0, 500.0, 40.0)), -1).reshape(
-        -1, 2
-    )
+    at = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     known = [scene.errors(0, 1, one[None], np.zeros((1, 2))) for one in at]
     at = at[[len(one) > 0 for one in known]]  # not beside a step
     truth = np.concatenate(known)
@@ -88,14 +98,15 @@ def test_a_patch_is_registered_where_the_truth_says(render) -> None:
     xy, ok, score = register_places([(v.path, v.size) for v in (a, b)], 1, at, truth + [1.0, -1.0], linear)
     assert ok.mean() > 0.8
     assert (np.abs(np.median((xy - truth)[ok], axis=0)) < 0.05).all()
-    assert (1.4826 * np.median(np.abs((xy - truth)[ok]), axis=0) < [0.15, 0.25]).all()
+    assert (1.4826 * np.median(np.abs((xy - truth)[ok]), axis=0) < most).all()
     assert ((score[ok] > 0.1) & (score[ok] < 1.0)).all()
 
 
-def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data) -> None:
+@pytest.mark.parametrize("step", [120.0, pytest.param(40.0, marks=pytest.mark.slow)])
+def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data, step: float) -> None:
     """Fields ten days apart on one grid, a corner of one under clouds, another without data."""
     paths = sorted((shared_data / "optical/s2_two_dates").glob("*.tif"))
-    grid = np.stack(np.meshgrid(np.arange(200.0, 920.0, 40.0), np.arange(200.0, 1160.0, 40.0)), -1).reshape(
+    grid = np.stack(np.meshgrid(np.arange(200.0, 920.0, step), np.arange(200.0, 1160.0, step)), -1).reshape(
         -1, 2
     )
     files, linear = (
@@ -110,25 +121,39 @@ def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data) -> None:
     assert np.abs([fit.coefficients[0] for fit in common] - np.array([-0.66, 1.85])).max() < 0.1
 
 
-def test_terrain_or_other_ties_narrow_the_altitudes(render) -> None:
-    views = tuple(render(views=2).views)
-    low, high = views[0].alt_range
+@pytest.fixture(scope="module")
+def small(render) -> tuple[View, View]:
+    """Used for 320 m of altitude about the scene's."""
+    first, second = (
+        replace(view, alt_range=(80.0, 400.0)) for view in render(views=2, size=(300, 300)).views
+    )
+    return first, second
+
+
+@pytest.fixture(scope="module")
+def matched(small) -> tuple[Matches, PairReport]:
+    """What structure finds of a pair."""
+    pair = select_pairs(small, TieOptions())[0]
+    return match_pair(small, (join([]), join([])), pair, TieOptions(matcher=STRUCTURE))
+
+
+def test_terrain_or_other_ties_narrow_the_altitudes(render, small, matched) -> None:
+    pair, (found, report) = small, matched
+    low, high = pair[0].alt_range
     middle = 0.5 * (low + high)
-    flat = _within(views, lambda lon, lat: np.full(len(lon), middle), (low, low))
+    flat = _within(pair, lambda lon, lat: np.full(len(lon), middle), (low, low))
     assert flat[0].alt_range == flat[1].alt_range == (max(low, middle - 150), min(high, middle + 150))
-    assert _within(views, None, None) == views
-    assert _within(views, None, (high + 1e4, high + 2e4)) == views
-    assert _within(views, lambda lon, lat: np.full(len(lon), np.nan), (low, low))[0].alt_range[1] == min(
+    assert _within(pair, None, None) == pair
+    assert _within(pair, None, (high + 1e4, high + 2e4)) == pair
+    assert _within(pair, lambda lon, lat: np.full(len(lon), np.nan), (low, low))[0].alt_range[1] == min(
         high, low + 150
     )
-    assert _within(views, None, (middle, middle), 50.0)[0].alt_range == (
+    assert _within(pair, None, (middle, middle), 50.0)[0].alt_range == (
         max(low, middle - 50),
         min(high, middle + 50),
     )
-    pair = select_pairs(views, TieOptions())[0]
-    found, report = match_pair(views, (join([]), join([])), pair, TieOptions(matcher=STRUCTURE))
-    known = _altitudes([(views, found)])
-    seen = render(views=2).altitude[0]
+    known = _altitudes([(pair, found)])
+    seen = render(views=2, size=(300, 300)).altitude[0]
     assert known is not None
     assert abs(known[0] - np.nanpercentile(seen, 2)) < 40  # cameras as delivered
     assert abs(known[1] - np.nanpercentile(seen, 98)) < 40
@@ -137,16 +162,16 @@ def test_terrain_or_other_ties_narrow_the_altitudes(render) -> None:
 
 
 @pytest.mark.parametrize("seen", [False, True])
-def test_only_terrain_that_both_may_see_counts(render, seen) -> None:
-    first, second = render(views=2).views
+def test_only_terrain_that_both_may_see_counts(seen) -> None:
+    first, second = views(camera(0.0), camera(0.0, lean=0.2))
     middle, flat = (
         0.5 * sum(first.alt_range),
-        first.sensor.localize(np.array([[150.0, 300.0]]), np.array([0.0])),
+        first.sensor.localize(np.array([[180.0, 540.0]]), np.array([0.0])),
     )
-    half = replace(second, sensor=second.sensor.crop(0.0 if seen else 450.0, 0.0), size=(150, 600))
+    half = replace(second, sensor=second.sensor.crop(0.0 if seen else 600.0, 0.0), size=(150, 1000))
 
     def hilly(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
-        """A hill where the first image has its column 150."""
+        """A hill where the first image has its column 180."""
         away = np.hypot((lon - flat[0, 0]) * np.cos(np.radians(lat)), lat - flat[0, 1]) * 111e3
         return np.where(away < 60.0, middle + 20.0, middle)
 
@@ -154,10 +179,10 @@ def test_only_terrain_that_both_may_see_counts(render, seen) -> None:
     assert found == min(first.alt_range[1], middle + (70.0 if seen else 50.0))
 
 
-def test_fewer_altitudes_are_tried_where_all_find_few(render, monkeypatch) -> None:
-    views, asked = tuple(render(views=2).views), []
+def test_fewer_altitudes_are_tried_where_all_find_few(small, monkeypatch) -> None:
+    asked = []
     wide, narrow = (
-        (replace(views[0], alt_range=around), views[1]) for around in ((0.0, 300.0), (100.0, 200.0))
+        (replace(small[0], alt_range=around), small[1]) for around in ((0.0, 300.0), (100.0, 200.0))
     )
 
     def few(pair: tuple[View, View], *_: object) -> tuple[Matches, PairReport]:
@@ -168,16 +193,14 @@ def test_fewer_altitudes_are_tried_where_all_find_few(render, monkeypatch) -> No
     for most, tries in ((99, 2), (100, 1)):
         asked.clear()
         report = _match_within(
-            [wide, narrow], (join([]), join([])), select_pairs(views, TieOptions())[0], TieOptions()
+            [wide, narrow], (join([]), join([])), select_pairs(small, TieOptions())[0], TieOptions()
         )[1]
         assert report.verified == most
         assert asked == [(0.0, 300.0), (100.0, 200.0)][:tries]
 
 
-def test_the_attempt_with_more_verified_matches_counts_and_a_refused_one_never(render) -> None:
-    views = tuple(render(views=2).views)
-    pair = select_pairs(views, TieOptions())[0]
-    found, report = match_pair(views, (join([]), join([])), pair, TieOptions(matcher=STRUCTURE))
+def test_the_attempt_with_more_verified_matches_counts_and_a_refused_one_never(matched) -> None:
+    found, report = matched
     few, refused = replace(report, verified=20), replace(report, verified=900, status="too few matches")
     for attempts, best in (
         ((few, report, refused), report),
@@ -187,3 +210,150 @@ def test_the_attempt_with_more_verified_matches_counts_and_a_refused_one_never(r
         won = _better(*((found, attempt) for attempt in attempts))[1]
         assert len(won.beaten) == len(attempts) - 1
         assert replace(won, beaten=()) == best
+
+
+# --- pieces -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("side", "pixels"),
+    [(1.0, 1), (2.0, 1), (0.72, 1), (0.70, 2), (0.5, 2), (0.36, 2), (0.35, 4), (0.01, 64), (1e-4, 64)],
+)
+def test_pictures_are_as_coarse_as_the_coarser_image_by_a_power_of_two(side, pixels) -> None:
+    """A pixel of A measures `side` px of B; with any turn, and mirrored."""
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    for linear in (side * np.eye(2), side * turn, side * turn @ np.diag([1.0, -1.0])):
+        assert _resolution(linear) == pixels
+
+
+def test_a_lattice_holds_the_multiples_of_its_pitch_in_a_box() -> None:
+    at = _lattice((10, 20, 31, 11), 10)
+    assert at.tolist() == [[10, 20], [20, 20], [30, 20], [40, 20], [10, 30], [20, 30], [30, 30], [40, 30]]
+    assert _lattice((11, 21, 9, 9), 10).tolist() == []
+    assert _lattice((11, 21, 10, 10), 10).tolist() == [[20, 30]]
+
+
+def level(
+    half: float, width: float, height: float, probes: int | None = None, band: float = 3.0, least: int = 1
+):
+    """Step and number of points of a look at a window, and their pitch."""
+    search = _Search.__new__(_Search)
+    search._least = least
+    search._prediction = Prediction(None, band, lambda: [], probes)  # type: ignore[arg-type]
+    step, points = search._level(half, [(0, 0, int(width), int(height))])
+    return step, np.diff(np.unique(points[:, 0]))[0]
+
+
+@pytest.mark.parametrize(
+    ("half", "step", "count"), [(47.9, 2, 1000), (48.1, 2, 500), (129.9, 2, 500), (130.1, 4, 500)]
+)
+def test_long_bands_are_looked_at_in_coarser_pictures_at_fewer_points(half, step, count) -> None:
+    found, pitch = level(half, 2000, 2000)
+    assert found == step
+    assert pitch == step * int((2000 * 2000 / count) ** 0.5 / step)
+    assert level(half, 4000, 4000, least=4)[0] == 4 * step
+
+
+@pytest.mark.parametrize(
+    ("band", "half", "step"),
+    [(20.0, 10.0, 2), (39.0, 10.0, 2), (61.0, 10.0, 4), (90.0, 10.0, 4), (101.0, 10.0, 8), (20.0, 239.0, 2),
+     (20.0, 241.0, 4), (20.0, 1e4, 4)],
+)  # fmt: skip
+def test_the_cameras_error_is_looked_for_in_pictures_as_coarse_as_the_search_is_wide(
+    band, half, step
+) -> None:
+    """A twentieth of its half width, or an eightieth of the altitudes' half length; powers of two."""
+    found, pitch = level(half, 3000, 3000, probes=1500, band=band)
+    assert found == step
+    assert pitch == step * int((3000 * 3000 / 200) ** 0.5 / step)
+
+
+@pytest.mark.parametrize(("side", "step"), [(480, 8), (479, 4), (240, 4), (239, 2), (100, 2), (20, 2)])
+def test_a_picture_has_sixty_pixels_a_side_where_it_can(side, step) -> None:
+    assert level(10.0, 1000, side, probes=1500, band=120.0)[0] == step
+
+
+def test_points_are_eight_pixels_apart_at_least() -> None:
+    assert level(10.0, 200, 200)[1] == 2 * 8
+    assert level(200.0, 500, 500)[1] == 4 * 8
+
+
+@pytest.mark.parametrize(
+    ("start", "axis", "most", "expected"),
+    [
+        ((500.0, 400.0), (1.0, 0.0), 100.0, (0.0, 100.0)),  # all of the segment
+        ((50.0, 400.0), (1.0, 0.0), 100.0, (20.0, 80.0)),  # from ten pixels before the image on
+        ((960.0, 400.0), (1.0, 0.0), 100.0, (-25.0, 75.0)),  # to ten behind it
+        ((500.0, 780.0), (0.0, 1.0), 100.0, (-35.0, 65.0)),
+        ((500.0, 15.0), (0.0, 1.0), 100.0, (37.5, 62.5)),
+        ((-500.0, 400.0), (1.0, 0.0), 100.0, (0.0, 0.0)),  # nothing of it
+    ],
+)
+def test_a_segment_is_looked_at_as_far_as_it_lies_in_the_image(start, axis, most, expected) -> None:
+    search = _Search.__new__(_Search)
+    search._files = (("a", (1, 1)), ("b", (1000, 800)))
+    (x, y), half = axis, np.full(1, most)
+    along, across = start[0] * x + start[1] * y, start[1] * x - start[0] * y
+    where = Frame(np.array(axis), np.array([along]), np.array([across]), np.zeros(1), -half, half, np.eye(2))
+    found = search._part_in_b(where, np.zeros(1), np.array([0]), 10.0)
+    assert found == pytest.approx(expected)
+
+
+def plain_tile(reach: tuple[int, int] = (4, 3), half: int = 5) -> Tile:
+    """Two points of a picture that is A and B; a pixel of it is two of B, turned by a right angle."""
+    noise = np.random.default_rng(0).normal(size=(2, 40, 50)).astype(np.float32)
+    at = np.array([[15, 12], [30, 25]])
+    matrix = np.array([[0.0, -2.0], [2.0, 0.0]])
+    return Tile(
+        (noise, noise),
+        at,
+        at.copy(),
+        np.zeros((2, 2)),
+        np.array(reach),
+        half,
+        matrix,
+        np.array([100.0, 200.0]),
+    )
+
+
+def test_the_best_place_of_a_template_is_its_own() -> None:
+    tile = plain_tile()
+    surface = tile.surfaces()
+    assert surface.shape == (2, 7, 9)
+    place, score = tile.peaks(surface)
+    np.testing.assert_allclose(place, tile.at, atol=0.2)
+    np.testing.assert_allclose(score, 1.0, atol=1e-5)
+    assert tile.returns(tile.at.astype(float)).all()
+    assert tile.returns(tile.at + [1.0, 1.0]).all()  # missed by 1.41
+    assert not tile.returns(tile.at + [2.0, 0.0]).any()
+    assert not tile.returns(tile.at + [0.0, -2.0]).any()
+
+
+def test_places_of_a_picture_are_places_of_b() -> None:
+    tile = plain_tile()
+    np.testing.assert_allclose(tile.in_b(np.array([[0.0, 0.0], [3.0, 1.0]])), [[100, 200], [98, 206]])
+    off = tile.offsets()
+    assert off.shape == (7, 9, 2)
+    np.testing.assert_allclose(off[3, 4], 0.0)
+    np.testing.assert_allclose(off[3, 5], [0.0, 2.0])  # one to the right in the picture
+    np.testing.assert_allclose(off[6, 0], [-6.0, -8.0])
+
+
+def test_a_peak_is_that_of_the_parabolas_through_its_neighbours_and_none_on_the_edge() -> None:
+    tile = plain_tile()
+    x, y = np.arange(-4, 5.0), np.arange(-3, 4.0)[:, None]
+    inner = 0.9 - 0.02 * (x - 1.3) ** 2 - 0.05 * (y + 0.6) ** 2
+    edge = 0.9 - 0.02 * (x - 4.4) ** 2 - 0.05 * (y + 0.6) ** 2
+    place, score = tile.peaks(np.stack([inner, edge]).astype(np.float32))
+    np.testing.assert_allclose(place - tile.whole, [[1.3, -0.6], [4.0, -1.0]], atol=1e-4)
+    np.testing.assert_allclose(
+        score, [0.9 - 0.02 * 0.09 - 0.05 * 0.16, 0.9 - 0.02 * 0.16 - 0.05 * 0.16], atol=1e-5
+    )
+
+
+def test_a_template_is_a_picture_where_more_than_nine_tenths_of_it_are_known() -> None:
+    tile = plain_tile()
+    for rows, known in ((1, True), (2, False)):  # of eleven
+        picture = tile.pictures[0].copy()
+        picture[:, 7 : 7 + rows, 10:21] = 0.0
+        assert replace(tile, pictures=(picture, picture)).shown().tolist() == [known, True]

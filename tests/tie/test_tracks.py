@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from barpc.scene import Tracks
-from barpc.tie import Matches, common_tracks, thin
+from barpc.tie import Matches, TieOptions, common_tracks, select_pairs, thin
 from barpc.tie import link as link_pairs
+from barpc.tie.matching import PairReport
+from barpc.tie.tracks import require_tracks
+from tests.tie.test_pairs import METRE, camera, views
 
 PLACES = np.random.default_rng(0).uniform(0, 100, (4, 10, 2))
 
@@ -18,6 +22,12 @@ def matches(i: int, j: int, *index: tuple[int, int], sigma: float = 0.2) -> tupl
     rows = np.array(index, dtype=np.int64).reshape(-1, 2)
     xy = np.stack([PLACES[i][rows[:, 0]], PLACES[j][rows[:, 1]]], axis=1)
     return (i, j), Matches(xy, np.zeros(len(rows)), rows, sigma)
+
+
+def tracks_of(*rows: tuple[int, int]) -> Tracks:
+    view, point = np.array(rows).T
+    xy = np.arange(2.0 * len(rows)).reshape(-1, 2) * 10.0 + 0.3
+    return Tracks(view, point, xy, np.full(len(rows), 0.2))
 
 
 def link(*found: tuple[tuple[int, int], Matches]) -> Tracks:
@@ -128,3 +138,62 @@ def test_common_tracks_come_in_the_same_order() -> None:
     first, third = common_tracks(tracks, 0, 2)
     np.testing.assert_array_equal(first, tracks.xy[tracks.view == 0])
     np.testing.assert_array_equal(third, tracks.xy[tracks.view == 2])
+
+
+def test_few_tracks_are_handed_back_as_they_are() -> None:
+    tracks = tracks_of(*[(v, p) for p in range(30) for v in (0, 1)])
+    for most in (30, 31, 1000):
+        assert thin(tracks, [(1000, 800)] * 2, most) is tracks
+    assert thin(tracks, [(1000, 800)] * 2, 29).num_points == 29
+    none = tracks.select(tracks.point < 0)
+    assert thin(none, [(1000, 800)] * 2, 5) is none
+
+
+def test_every_place_has_its_four_before_one_has_five() -> None:
+    """A hundred tracks at one place of an image and six each at three others."""
+    place = np.array([[100.0, 100.0], [900.0, 100.0], [100.0, 900.0], [900.0, 900.0]])
+    of = np.repeat([0, 1, 2, 3], [100, 6, 6, 6])
+    xy = np.repeat(place[of], 2, axis=0)
+    tracks = Tracks(np.tile([0, 1], 118), np.repeat(np.arange(118), 2), xy, np.full(236, 0.1))
+
+    def kept(most: int) -> list[int]:
+        left = thin(tracks, [(1000, 1000)] * 2, most)
+        near = np.abs(left.xy[left.view == 0][:, None] - place).sum(axis=2).argmin(axis=1)
+        return np.bincount(near, minlength=4).tolist()
+
+    assert kept(16) == [4, 4, 4, 4]
+    assert kept(28) == [10, 6, 6, 6]
+    assert kept(100) == [16, 6, 6, 6]  # and none more than sixteen
+
+
+def test_cells_hold_the_first_quota_of_as_many_observations_as_are_kept(monkeypatch) -> None:
+    seen = []
+
+    def fill(tracks: Tracks, cell: list[int], cells: int, most: int, views: int) -> np.ndarray:
+        seen.append((cell, cells))
+        return np.ones(tracks.num_points, dtype=bool)
+
+    monkeypatch.setattr(sys.modules["barpc.tie.tracks"], "_fill", fill)
+    tracks = tracks_of(*[(v, p) for p in range(30) for v in (0, 1)])
+    thin(tracks, [(1000, 800), (700, 700)], 20)
+    ((cell, count),) = seen
+    sides = [np.sqrt(4 * 1000 * 800 / 20), np.sqrt(4 * 700 * 700 / 20)]
+    columns, rows = (
+        [int(1000 / sides[0]) + 2, int(700 / sides[1]) + 2],
+        [int(800 / sides[0]) + 2, int(700 / sides[1]) + 2],
+    )
+    assert count == columns[0] * rows[0] + columns[1] * rows[1]
+    for k, found in enumerate(cell):
+        v = int(tracks.view[k])
+        col, row = ((tracks.xy[k] + 0.5) // sides[v]).astype(int)
+        assert found == v * columns[0] * rows[0] + row * columns[v] + col
+
+
+def test_tracks_must_tie_every_pair_after_registration() -> None:
+    two = views(camera(0.0), camera(100 * METRE))
+    pairs = select_pairs(two, TieOptions())
+    reports = [PairReport(("v0", "v1"), "ok", (50, 50), 30, 20)]
+    tracks = tracks_of(*[(v, p) for p in range(12) for v in (0, 1)])
+    require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=12))
+    with pytest.raises(Exception, match="only 12 tracks after registration"):
+        require_tracks(two, tracks, pairs, reports, TieOptions(min_matches=13))

@@ -1,0 +1,224 @@
+"""What is tried with a pair, in which order, and what is taken as it is where registration finds too little."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from barpc.scene import Tracks
+from barpc.tie import Matches, TieOptions, matching, tracks
+from barpc.tie.features import join
+from barpc.tie.matcher import NO_MATCHES
+from barpc.tie.matching import PairReport, _altitudes, match, match_pair
+from barpc.tie.pairs import Pair
+from barpc.tie.tracks import _twice, _unlike, _with_unregistered
+
+from .test_pairs import camera, views
+
+PAIR = Pair((0, 1), 1.0, 5.0)
+NOBODY = join([]), join([])
+
+
+@pytest.fixture
+def attempts(monkeypatch):
+    """`attempts(first, second)`: what the attempts report, one after the other; the options of those made."""
+    made: list[TieOptions] = []
+
+    def scripted(*reports: PairReport) -> list[TieOptions]:
+        script = iter(reports)
+
+        def attempt(_views, _keypoints, _pair, options: TieOptions) -> tuple[Matches, PairReport]:
+            made.append(options)
+            return NO_MATCHES, replace(next(script), matcher=options.matcher)
+
+        monkeypatch.setattr(matching, "_attempt", attempt)
+        return made
+
+    return scripted
+
+
+def report(verified: int, status: str = "ok", matches: int = 200) -> PairReport:
+    return PairReport(("a", "b"), status, (900, 900), matches, verified, overlap=1.0)
+
+
+# --- thresholds ---------------------------------------------------------------------------------------------
+
+
+def test_a_pair_with_enough_is_tried_once(attempts) -> None:
+    made = attempts(report(100))
+    assert match_pair((None, None), NOBODY, PAIR, TieOptions())[1] == report(100)  # type: ignore[arg-type]
+    assert made == [TieOptions()]
+
+
+@pytest.mark.parametrize(
+    ("given", "loosened"),
+    [
+        ({}, (0.95, 0.05, 8)),
+        ({"ratio": 0.97, "min_matches": 5}, (0.97, 0.05, 5)),
+        ({"min_matches": 9}, (0.95, 0.05, 8)),
+    ],
+)
+def test_a_pair_with_fewer_is_tried_again_with_looser_thresholds(attempts, given, loosened) -> None:
+    made = attempts(report(99), report(120))
+    found = match_pair((None, None), NOBODY, PAIR, TieOptions(**given))[1]  # type: ignore[arg-type]
+    assert found == replace(report(120), loosened=True, beaten=("guided 99 of 100",))
+    assert (made[1].ratio, made[1].false_share, made[1].min_matches) == loosened
+    assert len(made) == 2
+
+
+def test_what_looser_thresholds_cannot_change_is_not_tried_again(attempts, monkeypatch) -> None:
+    """No keypoints; a matcher of the user's own; structure that saw nothing."""
+    few = report(0, "too few keypoints")
+    made = attempts(few, report(120))
+    assert match_pair((None, None), NOBODY, PAIR, TieOptions())[1] == few  # type: ignore[arg-type]
+    own = TieOptions(matcher="somewhere:match")
+    made = attempts(report(20), report(120))
+    assert match_pair((None, None), NOBODY, PAIR, own)[1].verified == 20  # type: ignore[arg-type]
+    structure = TieOptions(matcher=matching.STRUCTURE)
+    for matches, again in ((7, False), (8, True)):
+        made.clear()
+        attempts(report(0, "too few matches", matches), report(120))
+        match_pair((None, None), NOBODY, PAIR, structure)  # type: ignore[arg-type]
+        assert len(made) == 1 + again
+
+
+# --- structure ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def second_look(monkeypatch):
+    """`second_look(reports, **given)`: the pairs that structure is asked for, and what the others reported."""
+
+    def asked(reports: list[PairReport], options: TieOptions, **given):
+        script, again = iter(reports), []
+        monkeypatch.setattr(matching, "match_pair", lambda *task: (given_matches(20), next(script)))
+
+        def within(several, _keypoints, pair, other) -> tuple[Matches, PairReport]:
+            again.append((pair.views, other.matcher, [v[0].alt_range for v in several]))
+            return NO_MATCHES, replace(report(150), matcher=other.matcher)
+
+        monkeypatch.setattr(matching, "_match_within", within)
+        many = views(*(camera(0.0, lean=0.1 * k) for k in range(len(reports) + 1)))
+        pairs = [Pair((k, k + 1), 1.0, 5.0) for k in range(len(reports))]
+        found = match(many, [join([])] * len(many), pairs, options, **given)
+        return again, [one.matcher for _, one in found]
+
+    return asked
+
+
+def flat(lon, lat):
+    return np.full(np.shape(lon), 80.0)
+
+
+def test_structure_is_asked_where_keypoints_find_few_and_not_where_there_are_none(second_look) -> None:
+    reports = [report(100), report(99), report(0, "too few keypoints"), report(0, "too few matches")]
+    again, matchers = second_look(reports, TieOptions())
+    assert [(views, name) for views, name, _ in again] == [((1, 2), "structure"), ((3, 4), "structure")]
+    assert matchers == ["guided", "structure", "guided", "structure"]
+
+
+def test_a_matcher_that_is_named_is_what_is_wanted_unless_the_terrain_tells_structure_more(
+    second_look,
+) -> None:
+    few = [report(40)]
+    assert second_look(few, TieOptions(matcher="somewhere:match"), terrain=flat)[0] == []
+    assert second_look(few, TieOptions(matcher="structure"))[0] == []
+    ((_, name, ranges),) = second_look(few, TieOptions(matcher="structure"), terrain=flat)[0]
+    assert name == "structure"
+    assert ranges == [(0.0, 200.0), (30.0, 130.0)]  # 150 m about the terrain, and 50
+    assert second_look([report(100)], TieOptions(matcher="structure"), terrain=flat)[0] == []
+
+
+def test_altitudes_are_known_from_pairs_whose_segments_are_five_pixels_to_either_side() -> None:
+    """Of cameras that lean apart by so many pixels a metre, over two hundred metres."""
+    for lean, tells in ((0.049, False), (0.051, True)):
+        two = tuple(views(camera(0.0, lean=0.0), camera(0.0, lean=lean)))
+        ground = np.column_stack([np.linspace(-1e-3, 1e-3, 201), np.zeros(201), np.linspace(0.0, 200.0, 201)])
+        xy = np.stack([view.sensor.project(ground) for view in two], axis=1)
+        known = _altitudes([(two, Matches.of_places(xy, np.zeros(201)))])
+        assert (known is not None) == tells
+        if known is not None:
+            assert known == pytest.approx((4.0, 196.0), abs=0.5)  # percentiles 2 and 98
+
+
+# --- what is taken as it is ---------------------------------------------------------------------------------
+
+
+def of(*rows: tuple[int, int, float, float]) -> Tracks:
+    view, point, x, y = (np.array(column) for column in zip(*rows, strict=True))
+    return Tracks(view.astype(int), point.astype(int), np.column_stack([x, y]), np.full(len(rows), 0.1))
+
+
+def test_a_track_is_there_twice_where_two_of_its_places_lie_beside_registered_ones() -> None:
+    known = of((0, 0, 100.0, 100.0), (1, 0, 50.0, 50.0), (0, 1, 300.0, 300.0), (1, 1, 350.0, 300.0))
+    other = of(
+        (0, 0, 102.1, 100.0), (1, 0, 50.0, 47.9),  # both within two pixels and a bit
+        (0, 1, 102.3, 100.0), (1, 1, 50.0, 50.0),  # one of them
+        (0, 2, 50.0, 50.0), (1, 2, 100.0, 100.0),  # of the other view
+        (0, 3, 301.0, 301.0), (1, 3, 351.0, 299.0),
+    )  # fmt: skip
+    assert _twice(known, other).tolist() == [True, False, False, True]
+
+
+def given_matches(count: int) -> Matches:
+    places = np.random.default_rng(0).uniform(50, 900, (count, 2))
+    numbers = -1 - np.arange(count)
+    return Matches(
+        np.stack([places, places + 1.0], axis=1), np.zeros(count), np.stack([numbers] * 2, axis=1), 0.3
+    )
+
+
+@pytest.mark.parametrize(
+    ("count", "kept", "unlike"),
+    [(60, 0.47, True), (60, 0.51, False), (1000, 0.09, True), (1000, 0.11, False), (1000, 0.0, True)],
+)
+def test_grey_values_do_not_compare_where_under_half_of_a_hundred_register_and_too_few_are_left(
+    monkeypatch, count, kept, unlike
+) -> None:
+    monkeypatch.setattr(
+        tracks,
+        "refine",
+        lambda views, linked, *_, **__: linked.select(linked.point < kept * linked.num_points),
+    )
+    given = {(0, 1): given_matches(count)}
+    found = _unlike([None, None], given, TieOptions(), {})  # type: ignore[list-item]
+    assert found == ([(0, 1)] if unlike else [])
+
+
+def test_given_matches_are_added_where_fewer_than_are_wanted_could_be_registered(caplog) -> None:
+    two, given = views(camera(0.0), camera(0.0)), {(0, 1): given_matches(40)}
+    places = given[0, 1].xy[:20]
+    registered = of(*((v, k, *places[k, v]) for k in range(20) for v in (0, 1)))
+    assert _with_unregistered(two, registered, given, TieOptions(min_matches=20)) is registered
+    with caplog.at_level(logging.WARNING):
+        more = _with_unregistered(two, registered, given, TieOptions(min_matches=21))
+    assert more.num_points == 40  # those that are registered once
+    assert (
+        "20 of 40 given matches could be registered: they are used as they are, good to 0.30 px"
+        in caplog.text
+    )
+    assert (np.diff(more.point) >= 0).all()
+    assert np.unique(more.sigma).tolist() == [0.1, 0.3]
+    assert (np.bincount(more.point) == 2).all()
+
+
+def test_the_quick_score_is_of_the_strongest_and_nought_where_there_are_none(render) -> None:
+    from barpc.tie.features import locate
+    from barpc.tie.store import Store, store_of
+
+    scene = render(views=2, size=(300, 300))
+    pair = tuple(scene.views)
+    with store_of(SimpleNamespace(store=None)) as store:  # type: ignore[arg-type]
+        files = locate(pair, TieOptions(), store)
+        assert min(map(len, files)) > 500
+        asked = [found.strongest(500) for found in files]
+        assert all(500 <= len(few) <= 500 + len(few.boxes) for few in asked)
+        score = matching.quick_score(pair, (files[0], files[1]), TieOptions())
+        assert 60 < score < 400
+        assert isinstance(store, Store)
+        none = replace(files[1], counts=(0,) * len(files[1].counts))
+        assert matching.quick_score(pair, (files[0], none), TieOptions()) == 0
