@@ -179,13 +179,12 @@ class Workspace:
         # without a state: nothing but our own folder is left by a run that was killed in its first moment
         unfinished = status in ("running", "failed") or (status is None and present <= {STATE})
         self._may_replace = overwrite or unfinished
+        self._earlier, self._named = _read_own(self.folder), set(names)
+        self._refuse_hiding(self._named)
         if present and not self._adds and not self._may_replace:
             raise OutputError(f"{self.folder}: exists and is not empty; give --overwrite or another -o")
-        self._earlier = _read_own(self.folder)
-        self._named = set(names)
         for name in self._named:
             self._refuse_foreign(name)
-        self._refuse_hiding(self._named)
 
     def _refuse_hiding(self, names: Iterable[str]) -> None:
         """Raise if a file to be written would be read in place of the RPC of an image that is there.

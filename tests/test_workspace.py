@@ -15,12 +15,8 @@ import numpy as np
 import pytest
 
 from barpc.errors import OutputError, TiePointError
-<<<<<<< HEAD
 from barpc.identity import take
-from barpc.workspace import Workspace, code_version, key_of, peak_memory
-=======
-from barpc.workspace import Workspace, code_version, fingerprint, key_of, peak_memory, timed
->>>>>>> main
+from barpc.workspace import Workspace, code_version, key_of, peak_memory, timed
 
 
 @dataclass(frozen=True)

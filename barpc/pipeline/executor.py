@@ -141,9 +141,10 @@ class CachingExecutor(Executor):
         """Give waiting tasks to the executor while few are in flight."""
         while batch := self._next_batch():
             try:
-                tasks = [(self._spill(task.args), self.guards(task.args)) for task in batch]
+                tasks = [self._spill(task.args) for task in batch]
+                guards = [self.guards(task.args) for task in batch]
                 assert self.executor is not None
-                future = self.executor.submit(run_batch, batch[0].fn, tasks, __version__)
+                future = self.executor.submit(run_batch, batch[0].fn, tasks, __version__, guards)
             except (RuntimeError, OSError) as error:  # the pool is broken or shut down; the disk is full
                 self._resolve(batch, [(0.0, None, _explained(error))] * len(batch))
             else:
@@ -290,17 +291,20 @@ class Spilled:
 
 
 def run_batch(
-    fn: Function, tasks: Sequence[tuple[tuple[Any, ...] | Spilled, tuple[Input, ...]]], version: str
+    fn: Function,
+    tasks: Sequence[tuple[Any, ...] | Spilled],
+    version: str,
+    guards: Sequence[tuple[Input, ...]] | None = None,
 ) -> tuple[list[Outcome], float]:
-    """Work on a batch, arguments and the inputs that they name, in a worker; CPU seconds that it took.
+    """Work on a batch, in a worker: one task's error leaves the others their results; CPU seconds that it took.
 
-    One task's error leaves the others their results; a batch from a cluster with another `version` is not worked on.
+    `guards`: the inputs that each task names. One that came to a cluster with another `version` works on nothing.
     """
     if version != __version__:
         return [(0.0, None, other_version(__version__, version))] * len(tasks), 0.0
     outcomes: list[Outcome] = []
     cpu = time.thread_time()
-    for task, inputs in tasks:
+    for task, inputs in zip(tasks, guards or [()] * len(tasks), strict=True):
         start = time.perf_counter()
         value: Any = None
         error: Exception | None = None
