@@ -180,6 +180,7 @@ def _decode(frame: Any, arrays: Mapping[str, npt.NDArray[Any]], sent: bool = Fal
 
 _DEFLATE = 1032  # bytes at most that one byte of a deflated stream stands for
 _HEADER = 1 << 12
+_NUMBER = 8  # bytes of what an element becomes, however small it is kept
 
 
 def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
@@ -197,6 +198,7 @@ def unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
         with zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             kind.check(f"{path}, unpacked", sum(member.file_size for member in members))
+            kind.check(f"{path}, as numbers", _NUMBER * sum(_header(archive, m)[0] for m in members))
             return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
     except BarpcError:
         raise
@@ -206,8 +208,8 @@ def unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
         ) from error
 
 
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
-    """A member, after its header was found to claim as many bytes as the archive does."""
+def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[int, int]:
+    """Elements and bytes of a member, as many as the archive claims; ValueError where it cannot hold them."""
     packed = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: _DEFLATE}.get(member.compress_type)
     if packed is None or member.file_size > packed * member.compress_size + _HEADER:
         raise ValueError(f"{member.filename} claims more bytes than it can hold")
@@ -221,5 +223,10 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any
             raise ValueError(
                 f"{member.filename} holds another number of bytes than its shape {shape} asks for"
             )
+    return math.prod(shape), member.file_size
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
+    """A member whose header was looked at."""
     with archive.open(member) as file:
         return np.asarray(npy.read_array(file, allow_pickle=False))

@@ -8,11 +8,10 @@ image and its altitudes. A vendor's file beside an image, which would be read in
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -32,14 +31,13 @@ from barpc.errors import OutputError
 from barpc.fit.certificate import Sample
 from barpc.geodesy import Array, wrap_longitude
 from barpc.raster import GDAL_OPTIONS
-from barpc.rpcio import Carrier, hidden_by, read_rpc, row_of, sidecars
+from barpc.rpcio import Carrier, read_rpc, row_of, sidecars
 from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.sensor import SensorModel
 from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import image_grid
 from barpc.vrt import Vrt, read_vrt
-from barpc.workspace import own_files
 
 TOLERANCE = 1e-6  # Largest difference [px] between a file and its model that passes
 
@@ -86,19 +84,6 @@ def difference(
 
 def _largest(project: Projection, ground: Array, image: Array) -> float:
     return float(np.linalg.norm(project(ground) - image, axis=1).max())
-
-
-def refuse_hiding(folder: Path, names: Sequence[str], inputs: Collection[Path]) -> None:
-    """Raise OutputError if a file to be written would be read in place of the RPC of an image that is there.
-
-    For the inputs it does not matter whether barpc wrote such a file before.
-    """
-    own = own_files(folder) if folder.is_dir() else set()
-    given = {path.resolve() for path in inputs}
-    for path, image, _ in hidden_by(folder / name for name in names):
-        known = "the input " * (image.resolve() in given)
-        if known or not (image.name in own or os.path.lexists(path)):
-            raise OutputError(f"{path}: would be read in place of the RPC of {known}{image}; give another -o")
 
 
 def verify(

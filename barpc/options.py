@@ -32,6 +32,7 @@ Model = Literal["auto", "rotation+translation", "rotation", "translation", "shif
 
 HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
 _MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
+_REAL = 1e30  # no option is larger, or smaller and not 0: squares, and squares of them, are numbers then
 _SHORT = reprlib.Repr()
 _SHORT.maxstring, _SHORT.maxother = 60, 200
 
@@ -189,7 +190,8 @@ def _plain(kind: Any, rule: Rule, value: Any) -> Any:
     if isinstance(value, Integral) and abs(int(value)) >= _MOST:
         return None
     number = kind(value)
-    return number if rule.holds(number) else None
+    beyond = kind is float and number != 0 and not 1 / _REAL <= abs(number) <= _REAL
+    return number if rule.holds(number) and not beyond else None
 
 
 # --- the records ------------------------------------------------------------------------------------------
@@ -570,7 +572,20 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
             raise InputError(
                 f"{path}: {name} is not taken from a file, which may be anybody's; give the flag"
             )
+    _refuse_code(path, RunOptions, data)
     return with_values(options or RunOptions(), data, str(path))
+
+
+def _refuse_code(path: str | Path, record: type[Options], values: Mapping[str, Any]) -> None:
+    """InputError where a file names a module that would be run: only a person may, by a flag or in Python."""
+    for name, one in declared(record).items():
+        value = values.get(name)
+        if isinstance(one.default, Options) and isinstance(value, Mapping):
+            _refuse_code(path, type(one.default), value)
+        elif one.rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value):
+            raise InputError(
+                f"{path}: {name} {value!r} would run code, which is not taken from a file; give the flag --{name}"
+            )
 
 
 def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
@@ -595,8 +610,7 @@ def _schema(kind: Any, rule: Rule) -> dict[str, Any]:
         count = {} if parts[-1] is ... else {"minItems": len(parts), "maxItems": len(parts)}
         return {"type": "array", "items": _schema(parts[0], rule), **count}
     if choices := rule.choices(kind):
-        listed = {"enum": list(choices)}
-        return {"anyOf": [listed, {"type": "string", "pattern": f"^{HOOK}$"}]} if rule.hook else listed
+        return {"enum": list(choices)}
     bounds = {
         "minimum": rule.least,
         "exclusiveMinimum": rule.above,

@@ -29,7 +29,9 @@ from rasterio.io import MemoryFile
 from rasterio.transform import array_bounds
 from rasterio.windows import Window
 
+from barpc import identity
 from barpc.errors import ImageError
+from barpc.identity import Input
 from barpc.remote import Place, Remote, RemoteFile, place
 from barpc.scene import BoolArray
 from barpc.sidefile import IMAGE, read_head
@@ -74,6 +76,7 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
     `barpc.vrt` or points at anything else than plain local rasters.
     """
     name = os.fspath(path)
+    identity.ask(path)
     file, driver = identify(path, driver)
     try:
         with (
@@ -149,6 +152,22 @@ def _mosaic(file: Place, name: str) -> Mosaic:
             if drivers[source.file] == "VRT":
                 raise ImageError(f"{name}: a VRT of a VRT is not read; give the images it is made of")
     return Mosaic(name, vrt, lambda source: _opened(source, drivers[source]))
+
+
+def hashed(path: Place | str) -> Input:
+    """A file, hashed; a VRT with the sources that it shows. ImageError where one cannot be read."""
+    try:
+        if isinstance(path, Remote) or driver_of(read_head(path, IMAGE, 64)) != "VRT":
+            return identity.take(path)
+        whole = identity.take(path)  # before it is read: what it shows is what was hashed
+        files = dict.fromkeys(source.file for source in read_vrt(Path(path)).sources)
+        found = replace(whole, parts=tuple(identity.take(file) for file in files))
+    except OSError as error:
+        if isinstance(error, ImageError):
+            raise
+        raise ImageError(f"{path}: cannot be read ({error.strerror or error})") from error
+    found.ask()
+    return found
 
 
 def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[Place, str]:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, TextIO
 from xml.etree import ElementTree
 
+from barpc import identity
 from barpc.errors import BarpcError, ImageError, InputError, RpcFormatError, visible
 from barpc.remote import BLOCK, Place, Remote, RemoteFile, pinned, place
 
@@ -107,6 +108,7 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
             what = next((words for test, words in _KINDS.items() if test(found.st_mode)), "a device")
             raise kind.error(f"{path}: {what}, not a file; {kind.words} is needed")
         kind.check(path, found.st_size)
+        identity.note(path, found)
         if kind.most is not None and found.st_size > _LONG:
             logger.warning("%s: reading %d MB, which takes a while", path, found.st_size >> 20)
     except BaseException:

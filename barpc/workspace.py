@@ -38,8 +38,7 @@ from barpc import __version__
 from barpc.atomic import PARTIAL, STATE, replacing
 from barpc.errors import BarpcError, OutputError
 from barpc.frozen import Arrays, load_npz
-from barpc.remote import Remote
-from barpc.sidefile import IMAGE, opened
+from barpc.rpcio import hidden_by
 
 logger = logging.getLogger(__name__)
 
@@ -51,9 +50,6 @@ _CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr
 KEEP_AFTER = 30.0
 """A run that is refused within so many seconds leaves nothing; after that its stages are kept."""
 
-_WHOLE_FILE = 64 << 20  # bytes: larger inputs are sampled for their fingerprint
-_SAMPLE = 1 << 20
-
 
 @cache
 def code_version() -> str:
@@ -64,27 +60,6 @@ def code_version() -> str:
         digest.update(path.relative_to(root).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def fingerprint(path: str | Path) -> str:
-    """A hash of a file's content; of files above 64 MiB 64 samples, the size and the time of change.
-
-    Of a file on another host its URL and the version that the host names: nothing is read for it.
-    """
-    if isinstance(path, Remote):
-        return hashlib.sha256(f"{path} {path.size} {path.tag}".encode()).hexdigest()
-    with opened(path, IMAGE) as file:  # a pipe or a device would never end
-        found = os.fstat(file.fileno())
-        digest = hashlib.sha256(str(found.st_size).encode())
-        if found.st_size <= _WHOLE_FILE:
-            while block := file.read(_SAMPLE):
-                digest.update(block)
-        else:
-            digest.update(str(found.st_mtime_ns).encode())
-            for start in np.linspace(0, found.st_size - _SAMPLE, 64).astype(np.int64):
-                file.seek(int(start))
-                digest.update(file.read(_SAMPLE))
-    return digest.hexdigest()
 
 
 def key_of(*parts: object) -> str:
@@ -145,13 +120,15 @@ class Workspace:
     folder : str or Path, that of an unfinished run is gone on with; another that is not empty needs `overwrite`
     overwrite : bool, replace what an earlier run wrote here and nobody has changed since; never anything else
     keep : iterable of Path, files that must never be written: the inputs
-    names : iterable of str, the outputs to come, if known: what is in their way is refused before any work
+    names : iterable of str, the outputs to come, if known: what is in their way is refused before any work, and they
+        where an image in the folder would be read with another RPC because of them
     adds : bool, other things may be in the folder: what earlier runs wrote stays theirs, free names are written
 
     Raises
     ------
     OutputError
-        The folder is not empty, holds a file that is in the way, is in use by another run, or cannot be written.
+        The folder is not empty, holds a file that is in the way or an image whose RPC would be hidden, is in use by
+        another run, or cannot be written.
     """
 
     def __init__(
@@ -202,11 +179,24 @@ class Workspace:
         # without a state: nothing but our own folder is left by a run that was killed in its first moment
         unfinished = status in ("running", "failed") or (status is None and present <= {STATE})
         self._may_replace = overwrite or unfinished
+        self._earlier, self._named = _read_own(self.folder), set(names)
+        self._refuse_hiding(self._named)
         if present and not self._adds and not self._may_replace:
             raise OutputError(f"{self.folder}: exists and is not empty; give --overwrite or another -o")
-        self._earlier = _read_own(self.folder)
-        for name in names:
+        for name in self._named:
             self._refuse_foreign(name)
+
+    def _refuse_hiding(self, names: Iterable[str]) -> None:
+        """Raise if a file to be written would be read in place of the RPC of an image that is there.
+
+        For the inputs it does not matter whether barpc wrote such a file before.
+        """
+        for path, image, _ in hidden_by(self.folder / name for name in names):
+            known = "the input " * (image.resolve() in self._keep)
+            if known or not (self.owns(image.name) or os.path.lexists(path)):
+                raise OutputError(
+                    f"{path}: would be read in place of the RPC of {known}{image}; give another -o"
+                )
 
     def _refuse_foreign(self, name: str) -> None:
         path = self.folder / name
@@ -291,6 +281,8 @@ class Workspace:
         with replacing(self.folder / name, overwrite=True, room=self.partial) as partial:
             yield partial
             self._refuse_foreign(name)
+            if name not in self._named:
+                self._refuse_hiding([name])
             sha = _digest(partial)
             if sha is None:
                 raise OutputError(f"{self.folder / name}: cannot be written (its temporary file is gone)")

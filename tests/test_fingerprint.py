@@ -1,4 +1,4 @@
-"""The fingerprint of what is no file: refused, not waited for."""
+"""What is no file is refused where it would be hashed, not waited for."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from barpc.errors import ImageError
-from barpc.workspace import fingerprint
+from barpc.errors import ImageError, InputError
+from barpc.raster import hashed
 
 
 def refused(path: Path) -> str:
@@ -17,8 +17,8 @@ def refused(path: Path) -> str:
     said: list[str] = []
 
     def ask() -> None:
-        with pytest.raises(ImageError) as caught:
-            fingerprint(path)
+        with pytest.raises((ImageError, InputError)) as caught:
+            hashed(path)
         said.append(str(caught.value))
 
     thread = threading.Thread(target=ask, daemon=True)
@@ -29,7 +29,7 @@ def refused(path: Path) -> str:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names on this system")
-def test_a_pipe_or_a_device_has_no_fingerprint(tmp_path: Path) -> None:
+def test_a_pipe_or_a_device_has_no_hash(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to(tmp_path / "pipe")
     for name in ("pipe", "link"):

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from barpc.errors import OutputError, TiePointError
-from barpc.workspace import Workspace, code_version, fingerprint, key_of, peak_memory, timed
+from barpc.identity import take
+from barpc.workspace import Workspace, code_version, key_of, peak_memory, timed
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,10 @@ def test_the_fingerprint_is_of_the_content(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
     a.write_bytes(b"one")
     b.write_bytes(b"one")
-    assert fingerprint(a) == fingerprint(b)
+    assert take(a).key == take(b).key == take(a).sha256
     b.write_bytes(b"two")
-    assert fingerprint(a) != fingerprint(b)
+    assert take(a).key != take(b).key
+    assert len({take(a).key, take(a, [take(b)]).key, take(b, [take(a)]).key, take(a, [take(a)]).key}) == 4
 
 
 def test_a_folder_with_other_things_is_refused_and_left_alone(tmp_path):

@@ -21,6 +21,7 @@ from barpc.ba.incremental import BlockPrior
 from barpc.ba.result import Adjustment
 from barpc.ba.snooping import MOST_TESTED, image_test
 from barpc.ba.solution import Solution, solve_block
+from barpc.errors import AdjustError
 from barpc.geodesy import Array
 from barpc.options import AUTO, AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Reference, Tracks, View
@@ -81,9 +82,15 @@ def adjust_tracks(
     block = join(tuple(views), tracks, gcps, options, keep_largest, reference)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     inner, outer = block.without(rows), block.without(~rows)
-    found, in_space = _choose_model(inner, outer, options, dem, centers, prior)
-    found.heights.warn()
-    return _adjustment(found, inner, outer, options, in_space, start)
+    try:
+        found, in_space = _choose_model(inner, outer, options, dem, centers, prior)
+        found.heights.warn()
+        return _adjustment(found, inner, outer, options, in_space, start)
+    except np.linalg.LinAlgError as error:
+        raise AdjustError(
+            f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "
+            "point, beyond anything real?"
+        ) from error
 
 
 def _choose_model(

@@ -114,7 +114,7 @@ class BlockPrior:
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
             radars = tuple(str(name) for name in file.get("radars", ()))
             prior = cls(names, *known, splines, edges, radars)
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
         if not prior._is_whole():
             raise InputError(f"{path}: not the prior of an adjusted block (its arrays do not go together)")

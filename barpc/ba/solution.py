@@ -151,11 +151,12 @@ def _tested(
     points, weight = start.points.copy(), block.use / block.sigma
     of_points = np.arange(block.num_tracks, block.num_known)
     cut = np.isin(of_points, block.point[block.use & ~outcome.inlier])
-    used = np.ones(len(cut), dtype=bool)
+    used = np.isin(of_points, control.index)  # what an earlier solve let go of is gone
     while True:
         if cut.any():
             used = used & ~cut
-            heights = replace(heights, control=(control.select(used), *heights.control[1:]))
+            kept = control.select(used[control.index - block.num_tracks])
+            heights = replace(heights, control=(kept, *heights.control[1:]))
             let_go = heights.hold(problem, points)
             for _ in range(FIRST_STEPS + 1):  # where their rays see them
                 moved = let_go.triangulate(points, let_go.project_points(start.params, points), weight)

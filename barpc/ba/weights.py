@@ -96,7 +96,7 @@ class Observations:
 
     def is_near(self, squared: Array, scale: float) -> BoolArray:
         """Observations (K,) that are no farther off than so many standard deviations; a reference's by their own."""
-        near = np.where(self.of_reference, squared <= _CUT**2, squared <= scale**2)
+        near = np.where(self.of_reference, squared <= _CUT**2, squared <= scale * scale)
         return np.asarray(near | (self.is_control & (squared < _GROSS**2)))
 
     def freedom(self, counted: Array) -> Array:

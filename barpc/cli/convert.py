@@ -21,7 +21,7 @@ from barpc.errors import FitError, InputError, OutputError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
-from barpc.handoff import TOLERANCE, Reading, refuse_hiding, unverified, verify, verify_grid
+from barpc.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
 from barpc.raster import open_raster
 from barpc.rpcio import (
     CARRIERS,
@@ -240,7 +240,6 @@ def _hand_off(
     names = [[file.stem + end for end in ends] for file in files]
     together = [name for row in names for name in row]
     inputs = [*files, *(Path(camera.path) for camera in cameras)]
-    refuse_hiding(folder, together, inputs)
     readings: list[Reading] = []
     reasons: list[str] = []
     with Workspace(folder, overwrite=overwrite, keep=inputs, names=together, adds=True) as workspace:

@@ -115,6 +115,9 @@ def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) 
     return ground, image
 
 
+_FARTHEST = 1e9  # px: no image is as wide
+
+
 def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
     """Points (N, 3) lon, lat [deg], alt [m] and (N, 2) [px] as finite arrays, longitudes made continuous.
 
@@ -134,6 +137,8 @@ def numbers(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
             raise FitError(
                 f"points: {wrong:g} is not a {name}: are the columns swapped? Give lon, lat [deg], alt [m]"
             )
+    if not (np.abs(image) <= _FARTHEST).all():
+        raise FitError(f"points: {np.abs(image).max():g} px is no place in an image")
     if np.ptp(ground[:, 0]) > 180.0:
         ground = np.column_stack([wrap_longitude(ground[:, 0], ground[0, 0]), ground[:, 1:]])
     return ground, image

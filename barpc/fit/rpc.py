@@ -331,7 +331,10 @@ def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
     value = np.asarray(sigma, dtype=np.float64)
     if value.shape != (count,) or not (np.isfinite(value).all() and (value > 0).all()):
         raise FitError(f"sigma: expected {count} positive numbers")
-    return np.asarray(value.min() / value)
+    weight = value.min() / value
+    if not (weight > np.finfo(float).eps).all():
+        raise FitError(f"sigma: from {value.min():g} to {value.max():g}, too far apart for one fit")
+    return np.asarray(weight)
 
 
 def _certified(

@@ -28,6 +28,7 @@ import numpy as np
 from barpc import __version__
 from barpc.errors import AdjustError, BarpcError
 from barpc.frozen import Arrays, from_arrays, to_arrays
+from barpc.identity import Input, guarded
 from barpc.pipeline.cluster import other_version
 from barpc.tie.store import Store
 from barpc.workspace import Workspace, key_of
@@ -55,15 +56,15 @@ def worker_count(executor: Executor | None) -> int:
 class CachingExecutor(Executor):
     """An executor that keeps results in a workspace.
 
-    `fingerprints` holds the path and hash of every input file: results belong to contents, not to names. Without an
-    `executor` this process works on the tasks, one after the other, when their result is asked for. With `keep` false
-    nothing is kept: of tasks that look at files.
+    `inputs` holds every input file by its path, as it was hashed: results belong to contents, not to names, and none
+    is kept that was made while its file changed. Without an `executor` this process works on the tasks, one after the
+    other, when their result is asked for. With `keep` false nothing is kept: of tasks that look at files.
     """
 
     def __init__(
         self,
         workspace: Workspace,
-        fingerprints: Mapping[str, str],
+        inputs: Mapping[str, Input],
         executor: Executor | None = None,
         keep: bool = True,
         store: Store | None = None,
@@ -71,7 +72,8 @@ class CachingExecutor(Executor):
         self.workspace, self.executor, self.keep = workspace, executor, keep
         self.store = store or Store(str(workspace.cache), str(workspace.partial))
         places = {self.store.folder: "cache", self.store.room: "partial"}  # wherever the run folder lies
-        self._fingerprints = {**fingerprints, **places}
+        self._inputs = inputs
+        self._fingerprints = {**{path: one.key for path, one in inputs.items()}, **places}
         self._limit = _PER_WORKER * worker_count(executor)
         self._lock = threading.Lock()
         self._storing = threading.RLock()  # while results are kept: `shutdown` waits for it
@@ -116,6 +118,16 @@ class CachingExecutor(Executor):
             return [self._canonical(v) for v in value]
         return value
 
+    def guards(self, args: Any) -> tuple[Input, ...]:
+        """The inputs that the arguments of a task name."""
+        if isinstance(args, str):
+            return (self._inputs[args],) if args in self._inputs else ()
+        if is_dataclass(args) and not isinstance(args, type):
+            args = [getattr(args, field.name) for field in fields(args) if field.init]
+        if not isinstance(args, (tuple, list)):
+            return ()
+        return tuple(dict.fromkeys(one for arg in args for one in self.guards(arg)))
+
     def _digest(self, value: np.ndarray[Any, Any]) -> str:
         known = self._digests.get(id(value))
         if known is None:  # the array is held with its digest, so that its id stays its own
@@ -130,8 +142,9 @@ class CachingExecutor(Executor):
         while batch := self._next_batch():
             try:
                 tasks = [self._spill(task.args) for task in batch]
+                guards = [self.guards(task.args) for task in batch]
                 assert self.executor is not None
-                future = self.executor.submit(run_batch, batch[0].fn, tasks, __version__)
+                future = self.executor.submit(run_batch, batch[0].fn, tasks, __version__, guards)
             except (RuntimeError, OSError) as error:  # the pool is broken or shut down; the disk is full
                 self._resolve(batch, [(0.0, None, _explained(error))] * len(batch))
             else:
@@ -245,7 +258,9 @@ class _Task(Future[Any]):
     def result(self, timeout: float | None = None) -> Any:
         """The result, worked out here where there is no executor."""
         if self._owner.executor is None and not self.done() and self.begin():
-            self.finish(self.fn(*self.args), None)
+            with guarded(self._owner.guards(self.args)):
+                found = self.fn(*self.args)
+            self.finish(found, None)
         return super().result(timeout)
 
     def _look_up(self) -> tuple[bool, Any]:
@@ -276,22 +291,26 @@ class Spilled:
 
 
 def run_batch(
-    fn: Function, tasks: Sequence[tuple[Any, ...] | Spilled], version: str
+    fn: Function,
+    tasks: Sequence[tuple[Any, ...] | Spilled],
+    version: str,
+    guards: Sequence[tuple[Input, ...]] | None = None,
 ) -> tuple[list[Outcome], float]:
     """Work on a batch, in a worker: one task's error leaves the others their results; CPU seconds that it took.
 
-    One that came to a cluster with another `version` works on nothing.
+    `guards`: the inputs that each task names. One that came to a cluster with another `version` works on nothing.
     """
     if version != __version__:
         return [(0.0, None, other_version(__version__, version))] * len(tasks), 0.0
     outcomes: list[Outcome] = []
     cpu = time.thread_time()
-    for task in tasks:
+    for task, inputs in zip(tasks, guards or [()] * len(tasks), strict=True):
         start = time.perf_counter()
         value: Any = None
         error: Exception | None = None
         try:
-            value = fn(*(task.load() if isinstance(task, Spilled) else task))
+            with guarded(inputs):
+                value = fn(*(task.load() if isinstance(task, Spilled) else task))
         except Exception as caught:  # noqa: BLE001  (raised again where the result is asked for)
             error = caught
             if not isinstance(caught, BarpcError):

@@ -23,7 +23,7 @@ from barpc.pipeline.pictures import pictures
 from barpc.report import Run, Summary
 from barpc.report.page import REPORT, can_render, report_html
 from barpc.report.records import plain
-from barpc.report.summary import StageEntry
+from barpc.report.summary import OutputEntry, StageEntry
 from barpc.report.tables import PICTURES, TABLES, gcps_geojson
 from barpc.rpcio import CARRIERS, WRITABLE, sidecars, write_camera
 from barpc.scene import View
@@ -175,7 +175,10 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
     with workspace.stage(REPORT):
         if can_render():
             workspace.write_text("report.html", report_html(now(), workspace.folder))
-        texts = {key: _json(value) for key, value in plain(summary).items()}
+        # the report shows times and may be made again: it is no result
+    results = sorted((name, sha) for name, sha in workspace.outputs.items() if name != "report.html")
+    summary = replace(summary, outputs=tuple(OutputEntry(name, sha) for name, sha in results))
+    texts = {key: _json(value) for key, value in plain(summary).items()}
     texts["stages"] = _json(plain(now().stages))
     body = ",\n".join(f"{json.dumps(key)}: {text}" for key, text in texts.items())
     workspace.write_text("summary.json", f"{{\n{body}\n}}\n")

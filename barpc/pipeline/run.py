@@ -21,13 +21,15 @@ from barpc.ba.ground import DEM_BIAS
 from barpc.dem import Dem
 from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
-from barpc.handoff import refuse_hiding, unverified
+from barpc.handoff import unverified
+from barpc.identity import Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.cluster import watched
 from barpc.pipeline.control import load_gcps
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.given import given_matches, given_tracks
 from barpc.pipeline.grids import write_grids
+from barpc.pipeline.hashed import hash_inputs
 from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs, with_located
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.views import Image, image_path, load_views
@@ -38,7 +40,7 @@ from barpc.report import Run, Summary, summarize
 from barpc.report.page import REPORT, remake_report
 from barpc.report.records import plain
 from barpc.report.run import pair_ties
-from barpc.report.summary import StageEntry
+from barpc.report.summary import InputEntry, StageEntry
 from barpc.rpcio import plain_source
 from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
@@ -46,11 +48,10 @@ from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
-from barpc.tie.hook import hook_file
 from barpc.tie.reference import Registration, register
 from barpc.tie.store import Bucket, Store
 from barpc.tie.tasks import Progress, ordered
-from barpc.workspace import Workspace, fingerprint, timed
+from barpc.workspace import Workspace, timed
 
 logger = logging.getLogger(__name__)
 
@@ -142,34 +143,36 @@ def adjust(
     options, folder = with_located(options or RunOptions()), Path(out_dir)
     plain_path(folder.absolute())
     stages: list[dict[str, Any]] = []
+    seen: dict[str, Stamp] = {}
     with watched(executor), timed("inputs", stages) as workers:
-        run = _loaded("adjust", images, options, executor, progress, workers)
+        with recorded(seen):
+            run = _loaded("adjust", images, options, executor, progress, workers)
         names, keep = _files(run, options, folder)
         workspace = Workspace(out_dir, overwrite=options.overwrite, keep=keep, names=names)
     with watched(executor), workspace:
         workspace.stages += stages
-        with workspace.stage("fingerprints"):
-            paths = [*(view.path for view in run.views), *_references(options)]
-            fingerprints = {path: fingerprint(path) for path in paths}
-            if (code := hook_file(options.tie.matcher)) is not None:
-                fingerprints[options.tie.matcher] = fingerprint(code)
-        with CachingExecutor(workspace, fingerprints, executor, store=_store(options)) as caching:
-            run = _solve(run, options, workspace, caching, progress)
+        with workspace.stage("fingerprints"), recorded(seen):
+            given = side_inputs(options, run.views)
+            inputs = hash_inputs(run, options, seen, executor, progress)
+        with CachingExecutor(workspace, inputs, executor, store=_store(options)) as caching:
+            with guarded(inputs.values()):
+                run = _solve(run, options, given, workspace, caching, progress)
             if run.adjustment is not None and options.stop_after == "all":
                 with workspace.stage("fit"):
                     run = _fitted(run, options, caching, progress)
-        if run.fits:
-            seen = (
-                executor if options.store is None else None
-            )  # of the run folder: else this process writes alone
-            run = _written(run, options, workspace, seen, progress)
+        with guarded(inputs.values()):  # asked again before outputs appear, and before the last one
+            ask()
+            if run.fits:  # workers that do not see the run folder do not write there
+                run = _written(run, options, workspace, executor if options.store is None else None, progress)
         if run.adjustment is not None:
             with _told(workspace, "block", progress), workspace.output(PRIOR) as partial:
                 block_prior(run.adjustment).save(partial)
         with _told(workspace, "summary", progress):
             run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
             summary = summarize(run)
-        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
+        files = {one.path: one for given in inputs.values() for one in given.every()}
+        read = tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
+        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)), inputs=read)
         _tell(progress, REPORT, 0)
         summary = write_tables(workspace, run, summary)
         _tell(progress, REPORT, 1)
@@ -250,15 +253,18 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
     keep = {Path(path) for path in inputs if not isinstance(path, Remote)}
     keep |= set(input_files(options))
     names = output_names(views, options, folder)
-    refuse_hiding(folder, names, keep)
     refuse_shadows(folder, names)
     return names, keep
 
 
 def _solve(
-    run: Run, options: RunOptions, workspace: Workspace, executor: Executor, progress: Progress | None
+    run: Run,
+    options: RunOptions,
+    given: tuple[Dem | None, BlockPrior | None],
+    workspace: Workspace,
+    executor: Executor,
+    progress: Progress | None,
 ) -> Run:
-    given = side_inputs(options, run.views)
     for number in range(1 if options.matches_only else options.num_passes):
         again = f" (pass {number + 1})" if number else ""
         with workspace.stage("tie points" + again):

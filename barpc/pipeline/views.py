@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from rasterio.windows import Window
 
 from barpc.cameras import Camera, open_split, split_spec
 from barpc.errors import BarpcError, ImageError, InputError, RpcError
+from barpc.identity import Stamp, also_seen, recorded
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
 from barpc.remote import Place, Remote, located
@@ -64,6 +65,7 @@ class _Read:
     camera: Camera | None = None
     sampled: bytes | None = None
     error: BarpcError | None = None
+    files: Mapping[str, Stamp] = field(default_factory=dict)  # all that was opened for it
 
 
 _Given = tuple[str, Place, Image]  # name, file, and what was given
@@ -121,6 +123,7 @@ def load_views(
         try:
             if read.error is not None:
                 raise read.error
+            also_seen(read.files)
             assert read.view is not None
             assert read.camera is not None
             if distinct:
@@ -158,8 +161,9 @@ def read_group(
     start, out = time.thread_time(), []
     for name, file, image in given:
         try:
-            view, camera = _load(name, file, image, band, hosts)
-            out.append(_Read(view, camera, _sampled(view, band) if distinct else None))
+            with recorded({}) as files:
+                view, camera = _load(name, file, image, band, hosts)
+                out.append(_Read(view, camera, _sampled(view, band) if distinct else None, files=files))
         except BarpcError as error:
             out.append(_Read(error=error))
     return out, time.thread_time() - start

@@ -5,6 +5,7 @@ COLMAP counts from the corner of the first pixel: its centre is (0.5, 0.5).
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import closing
@@ -19,11 +20,12 @@ from barpc.geodesy import Array
 from barpc.pointio.links import PairPoints, index_pairs
 from barpc.pointio.names import ViewNames
 from barpc.scene import IntArray
-from barpc.sidefile import MB, Kind, opened
+from barpc.sidefile import MB, Kind, opened, read_head
 
 MAGIC = b"SQLite format 3\0"
 _DATABASE = Kind("a COLMAP database", None)  # most of it are descriptors, which are not read
 _CONTENT = Kind("the keypoints and matches of a database", 1024 * MB)
+_JOURNAL = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"  # a rollback journal begins so while it counts
 _IDS = 2147483647  # a pair's number is that of its first image times this, and that of the second
 _TABLES = ("images", "keypoints", "two_view_geometries", "matches")
 _STEPS = 2000  # of 100,000 instructions of SQLite, seconds of work: a damaged file may hold a loop
@@ -33,15 +35,24 @@ def read_colmap(path: Path, views: ViewNames) -> Iterator[PairPoints]:
     """The matches between two of the views; InputError where the file is no such database."""
     with opened(path, _DATABASE):  # no pipe, no device
         pass
-    log = path.with_name(path.name + "-wal")
-    if log.exists() and log.stat().st_size:
-        raise InputError(f"{path}: another program has not finished writing it ({log.name}); close it first")
+    for log in (path.with_name(f"{path.name}-{end}") for end in ("wal", "journal")):
+        if _is_hot(log):
+            raise InputError(
+                f"{path}: another program has not finished writing it ({log.name}); close it first"
+            )
     where = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
     try:
         with closing(sqlite3.connect(where, uri=True)) as database:
             yield from _matches(_Tables(path, database), views)
     except (sqlite3.Error, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: not a COLMAP database that can be read ({error})") from error
+
+
+def _is_hot(log: Path) -> bool:
+    """Whether a log holds what the database has not; one of zeros is over, and kept for the next time."""
+    if not os.path.lexists(log):
+        return False
+    return any(read_head(log, _DATABASE, len(_JOURNAL)))
 
 
 class _Tables:

@@ -128,7 +128,7 @@ def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str
     found = _header(words, {**_COLUMNS, **_NAMES, **_SIGMAS})
     needed = [*_COLUMNS, "image"][: len(_COLUMNS) + (len(views.names) > 1)]
     if missing := [name for name in needed if name not in found]:
-        raise InputError(f"{path}: no column {', '.join(missing)}; found {', '.join(words)}")
+        raise InputError(f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line")
     for i, word in enumerate(words):
         if i not in found.values() and re.match("sigma|std|stdev|acc|err", word.lower()):
             raise InputError(
@@ -323,9 +323,11 @@ def _read_table(path: Path) -> Correspondences:
         if not columns and words:
             columns = dict(zip(_COLUMNS, range(5), strict=True)) if values else _header(words)
             if missing := [name for name in _COLUMNS if name not in columns]:
-                raise InputError(f"{path}: no column {', '.join(missing)}; found {', '.join(words)}")
+                raise InputError(
+                    f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line"
+                )
         elif words and values is None:
-            raise InputError(f"{path}, line {number}: expected numbers, found {words[0][:40]!r}")
+            raise InputError(f"{path}, line {number}: expected numbers")
         if values:
             if len(values) <= max(columns.values()):
                 raise InputError(f"{path}, line {number}: expected {max(columns.values()) + 1} columns")

@@ -22,6 +22,8 @@ MAGIC = b"\x89HDF\r\n\x1a\n"
 _FILE = Kind("an HDF5 file", None)  # most of it are descriptors, which are not read
 _CONTENT = Kind("the keypoints and matches of an HDF5 file", 1024 * MB)
 _KEYPOINTS, _MATCHES = "keypoints", "matches0"
+_DEFLATE, _HEADER, _NUMBER = 1032, 1 << 12, 8  # as of `barpc.frozen`
+_MOST, _DEEPEST = 2_000_000, 32  # objects, and groups in each other
 _FEATURES = ("features.h5", "keypoints.h5")
 
 
@@ -56,6 +58,24 @@ def _features(path: Path) -> Path:
     raise InputError(f"{path}: holds no keypoints; they are looked for beside it as {', '.join(names)}")
 
 
+def _datasets(file: Any, h5py: Any) -> Iterator[tuple[str, Any]]:
+    """The datasets of a file by their names; links, to other files and within, are passed over."""
+    waiting, count = [(file, "", 0)], 0
+    while waiting:
+        group, place, depth = waiting.pop()
+        for name in group:
+            count += 1
+            if count > _MOST or depth > _DEEPEST:
+                raise ValueError(f"more than {_MOST} objects, or groups nested more than {_DEEPEST} deep")
+            if group.get(name, getlink=True).__class__ is not h5py.HardLink:
+                continue
+            found = group[name]
+            if isinstance(found, h5py.Dataset):
+                yield place + name, found
+            elif isinstance(found, h5py.Group):
+                waiting.append((found, f"{place}{name}/", depth + 1))
+
+
 class _Datasets:
     """The arrays of a file by image and by pair; links to other files are not followed."""
 
@@ -65,22 +85,20 @@ class _Datasets:
         self.keypoints: dict[str, Any] = {}
         self.matches: dict[tuple[str, str], Any] = {}
 
-        def sort(name: str, found: Any) -> None:
-            if not isinstance(found, h5py.Dataset):
-                return
+        for name, found in _datasets(file, h5py):
             *parts, last = name.split("/")
             if last == _KEYPOINTS or (found.ndim == 2 and found.shape[1] == 2 and found.dtype.kind == "f"):
                 self.keypoints["-".join(parts if last == _KEYPOINTS else [*parts, last])] = found
             elif len(ends := parts if last == _MATCHES else [*parts, last]) == 2 and found.dtype.kind in "iu":
                 self.matches[ends[0], ends[1]] = found
 
-        file.visititems(sort)  # passes over links, to other files and within
-
     def array(self, found: Any) -> Any:
         """The content of a dataset that lies in the file itself."""
         if found.is_virtual or found.external:
             raise ValueError(f"{found.name} lies in another file")
-        self._bytes += found.size * found.dtype.itemsize
+        if found.nbytes > _DEFLATE * found.id.get_storage_size() + _HEADER:
+            raise ValueError(f"{found.name} claims more bytes than it can hold")
+        self._bytes += found.size * max(_NUMBER, found.dtype.itemsize)
         _CONTENT.check(self._path, self._bytes)
         return np.asarray(found[()])
 

@@ -129,7 +129,7 @@ def _read_csv(path: Path, views: ViewNames) -> Links:
         header = [word.strip().lower() for word in next(lines, [])]
         if missing := [name for name in _COLUMNS if name not in header]:
             raise InputError(
-                f"{path}: no column {', '.join(missing)}; found {', '.join(header) or 'nothing'}"
+                f"{path}: no column {', '.join(missing)} among the {len(header)} of its first line"
             )
         image, *numbers = (header.index(name) for name in _COLUMNS)
         spread = header.index("sigma") if "sigma" in header else None
@@ -142,7 +142,7 @@ def _read_csv(path: Path, views: ViewNames) -> Links:
                 track = line[numbers[2]].strip()
             except (ValueError, IndexError) as error:
                 raise InputError(
-                    f"{path}: {', '.join(line)!r} does not hold image, col, row, track"
+                    f"{path}: line {lines.line_num} does not hold image, col, row, track"  # whatever it holds
                 ) from error
             if view is not None:
                 rows.append((view, col, row, own))

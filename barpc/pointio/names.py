@@ -56,6 +56,11 @@ def unique_names(files: Sequence[Place]) -> list[str]:
             f"{places[again[0]]} and {places[twin]}: their names cannot be told apart; rename one, or give a link to it"
         )
     for name, file in zip(names, places, strict=True):
+        if name.startswith("."):
+            raise InputError(
+                f"{file}: its name in this run, {name!r}, begins with a dot, and files of such names are hidden; "
+                "rename it, or give a link to it"
+            )
         if len(os.fsencode(name)) > MAX_NAME:
             raise InputError(
                 f"{file}: its name in this run has more than {MAX_NAME} bytes, too long for the files that carry it;"

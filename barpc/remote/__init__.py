@@ -14,6 +14,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from ipaddress import IPv6Address
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,7 +24,7 @@ HOST = re.compile(r"(?:(?:https?|s3|gs|az)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:]
 """An entry of the list of hosts: a host is that of https; http, and the buckets of object stores, say so."""
 BUCKET = re.compile(r"(?:s3|gs|az)://[A-Za-z0-9._-]+(?:/[A-Za-z0-9._-]+)*")
 """A folder of an object store."""
-_URL = re.compile(r"(https?|s3|gs|az)://([^/?#]+)/([^?#]+)")
+_URL = re.compile(r"(https?|s3|gs|az)://([^/?#]+)/([^?#]+)", re.IGNORECASE)
 _FLAT = re.compile(r"(?:https?|s3|gs|az):/[^/]")  # what pathlib makes of a URL
 
 BLOCK = 1 << 16  # bytes that are asked for at a time, at least
@@ -81,7 +82,8 @@ Place = Path | Remote
 
 def is_url(text: str | os.PathLike[str]) -> bool:
     """Whether a text names a file on another host, and none here."""
-    return re.match(r"(https?|s3|gs|az)://", os.fspath(text)) is not None and not os.path.lexists(text)
+    found = re.match(r"(https?|s3|gs|az)://", os.fspath(text), re.IGNORECASE)
+    return found is not None and not os.path.lexists(text)
 
 
 def place(path: str | os.PathLike[str]) -> Place:
@@ -100,16 +102,28 @@ def located(path: str | os.PathLike[str], hosts: Iterable[str]) -> Place:
     if isinstance(path, Remote) or not is_url(text):
         return place(path)
     found = _URL.fullmatch(text)
-    if found is None or not HOST.fullmatch(found[2]):
+    if found is None or not HOST.fullmatch(found[2]) or not _is_host(found[2]):
         raise ImageError(
             f"{text}: a URL is SCHEME://HOST/PATH without user and query, which would be written into outputs"
         )
-    scheme, host, _ = found.groups()
+    scheme, host, rest = found[1].lower(), found[2], found[3]
     known = {entry.lower() if "://" in entry else f"https://{entry.lower()}" for entry in hosts}
     if f"{scheme}://{host.lower()}" not in known:
         entry = host if scheme == "https" else f"{scheme}://{host}"
         raise ImageError(f"{text}: remote files are read where you say so: give --allow-remote {entry}")
-    return Remote(text)
+    return Remote(f"{scheme}://{host}/{rest}")
+
+
+def _is_host(text: str) -> bool:
+    """Whether a host and its port can be asked: labels of a name, a number in brackets, a port that there is."""
+    name, _, port = text.rpartition(":") if re.search(r":\d+$", text) else (text, "", "80")
+    if name.startswith("["):
+        try:
+            IPv6Address(name[1:-1])
+        except ValueError:
+            return False
+        return 0 < int(port) < 1 << 16
+    return all(0 < len(label) < 64 for label in name.removesuffix(".").split(".")) and 0 < int(port) < 1 << 16
 
 
 # --- reading ----------------------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ _AGAIN = (408, 425, 429, 500, 502, 503, 504)
 _ELSEWHERE = (301, 302, 303, 307, 308)
 _MOVES = 3
 _PIECE = 1 << 16
+_KEPT = "/%:@!$&'()*+,;=~"  # characters that stand in an address as they are
 _TOGETHER = 8  # requests for side files at a time
 
 _idle: dict[
@@ -61,8 +62,12 @@ def _moved(at: str, start: int, stop: int) -> Part:
         found = _once(url, start, stop)
         if isinstance(found, Part):
             return found
-        url = urljoin(url, found)
-        if urlsplit(url)[:2] != urlsplit(at)[:2]:
+        try:
+            url = urljoin(url, found)
+            same = urlsplit(url)[:2] == urlsplit(at)[:2]
+        except ValueError as error:
+            raise OSError(f"its host sends us on to what is no address ({visible(found[:200])})") from error
+        if not same:
             raise OSError(
                 f"its host sends us on to {visible(url[:200])}, which is not followed; give that address"
             )
@@ -71,7 +76,7 @@ def _moved(at: str, start: int, stop: int) -> Part:
 
 def _once(url: str, start: int, stop: int) -> Part | str:
     """The part, or the address where it is said to be."""
-    scheme, host, path = urlsplit(url)[:3]
+    scheme, host, path, query = urlsplit(url)[:4]
     connection = _connection(scheme, host)
     limit = threading.Timer(TIMEOUT + (stop - start) / _SLOWEST, _cut, (connection.sock,))
     limit.start()
@@ -79,7 +84,7 @@ def _once(url: str, start: int, stop: int) -> Part | str:
     try:
         connection.request(
             "GET",
-            quote(path, safe="/%:@!$&'()*+,;=~"),
+            quote(path, safe=_KEPT) + (f"?{quote(query, safe=_KEPT + '?')}" if query else ""),
             headers={"Range": f"bytes={start}-{stop - 1}", "Accept-Encoding": "identity"},
         )
         with closing(connection.getresponse()) as answer:

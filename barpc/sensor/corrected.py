@@ -27,7 +27,7 @@ from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_mat
 
 IntArray = npt.NDArray[np.int64]
 
-_ROW_STEPS = 60  # a drift moves a point by thousandths of a pixel a row: three digits a step; wild ones need more
+_ROW_STEPS = 60  # a drift of thousandths of a pixel a row gains three digits a step; wild ones need more
 _ROW_SETTLED = 1e-6  # px: what is left is a thousandth of it
 _STEPS = 12
 _SETTLED = 1e-4  # px: what is left after a step from there is below rounding

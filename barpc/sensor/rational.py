@@ -157,7 +157,10 @@ class Rational:
             center = (arguments.max(axis=1) + arguments.min(axis=1))[:, None] / 2
             scale = np.maximum(np.ptp(arguments, axis=1)[:, None] / 2, 1e-300)
             basis = monomials((arguments - center) / scale)
-            coeffs = np.asarray(np.linalg.lstsq(basis.T, x[:2].T, rcond=None)[0].T, dtype=np.float64)
+            try:
+                coeffs = np.asarray(np.linalg.lstsq(basis.T, x[:2].T, rcond=None)[0].T, dtype=np.float64)
+            except np.linalg.LinAlgError:  # coefficients at the ends of what doubles hold
+                return None
             # what one step leaves of an error of 1e-3: quadratic, so it scales with the step's square
             start = x + np.array([[1e-3], [1e-3], [0.0]])
             length = self._step(value, start)

@@ -6,10 +6,12 @@ that works on pairs imports it by that name; nothing but an option can name it.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
+from modulefinder import ModuleFinder
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -78,11 +80,28 @@ def hooked(name: str) -> type[Matcher] | Hook:
     return found if isinstance(found, type) else Hook(name, found)
 
 
-def hook_file(name: str) -> str | None:
-    """The file of the module that `module:name` means; None where the name is a table's, or it has none."""
-    module = name.partition(":")[0] if ":" in name else ""
+def hook_files(name: str) -> list[Path]:
+    """What `module:name` is made of: its module, those beside it that it imports, and the files that it declares.
+
+    `name.files`, paths from where the module lies, are files that decide what it finds, such as weights. None for a
+    matcher of the table, or a module without a file.
+    """
+    if ":" not in name:
+        return []
+    matcher = hooked(name)
+    function = matcher.function if isinstance(matcher, Hook) else matcher
+    module = sys.modules[name.partition(":")[0]]
+    if getattr(module, "__file__", None) is None:
+        return []
+    first = Path(str(module.__file__))
+    found = ModuleFinder([str(first.parents[module.__name__.count(".") + (first.name == "__init__.py")])])
     try:
-        spec = find_spec(module) if module else None
-    except Exception:  # noqa: BLE001  (of a package above it: said when it is imported)
-        return None
-    return spec.origin if spec is not None and spec.has_location else None
+        found.run_script(str(first))
+    except Exception as error:
+        raise InputError(f"matcher {name}: {first} cannot be looked through ({error})") from error
+    beside = {Path(one.__file__) for one in found.modules.values() if one.__file__}  # type: ignore[attr-defined]
+    declared = [first.parent / path for path in getattr(function, "files", ())]
+    for path in declared:
+        if not path.is_file():
+            raise InputError(f"matcher {name}: declares {path}, which is no file")
+    return [first, *sorted({*beside, *declared} - {first})]

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from barpc import identity
 from barpc.atomic import replacing
 from barpc.errors import InputError
 from barpc.frozen import Arrays, load_npz, unpack
@@ -35,7 +36,8 @@ class Store:
     needs = "images and run folder must be on a disk that all workers see under the same path"
 
     def write(self, name: str, arrays: Arrays) -> None:
-        """Keep named arrays, whole or not at all."""
+        """Keep named arrays, whole or not at all; not if a file that they were made of has changed."""
+        identity.ask()
         path = Path(self.folder) / f"{name}.npz"
         with (
             replacing(path, overwrite=True, durable=False, room=Path(self.room)) as partial,
@@ -76,6 +78,7 @@ class Bucket(Store):
 
     def write(self, name: str, arrays: Arrays) -> None:
         """As of `Store`."""
+        identity.ask()
         data = io.BytesIO()
         np.savez(data, **arrays)  # type: ignore[arg-type]
         put(f"{self.folder}/{name}.npz", data.getvalue())

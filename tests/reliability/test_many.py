@@ -46,7 +46,7 @@ from pathlib import Path
 resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]),) * 2)
 from barpc.pipeline import load_views
 from barpc.tie import TieOptions, detect
-from barpc.workspace import fingerprint
+from barpc.raster import hashed
 most, over = 0, threading.Event()
 def watch():
     global most
@@ -54,7 +54,7 @@ def watch():
         most = max(most, len(list(Path("/proc/self/fd").iterdir())))
 threading.Thread(target=watch, daemon=True).start()
 loaded = load_views(sorted(Path(sys.argv[2]).glob("*.vrt")))
-prints = {fingerprint(view.path) for view in loaded.views}
+prints = {hashed(view.path).key for view in loaded.views}
 found = detect(loaded.views, TieOptions())
 over.set()
 usage = resource.getrusage(resource.RUSAGE_SELF)

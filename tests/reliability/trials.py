@@ -34,8 +34,9 @@ from barpc.workspace import code_version
 
 SAMPLES = sorted((Path(__file__).resolve().parents[2] / "data_samples").glob("*.tif"))
 SIDE = 160  # px of a crop: a third of a second a run
-ABOUT_THE_RUN = ("stages", "out_dir")
-"""What summary.json tells about the run and not about its result; report.html shows the stages, too."""
+ABOUT_THE_RUN = ("stages", "out_dir", "outputs")
+"""What summary.json tells about the run and not about its result (the outputs' hashes: of files that hold paths);
+report.html shows the stages, too."""
 
 
 def crop(source: Path, target: Path, side: int = SIDE, start: int = 300) -> Path:

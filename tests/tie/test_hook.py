@@ -17,7 +17,7 @@ from barpc.pipeline import RunOptions, adjust
 from barpc.scene import View
 from barpc.tie import Matches, common_tracks, find_tracks
 from barpc.tie.epipolar import Frame
-from barpc.tie.hook import Hook, hook_file, hooked
+from barpc.tie.hook import Hook, hook_files, hooked
 from barpc.tie.matcher import Prediction
 from barpc.tie.matching import MATCHERS, matcher_named
 from tests.lanes import rest_slow
@@ -112,18 +112,22 @@ def test_a_name_that_is_none_is_refused_before_anything_is_imported(name: str) -
         TieOptions(matcher=name)
 
 
-def test_reading_options_imports_nothing(tmp_path: Path) -> None:
+def test_an_options_file_names_no_code_and_reading_it_imports_nothing(tmp_path: Path) -> None:
     (tmp_path / "o.toml").write_text('[tie]\nmatcher = "antigravity:match"\n')
-    assert read_options(tmp_path / "o.toml").tie.matcher == "antigravity:match"
+    with pytest.raises(InputError, match=r"o\.toml: matcher 'antigravity:match' would run code.*--matcher"):
+        read_options(tmp_path / "o.toml")
     assert "antigravity" not in sys.modules
+    (tmp_path / "o.toml").write_text('[tie]\nmatcher = "structure"\n')
+    assert read_options(tmp_path / "o.toml").tie.matcher == "structure"
 
 
 def test_rows_of_the_table_and_classes_are_what_they_are(module) -> None:
     assert matcher_named("guided") is MATCHERS["guided"]
     assert hooked("barpc.tie.guided:Guided") is MATCHERS["guided"]
-    assert hook_file("guided") is None
-    assert hook_file("nowhere_at_all.x:match") is None
-    assert Path(hook_file(f"{module()}:match")).name == "users_matcher.py"
+    assert hook_files("guided") == []
+    with pytest.raises(InputError, match="cannot be imported"):
+        hook_files("nowhere_at_all.x:match")
+    assert [path.name for path in hook_files(f"{module()}:match")] == ["users_matcher.py"]
 
 
 @pytest.mark.slow

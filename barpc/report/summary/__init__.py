@@ -55,11 +55,46 @@ from barpc.report.summary.views import (
 from barpc.report.summary.words import ABOVE, STATUS_WORDS, Count, largest, listed, median, metres
 
 __all__ = [
-    "CELLS", "DATUM", "GCPS", "SCHEMA", "STATUS_WORDS", "AskedEntry", "CenterEntry", "CheckPointEntry",
-    "ControlTestEntry", "CorrectionEntry", "DatumEntry", "DemEntry", "EllipseEntry", "FitEntry", "GcpEntry",
-    "KnownPoint", "LeftOutEntry", "ModeEntry", "OffsetEntry", "PairEntry", "ReferenceEntry", "ReferenceViewEntry",
-    "SceneEntry", "SeenEntry", "SourceEntry", "StageEntry", "Summary", "TablesEntry", "TracksEntry", "ViewEntry",
-    "cell_numbers", "largest", "listed", "measure", "median", "metres", "mode_in_words", "published_schema",
+    "CELLS",
+    "DATUM",
+    "GCPS",
+    "SCHEMA",
+    "STATUS_WORDS",
+    "AskedEntry",
+    "CenterEntry",
+    "CheckPointEntry",
+    "ControlTestEntry",
+    "CorrectionEntry",
+    "DatumEntry",
+    "DemEntry",
+    "EllipseEntry",
+    "FitEntry",
+    "GcpEntry",
+    "InputEntry",
+    "KnownPoint",
+    "LeftOutEntry",
+    "ModeEntry",
+    "OffsetEntry",
+    "OutputEntry",
+    "PairEntry",
+    "ReferenceEntry",
+    "ReferenceViewEntry",
+    "SceneEntry",
+    "SeenEntry",
+    "SourceEntry",
+    "StageEntry",
+    "Summary",
+    "TablesEntry",
+    "TracksEntry",
+    "ViewEntry",
+    "cell_numbers",
+    "largest",
+    "listed",
+    "measure",
+    "median",
+    "metres",
+    "mode_in_words",
+    "published_schema",
     "shift_in_image",
 ]  # fmt: skip
 
@@ -73,6 +108,23 @@ class LeftOutEntry(Record):
 
     path: str = said("File")
     reason: str = said("Why")
+
+
+class InputEntry(Record):
+    """A file that the run read."""
+
+    path: str = said("File; a matcher by its name goes by its module")
+    bytes: Count = said("Its size")
+    sha256: str = said(
+        "SHA-256 of its bytes; of a file on another host of its URL and the version named there"
+    )
+
+
+class OutputEntry(Record):
+    """A file that the run wrote."""
+
+    file: str = said("Its name in the run folder")
+    sha256: str = said("SHA-256 of its bytes")
 
 
 class TracksEntry(Record):
@@ -133,6 +185,12 @@ class Summary(Record):
         "The residuals of control in the images, each tested; null without control", default=None
     )
     reference: ReferenceEntry | None = said("A reference orthoimage, where one was given", default=None)
+    inputs: tuple[InputEntry, ...] | None = said(
+        "Every file that was read, as `barpc verify` asks", default=None
+    )
+    outputs: tuple[OutputEntry, ...] | None = said(
+        "Every file that was written but this one and the report", default=None
+    )
 
     def __repr__(self) -> str:
         return f"Summary({self.kind} of {len(self.views)} views, {self.status}: {self.headline})"

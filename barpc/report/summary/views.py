@@ -28,7 +28,7 @@ from barpc.report.summary.words import (
 )
 from barpc.scene import IntArray
 from barpc.sensor.corrected import Corrected, Correction, ImageCorrected
-from barpc.sensor.geometry import Several, ground_sample_distance, view_angles
+from barpc.sensor.geometry import Several, ground_sample_distance, image_grid, view_angles
 from barpc.sensor.splined import RowSpline, Splined
 from barpc.sensor.timing import Timed
 
@@ -237,6 +237,10 @@ class ViewEntry(Record):
     )
     control_w_point: str | None = said("Control point that it is of", head="largest at", default=None)
     date: str | None = said("Day it was taken, where its metadata say so", default=None)
+    certified: tuple[tuple[float, float, float, float, float], ...] | None = said(
+        "Ground points (lon, lat, alt) over the image and where the new camera sees them (col, row)",
+        default=None,
+    )
 
 
 # --- how they are measured --------------------------------------------------------------------------------
@@ -289,6 +293,7 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
             fit=_fit_entry(run.fits[i]) if run.fits else None,
             outputs=dict(run.written[i]) if run.written else {},
+            certified=_certified(run, i) if run.written else None,
             date=view.date or None,
             stated_ce90_m=stated_ce90(view),
             **_control(tests.get(i)),
@@ -299,6 +304,15 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
         )
         entries.append(entry)
     return tuple(entries)
+
+
+def _certified(run: Run, number: int) -> tuple[Any, ...]:
+    """Ground points at the ends of an image and its altitudes, and where its new camera sees them."""
+    assert run.adjustment is not None
+    view, model = run.views[number], run.adjustment.sensors[number]
+    ground = model.localize(*image_grid(view.size, view.alt_range, (3, 2)))
+    ground = ground[np.isfinite(ground).all(axis=1)]
+    return tuple(map(tuple, np.hstack([ground, model.project(ground)]).tolist()))
 
 
 def _control(worst: ControlResidual | None) -> dict[str, Any]:

@@ -1,0 +1,180 @@
+"""What was read is what was hashed: a file is known by its content and by what the system says of it.
+
+A run hashes its inputs once. From then on the system is asked whether a file is still that one wherever it matters: as
+a worker opens it, before a result is kept, before outputs appear. Nothing is read for that.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+
+from barpc.errors import InputError
+from barpc.remote import Remote
+
+_HOST = platform.node()
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """What the system says of a file: its times change with whatever is written or put in its place."""
+
+    size: int
+    mtime_ns: int
+    ctime_ns: int
+    inode: int
+    device: int
+    host: str
+
+    @classmethod
+    def of(cls, found: os.stat_result) -> Stamp:
+        """Of what `os.stat` finds here."""
+        return cls(found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino, found.st_dev, _HOST)
+
+    def times(self) -> tuple[int, int, int]:
+        """What every host sees alike."""
+        return self.size, self.mtime_ns, self.ctime_ns
+
+    def matches(self, other: Stamp) -> bool:
+        """Whether both are of one file; the numbers of devices are each host's own."""
+        same = self.times() == other.times() and self.inode == other.inode
+        return same and (self.host != other.host or self.device == other.device)
+
+
+@dataclass(frozen=True)
+class Input:
+    """A file as it was hashed, and those that it is made of (the sources of a VRT)."""
+
+    path: str
+    size: int
+    sha256: str  # of its bytes; of a file on another host of its URL and the version that the host names
+    stamp: Stamp | None  # None: on another host, which is asked for that version
+    parts: tuple[Input, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """A hash of all that it is made of."""
+        if not self.parts:
+            return self.sha256
+        return hashlib.sha256(
+            " ".join([self.sha256, *(part.key for part in self.parts)]).encode()
+        ).hexdigest()
+
+    def every(self) -> Iterator[Input]:
+        """Itself and its parts."""
+        yield self
+        for part in self.parts:
+            yield from part.every()
+
+    def ask(self) -> None:
+        """InputError unless it and its parts are still what was hashed."""
+        for one in self.every():
+            if one.stamp is not None and not one._same():
+                raise changed(one.path)
+
+    def _same(self) -> bool:
+        assert self.stamp is not None
+        try:
+            found = Stamp.of(Path(self.path).stat())
+        except OSError:
+            return False
+        if found.matches(self.stamp) or found == _known.get(self.path):
+            return True
+        # some file systems number a file anew: then its bytes are asked
+        if found.times() != self.stamp.times() or take(self.path).sha256 != self.sha256:
+            return False
+        _known[self.path] = found
+        return True
+
+
+_known: dict[str, Stamp] = {}  # files whose bytes were asked by this process
+
+
+def changed(path: str) -> InputError:
+    """The one line for a file that is no longer what it was."""
+    return InputError(
+        f"{path}: was changed or replaced while the run was at work; nothing of it is kept; run the same command again"
+    )
+
+
+def take(path: str | os.PathLike[str], parts: Iterable[Input] = ()) -> Input:
+    """Hash a file; InputError where it changes meanwhile, OSError where it cannot be read."""
+    if isinstance(path, Remote):
+        text = f"{path} {path.size} {path.tag}"
+        return Input(str(path), path.size or 0, hashlib.sha256(text.encode()).hexdigest(), None)
+    name = os.fspath(path)
+    descriptor = os.open(name, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    with open(descriptor, "rb", buffering=0) as file:  # noqa: PTH123  (a pipe would wait, a device has no end)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise InputError(f"{name}: not a regular file")
+        before = Stamp.of(os.fstat(file.fileno()))
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        after = Stamp.of(os.fstat(file.fileno()))
+    if not before.matches(after):
+        raise changed(name)
+    noted = (_seen.get() or {}).get(name)
+    if noted is not None and not noted.matches(before):
+        raise changed(name)
+    return Input(name, before.size, digest, before, tuple(parts))
+
+
+# --- what a task may rely on ------------------------------------------------------------------------------
+
+_guard: ContextVar[Mapping[str, Input]] = ContextVar("guard")
+
+
+@contextmanager
+def guarded(inputs: Iterable[Input]) -> Iterator[None]:
+    """Within the block `ask` knows these; at its good end all are asked again."""
+    token = _guard.set({one.path: one for one in inputs})
+    try:
+        yield
+        ask()
+    except Exception:
+        ask()  # what was half replaced may fail in any way
+        raise
+    finally:
+        _guard.reset(token)
+
+
+def ask(path: str | os.PathLike[str] | None = None) -> None:
+    """InputError where a file that the block relies on is no longer what was hashed; None: any of them."""
+    known = _guard.get({})
+    for one in known.values() if path is None else filter(None, [known.get(os.fspath(path))]):
+        one.ask()
+
+
+# --- what was read ----------------------------------------------------------------------------------------
+
+_seen: ContextVar[dict[str, Stamp] | None] = ContextVar("seen", default=None)
+
+
+@contextmanager
+def recorded(seen: dict[str, Stamp]) -> Iterator[dict[str, Stamp]]:
+    """Every file that `barpc.sidefile` opens in the block, as it was the first time."""
+    token = _seen.set(seen)
+    try:
+        yield seen
+    finally:
+        _seen.reset(token)
+
+
+def note(path: str | os.PathLike[str], found: os.stat_result) -> None:
+    """A file was opened: InputError where it is another one than the last time."""
+    also_seen({os.fspath(Path(path).absolute()): Stamp.of(found)})
+
+
+def also_seen(files: Mapping[str, Stamp]) -> None:
+    """What was opened, here or in another process."""
+    seen = _seen.get()
+    if seen is not None:
+        for name, stamp in files.items():
+            if not seen.setdefault(name, stamp).matches(stamp):
+                raise changed(name)

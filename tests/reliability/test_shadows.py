@@ -1,0 +1,72 @@
+"""No verb makes an image that is there seem another camera, whatever it writes beside it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc import adjust
+from barpc.cameras import open_camera
+from barpc.export import TARGETS
+from barpc.options import RunOptions
+from barpc.raster import open_raster
+from tests.lanes import rest_slow
+from tests.reliability.conftest import barpc
+from tests.reliability.trials import SAMPLES, crop
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("shadows")
+    (folder / "in").mkdir()
+    images = [crop(source, folder / "in" / source.name) for source in SAMPLES[:2]]
+    adjust(images, folder / "run", RunOptions(pictures=False))
+    return folder
+
+
+def seen(folder: Path) -> dict[str, object]:
+    """What barpc and GDAL make of every image in a folder, and its bytes."""
+    found: dict[str, object] = {}
+    for path in sorted(folder.glob("view_*.tif")):
+        with open_raster(path) as image:
+            ground = open_camera(path).model.localize(
+                np.array([[0.0, 0.0], [99.0, 7.0]]), np.array([90.0, 99.0])
+            )
+            found[path.name] = (path.read_bytes(), image.shape, ground.tobytes())
+        with rasterio.open(path) as image:
+            found[f"gdal {path.name}"] = str(image.rpcs)
+    return found
+
+
+VERBS = {
+    **{f"export {target}": ("export", "{run}", "{in}", "--to", target, "--overwrite") for target in TARGETS},
+    "adjust": ("adjust", "{a}", "{b}", "-o", "{in}", "--overwrite", "--rpc-format", "geom"),
+    "match": ("match", "{a}", "{b}", "-o", "{in}", "--overwrite"),
+    "convert to a folder": ("convert", "{a}", "{b}", "-o", "{in}", "--rpc", "{run}", "--overwrite"),
+    **{
+        f"convert to .{end}": ("convert", "{run}/view_00.vrt", f"{{in}}/view_00{sep}{end}")
+        for sep, end in ((".", "RPB"), ("_", "RPC.TXT"), (".", "geom"), (".", "rpc"))
+    },
+    "fit": ("fit", "{run}/view_00.vrt", "-o", "{in}/view_00_RPC.TXT", "--keep-going"),
+    "report": ("report", "{run}"),
+}
+
+
+@pytest.mark.parametrize("verb", rest_slow(VERBS, len(TARGETS) + 3))
+def test_an_image_stays_the_camera_that_it_was(finished, tmp_path, verb) -> None:
+    folder = tmp_path / "in"
+    shutil.copytree(finished / "in", folder)
+    places = {"run": finished / "run", "in": folder, "a": folder / "view_00.tif", "b": folder / "view_01.tif"}
+    before = seen(folder)
+    if verb.startswith("export"):  # of a run whose images these are
+        shutil.copytree(finished / "run", tmp_path / "run")
+        summary = tmp_path / "run" / "summary.json"
+        summary.write_text(summary.read_text().replace(str(finished / "in"), str(folder)))
+        places["run"] = tmp_path / "run"
+    said = barpc(*(word.format(**places) for word in VERBS[verb]))
+    assert "unexpected" not in said.err
+    assert seen(folder) == before, said
