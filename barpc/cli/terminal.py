@@ -68,7 +68,7 @@ def print_summary(summary: Summary) -> None:
     errors = "Reprojection error of the tie points"
     offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
     datum = () if summary.scene is None else summary.scene.datum
-    if len(DatumEntry.columns(datum)) <= 3:  # one source holds all: the verdict says so
+    if len(DatumEntry.columns(datum).split()) <= 3:  # one source holds all: the verdict says so
         datum = ()
     for shown in (
         table("views", errors, summary.views, ViewEntry, ViewEntry.TERMINAL, summary.adjusted),

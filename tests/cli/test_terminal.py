@@ -179,8 +179,9 @@ def test_what_holds_the_scene_is_a_table_where_several_sources_do(
         False,
     ]
     assert row.split() == ["east", "0.50", "70", "30"]
-    print_summary(a_summary([], scene=SimpleNamespace(datum=())))
-    assert capsys.readouterr().out == "All well.\n"
+    for alone in ((), (DatumEntry("east", 0.5, 0.996, 0.0, 0.0, 0.004, 0.0),)):  # the verdict says it
+        print_summary(a_summary([], scene=SimpleNamespace(datum=alone)))
+        assert capsys.readouterr().out == "All well.\n"
 
 
 @pytest.mark.parametrize(("status", "colour"), [("good", "green"), ("bad", "red")])
