@@ -14,7 +14,6 @@ from barpc.handoff import (
     TOLERANCE,
     control_grid,
     difference,
-    refuse_hiding,
     unverified,
     verify,
 )
@@ -34,6 +33,12 @@ from tests.rpcio.conftest import make_rpc, write_image
 
 SIZE, ALTITUDES = (2000, 1900), (30.0, 300.0)
 NAMES = [f"a{row.suffixes[0]}" for name, row in {**WRITABLE, **CARRIERS}.items() if name != "nitf"]
+
+
+def refuse_hiding(folder: Path, names: list[str], inputs: list[Path]) -> None:
+    """A workspace that is to write these files, in a folder that holds other things, too."""
+    with Workspace(folder, overwrite=True, keep=inputs, adds=True) as run:
+        run._refuse_hiding(names)
 
 
 def write(rpc: RPC, image: Path, folder: Path, name: str) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ from barpc.pipeline import outputs
 from barpc.pipeline.inputs import PRIOR
 from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, write_views
 from barpc.report.page import can_render
-from barpc.report.summary import StageEntry
+from barpc.report.summary import OutputEntry, StageEntry
 from barpc.report.tables import TABLES
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import View
@@ -49,6 +50,7 @@ def write_view(
 class Said:
     of: str
     stages: tuple[StageEntry, ...] = ()
+    outputs: tuple[OutputEntry, ...] = ()
 
 
 @pytest.fixture
@@ -313,6 +315,10 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
     if page:
         assert (folder / "report.html").read_text() == "<p>what was found in out</p>"
     summary = json.loads((folder / "summary.json").read_text())
+    assert summary.pop("outputs") == [
+        {"file": name, "sha256": hashlib.sha256((folder / name).read_bytes()).hexdigest()}
+        for name in names[:2]
+    ]
     assert summary == {"of": "what was found", "stages": [asdict(stage) for stage in told.stages]}
     assert [stage["stage"] for stage in summary["stages"]] == ["tables", "report"]
     assert (folder / "summary.json").read_text().endswith("\n")

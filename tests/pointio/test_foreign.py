@@ -304,7 +304,8 @@ class Stored:
     def __init__(self, array: np.ndarray, name: str) -> None:
         self.array, self.name = array, name
         self.shape, self.ndim, self.size, self.dtype = array.shape, array.ndim, array.size, array.dtype
-        self.is_virtual, self.external = False, None
+        self.is_virtual, self.external, self.nbytes = False, None, array.nbytes
+        self.id = types.SimpleNamespace(get_storage_size=lambda: array.nbytes)
 
     def __getitem__(self, _: object) -> np.ndarray:
         return self.array
@@ -313,27 +314,40 @@ class Stored:
 def shelf(monkeypatch: pytest.MonkeyPatch, contents: dict[str, dict[str, np.ndarray]]) -> None:
     """In place of h5py, which may be missing, one that finds these arrays by what stands behind the first bytes."""
 
-    class File:
+    class Link: ...
+
+    class Group:
+        def __init__(self, arrays: dict[str, np.ndarray], place: str = "") -> None:
+            self.arrays, self.place = arrays, place
+
+        def __iter__(self):
+            return iter(dict.fromkeys(path.split("/")[0] for path in self.arrays))
+
+        def __getitem__(self, name: str):
+            if name in self.arrays:
+                return Stored(self.arrays[name], f"{self.place}/{name}")
+            below = {p.partition("/")[2]: a for p, a in self.arrays.items() if p.startswith(f"{name}/")}
+            return Group(below, f"{self.place}/{name}")
+
+        def get(self, name: str, getlink: bool) -> Link:
+            return Link()
+
+    class File(Group):
         def __init__(self, file, _mode: str) -> None:
-            self.arrays = contents[file.read()[8:].decode()]
+            super().__init__(contents[file.read()[8:].decode()])
 
         def __enter__(self):
             return self
 
         def __exit__(self, *_: object) -> None: ...
 
-        def visititems(self, visit) -> None:
-            for path, array in self.arrays.items():
-                for parent in Path(path).parents[-2::-1] if "/" in path else ():
-                    visit(str(parent), object())
-                visit(path, Stored(array, f"/{path}"))
-
-    fake = types.SimpleNamespace(File=File, Dataset=Stored)
+    fake = types.SimpleNamespace(File=File, Dataset=Stored, Group=Group, HardLink=Link)
     monkeypatch.setitem(sys.modules, "h5py", fake)
 
 
 FEATURES = {
     "hloc": {f"sub/{name}.tif/keypoints": xy.astype(np.float32) for name, xy in KEYPOINTS.items()},
+    "within": {f"{name}.tif/keypoints": xy for name, xy in KEYPOINTS.items()},
     "plain": {f"{name}.tif": xy for name, xy in KEYPOINTS.items()},
 }
 FEATURES["hloc"]["sub/a.tif/descriptors"] = FEATURES["plain"]["more/descriptors"] = np.ones(
@@ -378,12 +392,12 @@ def test_keypoints_may_lie_beside_their_matches_in_one_file(tmp_path, monkeypatc
     path = tmp_path / "all.h5"
     path.write_bytes(b"\x89HDF\r\n\x1a\nall.h5")
     rows = {f"{a}.tif/{b}.tif": np.array(found) for (a, b), found in MATCHES.items()}
-    shelf(monkeypatch, {"all.h5": {**FEATURES["plain"], **rows}})
+    shelf(monkeypatch, {"all.h5": {**FEATURES["within"], **rows}})
     assert len(read_links(path, NAMES).ends) == 4
-    shelf(monkeypatch, {"all.h5": {**FEATURES["plain"], "a.tif/b.tif": np.array([[0, 9]])}})
+    shelf(monkeypatch, {"all.h5": {**FEATURES["within"], "a.tif/b.tif": np.array([[0, 9]])}})
     with pytest.raises(InputError, match=r"not an HDF5 file of matches .*beyond the 3 and 4"):
         read_links(path, NAMES)
-    shelf(monkeypatch, {"all.h5": {**FEATURES["plain"], "a.tif/a.tif": np.array([[0, 1]])}})
+    shelf(monkeypatch, {"all.h5": {**FEATURES["within"], "a.tif/a.tif": np.array([[0, 1]])}})
     with pytest.raises(InputError, match="no track is seen in two"):
         read_links(path, NAMES)
     elsewhere = Stored(np.array([[0, 1]]), "/a.tif/b.tif")
@@ -392,7 +406,7 @@ def test_keypoints_may_lie_beside_their_matches_in_one_file(tmp_path, monkeypatc
         ("external", [("other", 0, 8)], "lies in another file"),
         ("size", 1 << 28, "too large for the keypoints and matches of an HDF5 file"),  # of 8 bytes each
     ):
-        shelf(monkeypatch, {"all.h5": {**FEATURES["plain"], "a.tif/b.tif": elsewhere.array}})
+        shelf(monkeypatch, {"all.h5": {**FEATURES["within"], "a.tif/b.tif": elsewhere.array}})
         monkeypatch.setattr(Stored, "__init__", _lying(field, value))
         with pytest.raises(InputError, match=words):
             read_links(path, NAMES)

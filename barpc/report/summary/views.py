@@ -293,7 +293,7 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
             fit=_fit_entry(run.fits[i]) if run.fits else None,
             outputs=dict(run.written[i]) if run.written else {},
-            certified=_certified(run, i) if run.written else None,
+            certified=_certified(run, i) if run.written and run.adjustment is not None else None,
             date=view.date or None,
             stated_ce90_m=stated_ce90(view),
             **_control(tests.get(i)),
