@@ -36,14 +36,14 @@ def enu_of(lon: float, lat: float) -> np.ndarray:
 
 
 def project_rpc(rpc: Any, ground: np.ndarray) -> np.ndarray:
-    """Col, row of one ground point, the twenty terms of RPC00B spelled out."""
-    L, P, H = (ground - rpc.ground_offset) / rpc.ground_scale
+    """Col, row (n, 2) of ground points (n, 3), the twenty terms of RPC00B spelled out."""
+    L, P, H = ((ground - rpc.ground_offset) / rpc.ground_scale).T
     terms = np.array([
-        1, L, P, H, L * P, L * H, P * H, L * L, P * P, H * H, P * L * H, L**3, L * P**2, L * H**2, L**2 * P,
+        L**0, L, P, H, L * P, L * H, P * H, L * L, P * P, H * H, P * L * H, L**3, L * P**2, L * H**2, L**2 * P,
         P**3, P * H**2, L**2 * H, P**2 * H, H**3,
     ])  # fmt: skip
-    col, col_den, row, row_den = (float(c @ terms) for c in rpc.coeffs)
-    return np.array([col / col_den, row / row_den]) * rpc.image_scale + rpc.image_offset
+    col, col_den, row, row_den = rpc.coeffs @ terms
+    return np.stack([col / col_den, row / row_den], axis=1) * rpc.image_scale + rpc.image_offset
 
 
 @dataclass
@@ -69,23 +69,24 @@ class Plain:
         ]
         self.distance = np.linalg.norm(self.centers - middle, axis=1)
 
-    def image(self, v: int, params: np.ndarray, ecef: np.ndarray, row: float) -> np.ndarray:
-        """Where view v sees a point through its correction, the drift being that of a row."""
+    def image(self, v: int, params: np.ndarray, ecef: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """Where view v sees points (n, 3) through its correction, the drift being that of rows (n,)."""
         view, distance = self.views[v], self.distance[v]
         turned = Rotation.from_rotvec(params[:3] / distance).apply(ecef - params[3:6] - self.centers[v])
         t = (row - (view.size[1] - 1) / 2) / (view.size[1] / 2)
-        omega = np.zeros(3)
+        omega = np.zeros((len(ecef), 3))
         for k in range(self.drift):
-            omega = omega + t ** (k + 1) * params[6 + 3 * k : 9 + 3 * k] / distance
+            omega = omega + t[:, None] ** (k + 1) * params[6 + 3 * k : 9 + 3 * k] / distance
         turned = Rotation.from_rotvec(omega).apply(turned)
         return project_rpc(view.sensor, ground_of(turned + self.centers[v]))
 
     def residual(self, params: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Every whitened residual: ties, camera priors, GCPs, heights."""
-        rows = [
-            (self.image(v, params[v], points[p], xy[1]) - xy) / sigma
-            for v, p, xy, sigma in zip(self.view, self.point, self.xy, self.sigma, strict=True)
-        ]
+        seen = np.empty_like(self.xy)
+        for v in range(len(params)):
+            rows = self.view == v
+            seen[rows] = self.image(v, params[v], points[self.point[rows]], self.xy[rows, 1])
+        rows = [((seen - self.xy) / self.sigma[:, None]).ravel()]
         rows.append((params / self.camera_sigma).ravel())
         for p, lonlatalt, sigma in self.gcps:
             rows.append(enu_of(*lonlatalt[:2]) @ (points[p] - ecef_of(lonlatalt)) / sigma)

@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from barpc.ba import dissection
 from barpc.ba.dissection import Dissection, dissect
+from tests.lanes import rest_slow
 
 KINDS = ("ring", "grid", "clique", "star", "two cliques", "time series", "random", "parts", "path of cliques")
 
@@ -79,7 +80,7 @@ def test_graphs_of_every_kind_are_cut_soundly(kind) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", rest_slow(range(25), mark=pytest.mark.nightly))
 @pytest.mark.parametrize("kind", KINDS[:8])
 def test_graphs_of_a_hundred_to_three_thousand_views_are_cut_at_once(kind, seed) -> None:
     rng = np.random.default_rng([seed, KINDS.index(kind)])
@@ -148,3 +149,14 @@ def test_a_cut_takes_as_few_views_as_any_could(seed) -> None:
     tied = rng.random(rng.integers(3, 30, 2)) < rng.uniform(0.02, 0.5)
     row, col = linear_sum_assignment(tied, maximize=True)
     assert len(_covered(sp.csr_array(tied.astype(np.int8)))) == tied[row, col].sum()
+
+
+def test_parts_that_nothing_ties_are_parted_by_nobody() -> None:
+    group = np.random.default_rng(0).permutation(60) % 2
+    i, j = np.triu_indices(60, 1)
+    pairs = np.stack([i, j], axis=1)[group[i] == group[j]]
+    order = dissect(pairs, np.random.default_rng(1).normal(size=(60, 2)), np.ones(60, dtype=bool))
+    found = sorted(sorted(front.pivots.tolist()) for front in order.fronts)
+    assert found == sorted(np.flatnonzero(group == part).tolist() for part in (0, 1))
+    assert all(not len(front.border) and front.parent == -1 for front in order.fronts)
+    assert len(_covered(sp.csr_array(np.zeros((3, 4), dtype=np.int8)))) == 0

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions
 from barpc.ba.block import Block, join
-from barpc.ba.heldout import HeldOut, _scrambled, keep_out, measure
+from barpc.ba.heldout import HeldOut, _scrambled, is_better, keep_out, measure
 from barpc.ba.starting import make_problem
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
@@ -38,6 +40,24 @@ def test_numbers_are_scrambled_as_splitmix_does_it() -> None:
     assert [hex(int(x)) for x in found] == ["0xe220a8397b1dcdaf", "0x6e789e6aa1b965f4", "0x6c45d188009454f"]
 
 
+def test_who_is_kept_out_is_told_by_quarters_of_a_pixel_and_stays_the_same(made) -> None:
+    """In whole numbers of Python: 2^64 over the golden ratio times the column, and the row, scrambled and summed."""
+    block, most = block_of(made), 2**64
+
+    def scrambled(x: int) -> int:
+        x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9 % most
+        x = (x ^ (x >> 27)) * 0x94D049BB133111EB % most
+        return x ^ (x >> 31)
+
+    drawn = np.zeros(block.num_points, dtype=object)
+    for point, (col, row) in zip(block.point, np.rint(4 * block.xy.T).astype(int).tolist(), strict=True):
+        drawn[point] = (drawn[point] + scrambled((col * 0x9E3779B97F4A7C15 + row) % most)) % most
+    out = np.array([scrambled(int(number)) < 0.1 * most for number in drawn])
+    out &= np.bincount(block.point, minlength=len(out)) >= 2
+    assert out.any()
+    np.testing.assert_array_equal(keep_out(block), out[block.point])
+
+
 def test_about_a_tenth_is_kept_out_everywhere_in_the_image(made) -> None:
     block = block_of(made)
     out = keep_out(block)
@@ -61,7 +81,7 @@ def test_what_rounding_does_to_positions_draws_hardly_another_track(made) -> Non
 
 def test_what_a_small_view_needs_and_what_holds_the_place_is_never_drawn(made) -> None:
     mine = np.flatnonzero(made.tracks.view == 2)
-    for count, needed in ((99, True), (110, False)):
+    for count, needed in ((99, True), (100, False)):
         keep = np.ones(len(made.tracks), dtype=bool)
         keep[mine[count:]] = False
         block = block_of(made, keep=keep)
@@ -114,6 +134,35 @@ def test_what_is_kept_out_is_measured_by_its_own_points(made) -> None:
     assert np.median(np.abs(spoilt.residual[0, three & ~wrong])) < 0.5
 
 
+@pytest.mark.parametrize("off", [0.3, -0.6, 1.2])
+def test_a_point_is_where_reweighted_rays_meet(made, off: float) -> None:
+    """Of a track of three views one off by some sigmas: three rounds by Geman and McClure's weights at four of them."""
+    block = block_of(made)
+    problem = make_problem(block, OPTIONS, centers_of(made), None)
+    point = int(np.flatnonzero(np.bincount(block.point) == 3)[0])
+    rows = np.flatnonzero(block.point == point)
+    xy = block.xy.copy()
+    xy[:, rows[1]] += [off, -0.5 * off]
+    params = np.array(
+        [np.r_[c.rotation * d, c.translation]
+         for c, d in zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)]
+    )  # fmt: skip
+    found = measure(problem, params, replace(block, xy=xy))
+    projected = problem.project_points(params, ecef_from_ground(made.truth.ground))
+    matrix = projected.by_point[:, :, rows].transpose(2, 0, 1)  # (3, 2, 3)
+    start, counted = (projected.image - xy)[:, rows].T, np.ones(3)
+    for step in range(4):
+        weight = np.sqrt(counted) / block.sigma[rows]
+        rhs = (weight[:, None] * start).ravel()
+        move = np.linalg.lstsq((weight[:, None, None] * matrix).reshape(6, 3), -rhs, rcond=None)[0]
+        left = start + matrix @ move
+        counted = 1.0 / (1.0 + (left**2).sum(axis=1) / (4.0 * block.sigma[rows]) ** 2) ** 2
+        if step == 0:
+            plain = left
+    np.testing.assert_allclose(found.residual[:, rows].T, left, atol=2e-4)
+    assert np.abs(left - plain).max() > 0.002
+
+
 def test_a_view_of_fewer_than_twenty_says_nothing(made) -> None:
     tracks = made.tracks
     for count in (19, 20):
@@ -129,3 +178,54 @@ def test_a_view_of_fewer_than_twenty_says_nothing(made) -> None:
     assert np.isnan(
         HeldOut(np.zeros((2, 0)), np.zeros(0, int), np.zeros((0, 3)), *np.full((2, 4), np.nan)).error
     )
+
+
+# --- which of two solutions is better -----------------------------------------------------------------------------
+
+
+def held(residual: np.ndarray, noise: float) -> HeldOut:
+    n = residual.shape[1]
+    return HeldOut(residual, np.arange(n), np.zeros((n, 3)), np.full(2, noise), np.full(2, noise))
+
+
+def compared(own: np.ndarray, other: np.ndarray, noise: tuple[float, float] = (0.9, 1.0)) -> bool:
+    """Whether residuals (K,) along the columns [px] of half as many tracks, each seen twice, are better than others."""
+    block: Any = SimpleNamespace(point=np.repeat(np.arange(len(own) // 2), 2), sigma=np.full(len(own), 0.1))
+    one, two = (np.stack([given, 0 * given]) for given in (own, other))
+    return is_better(held(one, noise[0]), held(two, noise[1]), block)
+
+
+def test_better_is_what_is_clearly_better_in_the_same_tracks() -> None:
+    other = np.random.default_rng(0).normal(0, 0.1, 400)
+    assert compared(0.9 * other, other)
+    assert not compared(other, other)
+    assert not compared(1.1 * other, other)
+    assert not compared(other[:0], other[:0])
+
+
+@pytest.mark.parametrize(("share", "better"), [(0.985, True), (0.995, False)])
+def test_an_error_less_by_a_hundredth_is_asked_for(share, better) -> None:
+    other = np.random.default_rng(0).normal(0, 0.1, 400)
+    assert compared(0.5 * other, other, (share, 1.0)) == better
+
+
+def costs(residual: np.ndarray, noise: float) -> np.ndarray:
+    """Squares of every track by the other's error, of which 16 is the most."""
+    square = (residual / (0.1 * noise)) ** 2
+    return (square / (1 + square / 16)).reshape(-1, 2).sum(axis=1)
+
+
+@pytest.mark.parametrize("noise", [1.0, 2.0])
+@pytest.mark.parametrize(("deviations", "better"), [(2.9, False), (3.1, True)])
+def test_squares_are_to_be_less_by_three_standard_deviations_of_chance(deviations, better, noise) -> None:
+    rng = np.random.default_rng(0)
+    other, change = rng.normal(0, 0.2, (2, 400))
+    low, high = 0.0, 0.5  # how much of the other's is taken away, against a change of any sign
+    for _ in range(60):
+        share = 0.5 * (low + high)
+        own = (1 - share) * other + 0.2 * change
+        less = costs(other, noise) - costs(own, noise)
+        sure = less.mean() / (less.std() / np.sqrt(200))
+        low, high = (share, high) if sure < deviations else (low, share)
+    assert sure == pytest.approx(deviations, abs=1e-6)
+    assert compared(own, other, (0.9, noise)) == better

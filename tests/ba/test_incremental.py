@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -139,3 +140,54 @@ def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(monkeypatch, tm
         replace(read, **{name: damaged}).save(tmp_path / "damaged.npz")
         with pytest.raises(InputError, match="do not go together"):
             BlockPrior.load(tmp_path / "damaged.npz")
+
+
+@pytest.mark.parametrize(("views", "refused"), [(10_000, False), (10_001, True)])
+def test_a_block_of_twenty_thousand_unknowns_is_gone_on_from(views: int, refused: bool) -> None:
+    whole = np.eye(2)
+    stored: Any = SimpleNamespace(toarray=lambda: whole)
+    prior = replace(prior_of(), names=("v",) * views, params=np.zeros((views, 2)), information=stored)
+    if refused:
+        with pytest.raises(InputError, match="10001 views, too many to go on from: at most 10000"):
+            prior.dense()
+    else:
+        assert prior.dense() is whole
+
+
+@pytest.mark.parametrize(
+    ("splines", "edges", "whole"),
+    [
+        (0, np.zeros((2, 0)), True),
+        (3, np.zeros((2, 0)), False),  # fewer than a cubic has
+        (4, np.zeros((2, 0)), True),
+        (5, np.zeros((2, 0)), True),
+        (6, np.zeros((2, 0)), False),  # more than unknowns
+        (0, np.zeros((3, 1)), False),
+        (0, np.zeros(2), False),
+    ],
+)
+def test_a_layout_of_splines_that_no_block_has_is_refused(
+    tmp_path, splines: int, edges: Any, whole: bool
+) -> None:
+    given = replace(prior_of(size=5), splines=splines, edges=edges, radars=("c",))
+    given.save(tmp_path / "prior.npz")
+    if not whole:
+        with pytest.raises(InputError, match="do not go together"):
+            BlockPrior.load(tmp_path / "prior.npz")
+        return
+    read = BlockPrior.load(tmp_path / "prior.npz")
+    assert (read.splines, read.radars) == (splines, ("c",))
+    np.testing.assert_array_equal(read.edges, edges)
+
+
+def test_views_go_on_with_their_own_detectors_and_new_ones_with_none() -> None:
+    prior = replace(prior_of(), splines=9, edges=np.array([[5.0, np.inf], [7.0, 9.0]]))
+    waves = prior.waves(("new", "c", "a"))
+    assert waves is not None
+    assert waves.count == 9
+    np.testing.assert_array_equal(waves.edges, [[np.inf] * 2, [7.0, 9.0], [5.0, np.inf]])
+    for edges, splines, some in ((None, 9, False), (np.zeros((2, 0)), 0, False), (np.zeros((2, 0)), 9, True)):
+        assert (replace(prior, edges=edges, splines=splines).waves(("a",)) is not None) == some
+    only_edges = replace(prior, splines=0).waves(("a",))
+    assert only_edges is not None
+    assert only_edges.count == 0

@@ -6,12 +6,25 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
-from barpc.ba import linear, normal
+from barpc.ba import Adjustment, linear, normal
 from barpc.ba.dissection import dissect
 from barpc.ba.multifrontal import Blocks
 from barpc.ba.structure import counting_sort
 from barpc.errors import AdjustError
+from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import solve as adjust
+
+
+@pytest.fixture(scope="module")
+def block() -> Block:
+    """Four views, 300 tie points."""
+    return simulate_block(4, 300, seed=11)
+
+
+@pytest.fixture(scope="module")
+def adjusted(block: Block) -> Adjustment:
+    """`block`, adjusted."""
+    return adjust(block)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, adjustment, block_prior
+from barpc.ba import solution as solved
 from barpc.ba.block import join
 from barpc.ba.rounds import Outcome
 from barpc.ba.solution import Solution
 from barpc.ba.starting import first_state, make_problem
+from barpc.ba.structure import make_structure
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks
@@ -36,7 +38,7 @@ def choose(
     """The model chosen where the one in space leaves 1 (error) and 1 px (rms); what is known of it; models solved."""
     asked: list[str] = []
 
-    def solved(block: Any, outer: Any, options: AdjustOptions, *rest: Any) -> Any:
+    def by_script(block: Any, outer: Any, options: AdjustOptions, *rest: Any) -> Any:
         asked.append(options.model)
         after = SimpleNamespace(error=1.0, whole_rms=1.0)
         if options.model == "affine":
@@ -45,7 +47,7 @@ def choose(
         said = {"is_skew": skew, "has_trend": trend, "has_waves": False, "tested": None}
         return SimpleNamespace(**said, after=after, model=options.model, problem=in_space)
 
-    monkeypatch.setattr(adjustment, "solve_block", solved)
+    monkeypatch.setattr(adjustment, "solve_block", by_script)
     monkeypatch.setattr(adjustment, "follow", lambda found, *_: found)
     prior = given.pop("prior", None)
     found, in_space = adjustment._choose_model(None, None, AdjustOptions(**given), None, None, prior)
@@ -200,7 +202,21 @@ def test_points_start_where_the_delivered_cameras_see_them_by_their_sigmas(made)
     assert np.median(off[0]) < 0.02 < 0.3 < np.median(off[1])
 
 
-@pytest.mark.parametrize("kept", [1.0, 0.5])
+def test_a_track_that_one_view_sees_is_weak_and_one_that_none_sees_is_none(made) -> None:
+    keep = np.ones(len(made.tracks), dtype=bool)
+    first, second = (np.flatnonzero(made.tracks.point == point) for point in (3, 8))
+    keep[first[1:]] = keep[second] = False
+    options = AdjustOptions(drift=0)
+    block = join(made.views, made.tracks, None, options).without(
+        ~keep[np.argsort(made.tracks.view, kind="stable")]
+    )
+    problem = make_problem(block, options, centers_of(made), None)
+    _, heights = first_state(problem, block, options, None)
+    assert heights.weak[[2, 3, 4, 8]].tolist() == [False, True, False, False]
+    assert np.setdiff1d(np.arange(150), heights.tracks).tolist() == [8]
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.993, 0.985, 0.5])
 def test_the_scenes_move_is_from_where_the_delivered_cameras_put_what_is_seen_now(made, kept: float) -> None:
     """Where much was cut, what it was cut for is mended before: its places are those of the adjusted cameras."""
     given = uneven(made)
@@ -213,7 +229,7 @@ def test_the_scenes_move_is_from_where_the_delivered_cameras_put_what_is_seen_no
     inlier = np.arange(len(block.view)) < kept * len(block.view)
     outcome: Any = SimpleNamespace(inlier=inlier, minimum=SimpleNamespace(state=final))
     found = Solution(problem, state, None, None, outcome, None, None, None).first_points(block)  # type: ignore[arg-type]
-    if kept == 1.0:
+    if kept > 0.99:
         np.testing.assert_array_equal(found, state.points)
         return
     sensors = problem.cameras.unknowns.corrected(params, given.views)
@@ -274,3 +290,195 @@ def test_views_with_too_few_observations_are_listed_up_to_ten(made) -> None:
     empty = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
     with pytest.raises(TiePointError, match=r"v09 \(0\), 2 more: at least 4 are needed"):
         join(views, empty, None, AdjustOptions())
+
+
+# --- which rounds are taken ---------------------------------------------------------------------------------------
+
+
+def script(
+    monkeypatch, noises: list[float], kept: list[int], found: bool = False, options: AdjustOptions | None = None,
+    suspect: bool = True, agreed: int = 80, drift: int = 1, prior: Any = None,
+) -> tuple[Any, list[tuple[int, str]]]:  # fmt: skip
+    """The solution of rounds by script: their noise and observations kept; every start, as drift and what was used."""
+    starts: list[tuple[int, str]] = []
+    unknowns = SimpleNamespace(drift=drift, center="centres")
+
+    def problem_of(block: Any, options: Any, centers: Any, prior: Any, drift: int | None = None) -> Any:
+        degree = unknowns.drift if drift is None else drift
+        cameras = SimpleNamespace(unknowns=SimpleNamespace(drift=degree, center="centres"))
+        return SimpleNamespace(
+            cameras=cameras, structure=None, xy=None, project_points=lambda *_: None, camera_prior=None
+        )
+
+    @dataclass(frozen=True)
+    class Start:
+        params: Any
+        points: Any
+
+    class Scripted:
+        def __init__(
+            self, problem: Any, block: Any, state: Any, options: Any, heights: Any, use: Any
+        ) -> None:
+            starts.append((problem.cameras.unknowns.drift, use))
+            self.number, self.residual, self.params = len(starts) - 1, "before", state.params
+
+        def run(self) -> Any:
+            inlier = np.arange(100) < kept[self.number]
+            smooth = SimpleNamespace(found=lambda least: np.array([found and least == 0.06]))
+            minimum = SimpleNamespace(state=Start(np.zeros((2, 9)), None))
+            return SimpleNamespace(
+                number=self.number,
+                noise=noises[self.number],
+                inlier=inlier,
+                smooth=smooth,
+                minimum=minimum,
+                residual=None,
+            )
+
+    start = Start(np.zeros((2, 9)), None)
+    monkeypatch.setattr(solved, "make_problem", problem_of)
+    monkeypatch.setattr(solved, "first_state", lambda *_: (start, None))
+    monkeypatch.setattr(solved, "measure", lambda *_: None)
+    monkeypatch.setattr(solved, "Rounds", Scripted)
+    monkeypatch.setattr(solved, "_is_suspect", lambda *_: suspect)
+    monkeypatch.setattr(solved, "agreeing", lambda *_: Agreed(agreed))
+    monkeypatch.setattr(solved, "revived", lambda problem, state, *_: (state, None))
+    monkeypatch.setattr(solved, "finished", lambda found, problem, block, outer, options, outcome: found)
+    use = np.ones(100)
+    block: Any = SimpleNamespace(use=use, sigma=1.0, views=("a", "b"))
+    options = AdjustOptions() if options is None else options
+    made = solved.solve_block(block, None, options, None, None, prior)  # type: ignore[arg-type]
+    named = [
+        (drift, "all" if given is use else "agreed" if isinstance(given, Agreed) else "kept")
+        for drift, given in starts
+    ]
+    return made, named
+
+
+class Agreed:
+    """So many observations that agree."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def sum(self) -> int:
+        return self.count
+
+
+@pytest.mark.parametrize(
+    ("noise", "kept", "taken"), [(1.58, 41, 1), (1.62, 41, 0), (1.58, 39, 0), (0.1, 40, 0)]
+)
+def test_an_agreement_is_taken_that_leaves_a_fifth_less_noise_and_half_of_what_agrees(
+    monkeypatch, noise: float, kept: int, taken: int
+) -> None:
+    found, starts = script(monkeypatch, [2.0, noise], [70, kept])
+    assert found.outcome.number == taken
+    assert starts == [(1, "all"), (1, "agreed")]
+
+
+def test_an_agreement_is_asked_for_where_rounds_are_suspect_and_robust(monkeypatch) -> None:
+    assert script(monkeypatch, [2.0], [70], suspect=False)[1] == [(1, "all")]
+    assert script(monkeypatch, [2.0], [70], options=AdjustOptions(loss="linear"))[1] == [(1, "all")]
+
+
+@pytest.mark.parametrize(
+    ("given", "degrees"),
+    [
+        ({}, [1, 2]),
+        ({"found": False}, [1]),  # nothing smooth above 0.06 px is left
+        ({"drift": 0}, [0]),  # nothing turns
+        ({"options": AdjustOptions(drift=1)}, [1]),
+        ({"prior": "an earlier block"}, [1]),
+    ],
+)
+def test_a_drift_of_another_degree_is_taken_where_it_may_be_and_something_smooth_is_left(
+    monkeypatch, given: dict[str, Any], degrees: list[int]
+) -> None:
+    found, starts = script(monkeypatch, [1.0, 1.0], [100, 90], suspect=False, **{"found": True, **given})
+    assert [drift for drift, _ in starts] == degrees
+    assert found.problem.cameras.unknowns.drift == degrees[-1]
+    assert set(found.asked) == ({"drift"} if len(degrees) > 1 else set())
+    if len(degrees) > 1:
+        assert starts[1][1] == "kept"
+        assert found.outcome.number == 1
+
+
+@pytest.mark.parametrize(
+    ("noise", "kept", "suspect"),
+    [(1.49, [86, 100], False), (1.51, [100, 100], True), (1.0, [84, 100], True), (1.0, [100, 84], True)],
+)
+def test_rounds_are_suspect_that_leave_much_noise_or_less_than_most_of_a_view(noise, kept, suspect) -> None:
+    structure = make_structure(np.repeat([0, 1], 120), np.tile(np.arange(120), 2), 2, 120)
+    use = np.tile(np.arange(120) < 100, 2)  # of which a hundred were to be used
+    inlier = np.concatenate([np.arange(120) < count for count in kept])
+    assert solved._is_suspect(SimpleNamespace(noise=noise, inlier=inlier), structure, use) == suspect
+
+
+@pytest.mark.parametrize(
+    ("rms", "shared", "waves"),
+    [(0.029, 0.029, False), (0.031, 0.0, True), (0.0, 0.031, True)],
+)
+def test_waves_are_what_is_smooth_or_what_neighbours_share(rms, shared, waves) -> None:
+    outcome = outcome_of(rms)
+    outcome.smooth.shared = np.array([0.0, shared])
+    assert solution(outcome).has_waves == waves
+
+
+def followed(
+    monkeypatch, error: float, prior: Any = None, geometric: bool = True, affine: float = 0.5
+) -> tuple[str, Any]:
+    """What is taken of an affine with half of the error and what follows the model in space, and the error noted."""
+
+    def solve_block(block: Any, outer: Any, options: AdjustOptions, *_: Any) -> Any:
+        after = SimpleNamespace(error=affine if options.model == "affine" else 1.0, whole_rms=1.0)
+        if options.model == "affine":
+            after.whole_rms = 0.5
+        unknowns = SimpleNamespace(unknowns=SimpleNamespace(geometric=geometric))
+        return SimpleNamespace(
+            name=options.model, is_skew=False, has_trend=True, has_waves=True, tested=None, after=after,
+            problem=SimpleNamespace(cameras=unknowns),
+        )  # fmt: skip
+
+    def follow(found: Any, *_: Any) -> Any:
+        assert found.name == "auto"
+        return SimpleNamespace(name="followed", after=SimpleNamespace(error=error))
+
+    monkeypatch.setattr(adjustment, "solve_block", solve_block)
+    monkeypatch.setattr(adjustment, "follow", follow)
+    found, left = adjustment._choose_model(None, None, AdjustOptions(), None, None, prior)  # type: ignore[arg-type]
+    return found.name, left
+
+
+def test_what_follows_the_model_in_space_is_taken_before_an_affine_that_is_not_much_better(
+    monkeypatch,
+) -> None:
+    assert followed(monkeypatch, 0.34) == ("followed", None)  # 0.7 of 0.5
+    assert followed(monkeypatch, 0.36) == ("affine", 1.0)
+    assert followed(monkeypatch, 0.9, affine=0.71) == ("followed", None)  # no affine was chosen
+    assert followed(monkeypatch, 0.1, prior="an earlier block") == ("auto", None)
+    assert followed(monkeypatch, 0.1, geometric=False) == ("affine", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("agrees", "left", "bent"),
+    [
+        (None, "", False),  # no control
+        (True, "", False),
+        (False, "", True),
+        (False, "is_skew", False),
+        (False, "has_trend", False),
+        (False, "has_waves", False),
+    ],
+)
+def test_a_trend_that_control_alone_bends_asks_for_no_other_model(monkeypatch, agrees, left, bent) -> None:
+    tested = None if agrees is None else SimpleNamespace(agrees=agrees)
+    block: Any = SimpleNamespace(point=np.arange(5), num_tracks=3, without=lambda rows: rows.tolist())
+
+    def solve_block(free: Any, outer: Any, options: Any, dem: Any, centers: Any, prior: Any) -> Any:
+        assert free == [False] * 3 + [True] * 2  # without the points that are known
+        assert prior is None
+        return SimpleNamespace(**{name: name == left for name in ("is_skew", "has_trend", "has_waves")})
+
+    monkeypatch.setattr(adjustment, "solve_block", solve_block)
+    found: Any = SimpleNamespace(tested=tested)
+    assert adjustment._bent_by_control(found, block, None, AdjustOptions(), None, None) == bent  # type: ignore[arg-type]

@@ -114,6 +114,11 @@ ELSEWHERE = {
     "min_observations": "test_a_view_needs_as_many_observations_as_asked_for",
     "solver": "test_the_solver_that_is_asked_for_is_the_one_that_runs",
 }
+ELSEWHERE_TOO = (
+    "model", "drift", "jitter", "detectors", "fixed", "dem_sigma", "dem_for_all", "tolerance", "max_steps",
+    "sigma_position", "learn_priors", "num_passes", "estimate_noise",
+)  # fmt: skip
+"""What tests of its own have among the fast ones, too."""
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +148,7 @@ def run(
         )
 
 
+@pytest.mark.slow
 def test_a_tenth_of_the_tracks_takes_no_part():
     dirty = simulate_block(4, 1200, seed=21, noise=0.2, outliers=0.1)
     dirty = replace(dirty, tracks=replace(dirty.tracks, sigma=np.full(len(dirty.tracks), 0.1)))
@@ -192,7 +198,17 @@ def test_every_option_has_a_row():
     assert set(ELSEWHERE.values()) <= set(globals())
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.field}: {row.low} to {row.high}")
+@pytest.mark.parametrize(
+    "row",
+    [
+        pytest.param(
+            row,
+            marks=pytest.mark.slow if row.field in ELSEWHERE_TOO else (),
+            id=f"{row.field}: {row.low} to {row.high}",
+        )
+        for row in ROWS
+    ],
+)
 def test_an_option_changes_the_result_in_its_direction(dirty, row):
     few, many = (
         row.observable(run(dirty, row.dem, **{**row.rest, row.field: value})) for value in (row.low, row.high)

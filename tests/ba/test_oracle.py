@@ -25,6 +25,7 @@ from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
 from tests.ba.oracle import Plain, ecef_of, enu_of, ground_of
 from tests.constants import chosen
+from tests.lanes import diagonal
 
 SIGMAS = {"sigma_attitude": 7.0, "sigma_position": 2.0, "sigma_drift": 3.0}
 EAST, NORTH = 0.3, -0.2  # slopes of the terrain
@@ -359,6 +360,31 @@ def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(
         assert mode.meaning == ("east", "north", "up", "tilt east", "tilt north", "turn", "scale")[largest]
 
 
+def test_a_sample_of_many_points_stands_for_the_scene_and_their_own_noise_averages_over_all(
+    case, monkeypatch
+):
+    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    before, use = case.points - [3.0, 0.0, 1.0] * (np.arange(12) == 7)[:, None], np.ones(12, dtype=bool)
+    whole = gauge_report(covariance, case.points, before, use)
+    monkeypatch.setattr("barpc.ba.gauge._SAMPLE", 12)
+    assert gauge_report(covariance, case.points, before, use).radius != whole.radius  # every second
+    monkeypatch.setattr("barpc.ba.gauge._SAMPLE", 4)
+    some = gauge_report(covariance, case.points, before, use)
+    monkeypatch.undo()
+    sample = np.arange(12) % 4 == 0
+    alone = gauge_report(covariance, case.points, before, sample)
+    assert some.radius == pytest.approx(alone.radius)
+    np.testing.assert_allclose(some.by_unknown, alone.by_unknown)
+    assert np.linalg.norm(some.shift) == pytest.approx(
+        np.linalg.norm(whole.shift), rel=1e-9
+    )  # the mean of all
+    assert np.linalg.norm(alone.shift) == pytest.approx(0.0, abs=1e-9)
+    of_cameras = np.diag(some.by_unknown @ covariance.solve(some.by_unknown.T))
+    own = [report.motion_sigma**2 - of_cameras for report in (some, alone)]
+    still = 2  # heights share errors, whose part is no average
+    np.testing.assert_allclose(own[0][:still], 0.25 * own[1][:still], rtol=0.02)
+
+
 def test_a_joint_prior_of_an_earlier_block_adds_its_information():
     made = simulate_block(4, 60, seed=3)
     options = AdjustOptions(
@@ -574,8 +600,24 @@ def test_weak_tracks_are_held_to_the_altitude_of_the_others(strong, spread, alt,
     assert replace(heights, weak=np.zeros(strong + 2, dtype=bool))._held(points) is None
 
 
-@pytest.mark.parametrize("known", [12, 11])  # the last known point is a GCP, or a reference's
-@pytest.mark.parametrize("fixed", [(), (1,)])
+def test_observations_are_looked_at_again_for_the_datum_only_where_points_are_known(case, monkeypatch):
+    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    report = gauge_report(covariance, case.points, case.points, np.ones(12, dtype=bool))
+    asked: list[Any] = []
+    linearise = Problem.linearise
+    monkeypatch.setattr(Problem, "linearise", lambda *given: asked.append(given) or linearise(*given))
+    given = covariance, report.by_unknown, case.problem, _state(case), case.weight
+    shares = datum_shares(*given, 12, 12)
+    assert not asked
+    assert shares["gcps"].max() == shares["fixed_views"].max() == shares["reference"].max() == 0.0
+    np.testing.assert_allclose(shares["cameras"] + shares["heights"], 1.0)
+    datum_shares(*given, 11, 12)
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("known", "fixed"), diagonal([12, 11], [(), (1,)])
+)  # the last point: a GCP, a reference's
 def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fixed, known):
     case = make_case(1, tuple(f"view_{v:04d}" for v in fixed))
     free = np.append(case.problem.free, np.ones(case.points.size, dtype=bool))

@@ -34,6 +34,7 @@ from barpc.sensor.sicd import open_sicd
 from barpc.sensor.sicd.formation import Aperture, Formation
 from barpc.sensor.timing import Clocked, Timing
 from barpc.simulate.orbit import Look, fly
+from tests.lanes import rest_slow
 from tests.sensor.radar_documents import document
 from tests.sensor.s1_product import Product
 
@@ -165,7 +166,7 @@ def scene_of(kind: str, folder: Path, move: Move, far: float = 0.0, seed: int = 
 MOVED = moved((4.0, -3.0, 2.0), (0.02, -0.03, 0.03)), 3.0
 
 
-@pytest.fixture(scope="module", params=["slc", "PFA", "PLANE"])
+@pytest.fixture(scope="module", params=rest_slow(["slc", "PFA", "PLANE"], keep=1))
 def scene(request, tmp_path_factory) -> Scene:
     return scene_of(request.param, tmp_path_factory.mktemp("radar"), *MOVED)
 

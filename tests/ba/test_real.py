@@ -19,6 +19,7 @@ from barpc.pointio.ground import read_gcps
 from barpc.rpcio import read_rpc
 from barpc.scene import GroundPoints, Tracks, View
 from barpc.sensor.geometry import altitude_range, epipolar_offset, triangulate
+from tests.lanes import rest_slow
 
 TRIPLET = [("img_01", "img_02"), ("img_01", "img_03"), ("img_02", "img_03")]
 
@@ -52,7 +53,7 @@ def triplet(shared_data) -> list[View]:
     return [_view(folder / f"{n}.tif", read_rpc(folder / f"{n}.tif"), size) for n, size in sizes.items()]
 
 
-@pytest.fixture(scope="module", params=["right_image", "right_image_bias"])
+@pytest.fixture(scope="module", params=rest_slow(["right_image", "right_image_bias"]))
 def ventoux(shared_data, request) -> list[View]:
     folder = shared_data / "optical" / "phr_ventoux"
     left = read_rpc(folder / "left_image.geom").crop(5000, 5000)
@@ -79,6 +80,7 @@ def _shift(views, found: Adjustment, checks: Tracks) -> np.ndarray:
     return enu @ np.nanmean(after - before, axis=0)
 
 
+@pytest.mark.slow
 def test_the_triplet_agrees_and_stays_where_it_was(shared_data, triplet):
     names = [view.name for view in triplet]
     tracks = _pairs(shared_data, "phr_triplet_north", TRIPLET, names, "sift")
@@ -96,6 +98,7 @@ def test_the_triplet_agrees_and_stays_where_it_was(shared_data, triplet):
     assert found.gauge.sigma[2] > 10.0  # and it says that it does not know the height
 
 
+@pytest.mark.slow
 def test_without_a_cap_many_points_move_the_scene_by_metres(shared_data, triplet):
     names = [view.name for view in triplet]
     tracks = _pairs(shared_data, "phr_triplet_north", TRIPLET, names, "sift")
@@ -147,6 +150,7 @@ def test_a_gcp_that_was_left_out_lies_nearer_than_before(shared_data):
     assert ecef_from_ground(gcps.lonlatalt).shape == (5, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ventoux", ["right_image"], indirect=True)
 @pytest.mark.parametrize("with_geoid", [True, False])
 def test_a_dem_that_holds_ventoux_moves_it_by_no_more_than_is_stated(shared_data, ventoux, with_geoid):

@@ -49,8 +49,21 @@ def test_reported_residuals_are_those_of_the_corrected_sensors(block, adjusted):
         assert (np.abs(adjusted.residuals[rows] - again) <= atol).all()
 
 
-@pytest.mark.parametrize("model", ["rotation", "rotation+translation", "translation"])
-def test_both_solvers_reach_the_same_minimum(block, model):
+@pytest.fixture(scope="module")
+def small():
+    """Four views, 300 tie points."""
+    return simulate_block(4, 300, seed=11)
+
+
+MODELS = ("rotation", "rotation+translation", "translation")
+
+
+@pytest.mark.parametrize(
+    ("size", "model"),
+    [*(("small", m) for m in MODELS), *(pytest.param("block", m, marks=pytest.mark.slow) for m in MODELS)],
+)
+def test_both_solvers_reach_the_same_minimum(request, size, model):
+    block = request.getfixturevalue(size)
     first, second = (solve(block, **L2, model=model, solver=solver) for solver in ("scipy", "sparse"))
     tight = solve(block, **L2, model=model, solver="sparse", tolerance=1e-14)
     assert first.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
@@ -61,20 +74,31 @@ def test_both_solvers_reach_the_same_minimum(block, model):
 PLACES = [(5.4, 43.3), (5.0, 0.0), (0.0, 51.0), (90.0, 30.0), (180.0, 10.0), (30.0, 84.0)]
 
 
-def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies():
-    for lon, lat in PLACES:
-        there = simulate_block(10, 1500, seed=4, lon=lon, lat=lat)
+@pytest.mark.parametrize(
+    ("views", "tracks", "places"),
+    [(4, 500, PLACES[4:]), pytest.param(10, 1500, PLACES, marks=pytest.mark.slow)],
+)
+def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, places):
+    for lon, lat in places:
+        there = simulate_block(views, tracks, seed=4, lon=lon, lat=lat)
         costs = [
             solve(there, **L2, solver="scipy").cost_history[-1],
             solve(there, **L2, solver="sparse", tolerance=1e-14).cost_history[-1],
         ]
         assert costs[0] == pytest.approx(costs[1], rel=1e-6), (lon, lat)
-        freedom = 2 * len(there.tracks) - 3 * 1500
+        freedom = 2 * len(there.tracks) - 3 * tracks
         assert costs[0] == pytest.approx(freedom, rel=0.1), (lon, lat)
 
 
-@pytest.mark.parametrize("solver", ["scipy", "sparse"])
-def test_plain_least_squares_takes_two_linearisations_from_metres_away(block, solver):
+@pytest.mark.parametrize(
+    ("size", "solver"),
+    [
+        ("small", "scipy"),
+        *(pytest.param("block", solver, marks=pytest.mark.slow) for solver in ("scipy", "sparse")),
+    ],
+)
+def test_plain_least_squares_takes_two_linearisations_from_metres_away(request, size, solver):
+    block = request.getfixturevalue(size)
     found = solve(block, **L2, solver=solver)
     assert (
         found.steps <= {"scipy": 5, "sparse": 4}[solver]
@@ -110,6 +134,7 @@ def test_a_fixed_view_keeps_its_camera_and_the_others_come_to_it(block):
     assert block.held_out_rms(list(found.sensors)) < 0.02
 
 
+@pytest.mark.slow
 def test_drift_is_corrected_as_if_there_were_none():
     ratio, price = [], []
     for seed in (1, 2, 3):
@@ -124,7 +149,20 @@ def test_drift_is_corrected_as_if_there_were_none():
     assert np.mean(price) <= 1.4  # three more unknowns a view cost a quarter, drift or not
 
 
-@pytest.mark.parametrize(("model", "bound"), [("affine", 0.02), ("shift-drift", 0.03), ("shift", 0.04)])
+def test_a_drift_is_followed_where_the_model_has_one():
+    drifting = simulate_block(4, 300, seed=1, drift=20e-6)
+    plain, found = (solve(drifting, drift=drift, jitter="off", learn_priors=False, **L2) for drift in (0, 1))
+    assert drifting.held_out_rms(list(plain.sensors)) > 1.0
+    assert 0.005 < drifting.held_out_rms(list(found.sensors)) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("model", "bound"),
+    [
+        ("affine", 0.02),
+        *(pytest.param(*row, marks=pytest.mark.slow) for row in (("shift-drift", 0.03), ("shift", 0.04))),
+    ],
+)
 def test_image_models_correct_what_they_can(model, bound):
     small = simulate_block(3, 1000, seed=6, size=(4000, 4000))
     found = solve(small, model=model, sigma_shift=30.0)
@@ -132,10 +170,11 @@ def test_image_models_correct_what_they_can(model, bound):
     assert small.held_out_rms([v.sensor for v in small.views]) > 3 * small.held_out_rms(list(found.sensors))
 
 
-def test_three_gcps_bring_the_scene_to_its_place():
+@pytest.mark.parametrize("tracks", [50, pytest.param(600, marks=pytest.mark.slow)])
+def test_three_gcps_bring_the_scene_to_its_place(tracks):
     errors, sigmas = [], []
     for seed in range(6):
-        triplet = simulate_block(3, 600, seed=seed, num_gcps=3)
+        triplet = simulate_block(3, tracks, seed=seed, num_gcps=3)
         gcps = replace(triplet.gcps, sigma=np.full((3, 3), 0.2))
         rng = np.random.default_rng(seed)
         enu = enu_basis(gcps.lonlatalt)
@@ -269,7 +308,10 @@ def test_rows_of_tracks_may_come_in_any_order(block, adjusted):
     np.testing.assert_allclose(found.residuals, adjusted.residuals[order], atol=1e-4)
 
 
-def test_centers_are_regressed_where_none_are_given(block, adjusted):
+@pytest.mark.parametrize("size", ["small", pytest.param("block", marks=pytest.mark.slow)])
+def test_centers_are_regressed_where_none_are_given(request, size):
+    block = request.getfixturevalue(size)
+    adjusted = solve(block)
     found = adjust_tracks(block.views, block.tracks, AdjustOptions(**INDEPENDENT))
     for mine, theirs in zip(found.corrections, block.truth.corrections, strict=True):
         assert isinstance(mine, Correction)

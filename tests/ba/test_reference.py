@@ -13,6 +13,7 @@ from barpc.ba.priors import prior_sigmas
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.scene import GroundPoints, Reference
 from barpc.simulate import simulate_block
+from tests.lanes import rest_slow
 
 BIAS = np.array([0.5, 0.5, 5.0])
 POINT = np.array([0.05, 0.05, 10.0])
@@ -65,7 +66,7 @@ def test_the_scene_comes_to_where_the_reference_says(block):
     assert found.reference_inlier.mean() > 0.97
 
 
-@pytest.mark.parametrize("shift", [(3.0, -2.0), (-0.7, 0.4)])
+@pytest.mark.parametrize("shift", rest_slow([(3.0, -2.0), (-0.7, 0.4)]))
 def test_what_a_reference_is_wrong_by_moves_the_scene_and_is_stated(block, shift):
     free, moved = (adjusted(block, reference_of(block, (*there, 0.0))) for there in ((0.0, 0.0), shift))
     went = move(moved, block) - move(free, block)
@@ -84,6 +85,7 @@ def test_points_that_disagree_are_cut_by_themselves(block):
     assert np.abs(move(found, block)[:2]).max() < 0.15
 
 
+@pytest.mark.slow
 def test_many_points_know_no_more_than_a_few_would():
     """With ten times the points heights and images are known no better, once there are more than are alike."""
     sigmas = []

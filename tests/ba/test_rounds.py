@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, rounds, solution
 from barpc.ba.block import join
+from barpc.ba.priors import CameraPrior
+from barpc.ba.problem import Problem
 from barpc.ba.rounds import _median
 from barpc.ba.solve import State
 from barpc.ba.starting import first_state, make_problem
@@ -80,7 +83,9 @@ def test_rounds_go_on_until_the_noise_stands(clean, monkeypatch) -> None:
     assert first / last == pytest.approx(found.noise, rel=0.05)
 
 
-@pytest.mark.parametrize(("outliers", "looked"), [(0.05, True), (0.008, True), (0.004, False)])
+@pytest.mark.parametrize(
+    ("outliers", "looked"), [pytest.param(0.05, True, marks=pytest.mark.slow), (0.008, True), (0.004, False)]
+)
 def test_tracks_that_were_cut_are_looked_at_again_where_they_are_many(monkeypatch, outliers, looked) -> None:
     again = seen(monkeypatch, rounds, "revived")
     dirty = simulate_block(3, 400, seed=5, outliers=outliers)
@@ -186,6 +191,7 @@ def test_residuals_settle_where_no_move_of_a_point_makes_them_smaller() -> None:
         np.testing.assert_allclose((settled[:, rows] * weight[rows]).ravel(), left, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
     dirty = simulate_block(3, 400, seed=5, outliers=0.1)
     passes = []
@@ -194,3 +200,94 @@ def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
         found = solve(dirty, **CALM, robust_threshold=1.2, estimate_noise=False)
         passes.append(int(found.status.split()[0]))
     assert passes == [6, 2]  # no more than six, and never less than two
+
+
+# --- when they end, by script -------------------------------------------------------------------------------------
+
+
+def passes(
+    monkeypatch, cut: list[int], noise: list[float], prior: list[float], **given: Any
+) -> tuple[int, list[int]]:
+    """Number of passes where so many of 10,000 observations are cut, such noise is seen and such priors are learnt.
+
+    The last of each goes on for ever. Also before which passes tracks were revived.
+    """
+    options = AdjustOptions(**{"estimate_noise": True, **given})
+    again: list[int] = []
+    every = np.ones(10_000, dtype=bool)
+
+    def learnt(n: int) -> CameraPrior:
+        return CameraPrior(np.zeros((1, 2)), np.full((1, 2), prior[min(n, len(prior) - 1)]))
+
+    class Scripted(rounds.Rounds):
+        def __init__(self) -> None:
+            found: Any = SimpleNamespace(covariance=lambda free: SimpleNamespace(is_large=False))
+            self.problem = Problem(None, None, None, learnt(0), None)  # type: ignore[arg-type]
+            self.state: Any = SimpleNamespace(points=None)
+            self.options, self.everything, self.use = options, every, every
+            self.passes, self.noise, self.robust, self.is_known = 0, noise[0], options.loss != "linear", True
+            self.heights: Any = SimpleNamespace(hold=lambda problem, points: problem)
+            self.observations: Any = SimpleNamespace(sigma=np.ones(10_000))
+            self.variances: Any = SimpleNamespace(learnt=lambda *_: (learnt(self.passes), "tested"))
+            self.smooth: Any = SimpleNamespace(test_neighbours=lambda *_: "smooth")
+            self.residual = self.weight = np.zeros(1)
+            self.found = found
+
+        def _cut(self) -> None:
+            if self.robust:
+                self.use = np.arange(10_000) >= cut[min(self.passes - 1, len(cut) - 1)]
+
+        def _solve(self) -> Any:
+            return self.found
+
+        def _estimate_noise(self) -> Any:
+            self.noise = noise[min(self.passes, len(noise) - 1)]
+
+    made = Scripted()
+    monkeypatch.setattr(
+        rounds,
+        "revived",
+        lambda problem, state, residual, *_: again.append(made.passes + 1) or (state, residual),
+    )
+    outcome = made.run()
+    assert outcome.noise == noise[min(outcome.passes, len(noise) - 1)]
+    return outcome.passes, again
+
+
+@pytest.mark.parametrize(
+    ("cut", "noise", "prior", "options", "expected"),
+    [
+        ([0], [1.0], [1.0], {}, 2),  # never less than two
+        ([0], [1.0], [1.0], {"loss": "linear"}, 1),
+        ([0, 10], [1.0], [1.0], {}, 2),  # a thousandth
+        ([0, 11], [1.0], [1.0], {}, 3),
+        ([0, 11, 22, 33, 44, 55, 66, 77], [1.0], [1.0], {}, 6),  # and no more than six
+        ([0], [1.0, 1.0, 1.019], [1.0], {}, 2),
+        ([0], [1.0, 1.0, 1.021], [1.0], {}, 3),
+        ([0], [1.0, 1.0, 0.979], [1.0], {}, 3),
+        ([0], [1.0, 1.0, 2.0], [1.0], {"estimate_noise": False}, 2),
+        ([0], [1.0], [1.0, 1.0, 1.21], {}, 2),  # a fifth, as a logarithm
+        ([0], [1.0], [1.0, 1.0, 1.23], {}, 3),
+        ([0], [1.0], [1.0, 1.0, 0.81], {}, 3),
+        ([0], [1.0, 1.03], [1.0], {"loss": "linear"}, 2),
+        ([0], [1.0], [1.0, 1.3], {"loss": "linear"}, 2),
+    ],
+)
+def test_rounds_end_where_cut_noise_and_priors_stand(
+    monkeypatch, cut, noise, prior, options, expected
+) -> None:
+    assert passes(monkeypatch, cut, noise, prior, **options)[0] == expected
+
+
+@pytest.mark.parametrize(
+    ("cut", "options", "revived"),
+    [
+        ([99], {}, []),
+        ([101], {}, [2]),  # more than a hundredth, and not before the first
+        ([101, 50, 50], {}, [2]),
+        ([50, 101, 150, 150], {}, [3, 4]),
+        ([101], {"loss": "linear"}, []),
+    ],
+)
+def test_tracks_are_revived_where_more_than_a_hundredth_was_cut(monkeypatch, cut, options, revived) -> None:
+    assert passes(monkeypatch, cut, [1.0], [1.0], **options)[1] == revived

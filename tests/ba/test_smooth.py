@@ -205,3 +205,26 @@ def test_what_neighbours_share_is_found_though_it_is_no_smooth_function(axis: in
         given = np.stack([0 * step, faint[1]])
         shared = smooth.test_neighbours(smooth.test(given, use), given, use).shared
         assert (shared[0] > 0.0) == found  # else it may be chance
+
+
+@pytest.mark.parametrize(("most", "once"), [(599, False), (600, True)])
+def test_terms_of_a_block_that_is_not_large_are_worked_out_once(monkeypatch, most: int, once: bool) -> None:
+    monkeypatch.setattr("barpc.ba.smooth._KEPT", most)
+    asked: list[slice] = []
+    terms = Smooth._terms
+    monkeypatch.setattr(Smooth, "_terms", lambda self, rows: asked.append(rows) or terms(self, rows))
+    smooth = made((300, 300))
+    for _ in range(3):
+        smooth.part(noise(smooth, 0.1), np.ones(600))
+    assert asked == [slice(None)] if once else len(asked) >= 6
+
+
+def test_terms_that_observations_hardly_tell_apart_stay_small() -> None:
+    """All of a view in a narrower and narrower stripe of columns: its powers are nearly the same."""
+    smooth = made((400,))
+    for width in np.geomspace(1e-3, 1.0, 60):
+        smooth._kept[SPLINES] = 0.5 + width * smooth._col  # type: ignore[index]
+        for power in (2, 3):
+            smooth._kept[SPLINES + power - 1] = smooth._kept[SPLINES] ** power  # type: ignore[index]
+        found = smooth.part(noise(smooth, 0.1), np.ones(400))
+        assert np.sqrt((found**2).mean()) < 0.03

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from barpc.ba import adjust_tracks
-from barpc.ba.snooping import CRITICAL, ControlTest
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment
+from barpc.ba.snooping import CRITICAL, ControlTest, _together
 from barpc.geodesy import ecef_from_ground, enu_basis, metres_per_unit
 from barpc.options import RunOptions
 from barpc.report import Run, summarize
 from barpc.report.summary import GcpEntry
 from barpc.scene import GroundPoints
 from barpc.sensor.geometry import sight_enu, triangulate
+from barpc.simulate import Block, simulate_block
 from benchmarks.referee import cases, judge, make
+from tests.ba.conftest import INDEPENDENT, centers_of
 from tests.ba.test_referee import hills
 
 SEEDS = (1, 2)
 
 
+@cache
 def scene_of(count: int, seed: int):
     return make(replace(cases()["5 GCPs"], gcps=count, seed=seed), hills)
 
@@ -61,6 +68,7 @@ def test_a_control_point_that_contradicts_is_said_to() -> None:
     assert [tested.status(g) for g in range(3)] == ["used", "contradicts", "rejected"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(
     ("count", "wrong"), [(5, {1: 3.0}), (5, {2: 30.0}), (10, {1: 30.0, 4: 30.0, 7: 30.0}), (3, {0: 30.0})]
@@ -81,6 +89,7 @@ def test_what_is_wrong_is_found_named_and_left_out(count, wrong, seed):
     assert (np.abs(moved) < 4 * found.gauge.sigma).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1, 7))
 def test_points_that_hold_are_all_used(seed):
     scene = scene_of(8, seed)
@@ -91,6 +100,7 @@ def test_points_that_hold_are_all_used(seed):
     assert (tested.redundancy <= 1).all()
 
 
+@pytest.mark.slow
 def test_a_residual_is_the_one_that_leaving_the_point_out_shows():
     scene = scene_of(6, 1)
     gcps = scene.gcps
@@ -109,6 +119,7 @@ def test_a_residual_is_the_one_that_leaving_the_point_out_shows():
         np.testing.assert_allclose(tested.residual[g], offset, atol=0.15)
 
 
+@pytest.mark.slow
 def test_a_wrong_position_in_one_image_costs_the_point_and_not_the_scene():
     scene = scene_of(6, 2)
     gcps = scene.gcps
@@ -119,6 +130,7 @@ def test_a_wrong_position_in_one_image_costs_the_point_and_not_the_scene():
     assert (np.abs(judge(scene, found.sensors).move) < 4 * found.gauge.sigma).all()
 
 
+@pytest.mark.slow
 def test_of_two_points_none_is_taken_out():
     scene = scene_of(2, 1)
     tested = adjust_tracks(scene.views, scene.tracks, None, blundered(scene.gcps, {0: 30.0})).control
@@ -133,6 +145,7 @@ def said(scene, gcps):
     return found.control, summarize(run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 4])
 def test_two_points_that_contradict_each_other_are_never_good(seed):
     scene = scene_of(2, seed)
@@ -150,6 +163,7 @@ def test_two_points_that_contradict_each_other_are_never_good(seed):
     assert not any("Nothing checks" in line for line in summary.verdict)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("times", "good"), [(1.0, True), (3.5, False)])
 def test_errors_that_are_no_ones_alone_show_in_all_together(seed, times, good):
@@ -163,6 +177,7 @@ def test_errors_that_are_no_ones_alone_show_in_all_together(seed, times, good):
     assert any("GCP" in reason for reason in summary.reasons) != good
 
 
+@pytest.mark.slow
 def test_a_point_that_nothing_checks_is_said_to_be():
     scene = scene_of(1, 1)
     tested, summary = said(scene, scene.gcps)
@@ -171,6 +186,7 @@ def test_a_point_that_nothing_checks_is_said_to_be():
     assert any(line == "Nothing checks it: an error in a GCP would not show." for line in summary.verdict)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_points_in_one_image_are_tested_across_its_line_of_sight(seed):
     scene = scene_of(6, seed)
@@ -193,6 +209,7 @@ def test_points_in_one_image_are_tested_across_its_line_of_sight(seed):
     assert not summary.passed
 
 
+@pytest.mark.slow
 def test_the_summary_has_every_point_with_its_residual_in_the_images():
     scene = scene_of(6, 1)
     gcps = blundered(scene.gcps, {1: 30.0}, 1)
@@ -211,3 +228,165 @@ def test_the_summary_has_every_point_with_its_residual_in_the_images():
     assert [int(one.w) for one in shown] == [*range(40, 60)]
     odd = GcpEntry.worst([replace(one, used=one.w != 3) for one in many])
     assert [int(one.w) for one in odd] == [3, *range(41, 60)]
+
+
+# --- a small block --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small() -> Block:
+    """Three views, a hundred tie points, six control points of 0.3 m and 0.1 px."""
+    block = simulate_block(3, 100, seed=5, num_gcps=6, num_checks=0)
+    gcps, rng = block.gcps, np.random.default_rng(1)
+    place = gcps.lonlatalt + rng.normal(0, 0.3, (6, 3)) / metres_per_unit(gcps.lonlatalt)
+    return replace(block, gcps=replace(gcps, lonlatalt=place, sigma=np.full((6, 3), 0.3)))
+
+
+def held(small: Block, gcps: GroundPoints, **options: Any) -> Adjustment:
+    options = {"drift": 0, "jitter": "off", "learn_priors": False, **INDEPENDENT, **options}
+    centers = centers_of(small)
+    return adjust_tracks(
+        small.views, small.tracks, AdjustOptions(**options), gcps, centers=centers, hold_out=False
+    )
+
+
+def some(gcps: GroundPoints, keep: np.ndarray) -> GroundPoints:
+    """Some of the observations."""
+    return replace(gcps, **{name: getattr(gcps, name)[keep] for name in ("point", "view", "xy", "xy_sigma")})
+
+
+def test_points_that_hold_are_used_and_a_blunder_is_left_out(small) -> None:
+    tested = held(small, small.gcps).control
+    assert tested.used.all()
+    assert tested.agrees
+    assert np.nanmax(tested.w) < CRITICAL
+    assert 0.5 < tested.scatter < 1.5
+    assert ((tested.redundancy > 0.3) & (tested.redundancy < 1.0)).all()
+    tested = held(small, blundered(small.gcps, {4: 8.0})).control
+    assert np.flatnonzero(~tested.used).tolist() == [4]
+    assert tested.status(4) == "rejected"
+    assert np.linalg.norm(tested.residual[4]) == pytest.approx(8.0, abs=1.0)
+    assert tested.agrees
+
+
+def test_a_residual_points_from_the_given_place_to_the_one_that_all_others_tell(small) -> None:
+    gcps = small.gcps
+    tested = held(small, gcps).control
+    loose = gcps.sigma.copy()
+    loose[2] = 1e5  # its rays count, its place does not
+    without = held(small, replace(gcps, sigma=loose))
+    offset = without.gcp_residuals[2]
+    np.testing.assert_allclose(tested.residual[2], offset, atol=0.02)
+    sigma = np.sqrt(np.diag(_enu_covariance(without, gcps, len(small.truth.ground) + 2)) + 0.3**2)
+    # at a blunder of any size the w-test is that of the point left out, component by component
+    moved = gcps.lonlatalt.copy()
+    moved[2, 2] += 3.0
+    both = held(small, replace(gcps, lonlatalt=moved))
+    assert both.control.residual[2][2] == pytest.approx(offset[2] - 3.0, abs=0.03)
+    assert both.control.w[2] == pytest.approx(np.max(np.abs(both.control.residual[2]) / sigma), rel=0.3)
+
+
+def _enu_covariance(found: Adjustment, gcps: GroundPoints, point: int) -> np.ndarray:
+    enu = enu_basis(gcps.lonlatalt[2])
+    return enu @ found.covariance.points(np.array([point]))[0] @ enu.T
+
+
+def test_what_nothing_tells_of_is_not_tested(small) -> None:
+    gcps = small.gcps
+    never = held(small, some(gcps, gcps.point != 3)).control  # a point that no image shows
+    assert np.isnan(never.w[3])
+    assert np.isnan(never.residual[3]).all()
+    assert never.redundancy[3] == 0.0
+    assert np.isfinite(np.delete(never.w, 3)).all()
+    first = np.flatnonzero(gcps.point == 3)[0]
+    once = held(small, some(gcps, (gcps.point != 3) | (np.arange(len(gcps.point)) == first))).control
+    ray = sight_enu(small.views[gcps.view[first]].sensor, gcps.lonlatalt[3])
+    assert abs(once.residual[3] @ ray) < 0.02  # along its ray nothing is told
+    assert 0.1 < once.redundancy[3] < 2 / 3
+
+
+def test_a_point_alone_is_not_checked_and_two_that_differ_contradict(small) -> None:
+    gcps = small.gcps
+    one, two = (
+        replace(
+            some(gcps, gcps.point < n),
+            names=gcps.names[:n],
+            lonlatalt=gcps.lonlatalt[:n],
+            sigma=gcps.sigma[:n],
+        )
+        for n in (1, 2)
+    )
+    alone = held(small, one).control
+    assert alone.used.all()
+    assert not alone.checked
+    both = held(small, blundered(two, {0: 12.0})).control
+    assert both.used.all()
+    assert [both.status(g) for g in (0, 1)] == ["contradicts"] * 2
+    assert not both.agrees
+
+
+@pytest.mark.parametrize("wrong", [0, 7])
+def test_an_observation_of_a_control_point_that_is_off_has_the_largest_w_in_the_order_given(
+    small, wrong
+) -> None:
+    gcps = small.gcps
+    gcps = some(gcps, np.random.default_rng(3).permutation(len(gcps.view)))
+    xy = gcps.xy.copy()
+    xy[wrong, 0] += 0.8
+    found = held(small, replace(gcps, xy=xy))
+    assert found.gcp_w.shape == found.gcp_inlier.shape == (len(gcps.view),)
+    assert found.gcp_inlier.all()
+    assert np.argmax(found.gcp_w) == wrong
+    assert 4.0 < found.gcp_w[wrong] < 12.0  # 8 sigmas, of which its point takes some
+    assert found.reference_w.shape == found.reference_inlier.shape == (0,)
+
+
+@pytest.mark.parametrize(("share", "fits"), [(0.97, True), (1.03, False)])
+def test_all_together_they_may_scatter_as_chance_lets_them_once_in_a_thousand(share, fits) -> None:
+    redundancy, used = np.array([0.5, 0.25, 0.9, 0.0]), np.array([True, True, False, True])
+    freedom = 3 * 0.75
+    whitened = np.full((4, 3), 9.0)  # of what is not used, and of what nothing tells, nothing counts
+    whitened[:2] = np.sqrt(share * stats.chi2.isf(1e-3, freedom) / 6)
+    scatter, may_be = _together(whitened, redundancy, used)
+    assert scatter == pytest.approx(np.sqrt(share * stats.chi2.isf(1e-3, freedom) / freedom))
+    assert may_be == fits
+
+
+@pytest.mark.parametrize(("redundancy", "told"), [(0.32, False), (0.35, True)])
+def test_of_less_than_one_degree_of_freedom_nothing_is_told(redundancy, told) -> None:
+    scatter, fits = _together(np.full((1, 3), 99.0), np.array([redundancy]), np.ones(1, dtype=bool))
+    assert np.isfinite(scatter) == told
+    assert fits != told
+
+
+@pytest.mark.parametrize(("redundancy", "checked"), [([0.09, 0.9], False), ([0.11, 0.0], True)])
+def test_a_point_is_checked_by_a_tenth_of_redundancy(redundancy, checked) -> None:
+    used = np.array([True, False])
+    tested = ControlTest(used, np.zeros((2, 3)), np.zeros(2), np.array(redundancy))
+    assert tested.checked == checked
+
+
+@pytest.mark.parametrize(("count", "tested"), [(0, 0), (1000, 1000), (1001, 501), (2001, 667)])
+def test_of_a_reference_of_many_points_every_nth_is_tested_in_the_images(
+    monkeypatch, count: int, tested: int
+) -> None:
+    """And all control points that are held and were kept; no tie points."""
+    point = np.concatenate([np.arange(10), np.arange(10, 14), 14 + np.arange(count)])
+    inlier = np.ones(len(point), dtype=bool)
+    inlier[10] = False
+    held = SimpleNamespace(index=np.concatenate([[3], np.arange(10, 13), 14 + np.arange(count)]))
+    outcome = SimpleNamespace(
+        problem=SimpleNamespace(point_prior=held), inlier=inlier, residual=None, weight=None
+    )
+    block: Any = SimpleNamespace(point=point, num_tracks=10, num_known=14)
+    asked: list[np.ndarray] = []
+    monkeypatch.setattr(
+        adjustment, "image_test", lambda *given: asked.append(given[-1]) or np.ones(len(given[-1]))
+    )
+    found: Any = SimpleNamespace(outcome=outcome, final=None)
+    w = adjustment._control_w(found, block, None)  # type: ignore[arg-type]
+    assert np.flatnonzero(np.isfinite(w)).tolist() == asked[0].tolist()
+    assert asked[0][:2].tolist() == [11, 12]  # 13 is not held: it was found wrong
+    assert len(asked[0]) == 2 + tested
+    outcome.problem.point_prior = None
+    assert np.isnan(adjustment._control_w(found, block, None)).all()  # type: ignore[arg-type]

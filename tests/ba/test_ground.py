@@ -1,0 +1,255 @@
+"""What is known of points: heights of a terrain and of a reference, and what is said of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyproj
+import pytest
+
+from barpc.ba.gauge import MOTIONS, _motion_of_points
+from barpc.ba.ground import DEM_BIAS, Heights, _join, _slopes, flat_heights, ground_control, terrain_heights
+from barpc.ba.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, _stated, prior_sigmas
+from barpc.errors import BarpcWarning
+from barpc.geodesy import ecef_from_ground
+from barpc.options import AdjustOptions
+from barpc.scene import GroundPoints, Reference
+from barpc.sensor.pushbroom import Pushbroom
+
+LON, LAT = 5.0, 43.0
+GEOD = pyproj.Geod(ellps="WGS84")
+
+
+def placed(east: Any, north: Any, alt: Any) -> np.ndarray:
+    """Points so many metres east and north of a place, ECEF (n, 3) [m]; for distances of a few km."""
+    east, north, alt = np.broadcast_arrays(
+        *(np.atleast_1d(np.asarray(x, dtype=float)) for x in (east, north, alt))
+    )
+    n = len(east)
+    lon, lat, _ = GEOD.fwd(
+        np.full(n, LON), np.full(n, LAT), np.degrees(np.arctan2(east, north)), np.hypot(east, north)
+    )
+    return ecef_from_ground(np.column_stack([lon, lat, alt]))
+
+
+def hill(lon: Any, lat: Any) -> np.ndarray:
+    """Rises by 0.2 m a metre to the east, 0.1 m a metre to the south; unknown west of 2 km."""
+    azimuth, _, distance = GEOD.inv(np.full(len(lon), LON), np.full(len(lat), LAT), lon, lat)
+    east, north = distance * np.sin(np.radians(azimuth)), distance * np.cos(np.radians(azimuth))
+    return np.where(east > -2000.0, 300.0 + 0.2 * east - 0.1 * north, np.nan)
+
+
+def heights(n: int = 6, **given: Any) -> Heights:
+    """Of n tracks the last two are weak."""
+    weak = np.arange(n) >= n - 2
+    options = AdjustOptions(**given.pop("options", {}))
+    return Heights(
+        (), weak, np.arange(n), (0.0, 500.0), options, given.pop("dem", hill), given.pop("reference", None)
+    )
+
+
+def test_a_terrain_is_met_along_its_normal() -> None:
+    points = placed([0.0, 500.0, -300.0], [0.0, 800.0, 100.0], 350.0)
+    prior = terrain_heights(points, np.arange(3), hill, 2.0, 0.0)
+    rows = prior.apart(points)
+    expected = (350.0 - hill(*_ground(points)[:, :2].T)) / 2.0
+    np.testing.assert_allclose(rows[:, 0], expected, rtol=1e-6)
+    assert not rows[:, 1:].any()
+    east = placed(np.array([0.0, 500.0, -300.0]) + 10.0, [0.0, 800.0, 100.0], 350.0)
+    south = placed([0.0, 500.0, -300.0], np.array([0.0, 800.0, 100.0]) - 10.0, 350.0)
+    np.testing.assert_allclose((prior.apart(east) - rows)[:, 0], -1.0, atol=2e-3)  # 10 m of 0.2, over two
+    np.testing.assert_allclose((prior.apart(south) - rows)[:, 0], -0.5, atol=2e-3)
+
+
+def _ground(points: np.ndarray) -> np.ndarray:
+    to_ground = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    return np.stack(to_ground.transform(*points.T), axis=-1)
+
+
+def test_slopes_are_taken_over_thirty_metres() -> None:
+    asked: list[np.ndarray] = []
+
+    def level(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        asked.append(np.column_stack([lon, lat]))
+        return np.zeros(len(lon))
+
+    terrain_heights(placed(0.0, 0.0, 0.0), np.array([0]), level, 1.0, 0.0)
+    middle, *around = np.concatenate(asked)
+    azimuth, _, distance = GEOD.inv(*np.tile(middle, (4, 1)).T, *np.array(around).T)
+    np.testing.assert_allclose(distance, 15.0, rtol=1e-5)
+    np.testing.assert_allclose(azimuth % 360.0, [90.0, 270.0, 0.0, 180.0], atol=1e-3)
+
+
+def test_where_the_slope_is_unknown_the_height_holds_alone_and_where_the_height_is_unknown_nothing() -> None:
+    points = placed([-1990.0, -2100.0, 0.0], 0.0, 350.0)
+    prior = terrain_heights(points, np.array([0, 1, 2]), hill, 1.0, 5.0)
+    assert prior.index.tolist() == [0, 2]
+    up = prior.rows[0, 0] @ (placed(-1990.0, 0.0, 351.0) - placed(-1990.0, 0.0, 350.0))[0]
+    east = prior.rows[0, 0] @ (placed(-1980.0, 0.0, 350.0) - placed(-1990.0, 0.0, 350.0))[0]
+    assert up == pytest.approx(1.0, rel=1e-6)
+    assert abs(east) < 0.02
+    nowhere = terrain_heights(points[1:2], np.array([0]), hill, 1.0, 5.0)
+    assert nowhere.common.shape == (0, 3, 3)
+    assert _join([nowhere, None]) is None
+
+
+def test_what_heights_share_is_a_level_and_slopes_that_are_as_large_at_the_edges() -> None:
+    points = placed([-1000.0, 0.0, 3000.0], [500.0, -1500.0, 1000.0], 300.0)
+    prior = flat_heights(points, np.arange(3), 300.0, 2.0, 6.0)
+    np.testing.assert_allclose(prior.common[:, 0, 0], 3.0)
+    east, north = np.array([-1000.0, 0.0, 3000.0]), np.array([500.0, -1500.0, 1000.0])
+    for column, offset in ((1, east), (2, north)):
+        away = offset - offset.mean()
+        np.testing.assert_allclose(prior.common[:, 0, column], 3.0 * away / np.abs(away).max(), atol=3e-3)
+    assert not prior.common[:, 1:].any()
+    # by the edges of others
+    np.testing.assert_allclose(_slopes(points[:1], points), prior.common[:1, 0, 1:] / 3.0, atol=1e-9)
+    lone = _slopes(points[:1], points[:1])
+    np.testing.assert_allclose(lone, 0.0, atol=1e-6)  # one point has no slope
+
+
+def test_blocks_with_and_without_errors_in_common_are_joined() -> None:
+    points = placed([0.0, 100.0, 200.0], 0.0, 300.0)
+    gcps = GroundPoints(
+        ("a",), _ground(points[:1]), [[0.1, 0.2, 0.4]], [0], [0], np.zeros((1, 2)), np.ones(1)
+    )  # fmt: skip
+    control, flat = (
+        ground_control(gcps, np.array([0])),
+        flat_heights(points, np.array([1, 2]), 300.0, 2.0, 6.0),
+    )
+    joined = _join([control, None, flat])
+    assert joined is not None
+    assert joined.index.tolist() == [0, 1, 2]
+    assert joined.common.shape == (3, 3, 3)
+    assert not joined.common[0].any()
+    np.testing.assert_array_equal(joined.common[1:], flat.common)
+    moved = points + placed(0.0, 0.0, 301.0) - placed(0.0, 0.0, 300.0)
+    np.testing.assert_allclose(control.apart(moved)[0], [0.0, 0.0, 2.5], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "index", "bias"),
+    [
+        ({}, [4, 5], DEM_BIAS),
+        ({"dem_bias_sigma": 3.0}, [4, 5], 3.0),
+        ({"dem_for_all": True}, [0, 1, 2, 3, 4, 5], DEM_BIAS),
+    ],
+)
+def test_a_terrain_holds_weak_tracks_or_all(options: dict[str, Any], index: list[int], bias: float) -> None:
+    points = placed(np.linspace(0, 2000, 6), np.linspace(0, 1000, 6), 350.0)
+    held = heights(options={"dem_sigma": 4.0, **options})._held(points)
+    assert held is not None
+    assert held.index.tolist() == index
+    np.testing.assert_allclose(1.0 / (held.rows[:, 0] @ _up(points[0])), 4.0, rtol=1e-3)
+    np.testing.assert_allclose(held.common[:, 0, 0], bias / 4.0)
+
+
+def _up(point: np.ndarray) -> np.ndarray:
+    lon, lat = np.radians(_ground(point[None])[0, :2])
+    return np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+
+
+@pytest.mark.parametrize(("n", "factor"), [(10, 1.0), (100, 2.0)])
+def test_tracks_beside_a_reference_share_its_terrain(n: int, factor: float) -> None:
+    """All are held, as well as 25 alone would be, and by the reference's own bias and edges."""
+    points = placed(np.linspace(-1500, 1500, n), np.linspace(-800, 800, n), 350.0)
+    span = placed([-4000.0, 4000.0], [-2000.0, 2000.0], 300.0)
+    gcps = GroundPoints(
+        ("a", "b"), _ground(span), np.ones((2, 3)), [0, 1], [0, 0], np.zeros((2, 2)), np.ones(2)
+    )
+    reference = Reference(gcps, np.array([1.0, 1.0, 8.0]), np.zeros((1, 2)))
+    made = heights(n, reference=reference, options={"dem_sigma": 4.0, "dem_bias_sigma": 99.0})
+    made = replace(made, control=(ground_control(gcps, np.arange(2)),) * 2)
+    held = made._held(points)
+    assert held is not None
+    assert len(held.index) == n
+    np.testing.assert_allclose(1.0 / (held.rows[:, 0] @ _up(points[0])), 4.0 * factor, rtol=1e-3)
+    np.testing.assert_allclose(held.common[:, 0, 0], 2.0 / factor)
+    assert held.common[-1, 0, 1] == pytest.approx(2.0 / factor * 1500 / 4000, rel=0.01)
+
+
+@pytest.mark.parametrize(("whole", "count"), [(False, 1), (True, 4)])
+def test_how_tie_points_lie_to_a_terrain_is_a_median_and_its_deviation(whole: bool, count: int) -> None:
+    east = np.array([0.0, 100.0, 200.0, 300.0, -2500.0, 500.0])
+    above = np.array([3.0, 7.0, 4.0, 900.0, 7.0, 9.0])
+    points = placed(east, 0.0, np.nan_to_num(300.0 + 0.2 * east) + above)
+    made = replace(heights(dem=hill, options={"dem_for_all": whole}), weak=np.arange(6) >= 3)
+    seen = np.array([1, 1, 1, 1, 1, 0], dtype=bool)
+    found = made.test(points, seen)
+    assert found is not None
+    assert (found.held, found.known, found.total, found.bias) == (count, 4, 5, 20.0)
+    assert found.offset == pytest.approx(5.5, abs=1e-3)  # of 3, 4, 7 and 900
+    assert found.spread == pytest.approx(1.4826 * 2.0, abs=2e-3)  # of 2.5, 1.5, 1.5, 894.5
+    none = made.test(placed(-2500.0, 0.0, np.full(6, 300.0)), seen)
+    assert none is not None
+    assert (none.held, none.known) == (0, 0)
+    assert np.isnan([none.offset, none.spread]).all()
+    assert replace(made, dem=None).test(points, seen) is None
+
+
+def test_tracks_that_are_held_in_height_without_a_terrain_are_counted(recwarn) -> None:
+    with pytest.warns(BarpcWarning, match=r"^2 of 6 tracks are seen under less than 3 deg: without a DEM"):
+        heights(dem=None, options={"min_convergence": 3.0}).warn()
+    heights().warn()  # with a DEM
+    replace(heights(dem=None), weak=np.zeros(6, dtype=bool)).warn()
+    assert not recwarn.list
+
+
+# --- what cameras state -------------------------------------------------------------------------------------------
+
+
+def flown(*accuracy: float) -> Any:
+    """A view of a camera of which so much is stated."""
+    sensor: Any = object.__new__(Pushbroom)
+    object.__setattr__(sensor, "accuracy", accuracy or None)
+    return SimpleNamespace(sensor=sensor)
+
+
+def test_a_camera_is_as_accurate_as_it_states_for_attitude_and_position() -> None:
+    assert _stated(flown(3.0, 0.5)) == (3.0, 0.5)
+    assert _stated(flown(0.01, 0.02)) == (USABLE_ACCURACY, USABLE_ACCURACY)
+    assert _stated(flown()) == (DEFAULT_ACCURACY, DEFAULT_ACCURACY)
+    views: Any = (flown(3.0, 0.5), flown(0.3, 9.0))
+    sigma = prior_sigmas(views, AdjustOptions(), 2)
+    np.testing.assert_array_equal(sigma[0], np.repeat([3.0, 0.5, 0.2, 0.2], 3))
+    np.testing.assert_array_equal(sigma[1], np.repeat([0.3, 9.0, 0.2, 0.2], 3))
+    # one that is known to be off by more than that is not held to it, in either
+    off = prior_sigmas(views, AdjustOptions(), 0, np.array([1.0, np.nan]))
+    np.testing.assert_array_equal(off, [np.repeat([3.0, 1.0], 3), np.repeat([0.3, 9.0], 3)])
+    given = prior_sigmas(views, AdjustOptions(sigma_position=2.0, sigma_drift=0.7), 1, None, 4)
+    np.testing.assert_array_equal(given[:, 3:], [[2.0] * 3 + [0.7] * 3 + [0.3] * 4] * 2)
+
+
+# --- motions of a scene ---------------------------------------------------------------------------------------------
+
+
+def test_motions_of_points_are_those_of_least_squares() -> None:
+    """Of a scene that was moved, tilted, turned and grown by known amounts."""
+    local = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    east, north = local.T
+    amount = np.arange(1.0, 8.0)
+    moves = np.stack(
+        [
+            amount[0] - amount[5] * north + amount[6] * east,
+            amount[1] + amount[5] * east + amount[6] * north,
+            amount[2] + amount[3] * east + amount[4] * north,
+        ],
+        axis=1,
+    )
+    found = np.einsum("mnx,nx->m", _motion_of_points(np.column_stack([local, np.zeros(20)])), moves)
+    np.testing.assert_allclose(found, amount, rtol=1e-6)
+    assert MOTIONS == ("east", "north", "up", "tilt east", "tilt north", "turn", "scale")
+
+
+def test_heights_without_a_terrain_may_be_wrong_together_by_a_quarter_of_their_spread() -> None:
+    points = placed(np.linspace(0, 2000, 6), 0.0, 350.0)
+    held = heights(dem=None)._held(points)
+    assert held is not None
+    np.testing.assert_allclose(held.common[:, 0, 0], 0.25)
+    views: Any = (flown(),)
+    np.testing.assert_array_equal(
+        prior_sigmas(views, AdjustOptions(model="affine"), 0), np.full((1, 6), 20.0)
+    )
