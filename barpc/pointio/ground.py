@@ -106,21 +106,22 @@ def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
             name = cells.pop("id", "")
             if delimiter == ";":  # where numbers have decimal commas
                 cells = {key: cell.replace(",", ".") for key, cell in cells.items()}
-            point = _csv_point(name, {key: float(cell) for key, cell in cells.items() if cell})
+            numbers = {key: float(cell) for key, cell in cells.items() if cell}
+            view = views.find(image) if "image" in columns else 0
+            point = _csv_point(name, -1 if view is None else view, numbers)
         except (ValueError, KeyError, IndexError, csv.Error) as error:
             raise InputError(f"{path}, line {number}: expected {', '.join(columns)} ({error})") from error
-        view = views.find(image) if "image" in columns else 0
         if view is not None:
-            yield replace(point, view=view)
+            yield point
 
 
-def _csv_point(name: str, of: Mapping[str, float]) -> _Point:
+def _csv_point(name: str, view: int, of: Mapping[str, float]) -> _Point:
     """The point of a line: its numbers by the names of `_COLUMNS` and `_SIGMAS`."""
     every = of.get("sigma", GROUND_SIGMA)
     level = of.get("sigma_xy", every)
     sigma = (of.get("sigma_x", level), of.get("sigma_y", level), of.get("sigma_z", every))
     pixels = [of[key] for key in ("sigma_px", "sigma_col", "sigma_row") if key in of] or [IMAGE_SIGMA]
-    return _Point(name, (of["lon"], of["lat"], of["alt"]), sigma, -1, (of["col"], of["row"]), max(pixels))
+    return _Point(name, (of["lon"], of["lat"], of["alt"]), sigma, view, (of["col"], of["row"]), max(pixels))
 
 
 def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str, int]:

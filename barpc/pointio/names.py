@@ -141,6 +141,7 @@ class ViewNames:
             del self._index[key]
         self._exact = {name: i for i, name in enumerate(names)}
         self._index.update(self._exact)
+        self._known: dict[str, int | None] = {}  # what names meant: a table repeats them in every line
 
     def exact(self, name: str) -> int | None:
         """Index of the view that has this very name."""
@@ -148,13 +149,20 @@ class ViewNames:
 
     def find(self, name: str) -> int | None:
         """Index of the view that `name` means; None where it means none, which `strangers` counts."""
+        if name not in self._known:
+            self._known[name] = self._meant(name)
+        found = self._known[name]
+        if found is None:
+            self.strangers[name] = self.strangers.get(name, 0) + 1
+        return found
+
+    def _meant(self, name: str) -> int | None:
         bare = name.strip()
         for text in dict.fromkeys((name, bare, bare.strip('"'))):
             path = PurePath(text)
             for key in (text, path.name, path.stem):
                 if key in self._index:
                     return self._index[key]
-        self.strangers[name] = self.strangers.get(name, 0) + 1
         return None
 
     def index(self, name: str) -> int:
