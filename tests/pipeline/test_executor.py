@@ -396,3 +396,27 @@ def test_a_kept_result_that_cannot_be_read_is_made_again(tmp_path, monkeypatch, 
         monkeypatch.setattr(Workspace, "load", lambda *given: {"no": np.zeros(1)})
         assert float(caching.submit(square, 3).result()["square"]) == 9.0
     assert "a kept result is made again" in caplog.text
+
+
+@dataclass(frozen=True)
+class Named:
+    path: str
+    other: object = None
+    made: object = field(default="a.tif", init=False)
+
+
+def test_a_task_relies_on_the_inputs_that_its_arguments_name(tmp_path) -> None:
+    a, b = (Input(name, 1, name, None) for name in ("a.tif", "b.tif"))
+    with Workspace(tmp_path / "run") as workspace:
+        caching = CachingExecutor(workspace, {"a.tif": a, "b.tif": b})
+        assert caching.guards(("a.tif", 1, None, np.arange(3.0))) == (a,)
+        assert caching.guards(([Named("b.tif")], ("x.tif", "a.tif"), Named("a.tif", "b.tif"))) == (b, a)
+        assert caching.guards((Named("x.tif"), {"a.tif": 1}, "a.tif.bak")) == ()
+
+
+def test_of_a_function_whose_time_is_not_known_one_task_goes_ahead(tmp_path) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        for n in range(40):
+            caching.submit(square, n)
+        assert [len(args[1]) for _, args in pool.batches] == [1] * len(pool.batches)
