@@ -390,3 +390,20 @@ def test_of_a_reference_of_many_points_every_nth_is_tested_in_the_images(
     assert len(asked[0]) == 2 + tested
     outcome.problem.point_prior = None
     assert np.isnan(adjustment._control_w(found, block, None)).all()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("used", "w", "fits", "agrees"),
+    [
+        ([1, 1, 1], [0.5, 1.0, 2.0], True, True),
+        ([1, 1, 1], [0.5, 1.0, 2.0], False, False),  # together they scatter by more than stated
+        ([1, 1, 1], [0.5, 1.0, 9.0], True, False),
+        ([1, 1, 0], [0.5, 1.0, 9.0], False, False),
+    ],
+)
+def test_control_agrees_where_no_point_and_not_all_together_contradict(used, w, fits, agrees) -> None:
+    n = len(used)
+    tested = ControlTest(
+        np.array(used, dtype=bool), np.zeros((n, 3)), np.array(w), np.ones(n), scatter=1.0, fits=fits
+    )
+    assert tested.agrees is agrees
