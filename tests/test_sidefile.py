@@ -33,7 +33,7 @@ from barpc.sidefile import (
     read_text,
 )
 from tests.fuzz.samples import SAMPLES
-from tests.lanes import diagonal
+from tests.lanes import diagonal, rest_slow
 
 SMALL = Kind("a list of names", 100)
 READERS: dict[str, Callable[[Path], object]] = {
@@ -187,7 +187,7 @@ def test_twenty_thousand_blank_lines_are_nothing():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fill", ["\n", " ", "(", "7", "<", "<a>", "a"])
+@pytest.mark.parametrize("fill", rest_slow(["<", "\n", " ", "(", "7", "<a>", "a"], mark=pytest.mark.nightly))
 def test_the_largest_rpc_file_that_is_read_ends_in_sensible_time(fill):
     data = (fill * (32 << 20))[: 32 << 20].encode()
     assert cpu(lambda: parse(b"x" + data[1:], "x")) < 20

@@ -95,7 +95,11 @@ def wide(tmp_path_factory) -> list[Path]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "jobs"),
-    [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 2)],
+    [
+        (signal.SIGINT, 1),
+        (signal.SIGTERM, 2),
+        pytest.param(signal.SIGINT, 2, marks=pytest.mark.nightly),
+    ],
 )
 def test_an_interrupted_run_leaves_its_work_and_says_how_to_go_on(wide, tmp_path, number, jobs):
     command = ("adjust", *wide, "-o", tmp_path / "out", "-j", jobs)

@@ -65,7 +65,7 @@ print(json.dumps(told | {"mb": peak, "cpu": usage.ru_utime + usage.ru_stime}))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="open files are counted in /proc")
 def test_images_without_number_are_read_with_few_open_files(tmp_path):
     source = crop(SAMPLES[0], tmp_path / "source.tif", side=128)

@@ -158,9 +158,8 @@ def test_stopped_between_two_outputs_the_same_command_finishes(
 
 
 @posix
-@pytest.mark.parametrize(
-    "step", [pytest.param(5, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("step", [5, 1])
 def test_killed_between_any_two_outputs_the_same_command_finishes(step):
     """adjust in all formats, with copies, over a finished run; match, apply: the same bytes."""
     command = [sys.executable, "-m", "tests.reliability.trials", "--every-output", str(step)]

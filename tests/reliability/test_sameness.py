@@ -100,7 +100,7 @@ def require_same(scene: Path, tmp_path: Path, way: str, orders: list[tuple[Path,
     assert all(other == files[0] for other in files[1:])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ten_images_in_ten_orders_give_the_same_bytes(tmp_path):
     images = write_scene(tmp_path / "scene", ImageOptions(views=10, size=(256, 256), seed=3))
     adjust(images, tmp_path / "sorted")

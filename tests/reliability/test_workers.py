@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.lanes import rest_slow
+
 from .conftest import barpc
 from .trials import SAMPLES, crop, outputs
 
@@ -47,7 +49,7 @@ def test_a_rerun_gives_the_same_bytes(scene, alone):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("jobs", [2, 4])
+@pytest.mark.parametrize("jobs", rest_slow([2, 4], mark=pytest.mark.nightly))
 def test_any_number_of_workers_gives_the_same_bytes(scene, alone, jobs):
     assert barpc(*command(scene, f"workers_{jobs}", "-j", jobs)).code == 0
     assert outputs(scene / f"workers_{jobs}") == alone

@@ -313,7 +313,7 @@ def chain(tmp_path_factory):
     return years, sorted(folder.glob("*.tif"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_chain_of_seasons_is_found_where_overlap_and_angle_miss_it(chain, tmp_path) -> None:
     years, images = chain
     options = RunOptions(tie=TieOptions(neighbours=1))
