@@ -228,3 +228,13 @@ def test_a_warning_is_only_given_where_it_is_due(tmp_path):
         warnings.simplefilter("error")
         dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
     assert np.isfinite(ecef_from_ground([5.0, 44.0, float(dem(5.0, 44.0))])).all()
+
+
+def test_points_that_spread_over_too_many_cells_are_refused_at_once(tmp_path, monkeypatch):
+    dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
+    lon, lat = 5 + STEP * np.array([0.0, 2.5]), 44 - STEP * np.array([0.0, 3.5])  # nodes 0 .. 3 by 0 .. 4
+    monkeypatch.setattr("barpc.dem._MAX_CELLS", 20)
+    assert np.isfinite(dem(lon, lat)).all()
+    monkeypatch.setattr("barpc.dem._MAX_CELLS", 19)
+    with pytest.raises(InputError, match="spread over 20 cells"):
+        dem(lon, lat)

@@ -11,7 +11,16 @@ import pyproj
 import pytest
 
 from barpc.ba.gauge import MOTIONS, _motion_of_points
-from barpc.ba.ground import DEM_BIAS, Heights, _join, _slopes, flat_heights, ground_control, terrain_heights
+from barpc.ba.ground import (
+    DEM_BIAS,
+    Heights,
+    _join,
+    _slopes,
+    flat_heights,
+    ground_control,
+    reference_control,
+    terrain_heights,
+)
 from barpc.ba.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, _stated, prior_sigmas
 from barpc.errors import BarpcWarning
 from barpc.geodesy import ecef_from_ground
@@ -253,3 +262,17 @@ def test_heights_without_a_terrain_may_be_wrong_together_by_a_quarter_of_their_s
     np.testing.assert_array_equal(
         prior_sigmas(views, AdjustOptions(model="affine"), 0), np.full((1, 6), 20.0)
     )
+
+
+def test_each_axis_of_a_reference_shares_its_own_error_over_its_own_sigma() -> None:
+    lonlatalt = np.column_stack([5.0 + 1e-3 * np.arange(4), np.full(4, 43.0), np.full(4, 100.0)])
+    sigma = np.tile([0.5, 2.0, 4.0], (4, 1))
+    none = np.zeros(0, dtype=np.int64)
+    points = GroundPoints(tuple("abcd"), lonlatalt, sigma, none, none, np.zeros((0, 2)), np.zeros(0))
+    held = reference_control(Reference(points, np.array([3.0, 5.0, 8.0]), np.zeros((1, 2))), np.arange(4))
+    np.testing.assert_allclose(held.common[:, 0, 3], 3.0 / 0.5)
+    np.testing.assert_allclose(held.common[:, 1, 4], 5.0 / 2.0)
+    np.testing.assert_allclose(held.common[:, 2, 0], 8.0 / 4.0)
+    np.testing.assert_allclose(held.common[:, 2, 5], 1.0)
+    assert not held.common[:, 0, 4].any()
+    assert not held.common[:, 1, 3].any()
