@@ -486,7 +486,7 @@ with Workspace(sys.argv[1], overwrite=sys.argv[4] == "overwrite", names=["a", "b
     [
         ("overwrite", [3]),
         pytest.param("fresh", range(1, 6), marks=pytest.mark.slow),
-        pytest.param("overwrite", range(1, 6), marks=pytest.mark.slow),
+        pytest.param("overwrite", range(1, 6), marks=pytest.mark.nightly),
     ],
 )
 def test_killed_at_any_rename_the_same_command_finishes(tmp_path, mode, numbers):

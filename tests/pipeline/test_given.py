@@ -136,7 +136,7 @@ def match(a, b, prediction):
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_matcher_by_name_works_in_worker_processes_with_the_same_bytes(tmp_path) -> None:
     (tmp_path / "mine.py").write_text(MODULE)
     written = []
