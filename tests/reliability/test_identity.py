@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc import adjust, identity
+from barpc import adjust
 from barpc.errors import InputError
 from barpc.options import RunOptions
 from barpc.rpcio import write_rpc_vrt
@@ -128,75 +128,3 @@ def test_what_does_not_change_a_file_does_not_end_a_run(images, tmp_path) -> Non
 
     adjust(images, tmp_path / "out", AGAIN, progress=progress)
     assert (tmp_path / "out" / "summary.json").is_file()
-
-
-MATCHER = """
-from users_helper import keep
-import numpy as np
-
-def match(a, b, prediction):
-    x = np.stack(np.meshgrid(np.arange(10, 150, 12.0), np.arange(10, 150, 12.0)), axis=-1).reshape(-1, 2)
-    return keep(np.stack([x, x], axis=1))
-
-match.files = ["weights.bin"]
-"""
-
-
-def test_all_that_a_matcher_of_ones_own_is_made_of_counts(tmp_path, monkeypatch) -> None:
-    from barpc.tie.hook import hook_files
-
-    (tmp_path / "users_own.py").write_text(MATCHER)
-    (tmp_path / "users_helper.py").write_text("def keep(places):\n    return places\n")
-    (tmp_path / "weights.bin").write_bytes(b"1")
-    monkeypatch.syspath_prepend(tmp_path)
-    found = hook_files("users_own:match")
-    assert [path.name for path in found] == ["users_own.py", "users_helper.py", "weights.bin"]
-    assert hook_files("guided") == []
-    (tmp_path / "weights.bin").unlink()
-    with pytest.raises(InputError, match=r"declares .*weights\.bin, which is no file"):
-        hook_files("users_own:match")
-
-
-# --- the value itself -------------------------------------------------------------------------------------
-
-
-def test_a_file_whose_number_changes_and_whose_bytes_do_not_is_the_same(tmp_path) -> None:
-    """Some file systems number files anew; times that changed mean that somebody was at it."""
-    path = tmp_path / "a"
-    path.write_bytes(b"x" * 1000)
-    found = identity.take(path)
-    found.ask()
-    assert found.stamp is not None
-    renumbered = identity.Input(
-        found.path, found.size, found.sha256, identity.Stamp(*found.stamp.times(), 1, 2, "here")
-    )
-    renumbered.ask()
-    wrong = identity.Input(
-        found.path, found.size, "0" * 64, identity.Stamp(*found.stamp.times(), 3, 2, "here")
-    )
-    identity._known.clear()
-    with pytest.raises(InputError, match="was changed or replaced"):
-        wrong.ask()
-    path.unlink()
-    with pytest.raises(InputError, match="was changed or replaced"):
-        found.ask()
-
-
-def test_devices_are_compared_on_one_host_only() -> None:
-    one = identity.Stamp(1, 2, 3, 4, 5, "here")
-    assert one.matches(one)
-    assert one.matches(identity.Stamp(1, 2, 3, 4, 6, "there"))
-    assert not one.matches(identity.Stamp(1, 2, 3, 4, 6, "here"))
-    for field in range(4):
-        values = [1, 2, 3, 4]
-        values[field] += 1
-        assert not one.matches(identity.Stamp(*values, 5, "there"))
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
-def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(tmp_path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InputError, match="not a regular file"):
-        identity.take(tmp_path / "pipe")
-    with pytest.raises(InputError, match="not a regular file"):
-        identity.take("/dev/zero")

@@ -260,3 +260,28 @@ def test_the_example_of_the_manual_runs_with_what_has_kornias_interface(render, 
     assert np.median(unlike[true]) < 0.9 * np.median(unlike[~true])
     errors = scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))
     assert 1.4826 * np.median(np.abs(errors), axis=0).max() <= 0.1
+
+
+OWN = """
+from users_helper import keep
+import numpy as np
+
+def match(a, b, prediction):
+    x = np.stack(np.meshgrid(np.arange(10, 150, 12.0), np.arange(10, 150, 12.0)), axis=-1).reshape(-1, 2)
+    return keep(np.stack([x, x], axis=1))
+
+match.files = ["weights.bin"]
+"""
+
+
+def test_all_that_a_matcher_of_ones_own_is_made_of_counts(tmp_path, monkeypatch) -> None:
+    (tmp_path / "users_own.py").write_text(OWN)
+    (tmp_path / "users_helper.py").write_text("def keep(places):\n    return places\n")
+    (tmp_path / "weights.bin").write_bytes(b"1")
+    monkeypatch.syspath_prepend(tmp_path)
+    found = hook_files("users_own:match")
+    assert [path.name for path in found] == ["users_own.py", "users_helper.py", "weights.bin"]
+    assert hook_files("guided") == []
+    (tmp_path / "weights.bin").unlink()
+    with pytest.raises(InputError, match=r"declares .*weights\.bin, which is no file"):
+        hook_files("users_own:match")
