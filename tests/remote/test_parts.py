@@ -620,3 +620,40 @@ def test_a_part_that_does_not_say_where_it_is_from_is_none_at_the_start_either(l
         told(Answer(206, b"abcd", Content_Length=length), 0, 4)
     with pytest.raises(OSError, match="other bytes"):
         told(Answer(206, b"abcd", Content_Range="bytes 0-0/0", Content_Length=length), 0, 4)
+
+
+def test_who_is_sent_on_within_a_host_takes_the_query_along(monkeypatch) -> None:
+    asked: list[str] = []
+
+    def once(url: str, _start: int, _stop: int) -> object:
+        asked.append(url)
+        return "/b.tif?key=a/b&n=1" if len(asked) == 1 else web.Part(b"1", 1, "tag")
+
+    monkeypatch.setattr(web, "_once", once)
+    assert web.fetch(Remote("https://a.org/a.tif"), 0, 1).data == b"1"
+    assert asked == ["https://a.org/a.tif", "https://a.org/b.tif?key=a/b&n=1"]
+
+
+def test_an_address_that_is_none_is_one_line(monkeypatch) -> None:
+    monkeypatch.setattr(web, "_once", lambda *_: "http://[bad/")
+    with pytest.raises(OSError, match=r"sends us on to what is no address \(http://\[bad/\)"):
+        web.fetch(Remote("https://a.org/a.tif"), 0, 1)
+
+
+def test_a_query_is_part_of_what_is_asked(monkeypatch) -> None:
+    asked: list[str] = []
+
+    class Connection:
+        sock = None
+
+        def request(self, _method: str, target: str, headers: object) -> None:
+            asked.append(target)
+            raise ConnectionError
+
+        def close(self) -> None: ...
+
+    monkeypatch.setattr(web, "_connection", lambda *_: Connection())
+    for url in ("https://a.org/x y.tif?k=a/b&n=ü", "https://a.org/x.tif"):
+        with pytest.raises(OSError, match="broke off"):
+            web._once(url, 0, 1)
+    assert asked == ["/x%20y.tif?k=a/b&n=%C3%BC", "/x.tif"]
