@@ -78,7 +78,8 @@ def _once(url: str, start: int, stop: int) -> Part | str:
     """The part, or the address where it is said to be."""
     scheme, host, path, query = urlsplit(url)[:4]
     connection = _connection(scheme, host)
-    limit = threading.Timer(TIMEOUT + (stop - start) / _SLOWEST, _cut, (connection.sock,))
+    longest, late = TIMEOUT + (stop - start) / _SLOWEST, threading.Event()
+    limit = threading.Timer(longest, _cut, (connection.sock, late))
     limit.start()
     again = False
     try:
@@ -90,7 +91,11 @@ def _once(url: str, start: int, stop: int) -> Part | str:
         with closing(connection.getresponse()) as answer:
             found = _answered(answer, start, stop)
             again = answer.isclosed() and not answer.will_close
-    except (HTTPException, TimeoutError, ConnectionError, ssl.SSLError) as error:
+    except (HTTPException, TimeoutError, ConnectionError, ssl.SSLError, _PassingError) as error:
+        if late.is_set():  # however the cut shows: as an end, as a reset
+            raise _PassingError(f"its host takes more than {longest:.3g} s for {stop - start} bytes") from error
+        if isinstance(error, _PassingError):
+            raise
         raise _PassingError(f"its host broke off ({type(error).__name__})") from error
     finally:
         limit.cancel()
@@ -104,7 +109,8 @@ def _once(url: str, start: int, stop: int) -> Part | str:
     return found
 
 
-def _cut(connected: socket.socket) -> None:
+def _cut(connected: socket.socket, late: threading.Event) -> None:
+    late.set()
     with suppress(OSError):
         connected.shutdown(socket.SHUT_RDWR)
 

@@ -440,7 +440,29 @@ def test_a_request_has_a_time_that_grows_with_its_bytes(made, monkeypatch):
 
     monkeypatch.setattr(web.threading, "Timer", Timer)
     web._once("https://a.org/x", 10, 14)
-    assert given == [(30.0 + 4 / 10_000, web._cut, (None,)), "start", "cancel"]
+    assert [given[0][0], *given[1:]] == [30.0 + 4 / 10_000, "start", "cancel"]
+    assert given[0][1] is web._cut and given[0][2][0] is None
+
+
+@pytest.mark.parametrize("shown", [ConnectionResetError(104, "reset"), TimeoutError(), None])
+def test_a_request_that_is_cut_is_said_to_be_late_however_the_cut_shows(made, monkeypatch, shown):
+    class Timer:
+        def __init__(self, _seconds, _function, arguments):
+            self.late = arguments[1]
+
+        def start(self):
+            self.late.set()
+
+        def cancel(self):
+            pass
+
+    def answered(answer, start, stop):
+        raise shown or web._PassingError("its host sent 0 of 4 bytes")
+
+    monkeypatch.setattr(web.threading, "Timer", Timer)
+    monkeypatch.setattr(web, "_answered", answered)
+    with pytest.raises(web._PassingError, match="takes more than 30 s for 4 bytes"):
+        web._once("https://a.org/x", 10, 14)
 
 
 def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(monkeypatch):
