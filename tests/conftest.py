@@ -21,6 +21,11 @@ def shared_data() -> Path:
     return folder
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """What `-n auto` takes: many tests wait for a process, a host or a disk."""
+    return max(2, (os.cpu_count() or 1) * 3 // 2)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """A sweep of the nightly lane is slow, too: `-m 'not slow'` leaves out both."""

@@ -186,7 +186,7 @@ def test_twenty_thousand_blank_lines_are_nothing():
         assert cpu(partial(row.sniff, "\n" * 20_000)) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("fill", rest_slow(["<", "\n", " ", "(", "7", "<a>", "a"], mark=pytest.mark.nightly))
 def test_the_largest_rpc_file_that_is_read_ends_in_sensible_time(fill):
     data = (fill * (32 << 20))[: 32 << 20].encode()

@@ -85,7 +85,7 @@ def test_fast_jitter_gets_denser_knots():
     assert 0.005 < after.across < 0.05 < 0.15 < solved("jitter 0.1 at 5 Hz", 1, jitter="off")[1].across
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_all_errors_together_with_detectors_found_and_given():
     seeds = SEEDS[1:]
     assert medians("all", lambda j: j.across, seeds, jitter="off") > 0.4

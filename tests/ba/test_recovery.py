@@ -60,7 +60,7 @@ MODELS = ("rotation", "rotation+translation", "translation")
 
 @pytest.mark.parametrize(
     ("size", "model"),
-    [*(("small", m) for m in MODELS), *(pytest.param("block", m, marks=pytest.mark.slow) for m in MODELS)],
+    [*(("small", m) for m in MODELS), *(pytest.param("block", m, marks=pytest.mark.nightly) for m in MODELS)],
 )
 def test_both_solvers_reach_the_same_minimum(request, size, model):
     block = request.getfixturevalue(size)
@@ -111,7 +111,10 @@ def test_plain_least_squares_takes_two_linearisations_from_metres_away(request, 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("views", "bounds"),
-    [(10, {0.10: 1.15, 0.25: 1.50, 0.40: 2.00}), (3, {0.10: 1.15, 0.25: 1.60, 0.40: 2.00})],
+    [
+        pytest.param(10, {0.10: 1.15, 0.25: 1.50, 0.40: 2.00}, marks=pytest.mark.nightly),
+        (3, {0.10: 1.15, 0.25: 1.60, 0.40: 2.00}),
+    ],
 )
 def test_outliers_cost_little(views, bounds):
     rms = {part: [] for part in (0.0, *bounds)}

@@ -72,7 +72,7 @@ def run_trials(block: Block, count: int, options: AdjustOptions = OPTIONS) -> Tr
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("views", "tracks"), [(3, 150), pytest.param(10, 300, marks=pytest.mark.nightly)])
 def test_errors_of_the_corrections_are_as_large_as_predicted(views, tracks):
     trials = run_trials(simulate_block(views, tracks, seed=1, noise=NOISE), 1000)

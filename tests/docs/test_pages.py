@@ -122,7 +122,7 @@ PLANTED = {
 """What a warning says -> the fault in a page that it is about."""
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_site_does_not_build_with_a_broken_link(tmp_path):
     tree = tmp_path / "tree"
     shutil.copytree(DOCS, tree / "docs")
@@ -138,7 +138,7 @@ def test_the_site_does_not_build_with_a_broken_link(tmp_path):
         assert any(said in line and "faq.md" in line for line in warned), said
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path):
     done = build(ROOT, tmp_path)
     assert done.returncode == 0, done.stderr
@@ -151,7 +151,7 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
 
 
 @pytest.mark.parametrize("name", sorted(p.name for p in Path(ROOT / "benchmarks").glob("*.py")))
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_benchmark_says_what_it_does(name):
     command = [sys.executable, str(ROOT / "benchmarks" / name), "--help"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -37,7 +37,7 @@ def fitted(name: str) -> RpcFit:
     return fit_rpc(*hard()[name], strict=False)
 
 
-@pytest.mark.parametrize("name", rest_slow(MODELS, keep=len(EASY)))
+@pytest.mark.parametrize("name", rest_slow(MODELS, keep=len(EASY), mark=pytest.mark.nightly))
 def test_the_largest_error_certified_is_that_of_a_hundred_thousand_points(name):
     fit = fitted(name)
     ground, image = truth(name)
@@ -133,7 +133,7 @@ def best_possible(name: str, axis: int, start: RPC) -> float:
     return min(found)
 
 
-@pytest.mark.parametrize("name", rest_slow(MODELS, keep=2))
+@pytest.mark.parametrize("name", rest_slow(MODELS, keep=2, mark=pytest.mark.nightly))
 def test_no_optimiser_finds_a_better_rpc_without_a_pole(name):
     ground, image = truth(name, 30_000, 12)
     rmse = np.sqrt(((fitted(name).rpc.project(ground) - image) ** 2).mean(axis=0))

@@ -18,7 +18,7 @@ def test_a_sample_is_accepted_as_it_is(kind, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "runs", [30, pytest.param(120, marks=pytest.mark.slow), pytest.param(1200, marks=pytest.mark.nightly)]
+    "runs", [30, pytest.param(120, marks=pytest.mark.nightly), pytest.param(1200, marks=pytest.mark.nightly)]
 )
 @pytest.mark.parametrize("kind", SAMPLES)
 def test_damage_is_a_value_or_one_error(kind, runs):

@@ -92,7 +92,7 @@ SPOILT = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SPOILT)
+@pytest.mark.parametrize("name", rest_slow(SPOILT, mark=pytest.mark.nightly))
 def test_an_image_that_was_turned_or_resampled_is_met_all_the_same(shared_data, triplet, name):
     result, _ = triplet
     found = adjust_tracks(SPOILT[name](list(result.run.views)), result.tracks)

@@ -283,7 +283,7 @@ KINDS = (
     "source, element", "source, attribute, without vsicurl", "a mask, attribute", "a web service",
     "a TIFF with overviews elsewhere",
 )  # fmt: skip
-EVERY = [pytest.param(name, marks=[pytest.mark.slow] * (name not in KINDS)) for name in CONTENTS]
+EVERY = [pytest.param(name, marks=[pytest.mark.nightly] * (name not in KINDS)) for name in CONTENTS]
 """All of `CONTENTS`; one of each kind before a commit."""
 
 
@@ -355,8 +355,10 @@ def test_a_hostile_file_beside_another_fetches_nothing(name, crops, tmp_path, tr
     assert_silent(trap, barpc("info", crops[0]), tmp_path / "out" / "applied")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CONTENTS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=pytest.mark.slow if x in KINDS else pytest.mark.nightly) for x in CONTENTS],
+)
 def test_a_hostile_file_beside_another_fetches_nothing_in_a_whole_run(name, crops, tmp_path, trap):
     for crop in crops:
         surrounded(trap, name, crop, BESIDE[:8])

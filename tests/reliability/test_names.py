@@ -102,7 +102,7 @@ class Page(HTMLParser):
 
 @pytest.mark.parametrize(
     "names",
-    [pytest.param(three, marks=[pytest.mark.slow] * (k >= SHORT)) for k, three in enumerate(THREES)],
+    [pytest.param(three, marks=[pytest.mark.nightly] * (k >= SHORT)) for k, three in enumerate(THREES)],
     ids=short,
 )
 def test_a_name_goes_through_every_file_and_back(names, pristine, tmp_path):

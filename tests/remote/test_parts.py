@@ -441,7 +441,8 @@ def test_a_request_has_a_time_that_grows_with_its_bytes(made, monkeypatch):
     monkeypatch.setattr(web.threading, "Timer", Timer)
     web._once("https://a.org/x", 10, 14)
     assert [given[0][0], *given[1:]] == [30.0 + 4 / 10_000, "start", "cancel"]
-    assert given[0][1] is web._cut and given[0][2][0] is None
+    assert given[0][1] is web._cut
+    assert given[0][2][0] is None
 
 
 @pytest.mark.parametrize("shown", [ConnectionResetError(104, "reset"), TimeoutError(), None])

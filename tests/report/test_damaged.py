@@ -92,7 +92,7 @@ def small_runs(tmp_path_factory) -> dict[str, Finished]:
     [
         ("check", 11),
         pytest.param("check", 1, marks=pytest.mark.slow),
-        pytest.param("adjust", 7, marks=pytest.mark.slow),
+        pytest.param("adjust", 7, marks=pytest.mark.nightly),
         pytest.param("adjust", 1, marks=pytest.mark.nightly),
     ],
 )

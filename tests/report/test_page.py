@@ -124,7 +124,7 @@ def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatc
     assert html.count('id="panel-after') == 2 * 4  # title and description
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore:.*held in height")
 def test_fifty_images_make_less_than_3_mb_in_seconds(tmp_path):
     run = run_of_block(50, 20_000, outliers=0.05)

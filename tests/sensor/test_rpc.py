@@ -41,7 +41,7 @@ REACHES = [3.0, 100.0, 1e4]
 vendors = pytest.mark.parametrize("file", VENDORS)
 few_vendors = pytest.mark.parametrize("file", rest_slow(VENDORS, keep=4))
 FAR = [
-    pytest.param(file, reach, marks=() if n == m else pytest.mark.slow)
+    pytest.param(file, reach, marks=() if n == m else pytest.mark.nightly)
     for n, file in enumerate(VENDORS)
     for m, reach in enumerate(REACHES)
 ]

@@ -102,7 +102,7 @@ def test_tracks_prefer_three_views_and_state_a_sigma_that_fits_their_errors(trip
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("col", "row"), [(500, 0), (0, -500)])
+@pytest.mark.parametrize(("col", "row"), [(500, 0), pytest.param(0, -500, marks=pytest.mark.nightly)])
 def test_a_camera_that_is_500_pixels_wrong_gives_the_same_tracks(triplet, triplet_ties, col, row) -> None:
     wrong = [triplet[0], replace(triplet[1], sensor=triplet[1].sensor.crop(col, row)), triplet[2]]
     tracks, expected = find_tracks(wrong).tracks, triplet_ties.tracks

@@ -52,8 +52,8 @@ def test_the_true_error_is_below_a_twelfth_of_a_pixel_in_both_directions(render,
     "conditions",
     [
         {"sun_azimuth": (150.0, 210.0), "clouds": 0.5},
-        {"sun_azimuth": (150.0, 210.0)},
-        {"saturation": 1200},
+        pytest.param({"sun_azimuth": (150.0, 210.0)}, marks=pytest.mark.nightly),
+        pytest.param({"saturation": 1200}, marks=pytest.mark.nightly),
     ],
     ids=["clouds and another sun", "another sun", "saturated"],
 )

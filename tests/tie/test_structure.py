@@ -52,7 +52,7 @@ def test_what_keypoints_find_too_little_of_is_tied_by_structure(render, winter, 
     assert 0.05 < tied.tracks.sigma.mean() < 0.2  # half of the variance at either end
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_same_images_give_the_same_bytes(winter) -> None:
     one, two = (find_tracks(winter, TieOptions(matcher=STRUCTURE)).tracks for _ in range(2))
     assert one.xy.tobytes() == two.xy.tobytes()
