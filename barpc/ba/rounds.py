@@ -13,7 +13,7 @@ from barpc.ba.ground import Heights
 from barpc.ba.problem import Problem
 from barpc.ba.smooth import TERMS, Fit, Smooth, SmoothTest
 from barpc.ba.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
-from barpc.ba.variances import PriorTest, Variances, same_prior
+from barpc.ba.variances import SAME_PRIOR, PriorTest, Variances, same_prior
 from barpc.ba.weights import LOSSES, MEDIAN, Observations
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
@@ -25,7 +25,6 @@ _LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that 
 _LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
 _SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
 _SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
-_SAME_PRIOR = 0.2  # nor of a prior's standard deviation
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
 _BACKFITTING = 6
 _MANY_CUT = 0.01  # of the observations: more are looked at again
@@ -133,7 +132,7 @@ class Rounds:
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
-        settled &= same_prior(prior, self.problem.camera_prior, _SAME_PRIOR)
+        settled &= same_prior(prior, self.problem.camera_prior, SAME_PRIOR)
         if once or self.passes > MAX_PASSES or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:

@@ -41,6 +41,7 @@ _UNEXPECTED = (
 _LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
 _ITERATIONS = 10
 _STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
+SAME_PRIOR = 0.2  # the same, below which a block is not solved again
 _SMALL = 400  # unknowns up to which every view is tried
 LEAST_WAVES = 0.01  # px: of splines and steps, counting as one observation
 _OWN = 2.0  # as many degrees of freedom has the size of all views beside that of one
@@ -144,14 +145,19 @@ class Variances:
         known = self._known(covariance, prior if around.small else now, exact)
         total, freedom = (float(part.sum()) for part in self._squares(params, known))
         ratio = total / freedom if freedom > _LEAST else float("nan")
-        for _ in range(_ITERATIONS):
-            if self.learn_constant and self._too_large(params, known, scale):
-                scale, odd = self._widened(around, params, known, wide)
+        stands = not self.learn_drift
+        for _ in range(2 * _ITERATIONS):
             before = prior
             if self.learn_waves:
                 self = self._going_on(self._waves(params, known, prior.sigma))
             wide = self._drift(params, known) if self.learn_drift else wide
             prior = self._prior(scale, wide)
+            # a drift that is larger than thought looks like constants that are: it is learnt before they are asked
+            last, least = (before, _STANDS) if around.small else (now, SAME_PRIOR)
+            stands |= same_prior(prior, last, least, self._of_drift)
+            if stands and self.learn_constant and self._too_large(params, known, scale):
+                scale, odd = self._widened(around, params, known, wide)
+                prior = self._prior(scale, wide)
             if not around.small or same_prior(prior, before, _STANDS):
                 break
             _, params, covariance = around.under(prior)
@@ -189,6 +195,10 @@ class Variances:
     @property
     def _degrees(self) -> int:
         return self.unknowns.drift if self.unknowns.geometric else 0
+
+    @property
+    def _of_drift(self) -> slice:
+        return slice(self.constants, self.constants + 3 * self._degrees)
 
     def _drift_part(self, degree: int) -> slice:
         return slice(self.constants + 3 * degree, self.constants + 3 * degree + 3)
@@ -300,7 +310,11 @@ def _possible(total: float, freedom: float) -> float:
     return float(total / (2.0 * gammaincinv(0.5 * freedom, _LOW)))
 
 
-def same_prior(a: CameraPrior, b: CameraPrior, share: float) -> bool:
-    """Whether the standard deviations of two priors differ by less than a share; infinite ones are infinite in both."""
-    finite = np.isfinite(a.sigma) & np.isfinite(b.sigma)
-    return bool((np.abs(np.log(a.sigma[finite] / b.sigma[finite])) < share).all())
+def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:
+    """Whether the standard deviations of two priors differ by less than a share; infinite ones are infinite in both.
+
+    Of all unknowns, or a part.
+    """
+    one, other = (prior.sigma[:, slice(None) if part is None else part] for prior in (a, b))
+    finite = np.isfinite(one) & np.isfinite(other)
+    return bool((np.abs(np.log(one[finite] / other[finite])) < share).all())
