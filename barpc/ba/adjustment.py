@@ -13,11 +13,12 @@ from barpc.ba.block import Block, join
 from barpc.ba.consensus import two_groups
 from barpc.ba.covariance import Covariance
 from barpc.ba.datum import datum_shares
-from barpc.ba.following import follow
+from barpc.ba.following import follow, without_strips
 from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Terrain
 from barpc.ba.heldout import enu_offsets, keep_out
 from barpc.ba.incremental import BlockPrior
+from barpc.ba.judge import standing_out
 from barpc.ba.result import Adjustment
 from barpc.ba.snooping import MOST_TESTED, image_test
 from barpc.ba.solution import Solution, solve_block
@@ -103,6 +104,8 @@ def _choose_model(
 ) -> tuple[Solution, float | None]:
     """The block solved; by an affine in the image where the data choose it, and what the model in space left [px]."""
     found, in_space = solve_block(block, outer, options, dem, centers, prior), None
+    if prior is None and found.problem.cameras.unknowns.geometric:
+        found = without_strips(found, block, outer, options)
     given = options.model != AUTO or options.drift is not None or prior is not None
     skew, chosen = found.is_skew, found
     trend = skew or found.has_trend or found.has_waves
@@ -178,6 +181,8 @@ def _adjustment(
         prior=outcome.prior,
         smooth=outcome.smooth,
         asked=found.asked,
+        findings=found.findings,
+        left=tuple(standing_out(outcome, block)),
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],

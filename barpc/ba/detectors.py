@@ -95,7 +95,8 @@ def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
     unknowns, steps = problem.cameras.unknowns, np.zeros_like(residual)
     if unknowns.waves is not None and unknowns.waves.edges.size:
         params = state.params.copy()
-        params[:, unknowns.in_waves][:, unknowns.waves.kinds[0]] = 0.0
+        for others in unknowns.waves.kinds[::2]:
+            params[:, unknowns.in_waves][:, others] = 0.0
         unknowns.add_waves(steps, steps[:, None, :][:, :0], params, problem.structure.view, problem.xy)
     return residual - steps
 

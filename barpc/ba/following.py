@@ -8,7 +8,9 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
+from barpc.ba.explanations import STRIP
 from barpc.ba.heldout import is_better
+from barpc.ba.judge import judge
 from barpc.ba.rounds import Rounds, revived
 from barpc.ba.solution import Solution, finished
 from barpc.ba.starting import make_problem
@@ -43,6 +45,28 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
         better = given or (asked and best is found) or is_better(tried.after, best.after, outer)
         best, misses = (tried, 0) if better else (best, misses + 1)
     return best if best is found else replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
+
+
+def without_strips(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
+    """The block with the rows and columns moved that lie off by themselves, where the judge finds such.
+
+    Refused where it makes tracks worse that took no part.
+    """
+    findings = judge(found.outcome, block)
+    strips = [one for one in findings if one.kind == STRIP]
+    found = replace(found, findings=tuple(findings))
+    if not strips or options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
+        return found
+    own = [[one for one in strips if one.view == v] for v in range(len(block.views))]
+    places = np.full((len(own), max(map(len, own)), 3), np.inf)
+    params = np.zeros((len(own), 2, places.shape[1]))
+    for v, of_view in enumerate(own):
+        for n, one in enumerate(of_view):
+            assert one.where is not None
+            places[v, n], params[v, :, n] = one.where, one.size
+    waves = Waves(0, np.zeros((len(own), 0)), places)
+    tried = _with_waves(found, block, outer, options, waves, start=params.reshape(len(own), -1))
+    return found if is_better(found.after, tried.after, outer) else tried
 
 
 def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
@@ -89,15 +113,23 @@ def _with_waves(
     options: AdjustOptions,
     waves: Waves,
     once: bool = False,
+    start: Array | None = None,
 ) -> Solution:
-    """A block solved again with splines and steps, from where it ended; every observation may come back."""
-    problem, ended = found.problem, found.outcome.minimum.state
-    unknowns = problem.cameras.unknowns
+    """A block solved again with splines and steps, from where it ended; every observation may come back.
+
+    `start` (N, waves.size) are those unknowns, where something is known of them.
+    """
+    ended, unknowns = found.outcome.minimum.state, found.problem.cameras.unknowns
+    if unknowns.waves is not None:  # strips that were found stay
+        waves = replace(waves, strips=unknowns.waves.strips)
     bent = make_problem(block, options, unknowns.center, None, unknowns.drift, waves)
-    there, _ = revived(problem, ended, found.outcome.residual, found.outcome.inlier, block.use / block.sigma)
-    known = unknowns.waves.kinds[0].stop if unknowns.waves and unknowns.waves.count == waves.count else 0
     params = np.zeros_like(bent.camera_prior.mean)
-    params[:, : unknowns.in_waves.start + known] = there.params[:, : unknowns.in_waves.start + known]
-    there = replace(there, params=params)
-    outcome = Rounds(bent, block, there, options, found.heights, block.use, found.outcome).run(once)
+    params[:, : unknowns.in_waves.start] = ended.params[:, : unknowns.in_waves.start]
+    if start is not None:
+        params[:, unknowns.in_waves.start :] = start
+    elif unknowns.waves is not None:
+        params[:, unknowns.in_waves.start :] = waves.carried(ended.params[:, unknowns.in_waves], unknowns.waves)
+    outcome, weight = found.outcome, block.use / block.sigma
+    there, _ = revived(bent, replace(ended, params=params), outcome.residual, outcome.inlier, weight)
+    outcome = Rounds(bent, block, there, options, found.heights, block.use, outcome).run(once)
     return finished(found, bent, block, outer, options, outcome)

@@ -48,7 +48,7 @@ class BlockPrior:
         Camera centres [m], ECEF.
     less : (m, n q)
         Rows B of B^T B that is still to be taken off a sparse matrix: what heights have in common.
-    splines, edges : int, (n, C)
+    splines, edges, strips : int, (n, C), (n, M, 3)
         Layout of the unknowns in the image (see `barpc.ba.waves`).
     radars : tuple of str
         Those of its views whose unknowns are of a radar's clocks.
@@ -64,16 +64,25 @@ class BlockPrior:
     splines: int = 0
     edges: Array | None = None
     radars: tuple[str, ...] = ()
+    strips: Array | None = None
 
     def waves(self, names: tuple[str, ...]) -> Waves | None:
-        """The unknowns in the image of views that go on from the block; a new one has no detectors."""
-        if self.edges is None or not (self.splines or self.edges.size):
+        """The unknowns in the image of views that go on from the block; a new one has no detectors and strips."""
+        edges, strips = self._edges, self._strips
+        if not (self.splines or edges.size or strips.size):
             return None
-        edges = np.full((len(names), self.edges.shape[1]), np.inf)
-        known = dict(zip(self.names, self.edges, strict=True))
-        for i, name in enumerate(names):
-            edges[i] = known.get(name, np.inf)
-        return Waves(self.splines, edges)
+        place = {name: i for i, name in enumerate(self.names)}
+        old = np.array([place.get(name, len(place)) for name in names])
+        edges, strips = (np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in (edges, strips))
+        return Waves(self.splines, edges, strips)
+
+    @property
+    def _edges(self) -> Array:
+        return np.zeros((len(self.names), 0)) if self.edges is None else self.edges
+
+    @property
+    def _strips(self) -> Array:
+        return np.zeros((len(self.names), 0, 3)) if self.strips is None else self.strips
 
     def save(self, path: Path) -> None:
         """Write the prior to an .npz file."""
@@ -91,7 +100,8 @@ class BlockPrior:
                 drift=self.drift,
                 splines=self.splines,
                 radars=np.array(self.radars, dtype=np.str_),
-                edges=np.zeros((len(self.names), 0)) if self.edges is None else self.edges,
+                edges=self._edges,
+                strips=self._strips,
                 **arrays,
             )
 
@@ -113,7 +123,8 @@ class BlockPrior:
             splines, edges = int(file.get("splines", 0)), file.get("edges", np.zeros((len(names), 0)))
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
             radars = tuple(str(name) for name in file.get("radars", ()))
-            prior = cls(names, *known, splines, edges, radars)
+            strips = file.get("strips", np.zeros((len(names), 0, 3)))
+            prior = cls(names, *known, splines, edges, radars, strips)
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
         if not prior._is_whole():
@@ -132,7 +143,10 @@ class BlockPrior:
             and all(array.dtype == np.float64 for array in arrays)
             and all(np.isfinite(getattr(a, "data" if sp.issparse(a) else "real")).all() for a in arrays)
             and bool((self.information.diagonal() > 0).all())
-            and (self.edges is None or (self.edges.ndim == 2 and len(self.edges) == n))
+            and self._edges.ndim == 2
+            and len(self._edges) == n
+            and self._strips.shape[::2] == (n, 3)
+            and self._strips.dtype == np.float64
             and (self.splines == 0 or 4 <= self.splines <= q)
             and (
                 self.less is None or (self.less.shape[1:] == (n * q,) and bool(np.isfinite(self.less).all()))
@@ -184,8 +198,9 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
         if isinstance(matrix, np.ndarray) or reduced.common is None
         else reduced.common.by_camera[:, free],
         waves.count if waves else 0,
-        waves.edges[views] if waves else None,
+        waves.edges[views] if waves and waves.edges.size else None,
         tuple(adjustment.names[v] for v in adjustment.cameras.unknowns.radars if v in views),
+        waves.strips[views] if waves and waves.strips.size else None,
     )
 
 

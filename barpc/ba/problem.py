@@ -93,7 +93,7 @@ class Problem:
             residual,
             by_point,
             by_unknown,
-            *self._point_terms(points),
+            *self.point_terms(points),
             jacobian**2,
             jacobian * self.camera_prior.residual(params),
             self.point_prior,
@@ -109,7 +109,7 @@ class Problem:
     def triangulate(self, points: Array, projected: Projected, weight: Array) -> Array:
         """One Gauss-Newton step of all points (P, 3) [m] with the cameras held."""
         residual = (projected.image - self.xy) * weight
-        matrix, gradient = self._point_terms(points)
+        matrix, gradient = self.point_terms(points)
         sums = self.structure.sum_points(point_products(projected.by_point * weight, residual))
         lower = cholesky3(sums[:6] + matrix)
         step = solve_transposed(lower, solve_lower(lower, sums[6:] + gradient))
@@ -129,7 +129,7 @@ class Problem:
 
         return settled
 
-    def _point_terms(self, points: Array) -> tuple[Array, Array]:
+    def point_terms(self, points: Array) -> tuple[Array, Array]:
         """What the priors add to the points' normal matrices (6, P) and gradients (3, P)."""
         matrix, gradient = np.zeros((6, len(points))), np.zeros((3, len(points)))
         prior = self.point_prior

@@ -12,6 +12,8 @@ from barpc.ba.consensus import TwoGroups
 from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import GaugeReport
 from barpc.ba.ground import TerrainTest
+from barpc.ba.judge import Finding
+from barpc.ba.scan import Interval
 from barpc.ba.smooth import SmoothTest
 from barpc.ba.snooping import ControlTest
 from barpc.ba.variances import PriorTest
@@ -73,6 +75,10 @@ class Adjustment:
         What is smooth in the residuals that are left.
     asked : mapping
         "drift" or "jitter" -> what was smooth before a degree was added, or splines or steps were followed, for that.
+    findings : tuple of Finding
+        What explains tie points beside the cameras' errors as stated, the first taken first.
+    left : tuple of Interval
+        Rows and columns in which ties were cut, or are off, more than elsewhere and chance allow, at the end.
     in_space_rms : float or None
         Where the data chose an affine in the image: what rotations, translations and drifts leave of the tracks
         that took no part [px].
@@ -123,6 +129,8 @@ class Adjustment:
     prior: PriorTest
     smooth: SmoothTest
     asked: Mapping[str, SmoothTest]
+    findings: tuple[Finding, ...]
+    left: tuple[Interval, ...]
     in_space_rms: float | None
     two_groups: tuple[TwoGroups, ...]
     held: BoolArray

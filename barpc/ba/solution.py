@@ -12,6 +12,7 @@ from barpc.ba.consensus import agreeing
 from barpc.ba.ground import Heights, Terrain
 from barpc.ba.heldout import HeldOut, measure
 from barpc.ba.incremental import BlockPrior
+from barpc.ba.judge import Finding
 from barpc.ba.priors import DRIFT_SIGMA
 from barpc.ba.problem import Problem
 from barpc.ba.rounds import Outcome, Rounds, revived
@@ -47,6 +48,7 @@ class Solution:
     tested: ControlTest | None  # control points against the rest
     # "drift", "jitter" -> what was smooth before another degree was taken, splines or steps followed
     asked: Mapping[str, SmoothTest] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()  # what explains ties beside the cameras, the first taken first
 
     @property
     def final(self) -> State:

@@ -150,7 +150,7 @@ class Unknowns:
         """Add what splines and steps do to points seen at (2, n) [px]: to image points (2, n) and derivatives."""
         assert self.waves is not None
         row = (seen[1] - self.middle[1, index]) / self.half[1, index]
-        basis = self.waves.basis(row, seen[0], index)
+        basis = self.waves.basis(row, seen, index)
         image += self.waves.displaced(params[:, self.in_waves], index, basis)
         if by_unknown.shape[1]:
             self.waves.stack(by_unknown[:, self.in_waves], basis)

@@ -295,7 +295,8 @@ class Variances:
 
     def _drift(self, params: Array, known: Array) -> Array:
         """By how much the drift's standard deviations are to be changed (D,), the given ones counting for a few."""
-        careful = self.cautious and not self.learn_waves  # what else bends heights is followed
+        waves = self.unknowns.waves  # of which splines and steps follow what else bends heights
+        careful = self.cautious and not (waves and (waves.count or waves.edges.size))
         factors = np.ones(self._degrees)
         for degree in range(self._degrees):
             total, freedom = (x.sum() for x in self._squares(params, known, part=self._drift_part(degree)))

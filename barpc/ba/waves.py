@@ -1,13 +1,14 @@
-"""What rotations, translations and drifts leave in the images: splines over the rows, steps between detectors.
+"""What rotations, translations and drifts leave in the images: splines over the rows, steps between detectors, strips.
 
-Both are displacements in the image, of where a point is seen: linear unknowns of a view beside its others. What the
+All are displacements in the image, of where a point is seen: linear unknowns of a view beside its others. What the
 drift can do is not theirs, so that their prior does not loosen it: splines are orthogonal to its polynomials of the
-row, steps to a shift and a scale of the columns. How large they are in a view is learnt (`barpc.ba.variances`).
+row, steps to a shift and a scale of the columns. A strip of rows or columns is moved as a whole. How large all of them
+are in a view is learnt (`barpc.ba.variances`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,6 +30,9 @@ class Waves:
     count: int  # B-splines over the rows of an image; 0: none
     # (N, C) columns where another detector begins [px], ascending; infinite where a view has fewer
     edges: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    # (N, M, 3) axis (0: columns, 1: rows), first and last place [px] of strips that lie off; infinite where a view has
+    # fewer
+    strips: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     @cached_property
     def _of_splines(self) -> Array:
@@ -50,9 +54,9 @@ class Waves:
         )
 
     @property
-    def parts(self) -> tuple[int, int]:
-        """Unknowns of one coordinate: of splines, of steps."""
-        return self._of_splines.shape[1], self._of_steps.shape[1]
+    def parts(self) -> tuple[int, int, int]:
+        """Unknowns of one coordinate: of splines, of steps, of strips."""
+        return self._of_splines.shape[1], self._of_steps.shape[1], self.strips.shape[1]
 
     @property
     def size(self) -> int:
@@ -60,10 +64,10 @@ class Waves:
         return 2 * sum(self.parts)
 
     @property
-    def kinds(self) -> tuple[slice, slice]:
-        """The unknowns of splines and of steps: those of the columns, then those of the rows."""
-        m, s = self.parts
-        return slice(0, 2 * m), slice(2 * m, 2 * (m + s))
+    def kinds(self) -> tuple[slice, ...]:
+        """The unknowns of splines, of steps and of strips: those of the columns, then those of the rows."""
+        stops = 2 * np.cumsum((0, *self.parts))
+        return tuple(map(slice, stops[:-1].tolist(), stops[1:].tolist()))
 
     @property
     def _filled(self) -> list[slice]:
@@ -71,18 +75,26 @@ class Waves:
 
     @cached_property
     def bands(self) -> Array:
-        """Which unknowns (size,) are about as large: half an octave of waves, or steps."""
-        m, s = self.parts
+        """Which unknowns (size,) are about as large: half an octave of waves, or steps, or strips."""
+        m, s, strips = self.parts
         octave = 2.0 * np.log2(np.arange(m) + _DEGREE + 1.0)
         rank = np.unique(np.floor(octave), return_inverse=True)[1]
-        return np.concatenate([rank, rank, np.full(2 * s, rank.max(initial=-1) + 1)])
+        further = rank.max(initial=-1) + 1
+        return np.concatenate([rank, rank, np.full(2 * s, further), np.full(2 * strips, further + bool(s))])
 
-    def basis(self, row: Array, col: Array, index: IntArray) -> list[Array]:
-        """What one unit of the unknowns of one coordinate adds (m, n), kind by kind; rows are normalised."""
+    def basis(self, row: Array, seen: Array, index: IntArray) -> list[Array]:
+        """What one unit of the unknowns of one coordinate adds (m, n), kind by kind, to points seen at (2, n) [px].
+
+        Their rows (n,) normalised are given, too.
+        """
         found = [self._of_splines.T @ bsplines(row, self.count)] if self.count else []
         if self.edges.shape[1]:
-            steps = self._of_steps.T[:, (col[:, None] >= self.edges[index]).sum(axis=1)]
+            steps = self._of_steps.T[:, (seen[0][:, None] >= self.edges[index]).sum(axis=1)]
             found.append(steps * np.isfinite(self.edges[index, 0]))
+        if self.strips.shape[1]:
+            axis, start, stop = np.moveaxis(self.strips, -1, 0)[:, index]  # (n, M) each
+            place = np.where(axis == 0.0, seen[0][:, None], seen[1][:, None])
+            found.append(((place >= start) & (place < stop)).T.astype(np.float64))
         return found
 
     def displaced(self, params: Array, index: IntArray, basis: list[Array]) -> Array:
@@ -104,13 +116,30 @@ class Waves:
 
     def correction(self, params: Array, view: int, row_offset: float, row_scale: float) -> RowSpline:
         """The correction of a view with the unknowns (size,)."""
-        m, s = self.parts
+        (m, s, num), (_, of_steps, of_strips) = self.parts, self.kinds
         coeffs = self._of_splines @ params[: 2 * m].reshape(2, m).T if m else np.zeros((0, 2))
+        found = RowSpline(coeffs, row_offset, row_scale)
         known = np.isfinite(self.edges[view]) if s else np.zeros(0, dtype=bool)
-        if not known.any():
-            return RowSpline(coeffs, row_offset, row_scale)
-        steps = self._of_steps @ params[2 * m :].reshape(2, s).T
-        return RowSpline(coeffs, row_offset, row_scale, self.edges[view][known], steps[: known.sum() + 1])
+        if known.any():
+            steps = self._of_steps @ params[of_steps].reshape(2, s).T
+            found = replace(found, edges=self.edges[view][known], steps=steps[: known.sum() + 1])
+        if num:
+            there = np.isfinite(self.strips[view, :, 1])
+            moved = params[of_strips].reshape(2, num).T
+            found = replace(found, strips=self.strips[view][there], moved=moved[there])
+        return found
+
+    def carried(self, params: Array, known: Waves) -> Array:
+        """Unknowns (N, size) that start from those of another layout (N, known.size), kind by kind where they agree."""
+        out = np.zeros((len(params), self.size))
+        same = self.count == known.count, False, bool(known.parts[2])
+        for agrees, mine, theirs in zip(same, self.kinds, known.kinds, strict=True):
+            if agrees:
+                old = params[:, theirs].reshape(len(params), 2, -1)
+                new = np.zeros((len(params), 2, (mine.stop - mine.start) // 2))
+                new[..., : old.shape[2]] = old
+                out[:, mine] = new.reshape(len(params), -1)
+        return out
 
 
 def _complement(vectors: Array) -> Array:

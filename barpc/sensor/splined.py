@@ -1,7 +1,7 @@
-"""What no rotation and no RPC holds: a correction in the image, a spline over its rows and steps between detectors.
+"""What no rotation and no RPC holds: a correction in the image, by a spline over its rows, steps and strips.
 
-Attitude jitter moves image rows against each other, a focal plane that is put together of detectors moves its columns.
-Both are functions of where a point is *seen*, so that x = P(X) + s(x): localisation is explicit, projection iterates.
+Attitude jitter moves image rows against each other, a focal plane that is put together of detectors moves its columns,
+a jump of the attitude or of the clock a strip of rows. All are functions of where a point is *seen*, so that x = P(X) + s(x): localisation is explicit, projection iterates.
 """
 
 from __future__ import annotations
@@ -60,6 +60,10 @@ class RowSpline(Frozen):
         Columns at which another detector begins [px], ascending.
     steps : (C + 1, 2)
         Displacement of each detector, (col, row) [px]; without any detector (0, 2).
+    strips : (M, 3)
+        Axis (0: columns, 1: rows), first and last place [px] of what lies off by itself; they may overlap.
+    moved : (M, 2)
+        By how much each of them, (col, row) [px].
     """
 
     coeffs: Array
@@ -67,10 +71,15 @@ class RowSpline(Frozen):
     row_scale: float = 1.0
     edges: Array = field(default_factory=lambda: np.zeros(0))
     steps: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    strips: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    moved: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
-        for name, shape in (("coeffs", (None, 2)), ("edges", (None,)), ("steps", (None, 2))):
+        shapes = (("coeffs", (None, 2)), ("edges", (None,)), ("steps", (None, 2)), ("strips", (None, 3)))
+        for name, shape in (*shapes, ("moved", (None, 2))):
             self._array(name, shape, RpcError)
+        if len(self.strips) != len(self.moved) or not np.isin(self.strips[:, 0], (0.0, 1.0)).all():
+            raise RpcError("strips: each has an axis (0 or 1), two ends and a displacement")
         if 0 < len(self.coeffs) < 4:
             raise RpcError(f"a cubic spline has at least 4 coefficients, found {len(self.coeffs)}")
         if (
@@ -93,6 +102,9 @@ class RowSpline(Frozen):
             out += self.steps[
                 np.searchsorted(self.edges, image[..., 0], side="right").clip(0, len(self.edges))
             ]
+        for (axis, start, stop), moved in zip(self.strips, self.moved, strict=True):
+            place = image[..., int(axis)]
+            out += ((place >= start) & (place < stop))[..., None] * moved
         return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
 
     def rate(self, row: Array) -> Array:

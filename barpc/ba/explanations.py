@@ -1,0 +1,135 @@
+"""What may be wrong beside the cameras as stated: a table of explanations, each a set of unknowns with a prior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from barpc.ba.mixture import Fit, Linear, log_likelihoods
+from barpc.ba.scan import Interval, price
+from barpc.geodesy import Array
+from barpc.sensor.splined import bsplines
+
+STRIP = "strip"
+WANDER = "wander"
+AFFINE = "affine"
+_SPLINES = 14  # over the rows of an image
+_WANDER = 0.5  # px
+_STRIP = 1.0  # px, before it is known; then its own size, for which a scale of x 30 is paid
+SCALE = float(np.log(2.0 * np.log(30.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Unknowns of one view that may explain what the cameras do not."""
+
+    kind: str  # a name of `EXPLANATIONS`
+    view: int
+    extra: Array = field(repr=False)  # (2, e, K) how a unit of each moves observations [px]
+    sigma: Array = field(repr=False)  # (e,) their prior [px]
+    price: float  # of the choice among places and sizes [nats]
+    where: tuple[int, float, float] | None = None  # axis (0: columns, 1: rows), start, stop [px]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Observations as explanations see them."""
+
+    linear: Linear
+    place: Array  # (2, K) [px]
+    size: Array  # (2, N) of the images [px]
+
+
+def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> Explanation:
+    """Rows or columns of an image that lie off by themselves."""
+    start, stop = _open_ended(interval.start, interval.stop, float(seen.size[interval.axis, interval.view]))
+    return _strip(seen, interval.view, (interval.axis, start, stop), sigma)
+
+
+def _strip(seen: Seen, view: int, where: tuple[int, float, float], sigma: float) -> Explanation:
+    axis, start, stop = where
+    place = seen.place[axis]
+    inside = ((place >= start) & (place < stop) & (seen.linear.view == view)).astype(np.float64)
+    extra = np.zeros((2, 2, len(inside)))
+    extra[0, 0] = extra[1, 1] = inside
+    cost = price(seen.linear.views) + SCALE
+    return Explanation(STRIP, view, extra, np.full(2, sigma), cost, where)
+
+
+def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explanation:
+    """A strip whose ends are where ties say, and whose prior is as wide as it is large.
+
+    `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
+    """
+    assert one.where is not None
+    axis = one.where[0]
+    moved = found.extra[-2:]
+    rows = np.flatnonzero((seen.linear.view == one.view) & (found.right + 1.0 > 0.0))
+    rows = rows[np.argsort(seen.place[axis, rows], kind="stable")]
+    left = seen.linear.left(found.step) + others / seen.linear.sigma
+    displaced = left.copy()
+    displaced[:, rows] += moved[:, None] / seen.linear.sigma[rows]
+    gain = (log_likelihoods(seen.linear, displaced, found) - log_likelihoods(seen.linear, left, found))[rows]
+    first, last = _largest_part(gain)
+    place, size = seen.place[axis, rows], float(seen.size[axis, one.view])
+    start = -np.inf if first == 0 else 0.5 * (place[first - 1] + place[first])
+    stop = np.inf if last == len(rows) - 1 else 0.5 * (place[last] + place[last + 1])
+    where = axis, *_open_ended(max(start, 0.0), min(stop, size), size)
+    sigma = float(np.clip(np.sqrt((moved**2).mean()), _STRIP / 30.0, _STRIP * 30.0))
+    return _strip(seen, one.view, where, sigma)
+
+
+def _open_ended(start: float, stop: float, size: float) -> tuple[float, float]:
+    """A strip that reaches an image's end goes on beyond it."""
+    return (-size if start <= 0.0 else start), (2.0 * size if stop >= size else stop)
+
+
+def _largest_part(gain: Array) -> tuple[int, int]:
+    """First and last of the run of values whose sum is the largest."""
+    sums = np.concatenate([[0.0], np.cumsum(gain)])
+    lowest = np.minimum.accumulate(sums[:-1])
+    last = int((sums[1:] - lowest).argmax())
+    return int(sums[: last + 1].argmin()), last
+
+
+def wander(seen: Seen, interval: Interval) -> Explanation:
+    """Rows of an image that wander: splines."""
+    view = interval.view
+    rows = np.flatnonzero(seen.linear.view == view)
+    u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
+    return _on_both(seen, WANDER, view, rows, bsplines(u, _SPLINES), _WANDER)
+
+
+def affine(seen: Seen, interval: Interval) -> Explanation:
+    """An image that was turned, stretched or bent otherwise than its camera says."""
+    view = interval.view
+    rows = np.flatnonzero(seen.linear.view == view)
+    u, v = 2.0 * seen.place[:, rows] / seen.size[:, view, None] - 1.0
+    return _on_both(seen, AFFINE, view, rows, np.stack([u, v, u * u, u * v, v * v]), 1.0)
+
+
+def _on_both(seen: Seen, kind: str, view: int, rows: Array, basis: Array, sigma: float) -> Explanation:
+    extra = np.zeros((2, 2 * len(basis), len(seen.linear.view)))
+    extra[0, : len(basis), rows] = extra[1, len(basis) :, rows] = basis.T
+    return Explanation(kind, view, extra, np.full(2 * len(basis), sigma), float(np.log(seen.linear.views)))
+
+
+EXPLANATIONS: dict[str, Callable[[Seen, Interval], Explanation]] = {
+    STRIP: strip,
+    WANDER: wander,
+    AFFINE: affine,
+}
+"""Name -> unknowns, proposed where an interval of an image stands out."""
+
+
+def proposed(seen: Seen, intervals: list[Interval]) -> Iterator[Explanation]:
+    """Explanations of the intervals that stand out; those of a whole image once."""
+    known = set()
+    for interval in intervals:
+        for kind, make in EXPLANATIONS.items():
+            key = (kind, interval.view, *((interval.axis, interval.start, interval.stop) if kind == STRIP else ()))
+            if key not in known:
+                known.add(key)
+                yield make(seen, interval)

@@ -1,0 +1,317 @@
+"""A block near its solution as a mixture: each observation, kept or cut, is noise about the model, or lies anywhere.
+
+With probability 1 - eps of its view an observation is normal about the model, else it is uniform over the area in
+which matches were found. Of a track of n views any subset of two or more may be right, its ground point integrated
+out, or none. Camera unknowns and what is tried beside them have normal priors; all is linear in them. The logarithm
+of the evidence is that of all observations, of the priors, and of the room that they leave (Laplace), so that
+explanations with different unknowns compare; eps and the noise are found by expectation and maximisation, cooled from
+gross errors down (MacKay 2003, "Information Theory, Inference, and Learning Algorithms", chapters 22 and 28).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from barpc.ba.problem import Problem
+from barpc.ba.solve import State
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+
+_HOTTEST = 200.0  # times the noise stated, where it is cooled from: 20 px of 0.1
+_COOLED = 0.6  # from one iteration to the next, at most
+_LEAST_NOISE = 0.2  # of what is stated
+_ITERATIONS = 60
+_BEGINNINGS = 6  # reweightings of a first guess
+_STANDS = 1e-3, 0.05  # change of the noise (logarithm) and of the log-likelihood at the end
+_WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
+_EPS = 1e-3, 0.98
+_MOST_SUBSETS = 4  # views of a track up to which every subset may be right; of more, all of them or all but one
+_NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """Tracks of n views each."""
+
+    rows: IntArray  # (T, n) their observations
+    view: IntArray  # (T, n)
+    subsets: BoolArray  # (S, n) which may be right together
+    project: Array  # (T, S, 2n, 2n) takes away what the ground point follows; zero outside the subset
+    volume: Array  # (T, S) log of what the integral over the ground point leaves
+    by_unknown: Array  # (T, n, 2, q)
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Tie points linearised at a state, in units of their stated standard deviations, and the cameras' priors."""
+
+    view: IntArray  # (K,)
+    residual: Array  # (2, K)
+    by_unknown: Array  # (2, q, K)
+    sigma: Array  # (K,) [px]
+    tracks: tuple[_Tracks, ...]
+    shape: tuple[int, int]  # N views, q unknowns
+    precision: Array  # (N q,) of the priors
+    offset: Array  # (N q,) unknowns at the state, less the priors' means
+    area: float  # in which a wrong match may lie
+    image: float  # of an image
+
+    @property
+    def views(self) -> int:
+        """N."""
+        return self.shape[0]
+
+    def left(self, step: Array) -> Array:
+        """Residuals (2, K) after a step (N, q) of the cameras."""
+        return self.residual + np.einsum("cqk,kq->ck", self.by_unknown, step[self.view])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What one explanation makes of a block."""
+
+    evidence: float  # log, but for a constant of the block
+    step: Array  # (N, q) of the cameras' unknowns from the state
+    extra: Array  # (e,) of what was tried beside them
+    noise: float  # observed over stated
+    eps: Array  # (N,) part of each view's observations that is wrong
+    right: Array  # (K,) probability that an observation is; 0 for those that take no part
+
+
+def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span: float) -> Linear:
+    """Tie points in use (K,) of a problem at a state where they may all be seen; heights span so much [m]."""
+    structure = problem.structure
+    projected = problem.linearise(state.params, state.points)
+    residual = (projected.image - problem.xy) / sigma
+    by_point, by_unknown = projected.by_point / sigma, projected.by_unknown / sigma
+    finite = np.isfinite(residual).all(axis=0) & np.isfinite(by_point).all(axis=(0, 1))
+    order = structure.by_point[(use & finite)[structure.by_point]]
+    point = structure.point[order]
+    start = np.flatnonzero(np.diff(point, prepend=-1))
+    count = np.diff(np.append(start, len(point)))
+    half, held = problem.cameras.unknowns.half, problem.point_terms(state.points)[0]
+    image = float(np.median(4.0 * half[0] * half[1]) / np.median(sigma) ** 2)
+    pixels = float(np.median(np.linalg.norm(by_point[:, :, order], axis=1)))  # a metre
+    volume = image / pixels**2 * max(span, 1.0)
+    tracks, bases = [], [np.zeros(0)]
+    for n in np.unique(count[count >= 2]).tolist():
+        rows = order[start[count == n][:, None] + np.arange(n)]
+        ground = by_point[:, :, rows].transpose(2, 3, 0, 1).reshape(len(rows), 2 * n, 3)
+        subsets = _subsets(n)
+        project, room = _projectors(ground, subsets, _matrices(held[:, structure.point[rows[:, 0]]]))
+        of_cameras = np.ascontiguousarray(by_unknown[:, :, rows].transpose(2, 3, 0, 1))
+        tracks.append(
+            _Tracks(rows, structure.view[rows], subsets, project, room - np.log(volume), of_cameras)
+        )
+        ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
+        bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
+    far = max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
+    parallax = float(np.median(np.concatenate(bases))) * volume / image if len(order) else 0.0
+    prior = problem.camera_prior
+    return Linear(
+        structure.view, residual, by_unknown, sigma, tuple(tracks), (structure.num_views, by_unknown.shape[1]),
+        (1.0 / prior.sigma**2).ravel(), (state.params - prior.mean).ravel(), 2.0 * far * max(2.0 * far, parallax), image,
+    )  # fmt: skip
+
+
+def _subsets(n: int) -> BoolArray:
+    """Which views of n may be right together (S, n): all, then fewer."""
+    sizes = range(n, 1, -1) if n <= _MOST_SUBSETS else range(n, n - 2, -1)
+    chosen = [subset for size in sizes for subset in combinations(range(n), size)]
+    out = np.zeros((len(chosen), n), dtype=bool)
+    for row, subset in zip(out, chosen, strict=True):
+        row[list(subset)] = True
+    return out
+
+
+def _matrices(triangle: Array) -> Array:
+    """Symmetric matrices (T, 3, 3) of their upper triangles (6, T)."""
+    a, b, c, d, e, f = triangle
+    return np.stack([np.stack(row, -1) for row in ((a, b, c), (b, d, e), (c, e, f))], -2)
+
+
+def _projectors(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, Array]:
+    """I - J (J' J + held)^-1 J' of each subset's rows (T, S, 2n, 2n), and -1/2 log det of the matrix (T, S)."""
+    size = ground.shape[1]
+    project = np.empty((len(ground), len(subsets), size, size))
+    room = np.empty((len(ground), len(subsets)))
+    for k, subset in enumerate(subsets):
+        mask = np.repeat(subset, 2).astype(np.float64)
+        part = ground * mask[:, None]
+        matrix = np.swapaxes(part, 1, 2) @ part + held
+        matrix += 1e-12 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        project[:, k] = np.diag(mask) - part @ np.linalg.solve(matrix, np.swapaxes(part, 1, 2))
+        room[:, k] = -0.5 * np.linalg.slogdet(matrix)[1]
+    return project, room
+
+
+def fit(linear: Linear, extra: Array | None = None, sigma: Array | None = None, warm: Fit | None = None) -> Fit:
+    """The block with cameras and, beside them, unknowns of which each moves observations by `extra` (2, e, K) [px].
+
+    Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, of which the unknowns may be fewer,
+    it is cooled again only from where the further ones begin.
+    """
+    return _Mixture(linear, extra, sigma, warm).run()
+
+
+def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
+    """Log-likelihood (K,) of the track of every observation, at residuals (2, K) in stated standard deviations."""
+    out = np.zeros(len(linear.view))
+    for tracks in linear.tracks:
+        weight = _expect(linear, tracks, residual, found.noise, found.eps)
+        out[tracks.rows] = weight.log[:, None]
+    return out
+
+
+def settled(linear: Linear, residual: Array, found: Fit) -> Array:
+    """Residuals (2, K) of the right observations once the ground points have moved to where these are smallest.
+
+    In standard deviations that they would have then; 0 of the wrong ones.
+    """
+    out = np.zeros_like(residual)
+    for tracks in linear.tracks:
+        weight = _expect(linear, tracks, residual, found.noise, found.eps)
+        count, n = tracks.rows.shape
+        project = np.einsum("ts,tsij->tij", weight.of_subset, tracks.project)
+        r = residual[:, tracks.rows].transpose(1, 2, 0).reshape(count, 2 * n, 1)
+        free = np.trace(project, axis1=1, axis2=2)[:, None, None] / (2 * n)
+        off = (project @ r) / np.sqrt(np.maximum(free, 0.1)) / found.noise
+        out[:, tracks.rows] = off.reshape(count, n, 2).transpose(2, 0, 1)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Expected:
+    log: Array  # (T,) log-likelihood of a track
+    of_subset: Array  # (T, S) probability of each subset
+    right: Array  # (T, n) of each observation, alone or with others
+    square: Array  # (T, S) squared residuals of the subsets
+
+
+def _expect(linear: Linear, tracks: _Tracks, residual: Array, noise: float, eps: Array) -> _Expected:
+    count, n = tracks.rows.shape
+    r = residual[:, tracks.rows].transpose(1, 2, 0).reshape(count, 1, 2 * n, 1)
+    square = (r * (tracks.project @ r))[..., 0].sum(axis=-1)
+    area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(_NEAR_LIMIT))
+    right, wrong = np.log1p(-eps)[tracks.view], np.log(eps)[tracks.view]
+    subsets, members = tracks.subsets.astype(np.float64), tracks.subsets.sum(axis=1)
+    log = right @ subsets.T + wrong @ (1.0 - subsets).T + tracks.volume - square / (2.0 * noise**2)
+    log -= (n - members) * np.log(area) + 0.5 * (2 * members - 3) * np.log(2.0 * np.pi * noise**2)
+    odds = np.exp(right - wrong)
+    alone = wrong.sum(axis=1) + np.log1p(odds.sum(axis=1)) - np.log(linear.image) - (n - 1) * np.log(area)
+    top = np.maximum(log.max(axis=1), alone)
+    share, of_none = np.exp(log - top[:, None]), np.exp(alone - top)
+    total = share.sum(axis=1) + of_none
+    share /= total[:, None]
+    single = (of_none / total / (1.0 + odds.sum(axis=1)))[:, None] * odds
+    return _Expected(top + np.log(total), share, share @ subsets + single, square)
+
+
+class _Mixture:
+    """One fit at work: unknowns x = (cameras N q, extra e)."""
+
+    def __init__(self, linear: Linear, extra: Array | None, sigma: Array | None, warm: Fit | None) -> None:
+        self.linear = linear
+        self.extra = np.zeros((2, 0, len(linear.sigma))) if extra is None else extra / linear.sigma
+        own = np.zeros(0) if sigma is None else 1.0 / sigma**2
+        self.precision = np.concatenate([linear.precision, own])
+        self.offset = np.concatenate([linear.offset, np.zeros(len(own))])
+        self.x = np.zeros(len(self.precision))
+        self.left = linear.residual
+        self.noise, self.eps = _HOTTEST, np.full(linear.views, _WRONG[0] / _WRONG[1])
+        if warm is not None:
+            known = warm.step.size + len(warm.extra)
+            self.x[:known] = *warm.step.ravel(), *warm.extra
+            self.noise, self.eps = warm.noise, warm.eps
+            if known < len(self.x):
+                self._begin(known)
+
+    def _begin(self, known: int) -> None:
+        """Unknowns after the first `known`: the least sum of what all tracks are off by, not of its squares."""
+        linear = self.linear
+        step, extra = np.split(self.x, [linear.precision.size])
+        left = linear.left(step.reshape(linear.shape)) + np.einsum("cek,e->ck", self.extra, extra)
+        new = self.extra[:, known - linear.precision.size :]
+        moved = np.zeros(new.shape[1])
+        spread = self.noise
+        for _ in range(_BEGINNINGS):
+            matrix, gradient, squares = np.diag(self.precision[known:]), self.precision[known:] * moved, []
+            for tracks in linear.tracks:
+                count, n = tracks.rows.shape
+                beside = new[:, :, tracks.rows].transpose(2, 3, 0, 1).reshape(count, 2 * n, -1)
+                some = np.flatnonzero(beside.any(axis=(1, 2)))
+                beside, project = beside[some], tracks.project[some, 0]
+                r = left[:, tracks.rows[some]].transpose(1, 2, 0).reshape(len(some), 2 * n, 1)
+                off = project @ (r + beside @ moved[:, None])
+                square = (off**2).sum(axis=(1, 2))
+                weight = 1.0 / np.sqrt(square + spread**2)[:, None, None]
+                matrix += (np.swapaxes(beside, 1, 2) @ (weight * (project @ beside))).sum(axis=0)
+                gradient = gradient + (np.swapaxes(beside, 1, 2) @ (weight * off)).sum(axis=0)[:, 0]
+                squares.append(square)
+            moved = moved - np.linalg.solve(matrix, gradient)
+        self.x[known:] = moved
+        if squares:
+            self.noise = max(self.noise, float(np.sqrt(np.median(np.concatenate(squares)))))
+
+    def run(self) -> Fit:
+        """Expect and maximise until nothing changes."""
+        linear, last = self.linear, -np.inf
+        right, matrix, log = np.zeros(len(linear.sigma)), np.zeros((0, 0)), 0.0
+        for _ in range(_ITERATIONS):
+            matrix, gradient = np.diag(self.precision), self.precision * (self.offset + self.x)
+            wrong, count = np.zeros(linear.views), np.zeros(linear.views)
+            log = squares = freedom = 0.0
+            for tracks, found in self._expected():
+                log += float(found.log.sum())
+                right[tracks.rows] = found.right
+                wrong += np.bincount(tracks.view.ravel(), (1.0 - found.right).ravel(), linear.views)
+                count += np.bincount(tracks.view.ravel(), minlength=linear.views)
+                squares += float((found.of_subset * found.square).sum())
+                freedom += float((found.of_subset * (2 * tracks.subsets.sum(axis=1) - 3)).sum())
+                self._add(tracks, found, matrix, gradient)
+            inverse = np.linalg.inv(matrix)
+            self.x = self.x - inverse @ gradient
+            known = len(self.x) - float(inverse.diagonal() @ self.precision)
+            seen = max(np.sqrt(squares / max(freedom - known, 1.0)), _LEAST_NOISE)
+            noise = seen if self.noise <= seen else max(seen, _COOLED * self.noise)
+            self.eps = np.clip((wrong + _WRONG[0]) / (count + _WRONG[1]), *_EPS)
+            settled = abs(np.log(noise / self.noise)) < _STANDS[0] and abs(log - last) < _STANDS[1]
+            self.noise, last = float(noise), log
+            if settled:
+                break
+        away = self.offset + self.x
+        room = float(np.linalg.slogdet(matrix)[1] - np.log(self.precision).sum())
+        evidence = log - 0.5 * float(self.precision @ away**2) - 0.5 * room
+        step, extra = np.split(self.x, [linear.shape[0] * linear.shape[1]])
+        return Fit(evidence, step.reshape(linear.shape), extra, self.noise, self.eps, right)
+
+    def _expected(self) -> Iterator[tuple[_Tracks, _Expected]]:
+        step, extra = np.split(self.x, [self.linear.precision.size])
+        self.left = self.linear.left(step.reshape(self.linear.shape)) + np.einsum("cek,e->ck", self.extra, extra)
+        for tracks in self.linear.tracks:
+            yield tracks, _expect(self.linear, tracks, self.left, self.noise, self.eps)
+
+    def _add(self, tracks: _Tracks, found: _Expected, matrix: Array, gradient: Array) -> None:
+        """Add the normal matrix and gradient of some tracks."""
+        (views, q), (count, n) = self.linear.shape, tracks.rows.shape
+        weight = np.einsum("ts,tsij->tij", found.of_subset, tracks.project) / self.noise**2
+        residual = self.left[:, tracks.rows].transpose(1, 2, 0).reshape(count, 2 * n, 1)
+        pull = (weight @ residual).reshape(count, n, 2)
+        place = tracks.view[..., None] * q + np.arange(q)
+        parts, places = tracks.by_unknown, place
+        if e := self.extra.shape[1]:
+            beside = self.extra[:, :, tracks.rows].transpose(2, 3, 0, 1)
+            parts = np.concatenate([parts, beside], axis=-1)
+            places = np.concatenate([place, np.broadcast_to(views * q + np.arange(e), (count, n, e))], axis=-1)
+        np.add.at(gradient, places, np.einsum("tna,tnap->tnp", pull, parts))
+        for i in range(n):
+            for j in range(n):
+                one = np.swapaxes(parts[:, i], 1, 2) @ weight[:, 2 * i : 2 * i + 2, 2 * j : 2 * j + 2] @ parts[:, j]
+                pairs = tracks.view[:, i] * views + tracks.view[:, j]
+                for pair in np.unique(pairs):
+                    rows = np.flatnonzero(pairs == pair)
+                    matrix[np.ix_(places[rows[0], i], places[rows[0], j])] += one[rows].sum(axis=0)

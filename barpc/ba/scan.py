@@ -1,0 +1,88 @@
+"""Where in an image ties are wrong, or off, more than elsewhere: scans over all intervals of its rows and columns.
+
+Two statistics, both about the logarithm of a likelihood ratio: of the share of observations that are wrong (Kulldorff
+1997, "A spatial scan statistic"), and of a displacement that all observations of the interval have in common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barpc.geodesy import Array
+from barpc.scene import IntArray
+
+BINS = 40  # stretches of an image's rows or columns
+SURE = 5.0  # nats: an explanation that gains less is none
+_CLIPPED = 8.0  # standard deviations: one residual tells no more
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A stretch of an image that stands out."""
+
+    view: int
+    axis: int  # 0: columns, 1: rows
+    start: float  # [px]
+    stop: float
+    gain: float  # nats, what the choice among all places costs taken off
+    share: float  # of its observations that are wrong
+    by_share: bool  # or by what they have in common
+
+
+def price(views: int) -> float:
+    """What the choice among the intervals of all views, rows and columns, costs [nats]."""
+    return float(np.log(BINS * (BINS + 1) / 2 * 2 * views))
+
+
+def scan(view: IntArray, place: Array, size: Array, wrong: Array, off: Array) -> list[Interval]:
+    """The interval that stands out most, by each statistic, of every view's columns and rows; the best first.
+
+    Parameters
+    ----------
+    view : (K,)
+    place : (2, K), where observations are [px], in images of `size` (2, N)
+    wrong : (K,), probability that an observation is wrong
+    off : (2, K), residuals in standard deviations that they would have
+    """
+    views = size.shape[1]
+    off = np.clip(off, -_CLIPPED, _CLIPPED)
+    found = []
+    for axis in (0, 1):
+        bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)
+        rows = np.array([np.ones(len(view)), wrong, *off, *(1.0 - wrong) * off])
+        sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
+        sums = np.pad(sums.reshape(-1, views, BINS).cumsum(axis=-1), ((0, 0), (0, 0), (1, 0)))
+        count, bad, col, row = (part[:, None, :] - part[:, :, None] for part in sums[:4])  # (N, start, stop)
+        total, all_bad = sums[:2, :, -1, None, None]
+        for by_share in (True, False):
+            if by_share:
+                gain = _shares(count, bad, total, all_bad)
+            else:
+                mean = sums[2:4, :, -1, None, None] / np.maximum(total, 1.0)
+                part = count * np.maximum(1.0 - count / np.maximum(total, 1.0), 1e-3)
+                both = (col - mean[0] * count) ** 2 + (row - mean[1] * count) ** 2
+                gain = np.where(count > 0, 0.5 * both / np.maximum(part, 1e-9), 0.0) - 1.0
+            gain[:, ~np.triu(np.ones((BINS + 1, BINS + 1), dtype=bool), 1)] = 0.0
+            gain[:, 0, BINS] = 0.0  # all of an image is no interval
+            for v in range(views):
+                i, j = np.unravel_index(int(gain[v].argmax()), gain[v].shape)
+                step = size[axis, v] / BINS
+                share = float(bad[v, i, j] / max(count[v, i, j], 1.0))
+                at = float(i * step), float(j * step)
+                found.append(Interval(v, axis, *at, float(gain[v, i, j]) - price(views), share, by_share))
+    return sorted(found, key=lambda one: -one.gain)
+
+
+def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:
+    """Logarithm of the likelihood ratio of two shares over one, where that inside is the larger."""
+
+    def log(k: Array, n: Array) -> Array:
+        p = k / np.maximum(n, 1e-9)
+        with np.errstate(all="ignore"):
+            return np.where(k > 0, k * np.log(p), 0.0) + np.where(n - k > 1e-9, (n - k) * np.log1p(-p), 0.0)
+
+    outside, bad_outside = total - count, all_bad - bad
+    more = bad * np.maximum(outside, 1e-9) > bad_outside * count
+    return np.where(more, log(bad, count) + log(bad_outside, outside) - log(all_bad, total), 0.0)
