@@ -55,7 +55,8 @@ def standing_out(outcome: Outcome, block: Block) -> list[Interval]:
 def judge(outcome: Outcome, block: Block) -> list[Finding]:
     """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out."""
     problem = outcome.problem
-    if not standing_out(outcome, block) or problem.free.size > _UNKNOWNS:
+    first = standing_out(outcome, block)
+    if not first or problem.free.size > _UNKNOWNS:
         return []
     state, _ = revived(
         problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
@@ -66,7 +67,7 @@ def judge(outcome: Outcome, block: Block) -> list[Finding]:
     low, high = block.alt_range
     linear = linearise(problem, state, use, block.sigma, high - low)
     size = np.array([view.size for view in block.views], dtype=np.float64).T
-    return _Search(Seen(linear, block.xy, size)).run()
+    return _Search(Seen(linear, block.xy, size), first).run()
 
 
 def _numbers(block: Block, use: BoolArray) -> float:
@@ -77,11 +78,10 @@ def _numbers(block: Block, use: BoolArray) -> float:
 class _Search:
     """Taking one explanation after the other."""
 
-    def __init__(self, seen: Seen) -> None:
-        self.seen = seen
+    def __init__(self, seen: Seen, first: list[Interval]) -> None:
+        self.seen, self.first = seen, first
         self.taken: list[Explanation] = []
         self.best = fit(seen.linear)
-        self.noise = self.best.noise
 
     def run(self) -> list[Finding]:
         found: list[tuple[Explanation, float, float, str]] = []
@@ -122,15 +122,18 @@ class _Search:
         left = linear.left(self.best.step) + self._moved(self.best.extra) / linear.sigma
         wrong = (1.0 - self.best.right)[rows]
         off = settled(linear, left, self.best)[:, rows]
-        out = [one for one in scan(linear.view[rows], self.seen.place[:, rows], self.seen.size, wrong, off) if one.gain > SURE]
-        made = []
-        for one in proposed(self.seen, out[:_TRIED]):
-            made.append(self._fitted(one))
+        out = scan(linear.view[rows], self.seen.place[:, rows], self.seen.size, wrong, off)
+        out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
+        out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
+        made = [(one, self._fit(one)) for one in proposed(self.seen, out)]
+        made.sort(key=lambda row: row[0].price - row[1].evidence)
+        strips = [n for n, row in enumerate(made) if row[0].kind == STRIP][:_SHARPENED]
+        for n in strips:
+            made[n] = self._sharpened(*made[n])
         return made
 
-    def _fitted(self, one: Explanation) -> tuple[Explanation, Fit]:
-        found = self._fit(one)
-        for _ in range(_SHARPENED if one.kind == STRIP else 0):
+    def _sharpened(self, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
+        for _ in range(_SHARPENED):
             again = sharpened(self.seen, one, found, self._moved(found.extra[: -len(one.sigma)]))
             better = self._fit(again)
             if not better.evidence > found.evidence:
@@ -151,6 +154,21 @@ class _Search:
             out += np.einsum("cek,e->ck", one.extra, extra[start:stop])
             start = stop
         return out
+
+
+def _distinct(intervals: list[Interval]) -> list[Interval]:
+    """Without those of which most is in a better one, and most of that in them."""
+    out: list[Interval] = []
+    for one in intervals:
+        if not any(_same(one, other) for other in out):
+            out.append(one)
+    return out
+
+
+def _same(one: Interval, other: Interval) -> bool:
+    common = min(one.stop, other.stop) - max(one.start, other.start)
+    either = max(one.stop, other.stop) - min(one.start, other.start)
+    return (one.view, one.axis) == (other.view, other.axis) and 2.0 * common > either
 
 
 def _differs(one: Explanation, other: Explanation) -> bool:

@@ -37,7 +37,8 @@ _NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise i
 class _Tracks:
     """Tracks of n views each."""
 
-    rows: IntArray  # (T, n) their observations
+    rows: IntArray  # (T, n) their observations, sorted by what views they are of
+    sets: IntArray  # where tracks of other views begin
     view: IntArray  # (T, n)
     subsets: BoolArray  # (S, n) which may be right together
     project: Array  # (T, S, 2n, 2n) takes away what the ground point follows; zero outside the subset
@@ -100,12 +101,14 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
     tracks, bases = [], [np.zeros(0)]
     for n in np.unique(count[count >= 2]).tolist():
         rows = order[start[count == n][:, None] + np.arange(n)]
+        rows = rows[np.lexsort(structure.view[rows].T)]
+        changes = (np.diff(structure.view[rows], axis=0, prepend=-1) != 0).any(axis=1)
         ground = by_point[:, :, rows].transpose(2, 3, 0, 1).reshape(len(rows), 2 * n, 3)
         subsets = _subsets(n)
         project, room = _projectors(ground, subsets, _matrices(held[:, structure.point[rows[:, 0]]]))
         of_cameras = np.ascontiguousarray(by_unknown[:, :, rows].transpose(2, 3, 0, 1))
         tracks.append(
-            _Tracks(rows, structure.view[rows], subsets, project, room - np.log(volume), of_cameras)
+            _Tracks(rows, np.flatnonzero(changes), structure.view[rows], subsets, project, room - np.log(volume), of_cameras)
         )
         ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
         bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
@@ -308,10 +311,12 @@ class _Mixture:
             parts = np.concatenate([parts, beside], axis=-1)
             places = np.concatenate([place, np.broadcast_to(views * q + np.arange(e), (count, n, e))], axis=-1)
         np.add.at(gradient, places, np.einsum("tna,tnap->tnp", pull, parts))
-        for i in range(n):
-            for j in range(n):
-                one = np.swapaxes(parts[:, i], 1, 2) @ weight[:, 2 * i : 2 * i + 2, 2 * j : 2 * j + 2] @ parts[:, j]
-                pairs = tracks.view[:, i] * views + tracks.view[:, j]
-                for pair in np.unique(pairs):
-                    rows = np.flatnonzero(pairs == pair)
-                    matrix[np.ix_(places[rows[0], i], places[rows[0], j])] += one[rows].sum(axis=0)
+        turned = np.ascontiguousarray(np.swapaxes(parts, 2, 3))
+        for j in range(n):
+            of_all = weight[:, :, 2 * j : 2 * j + 2] @ parts[:, j]
+            for i in range(j + 1):
+                sums = np.add.reduceat(turned[:, i] @ of_all[:, 2 * i : 2 * i + 2], tracks.sets, axis=0)
+                for first, one in zip(tracks.sets.tolist(), sums, strict=True):
+                    matrix[np.ix_(places[first, i], places[first, j])] += one
+                    if i < j:
+                        matrix[np.ix_(places[first, j], places[first, i])] += one.T
