@@ -54,6 +54,7 @@ from barpc.rpcio import write_rpc  # noqa: E402
 from barpc.scene import BoolArray  # noqa: E402
 from barpc.sensor import SensorModel  # noqa: E402
 from barpc.sensor.geometry import triangulate  # noqa: E402
+from barpc.sensor.rpc import RPC  # noqa: E402
 from benchmarks.worlds_cameras import CHIPS, Array, Flaw, compass, ecef  # noqa: E402
 from benchmarks.worlds_families import FAMILIES, NAMES, PRIOR, Plan, World, draw, fly, make, step, wave  # noqa: E402
 
@@ -88,6 +89,7 @@ def command(world: World) -> Outcome:
         for view in world.views:
             with rasterio.open(folder / view.path, "w", width=view.size[0], height=view.size[1], **shape):
                 pass
+            assert isinstance(view.sensor, RPC)
             write_rpc(view.sensor, folder / f"{view.name}_RPC.TXT")
             paths.append(folder / view.path)
         write_matches(folder / "ties.npz", world.tracks, [view.name for view in world.views])
@@ -546,7 +548,7 @@ def _selftest_flaw(kind: str) -> None:
 
 def _seeds(text: str) -> list[int]:
     """0-9,12 -> numbers."""
-    found = []
+    found: list[int] = []
     for part in text.split(","):
         first, _, last = part.partition("-")
         found += range(int(first), int(last or first) + 1)

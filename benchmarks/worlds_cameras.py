@@ -224,13 +224,15 @@ class Camera:
     def _pose(self, row: Array, flaw: Flaw) -> tuple[Array, Array]:
         """Place (n, 3) and attitude (n, 3, 3) at rows."""
         lag = (row - (self.size[1] - 1) / 2.0) * self.period * (1.0 + flaw.rate)
-        turn = np.polynomial.chebyshev.chebval(np.clip(lag / self._half(), -1.2, 1.2), self.turns).T
+        turn = np.asarray(
+            np.polynomial.chebyshev.chebval(np.clip(lag / self._half(), -1.2, 1.2), self.turns).T, float
+        )
         off = np.zeros((len(row), 2))
         for pointing in flaw.pointing:
             off = off + pointing(row)
         wrong = flaw.attitude + flaw.drift * (2.0 * row / (self.size[1] - 1) - 1.0)[:, None]
         wrong = wrong + np.stack([-off[:, 0], -off[:, 1], np.zeros(len(row))], -1) * self.ifov
-        return self.orbit.at(self.time + lag)[0] + flaw.place, self.middle @ turned(turn) @ turned(wrong)
+        return self.orbit.at(self.time + lag)[0] + flaw.place, self.middle @ (turned(turn) @ turned(wrong))
 
     def _look(self, col: Array, flaw: Flaw) -> Array:
         """Tangents x, y (n, 2) of columns; of `flaw` the focal length."""
@@ -321,7 +323,7 @@ def aim(
     target = ecef(orbit.target)
     ifov = gsd / float(np.linalg.norm(target - place[0]))
     steady = _steady_rate(orbit, time, place[0], ahead[0])
-    period = gsd / (np.linalg.norm(steady) * speed)
+    period = gsd / (float(np.linalg.norm(steady)) * speed)
     lag = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES) * _half_span(size[1], period)
     if scan is None:
         first = _frame(target - place[0], steady)
@@ -341,7 +343,7 @@ def aim(
     turns = np.polynomial.chebyshev.chebfit(
         lag / _half_span(size[1], period), vector(first.T @ attitude), _DEGREE
     )
-    return Camera(orbit, time, float(period), size, ifov, first, turns, *optics)
+    return Camera(orbit, time, period, size, ifov, first, np.asarray(turns, dtype=float), *optics)
 
 
 def _level(place: Array, ahead: Array) -> Array:

@@ -184,8 +184,8 @@ def _detector(plan: Plan, view: int) -> None:
     chips = np.zeros((CHIPS, 2))
     chips[chip] = size * plan.direction()
     plan.flaw(view, chips=chips)
-    edges = np.array([chip, chip + 1]) * plan.size[0] / CHIPS
-    plan.injected.append(Injected("detector", (view,), 0, *edges.tolist(), size))
+    wide = plan.size[0] / CHIPS
+    plan.injected.append(Injected("detector", (view,), 0, chip * wide, (chip + 1) * wide, size))
 
 
 def _decay(plan: Plan, views: Sequence[int]) -> None:
