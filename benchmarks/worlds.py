@@ -217,7 +217,7 @@ def _near_edges(world: World) -> BoolArray:
     near = np.zeros(len(world.check), dtype=bool)
     names = [view.name for view in world.views]
     for fault in world.plan.injected:
-        if fault.kind not in ("jump", "detector"):
+        if fault.kind not in ("jump", "detector", "settling"):
             continue
         for view in (names.index(NAMES[v]) for v in fault.views if NAMES[v] in names):
             ties = np.sort(world.tracks.xy[(world.tracks.view == view) & ~world.bad, fault.axis])

@@ -354,9 +354,11 @@ def _wander(seed: int, rng: np.random.Generator) -> Plan:
         if kind in ("walk", "all"):
             plan.flaw(view, pointing=_walk(rows, walk / ifov, rng))
         if kind in ("settling", "all"):
-            plan.flaw(
-                view,
-                pointing=_fade(rng.uniform(0, 0.8) * rows, 1.0 / period, 20e-6 / ifov * plan.direction()),
+            start = float(rng.uniform(0, 0.8) * rows)
+            shift = 20e-6 / ifov * plan.direction()
+            plan.flaw(view, pointing=_fade(start, 1.0 / period, shift))
+            plan.injected.append(
+                Injected("settling", (view,), 1, start, start, 20e-6 / ifov, f"from row {start:.0f}")
             )
         if kind in ("focal", "all"):
             plan.flaw(view, focal=rng.choice([-1e-4, 1e-4]))
@@ -364,7 +366,8 @@ def _wander(seed: int, rng: np.random.Generator) -> Plan:
             plan.flaw(view, rate=rng.choice([-1e-4, 1e-4]))
     sizes = {"walk": walk / ifov, "settling": 20e-6 / ifov, "focal": 5e-5 * plan.size[0], "rate": 5e-5 * rows}
     size = max(sizes.values()) if kind == "all" else sizes[kind]
-    plan.injected.append(Injected(kind, views, 1, 0, 0, size))
+    if kind != "settling":
+        plan.injected.append(Injected(kind, views, 1, 0, 0, size))
     return plan
 
 
