@@ -10,6 +10,7 @@ import numpy as np
 from barpc.ba.mixture import Fit, Linear, log_likelihoods
 from barpc.ba.scan import Interval, price
 from barpc.geodesy import Array
+from barpc.scene import IntArray
 from barpc.sensor.splined import bsplines
 
 STRIP = "strip"
@@ -110,7 +111,7 @@ def affine(seen: Seen, interval: Interval) -> Explanation:
     return _on_both(seen, AFFINE, view, rows, np.stack([u, v, u * u, u * v, v * v]), 1.0)
 
 
-def _on_both(seen: Seen, kind: str, view: int, rows: Array, basis: Array, sigma: float) -> Explanation:
+def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sigma: float) -> Explanation:
     extra = np.zeros((2, 2 * len(basis), len(seen.linear.view)))
     extra[0, : len(basis), rows] = extra[1, len(basis) :, rows] = basis.T
     return Explanation(kind, view, extra, np.full(2 * len(basis), sigma), float(np.log(seen.linear.views)))
@@ -129,7 +130,11 @@ def proposed(seen: Seen, intervals: list[Interval]) -> Iterator[Explanation]:
     known = set()
     for interval in intervals:
         for kind, make in EXPLANATIONS.items():
-            key = (kind, interval.view, *((interval.axis, interval.start, interval.stop) if kind == STRIP else ()))
+            key = (
+                kind,
+                interval.view,
+                *((interval.axis, interval.start, interval.stop) if kind == STRIP else ()),
+            )
             if key not in known:
                 known.add(key)
                 yield make(seen, interval)

@@ -128,7 +128,9 @@ def _with_waves(
     if start is not None:
         params[:, unknowns.in_waves.start :] = start
     elif unknowns.waves is not None:
-        params[:, unknowns.in_waves.start :] = waves.carried(ended.params[:, unknowns.in_waves], unknowns.waves)
+        params[:, unknowns.in_waves.start :] = waves.carried(
+            ended.params[:, unknowns.in_waves], unknowns.waves
+        )
     outcome, weight = found.outcome, block.use / block.sigma
     there, _ = revived(bent, replace(ended, params=params), outcome.residual, outcome.inlier, weight)
     outcome = Rounds(bent, block, there, options, found.heights, block.use, outcome).run(once)

@@ -73,7 +73,9 @@ class BlockPrior:
             return None
         place = {name: i for i, name in enumerate(self.names)}
         old = np.array([place.get(name, len(place)) for name in names])
-        edges, strips = (np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in (edges, strips))
+        edges, strips = (
+            np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in (edges, strips)
+        )
         return Waves(self.splines, edges, strips)
 
     @property

@@ -32,7 +32,9 @@ class Finding:
     kind: str  # a name of `barpc.ba.explanations.EXPLANATIONS`
     view: int
     where: tuple[int, float, float] | None  # axis, start and stop [px]
-    size: Array  # (2,) root mean square displacement of what it moves, col and row, with sign for a strip [px]
+    size: (
+        Array  # (2,) root mean square displacement of what it moves, col and row, with sign for a strip [px]
+    )
     gain: float  # nats over the next without it
     gap: float  # nats over the runner-up
     runner_up: str  # its kind, or "" for none
@@ -43,7 +45,9 @@ def standing_out(outcome: Outcome, block: Block) -> list[Interval]:
     problem = outcome.problem
     is_tie = (block.point < block.num_tracks) & block.use
     observations = Observations(problem, block.sigma, 0.0, is_tie)
-    spread = block.sigma * outcome.noise * np.sqrt(0.5 * observations.freedom(outcome.inlier.astype(np.float64)))
+    spread = (
+        block.sigma * outcome.noise * np.sqrt(0.5 * observations.freedom(outcome.inlier.astype(np.float64)))
+    )
     rows = is_tie & np.isfinite(outcome.residual).all(axis=0)
     size = np.array([view.size for view in block.views], dtype=np.float64).T
     wrong = (~outcome.inlier[rows]).astype(np.float64)

@@ -29,8 +29,12 @@ _BEGINNINGS = 6  # reweightings of a first guess
 _STANDS = 1e-3, 0.05  # change of the noise (logarithm) and of the log-likelihood at the end
 _WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
 _EPS = 1e-3, 0.98
-_MOST_SUBSETS = 4  # views of a track up to which every subset may be right; of more, all of them or all but one
-_NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
+_MOST_SUBSETS = (
+    4  # views of a track up to which every subset may be right; of more, all of them or all but one
+)
+_NEAR_LIMIT = (
+    4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +72,8 @@ class Linear:
 
     def left(self, step: Array) -> Array:
         """Residuals (2, K) after a step (N, q) of the cameras."""
-        return self.residual + np.einsum("cqk,kq->ck", self.by_unknown, step[self.view])
+        left: Array = self.residual + np.einsum("cqk,kq->ck", self.by_unknown, step[self.view])
+        return left
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,18 +112,27 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         subsets = _subsets(n)
         project, room = _projectors(ground, subsets, _matrices(held[:, structure.point[rows[:, 0]]]))
         of_cameras = np.ascontiguousarray(by_unknown[:, :, rows].transpose(2, 3, 0, 1))
-        tracks.append(
-            _Tracks(rows, np.flatnonzero(changes), structure.view[rows], subsets, project, room - np.log(volume), of_cameras)
-        )
+        seen = np.flatnonzero(changes), structure.view[rows]
+        tracks.append(_Tracks(rows, *seen, subsets, project, room - np.log(volume), of_cameras))
         ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
         bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
-    far = max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
+    far = (
+        max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
+    )
     parallax = float(np.median(np.concatenate(bases))) * volume / image if len(order) else 0.0
     prior = problem.camera_prior
     return Linear(
-        structure.view, residual, by_unknown, sigma, tuple(tracks), (structure.num_views, by_unknown.shape[1]),
-        (1.0 / prior.sigma**2).ravel(), (state.params - prior.mean).ravel(), 2.0 * far * max(2.0 * far, parallax), image,
-    )  # fmt: skip
+        structure.view,
+        residual,
+        by_unknown,
+        sigma,
+        tuple(tracks),
+        (structure.num_views, by_unknown.shape[1]),
+        (1.0 / prior.sigma**2).ravel(),
+        (state.params - prior.mean).ravel(),
+        2.0 * far * max(2.0 * far, parallax),
+        image,
+    )
 
 
 def _subsets(n: int) -> BoolArray:
@@ -152,11 +166,13 @@ def _projectors(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, 
     return project, room
 
 
-def fit(linear: Linear, extra: Array | None = None, sigma: Array | None = None, warm: Fit | None = None) -> Fit:
+def fit(
+    linear: Linear, extra: Array | None = None, sigma: Array | None = None, warm: Fit | None = None
+) -> Fit:
     """The block with cameras and, beside them, unknowns of which each moves observations by `extra` (2, e, K) [px].
 
-    Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, of which the unknowns may be fewer,
-    it is cooled again only from where the further ones begin.
+    Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, whose unknowns may be fewer, it
+    is cooled again only from where the further ones begin.
     """
     return _Mixture(linear, extra, sigma, warm).run()
 
@@ -294,7 +310,9 @@ class _Mixture:
 
     def _expected(self) -> Iterator[tuple[_Tracks, _Expected]]:
         step, extra = np.split(self.x, [self.linear.precision.size])
-        self.left = self.linear.left(step.reshape(self.linear.shape)) + np.einsum("cek,e->ck", self.extra, extra)
+        self.left = self.linear.left(step.reshape(self.linear.shape)) + np.einsum(
+            "cek,e->ck", self.extra, extra
+        )
         for tracks in self.linear.tracks:
             yield tracks, _expect(self.linear, tracks, self.left, self.noise, self.eps)
 
@@ -309,7 +327,9 @@ class _Mixture:
         if e := self.extra.shape[1]:
             beside = self.extra[:, :, tracks.rows].transpose(2, 3, 0, 1)
             parts = np.concatenate([parts, beside], axis=-1)
-            places = np.concatenate([place, np.broadcast_to(views * q + np.arange(e), (count, n, e))], axis=-1)
+            places = np.concatenate(
+                [place, np.broadcast_to(views * q + np.arange(e), (count, n, e))], axis=-1
+            )
         np.add.at(gradient, places, np.einsum("tna,tnap->tnp", pull, parts))
         turned = np.ascontiguousarray(np.swapaxes(parts, 2, 3))
         for j in range(n):

@@ -93,7 +93,9 @@ def _once(url: str, start: int, stop: int) -> Part | str:
             again = answer.isclosed() and not answer.will_close
     except (HTTPException, TimeoutError, ConnectionError, ssl.SSLError, _PassingError) as error:
         if late.is_set():  # however the cut shows: as an end, as a reset
-            raise _PassingError(f"its host takes more than {longest:.3g} s for {stop - start} bytes") from error
+            raise _PassingError(
+                f"its host takes more than {longest:.3g} s for {stop - start} bytes"
+            ) from error
         if isinstance(error, _PassingError):
             raise
         raise _PassingError(f"its host broke off ({type(error).__name__})") from error

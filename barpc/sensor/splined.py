@@ -1,7 +1,8 @@
 """What no rotation and no RPC holds: a correction in the image, by a spline over its rows, steps and strips.
 
 Attitude jitter moves image rows against each other, a focal plane that is put together of detectors moves its columns,
-a jump of the attitude or of the clock a strip of rows. All are functions of where a point is *seen*, so that x = P(X) + s(x): localisation is explicit, projection iterates.
+a jump of the attitude or of the clock a strip of rows. All are functions of where a point is *seen*, so that
+x = P(X) + s(x): localisation is explicit, projection iterates.
 """
 
 from __future__ import annotations
