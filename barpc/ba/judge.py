@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,7 +53,8 @@ def standing_out(outcome: Outcome, block: Block) -> list[Interval]:
     wrong = (~outcome.inlier[rows]).astype(np.float64)
     off = np.where(outcome.inlier[rows], outcome.residual[:, rows] / spread[rows], 0.0)
     found = scan(block.view[rows], block.xy[:, rows], size, wrong, off)
-    return [one for one in found if one.gain > SURE]
+    pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 0.0
+    return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
 
 
 def judge(outcome: Outcome, block: Block) -> list[Finding]:

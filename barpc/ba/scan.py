@@ -28,7 +28,8 @@ class Interval:
     stop: float
     gain: float  # nats, what the choice among all places costs taken off
     share: float  # of its observations that are wrong
-    by_share: bool  # or by what they have in common
+    off: float  # what the others have in common, in the units of the residuals
+    by_share: bool  # whether the share stands out, or what they have in common
 
 
 def price(views: int) -> float:
@@ -51,19 +52,13 @@ def scan(view: IntArray, place: Array, size: Array, wrong: Array, off: Array) ->
     found = []
     for axis in (0, 1):
         bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)
-        rows = np.array([np.ones(len(view)), wrong, *off, *(1.0 - wrong) * off])
+        rows = np.array([np.ones(len(view)), wrong, *off])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         sums = np.pad(sums.reshape(-1, views, BINS).cumsum(axis=-1), ((0, 0), (0, 0), (1, 0)))
         count, bad, col, row = (part[:, None, :] - part[:, :, None] for part in sums[:4])  # (N, start, stop)
         total, all_bad = sums[:2, :, -1, None, None]
-        for by_share in (True, False):
-            if by_share:
-                gain = _shares(count, bad, total, all_bad)
-            else:
-                mean = sums[2:4, :, -1, None, None] / np.maximum(total, 1.0)
-                part = count * np.maximum(1.0 - count / np.maximum(total, 1.0), 1e-3)
-                both = (col - mean[0] * count) ** 2 + (row - mean[1] * count) ** 2
-                gain = np.where(count > 0, 0.5 * both / np.maximum(part, 1e-9), 0.0) - 1.0
+        both = np.stack([_shares(count, bad, total, all_bad), _means(count - bad, col, row)])
+        for by_share, gain in zip((True, False), both, strict=True):
             gain[:, ~np.triu(np.ones((BINS + 1, BINS + 1), dtype=bool), 1)] = 0.0
             gain[:, 0, BINS] = 0.0  # all of an image is no interval
             for v in range(views):
@@ -71,8 +66,18 @@ def scan(view: IntArray, place: Array, size: Array, wrong: Array, off: Array) ->
                 step = size[axis, v] / BINS
                 share = float(bad[v, i, j] / max(count[v, i, j], 1.0))
                 at = float(i * step), float(j * step)
-                found.append(Interval(v, axis, *at, float(gain[v, i, j]) - price(views), share, by_share))
+                common = float(np.hypot(col[v, i, j], row[v, i, j]) / max(count[v, i, j] - bad[v, i, j], 1.0))
+                worth = float(gain[v, i, j]) - price(views)
+                found.append(Interval(v, axis, *at, worth, share, common, bool(by_share)))
     return sorted(found, key=lambda one: -one.gain)
+
+
+def _means(count: Array, col: Array, row: Array) -> Array:
+    """Logarithm of the likelihood ratio of a displacement inside, and another outside, over one of all."""
+    whole = np.maximum(count[:, :1, -1:], 1.0)
+    part = count / whole
+    inside = np.hypot(col - col[:, :1, -1:] * part, row - row[:, :1, -1:] * part)
+    return np.asarray(0.5 * inside**2 / np.maximum(count * (1.0 - part), 0.5))
 
 
 def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:

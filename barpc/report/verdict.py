@@ -13,6 +13,7 @@ from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
+from barpc.report.summary.causes import explanations, left_over
 from barpc.tie.reference import PEAK
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
@@ -20,6 +21,7 @@ FEW_OBSERVATIONS = 30  # A view with fewer is called weakly tied, unless control
 ENOUGH_GCPS = 3  # Control points that hold a view without any tie point
 MANY_REJECTED = 0.3  # A view that lost a larger share of its observations is called doubtful
 
+WORST_LEFT = 0.15  # px: an image with more anywhere is called doubtful
 SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
 NOISE_LIMIT = 2.5  # Tie points that scatter by more than so many times what the matcher states need a look
@@ -122,17 +124,22 @@ def _beyond(view: ViewEntry, run: Run) -> str:
         float(np.linalg.norm([_known(v) for v in view.fit.rmse_px])),
         max(map(_known, view.fit.max_px)),
     )
-    if left <= SMOOTH_LEFT:
+    if left <= SMOOTH_LEFT and most <= WORST_LEFT:
         return ""
+    assert view.correction is not None
+    follows = "attitude jitter or steps between detectors"
+    if view.correction.strip_px:
+        follows = "rows or columns that lie off by themselves"
     return (
-        "its corrected camera follows attitude jitter or steps between detectors, of which one RPC leaves "
+        f"its corrected camera follows {follows}, of which one RPC leaves "
         f"{left:.2f} px (RMS; {most:.2f} px at most): use its grids, --tiles or --resample"
     )
 
 
 def _follows_more(view: ViewEntry) -> bool:
     """Whether a camera was corrected by more than one RPC holds."""
-    return view.correction is not None and bool(view.correction.jitter_px or view.correction.detector_px)
+    one = view.correction
+    return one is not None and bool(one.jitter_px or one.detector_px or one.strip_px)
 
 
 def _left(i: int, adjustment: Adjustment) -> str:
@@ -167,6 +174,7 @@ def _block_reasons(run: Run) -> list[str]:
             f"{tilts} (east, north) only."
         )
     names = run.adjustment.names
+    out += _left_reasons(run)
     for group in run.adjustment.two_groups:
         i, j = group.views
         if not (_oddity(i, run.adjustment) or _oddity(j, run.adjustment)):
@@ -188,6 +196,22 @@ def _block_reasons(run: Run) -> list[str]:
             "stated; control points or a DEM would tell."
         )
     return out
+
+
+def _left_reasons(run: Run) -> list[str]:
+    """Rows and columns in which tie points were cut, or are off, more than elsewhere; each image's worst."""
+    assert run.adjustment is not None
+    worst: dict[str, str] = {}
+    for one in left_over(run.adjustment):
+        if one.rejected > MANY_REJECTED:
+            what = f"{100 * one.rejected:.0f} % of their tie points contradict the others"
+        elif one.off_px > SMOOTH_LEFT:
+            what = f"their tie points are left with {one.off_px:.2f} px in common"
+        else:
+            continue
+        place = f"{one.axis} {one.first:.0f}-{one.last:.0f} of {one.image}"
+        worst.setdefault(one.image, f"{place[0].upper()}{place[1:]} stand out: {what}.")
+    return list(worst.values())
 
 
 def _place_is_free(run: Run) -> bool:
@@ -280,6 +304,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         sizes = f"{_lengths(prior.drift_sigma)} at the first and last row"
         lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
     lines += _jitter_lines(views) + _radar_lines(views)
+    lines += [f"{one.sentence[0].upper()}{one.sentence[1:]}." for one in explanations(run.adjustment)]
     if len(run.tracks) or run.gcps is not None:
         lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
     lines += _reference_lines(run)

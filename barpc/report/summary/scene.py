@@ -11,6 +11,7 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.ba.gauge import MOTIONS, Mode
 from barpc.report.records import Column, Number, Record, said
+from barpc.report.summary.causes import ExplanationEntry, LeftEntry, explanations, left_over
 from barpc.report.summary.words import Count, Vector, metres, percent_of
 
 _LEVEL = 1e-4  # probability of the F test below which something is called smooth
@@ -129,6 +130,10 @@ class SceneEntry(Record):
         "px",
         default=None,
     )
+    explanations: tuple[ExplanationEntry, ...] = said(
+        "What explains tie points beside the cameras' errors as stated, the first taken first", default=()
+    )
+    left: tuple[LeftEntry, ...] = said("Rows and columns that stand out at the end", default=())
 
 
 _DEM = attrgetter("held", "known", "total", "offset", "spread")
@@ -167,6 +172,8 @@ def measure_scene(adjustment: Adjustment) -> SceneEntry:
         num_held_in_height=int(np.count_nonzero(adjustment.held)),
         gcp_residuals_enu_m=adjustment.gcp_residuals.tolist(),
         solver=adjustment.status,
+        explanations=explanations(adjustment),
+        left=left_over(adjustment),
     )
 
 

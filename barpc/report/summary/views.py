@@ -74,6 +74,7 @@ class CorrectionEntry(Record):
     )
     jitter_rows: Number = said("Rows between its knots", "px", default=None)
     detector_px: Number = said("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
+    strip_px: Number = said("RMS of the strips that lie off", "px", "strips", ".2f", default=None)
     ellipse: EllipseEntry | None = said(
         "How well it tells where the middle of its image is, the scene's own uncertain place in it",
         default=None,
@@ -158,7 +159,7 @@ class ViewEntry(Record):
     )
     DECISIONS: ClassVar = (
         "name prior_scale num_rejected rejected smooth_px smooth_p shared_px correction.jitter_px "
-        "correction.detector_px"
+        "correction.detector_px correction.strip_px"
     )
     CONTROL: ClassVar = "name control_w control_w_point"
     CLOCKS: ClassVar = " correction.range_m correction.azimuth_ms"
@@ -398,10 +399,14 @@ def _in_image(spline: RowSpline | None) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if len(spline.coeffs):
         rows = spline.row_offset + spline.row_scale * np.linspace(-1, 1, _ROWS)
-        along = replace(spline, edges=np.zeros(0), steps=np.zeros((0, 2))).at(np.column_stack([rows, rows]))
+        along = RowSpline(spline.coeffs, spline.row_offset, spline.row_scale).at(
+            np.column_stack([rows, rows])
+        )
         found |= {"jitter_px": _size(along), "jitter_rows": spline.spacing}
     if len(spline.steps):
         found |= {"detector_px": _size(spline.steps), "detectors": tuple((spline.edges + 0.5).tolist())}
+    if len(spline.strips):
+        found["strip_px"] = _size(spline.moved)
     return found
 
 

@@ -1,0 +1,74 @@
+"""What explains the tie points beside the cameras' errors as stated, and where something is left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from barpc.ba import Adjustment
+from barpc.ba.explanations import AFFINE, STRIP, WANDER
+from barpc.ba.scan import Interval
+from barpc.report.records import Number, Record, said
+
+AXES = "columns", "rows"
+_WORDS = {
+    STRIP: "{axis} {first:.0f}-{last:.0f} of {image} lie {size:.2f} px off the rest of it",
+    WANDER: "rows of {image} wander by {size:.2f} px",
+    AFFINE: "{image} is turned, stretched or bent by {size:.2f} px otherwise than its camera says",
+}
+
+
+class ExplanationEntry(Record):
+    """Something that explains tie points, those that were cut among them, better than its rivals."""
+
+    name: str = said("What it is", enum=list(_WORDS))
+    sentence: str = said("The same in words", minLength=1)
+    image: str = said("View")
+    gain: float = said("Logarithm of the evidence, over that without it", "nats")
+    gap: float = said("The same, over the runner-up", "nats")
+    runner_up: str | None = said("What explains next as much; null for nothing", default=None)
+    axis: str | None = said("Whether it is of rows or of columns", default=None, enum=[*AXES, None])
+    first: Number = said("Its first row or column", "px", default=None)
+    last: Number = said("Its last row or column", "px", default=None)
+    size_px: Number = said("RMS displacement of what it moves", "px", default=None)
+
+
+class LeftEntry(Record):
+    """Rows or columns of an image in which tie points were cut, or are off, more than elsewhere and chance allow."""
+
+    image: str = said("View")
+    axis: str = said("Rows or columns", enum=list(AXES))
+    first: float = said("The first", "px")
+    last: float = said("The last", "px")
+    rejected: float = said("Share of their tie points that was cut")
+    off_px: float = said("What the others have in common", "px")
+    gain: float = said("Logarithm of the likelihood, over that of a whole image alike", "nats")
+
+
+def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
+    """What was taken, the first first."""
+    found = []
+    for one in adjustment.findings:
+        image, size = adjustment.names[one.view], float(np.hypot(*one.size))
+        place: dict[str, Any] = {}
+        if one.where is not None:
+            axis, start, stop = one.where
+            last = 2.0 * adjustment.cameras.unknowns.half[axis, one.view] - 1.0
+            ends = float(np.clip(np.ceil(start), 0.0, last)), float(np.clip(np.ceil(stop) - 1.0, 0.0, last))
+            place = dict(zip(("axis", "first", "last"), (AXES[axis], *ends), strict=True))
+        words = _WORDS[one.kind].format(image=image, size=size, **place)
+        numbers = one.gain, one.gap, one.runner_up or None
+        found.append(ExplanationEntry(one.kind, words, image, *numbers, **place, size_px=size))
+    return tuple(found)
+
+
+def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
+    """Where something stands out at the end, the most first."""
+    return tuple(_left(one, adjustment.names) for one in adjustment.left)
+
+
+def _left(one: Interval, names: Sequence[str]) -> LeftEntry:
+    ends = one.start, one.stop - 1.0
+    return LeftEntry(names[one.view], AXES[one.axis], *ends, one.share, one.off, one.gain)
