@@ -49,6 +49,7 @@ def choose(
 
     monkeypatch.setattr(adjustment, "solve_block", by_script)
     monkeypatch.setattr(adjustment, "follow", lambda found, *_: found)
+    monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
     prior = given.pop("prior", None)
     found, in_space = adjustment._choose_model(None, None, AdjustOptions(**given), None, None, prior)
     return found.model, in_space, asked
