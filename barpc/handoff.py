@@ -298,10 +298,21 @@ def _shareloc(path: Path) -> Projection:
     model = import_module("shareloc.geomodels.rpc").RPC.load(str(path))
 
     def project(ground: Array) -> Array:
-        row, col, _ = model.inverse_loc(*np.ascontiguousarray(ground.T))
-        return np.column_stack([col, row]) - 0.5  # its first pixel's centre is (0.5, 0.5)
+        lon = wrap_longitude(ground[:, 0], model.offset_x)  # it adds no whole turns
+        row, col, _ = model.inverse_loc(lon, *np.ascontiguousarray(ground.T[1:]))
+        return _told(np.column_stack([col, row]), lon) - 0.5  # its first pixel's centre is (0.5, 0.5)
 
     return project
+
+
+def _told(found: Array, lon: Array) -> Array:
+    """What shareloc found (N, ...) at longitudes; OutputError where it leaves out those beyond 180 degrees alone."""
+    lost, beyond = ~np.isfinite(found).all(axis=1), np.abs(lon) > 180.0
+    if lost.any() and not (lost & ~beyond).any():
+        raise OutputError(
+            f"shareloc takes no longitude beyond 180 degrees, where {lost.sum()} of {len(lon)} points lie"
+        )
+    return found
 
 
 def _orthority(path: Path) -> Projection:
@@ -324,8 +335,14 @@ def _keywords(path: Path) -> Projection:
 
 
 def _shareloc_grid(path: Path) -> Projection:
-    model = import_module("shareloc.geomodels").GeoModel(str(path), "GRID")
-    return lambda at: np.asarray(model.direct_loc_h(at[:, 1] + 0.5, at[:, 0] + 0.5, at[:, 2]))
+    model, own = import_module("shareloc.geomodels").GeoModel(str(path), "GRID"), open_camera(path).model
+
+    def localize(at: Array) -> Array:
+        found = np.asarray(model.direct_loc_h(at[:, 1] + 0.5, at[:, 0] + 0.5, at[:, 2]))
+        lost = ~np.isfinite(found).all(axis=1)
+        return _told(found, own.localize(at[:, :2], at[:, 2])[:, 0]) if lost.any() else found
+
+    return localize
 
 
 def _own_grid(path: Path) -> Projection:

@@ -13,9 +13,11 @@ import math
 import os
 import stat
 import unicodedata
+from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, TextIO
 from xml.etree import ElementTree
@@ -190,6 +192,9 @@ def plain_path(path: str | os.PathLike[str]) -> Place:
 
 _DIGITS = 18  # of a whole number: more do not fit 64 bits
 _LARGEST = 1e100  # no number of a side file comes near, and its square is finite
+_MAX_DEPTH = 100  # levels of JSON and of XML
+_NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
+_STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down or up, as signed bytes
 
 
 def read_json(path: Path | str, kind: Kind) -> Any:
@@ -201,12 +206,21 @@ def read_json(path: Path | str, kind: Kind) -> Any:
         raise kind.error(f"{path}: not JSON that can be read, so not {kind.words} ({error})") from error
 
 
-def parse_json(text: str | bytes) -> Any:
+def parse_json(text: str) -> Any:
     """What a JSON text holds; ValueError for numbers that are not finite or beyond 64 bits, or nested too deep."""
-    try:
-        return json.loads(text, parse_constant=_refuse, parse_int=_whole, parse_float=_finite)
-    except RecursionError:
-        raise ValueError("nested too deep") from None
+    if _depth(text) > _MAX_DEPTH:  # how deep json itself goes differs between versions of Python
+        raise ValueError(f"nested too deep, at most {_MAX_DEPTH} levels are read")
+    return json.loads(text, parse_constant=_refuse, parse_int=_whole, parse_float=_finite)
+
+
+def _depth(text: str) -> int:
+    """How many brackets of a JSON text are open at most, those in its strings left out; a bound where they are few."""
+    few = text.count("[") + text.count("{")
+    if few <= _MAX_DEPTH:
+        return few
+    plain = text.replace(r"\\", "").replace(r"\"", "")
+    outside = "".join(plain.split('"')[::2]).encode("ascii", "ignore")
+    return max(accumulate(array("b", outside.translate(_STEPS, _NO_BRACKETS))), default=0)
 
 
 def _refuse(constant: str) -> NoReturn:
@@ -228,7 +242,6 @@ def _finite(text: str) -> float:
 
 # --- XML --------------------------------------------------------------------------------------------------
 
-_MAX_DEPTH = 100
 _MAX_ELEMENTS = 2_000_000
 
 

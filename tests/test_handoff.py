@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from barpc.errors import OutputError
+from barpc.geodesy import Array
 from barpc.handoff import (
     CONSUMERS,
     TOLERANCE,
@@ -27,6 +29,7 @@ from barpc.rpcio import (
     write_rpc,
     write_rpc_copy,
 )
+from barpc.scene import BoolArray
 from barpc.sensor.rpc import RPC
 from barpc.workspace import Workspace
 from tests.rpcio.conftest import make_rpc, write_image
@@ -214,20 +217,61 @@ def test_rpcm_is_asked_in_the_way_that_suits_the_file(name, reader, image, tmp_p
         assert (content, rest) == (str(path), [])
 
 
-def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(monkeypatch, tmp_path):
-    rpc = make_rpc()
+def shareloc(rpc: RPC, takes: Callable[[Array], BoolArray] = lambda lon: np.abs(lon) <= 180.0) -> Other:
+    """Stands for shareloc, which gives NaN at longitudes that it does not take, and adds no whole turns."""
     model = Other(rpc)
 
     def inverse_loc(lon, lat, alt):
-        col, row = rpc.project(np.column_stack([lon, lat, alt])).T
+        turned = np.where(takes(lon) & (np.abs(lon - rpc.ground_offset[0]) < 180.0), lon, np.nan)
+        col, row = rpc.project(np.column_stack([turned, lat, alt])).T
         return row + 0.5, col + 0.5, alt
 
-    model.inverse_loc = inverse_loc
+    model.inverse_loc, model.offset_x = inverse_loc, rpc.ground_offset[0]
+    return model
+
+
+@pytest.mark.parametrize(("lon", "turn"), [(5.0, 0.0), (179.98, 0.0), (-160.0, 360.0), (160.0, -360.0)])
+def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(
+    lon, turn, monkeypatch, tmp_path
+):
+    rpc = make_rpc(lon=lon)
+    model = shareloc(rpc)
     monkeypatch.setattr("barpc.handoff.import_module", lambda _: model)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
-    found = CONSUMERS["shareloc"].open(tmp_path / "a.tif")(ground)
-    np.testing.assert_allclose(found, rpc.project(ground), atol=1e-9)
+    found = CONSUMERS["shareloc"].open(tmp_path / "a.tif")(ground + [turn, 0.0, 0.0])
+    np.testing.assert_allclose(found, rpc.project(ground), atol=1e-6 if turn else 1e-9)
     assert (str(tmp_path / "a.tif"),) in model.asked
+
+
+@pytest.mark.parametrize(
+    ("lon", "takes", "note"),
+    [
+        (
+            179.9999,
+            lambda lon: np.abs(lon) <= 180.0,
+            "shareloc takes no longitude beyond 180 degrees, where ",
+        ),
+        (
+            -179.9999,
+            lambda lon: np.abs(lon) <= 180.0,
+            "shareloc takes no longitude beyond 180 degrees, where ",
+        ),
+        (200.0, lambda lon: np.abs(lon) <= 180.0, "where 605 of 605 points lie"),
+        (179.9999, lambda lon: lon < 1000.0, ""),  # a version that takes them
+        (179.9999, lambda lon: lon > 1000.0, "it projects to no finite point"),
+        (5.0, lambda lon: lon < 5.0, "it projects to no finite point"),
+    ],
+)
+def test_what_shareloc_leaves_out_beyond_180_degrees_is_told(lon, takes, note, monkeypatch, tmp_path):
+    rpc = make_rpc(lon=lon)
+    monkeypatch.setattr("barpc.handoff.import_module", lambda _: shareloc(rpc, takes))
+    monkeypatch.setattr("barpc.handoff._readers", lambda _: {"shareloc": True})
+    write_rpc(rpc, tmp_path / "a.geom")
+    reading, own = verify([tmp_path / "a.geom"], rpc, SIZE, ALTITUDES)
+    assert own.passed
+    assert reading.passed == (not note)
+    assert note in reading.note
+    assert bool(note) == bool(reading.note)
 
 
 def test_orthority_counts_as_barpc_does(monkeypatch, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import io
+import json
 import os
 import time
 import zipfile
@@ -99,6 +100,33 @@ def test_json_holds_finite_numbers_and_is_not_endlessly_deep(text):
     with pytest.raises(ValueError) as caught:
         parse_json(text)
     assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize(("start", "end"), [("[", "]"), ('{"a":', "}"), ('[1,{"}":', '},"]"]')])
+def test_json_is_read_to_a_hundred_levels_by_any_python(start, end):
+    """What is deeper is refused for that, whether or not it ends; how deep json itself reads differs by version."""
+    fits = 100 // (start.count("[") + start.count("{"))
+    for text in (start * fits + "1" + end * fits, f"[{start * (fits - 1)}1{end * (fits - 1)}, {{}}]"):
+        assert parse_json(text) == json.loads(text)
+    for text in (
+        start * (fits + 1) + "1" + end * (fits + 1),
+        start * (fits + 1),
+        start * 1800 + "1" + end * 1800,
+    ):
+        with pytest.raises(ValueError, match="nested too deep"):
+            parse_json(text)
+
+
+@pytest.mark.parametrize("inner", ["[" * 200, '\\"[' * 200, '\\\\\\"{' * 200, "\\u005b[" * 200, "é[" * 200])
+def test_brackets_in_the_strings_of_json_are_no_levels(inner):
+    text = f'{{"a": "{inner}", "b{inner}": [1, "\\\\"]}}'
+    assert parse_json(text) == json.loads(text)
+    with pytest.raises(ValueError, match="nested too deep"):
+        parse_json(f'["{inner}\\\\", {"[" * 100}')
+
+
+def test_json_of_many_values_is_not_deep():
+    assert parse_json(json.dumps([[[k, k]] for k in range(1000)]))[999] == [[999, 999]]
 
 
 def bomb(path: Path, claimed: int, stored: bytes, compression: int = zipfile.ZIP_DEFLATED) -> Path:

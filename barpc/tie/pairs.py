@@ -30,7 +30,7 @@ _ANGLE_DECAY = 15.0  # deg
 GIVEN = "given"
 """Why a pair is tried that others have matched."""
 _MALFORMED = (
-    ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, shapely.GEOSException,
+    ValueError, LookupError, TypeError, AttributeError, OverflowError, shapely.GEOSException,
 )  # fmt: skip
 _MOST_CROSSED = 2000  # times that an outline is untangled: GEOS takes a second, of twice as many ten
 _TOGETHER = 64  # sides of an outline that are looked at together

@@ -140,6 +140,16 @@ def test_consumers_find_the_error_of_a_grid_and_not_less(folder, camera, sample,
         assert 0.8 < reading.max_error < 3.0, reading
 
 
+@pytest.mark.parametrize(("lon", "across"), [(179.98, False), (179.9999, True)])
+def test_a_grid_across_the_antimeridian_is_read_by_all_but_shareloc_which_says_why(lon, across, tmp_path):
+    rpc, size, alts = make_rpc(lon=lon), (2000, 1900), (30.0, 300.0)
+    write_grid(DirectGrid.of(rpc, size, alts), tmp_path / f"a{GRID}")
+    for reading in verify_grid(tmp_path / f"a{GRID}", Sample.of(rpc, size, alts)):
+        told = "shareloc takes no longitude beyond 180 degrees" in reading.note
+        assert told == (across and reading.consumer == "shareloc")
+        assert told or reading.max_error < LINEAR, reading
+
+
 def test_a_file_that_cannot_be_read_is_named_with_its_reason(sample, tmp_path):
     (tmp_path / f"a{GRID}").write_bytes(b"II*\0")
     for reading in verify_grid(tmp_path / f"a{GRID}", sample):

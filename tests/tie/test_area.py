@@ -128,6 +128,7 @@ def test_the_whole_world_is_an_area(tmp_path) -> None:
         ({**box(1, 2, 3, 4), "crs": {"properties": {"name": "EPSG:32631"}}}, "EPSG:32631"),
         ('{"type": "FeatureCollection", "features":' * 5000, "nested too deep"),
         ('{"type": "GeometryCollection", "geometries":[' * 900 + "]}" * 900, "nested too deep"),
+        ('{"type": "GeometryCollection", "geometries":[' * 50 + "]}" * 50, "of any extent"),
     ],
 )  # fmt: skip
 def test_what_is_no_area_is_refused_in_one_line(tmp_path, data, message) -> None:

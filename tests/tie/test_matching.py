@@ -41,7 +41,7 @@ def test_a_pair_is_tried_again_where_it_has_fewer_matches_than_it_should(
 
 
 def test_a_report_says_which_attempts_found_fewer_of_how_many_that_were_wanted() -> None:
-    few = PairReport(("v0", "v1"), "ok", (360, 400), 40, 20, overlap=0.5)
+    few = PairReport(("v0", "v1"), "ok", (360, 400), 40, 20, spread=0.5, angle=9.0, overlap=0.5)
     loose = replace(few, verified=25, loosened=True)
     many = replace(few, matcher="structure", keypoints=(0, 0), verified=240)
     first = _better((NO_MATCHES, few), (NO_MATCHES, loose))
