@@ -182,7 +182,7 @@ def _adjustment(
         smooth=outcome.smooth,
         asked=found.asked,
         findings=found.findings,
-        left=tuple(standing_out(outcome, block)),
+        left=tuple(standing_out(outcome, block, options.noise_floor)),
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],

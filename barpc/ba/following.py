@@ -52,7 +52,7 @@ def without_strips(found: Solution, block: Block, outer: Block, options: AdjustO
 
     Refused where it makes tracks worse that took no part.
     """
-    findings = judge(found.outcome, block)
+    findings = judge(found.outcome, block, options.noise_floor)
     strips = [one for one in findings if one.kind == STRIP]
     found = replace(found, findings=tuple(findings))
     if not strips or options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):

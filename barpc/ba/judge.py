@@ -40,8 +40,11 @@ class Finding:
     runner_up: str  # its kind, or "" for none
 
 
-def standing_out(outcome: Outcome, block: Block) -> list[Interval]:
-    """Intervals of images in which ties were cut, or are off, more than elsewhere and chance allow."""
+def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
+    """Intervals of images in which ties were cut, or are off, more than elsewhere and chance allow.
+
+    A mean below `floor` [px] is none.
+    """
     problem = outcome.problem
     is_tie = (block.point < block.num_tracks) & block.use
     observations = Observations(problem, block.sigma, 0.0, is_tie)
@@ -52,15 +55,15 @@ def standing_out(outcome: Outcome, block: Block) -> list[Interval]:
     size = np.array([view.size for view in block.views], dtype=np.float64).T
     wrong = (~outcome.inlier[rows]).astype(np.float64)
     off = np.where(outcome.inlier[rows], outcome.residual[:, rows] / spread[rows], 0.0)
-    found = scan(block.view[rows], block.xy[:, rows], size, wrong, off)
-    pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 0.0
+    pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
+    found = scan(block.view[rows], block.xy[:, rows], size, wrong, off, floor / pixel)
     return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
 
 
-def judge(outcome: Outcome, block: Block) -> list[Finding]:
+def judge(outcome: Outcome, block: Block, floor: float) -> list[Finding]:
     """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out."""
     problem = outcome.problem
-    first = standing_out(outcome, block)
+    first = standing_out(outcome, block, floor)
     if not first or problem.free.size > _UNKNOWNS:
         return []
     state, _ = revived(
@@ -72,7 +75,7 @@ def judge(outcome: Outcome, block: Block) -> list[Finding]:
     low, high = block.alt_range
     linear = linearise(problem, state, use, block.sigma, high - low)
     size = np.array([view.size for view in block.views], dtype=np.float64).T
-    return _Search(Seen(linear, block.xy, size), first).run()
+    return _Search(Seen(linear, block.xy, size), first, floor / float(np.median(block.sigma))).run()
 
 
 def _numbers(block: Block, use: BoolArray) -> float:
@@ -83,8 +86,8 @@ def _numbers(block: Block, use: BoolArray) -> float:
 class _Search:
     """Taking one explanation after the other."""
 
-    def __init__(self, seen: Seen, first: list[Interval]) -> None:
-        self.seen, self.first = seen, first
+    def __init__(self, seen: Seen, first: list[Interval], floor: float) -> None:
+        self.seen, self.first, self.floor = seen, first, floor
         self.taken: list[Explanation] = []
         self.best = fit(seen.linear)
 
@@ -127,7 +130,8 @@ class _Search:
         left = linear.left(self.best.step) + self._moved(self.best.extra) / linear.sigma
         wrong = (1.0 - self.best.right)[rows]
         off = settled(linear, left, self.best)[:, rows]
-        out = scan(linear.view[rows], self.seen.place[:, rows], self.seen.size, wrong, off)
+        floor = self.floor / self.best.noise
+        out = scan(linear.view[rows], self.seen.place[:, rows], self.seen.size, wrong, off, floor)
         out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
         made = [(one, self._fit(one)) for one in proposed(self.seen, out)]

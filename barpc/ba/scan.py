@@ -37,7 +37,9 @@ def price(views: int) -> float:
     return float(np.log(BINS * (BINS + 1) / 2 * 2 * views))
 
 
-def scan(view: IntArray, place: Array, size: Array, wrong: Array, off: Array) -> list[Interval]:
+def scan(
+    view: IntArray, place: Array, size: Array, wrong: Array, off: Array, floor: float = 0.0
+) -> list[Interval]:
     """The interval that stands out most, by each statistic, of every view's columns and rows; the best first.
 
     Parameters
@@ -45,7 +47,8 @@ def scan(view: IntArray, place: Array, size: Array, wrong: Array, off: Array) ->
     view : (K,)
     place : (2, K), where observations are [px], in images of `size` (2, N)
     wrong : (K,), probability that an observation is wrong
-    off : (2, K), residuals in standard deviations that they would have
+    off : (2, K), residuals in standard deviations that they would have; 0 of those that are wrong
+    floor : float, what means are let be [the same]: no adjustment is asked to be better
     """
     views = size.shape[1]
     off = np.clip(off, -_CLIPPED, _CLIPPED)
@@ -57,7 +60,7 @@ def scan(view: IntArray, place: Array, size: Array, wrong: Array, off: Array) ->
         sums = np.pad(sums.reshape(-1, views, BINS).cumsum(axis=-1), ((0, 0), (0, 0), (1, 0)))
         count, bad, col, row = (part[:, None, :] - part[:, :, None] for part in sums[:4])  # (N, start, stop)
         total, all_bad = sums[:2, :, -1, None, None]
-        both = np.stack([_shares(count, bad, total, all_bad), _means(count - bad, col, row)])
+        both = np.stack([_shares(count, bad, total, all_bad), _means(count - bad, col, row, floor)])
         for by_share, gain in zip((True, False), both, strict=True):
             gain[:, ~np.triu(np.ones((BINS + 1, BINS + 1), dtype=bool), 1)] = 0.0
             gain[:, 0, BINS] = 0.0  # all of an image is no interval
@@ -72,12 +75,13 @@ def scan(view: IntArray, place: Array, size: Array, wrong: Array, off: Array) ->
     return sorted(found, key=lambda one: -one.gain)
 
 
-def _means(count: Array, col: Array, row: Array) -> Array:
+def _means(count: Array, col: Array, row: Array, floor: float) -> Array:
     """Logarithm of the likelihood ratio of a displacement inside, and another outside, over one of all."""
     whole = np.maximum(count[:, :1, -1:], 1.0)
     part = count / whole
     inside = np.hypot(col - col[:, :1, -1:] * part, row - row[:, :1, -1:] * part)
-    return np.asarray(0.5 * inside**2 / np.maximum(count * (1.0 - part), 0.5))
+    spread = np.maximum(count * (1.0 - part), 0.5)
+    return np.asarray(0.5 * inside**2 / (spread + (spread * floor) ** 2))
 
 
 def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:
