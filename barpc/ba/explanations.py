@@ -7,15 +7,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from barpc.ba.mixture import Fit, Linear, log_likelihoods
+from barpc.ba.mixture import Fit, Linear, first_guess, log_likelihoods
 from barpc.ba.scan import Interval, price
 from barpc.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import bsplines
+from barpc.sensor.splined import bsplines, profile
 
 STRIP = "strip"
+FADE = "fade"
 WANDER = "wander"
 AFFINE = "affine"
+LOCAL = STRIP, FADE
+"""Those of a part of an image: they follow each other, and the adjustment follows them."""
+_LENGTHS = 2.0 ** np.arange(-4.0, 1.0)  # of an interval: over what it may fade
 _SPLINES = 14  # over the rows of an image
 _WANDER = 0.5  # px
 _STRIP = 1.0  # px, before it is known; then its own size, for which a scale of x 30 is paid
@@ -31,7 +35,11 @@ class Explanation:
     extra: Array = field(repr=False)  # (2, e, K) how a unit of each moves observations [px]
     sigma: Array = field(repr=False)  # (e,) their prior [px]
     price: float  # of the choice among places and sizes [nats]
-    where: tuple[int, float, float] | None = None  # axis (0: columns, 1: rows), start, stop [px]
+    where: Where | None = None
+
+
+Where = tuple[int, float, float, float, float]
+"""Axis (0: columns, 1: rows), start, stop, and from where and how fast it fades [px, 1/px] (`RowSpline.strips`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,22 +49,45 @@ class Seen:
     linear: Linear
     place: Array  # (2, K) [px]
     size: Array  # (2, N) of the images [px]
+    base: Fit  # what was found so far
+    extra: Array  # (2, e, K) what of it is beside the cameras [px]
 
 
 def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> Explanation:
     """Rows or columns of an image that lie off by themselves."""
     start, stop = _open_ended(interval.start, interval.stop, float(seen.size[interval.axis, interval.view]))
-    return _strip(seen, interval.view, (interval.axis, start, stop), sigma)
+    return _local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)
 
 
-def _strip(seen: Seen, view: int, where: tuple[int, float, float], sigma: float) -> Explanation:
-    axis, start, stop = where
-    place = seen.place[axis]
-    inside = ((place >= start) & (place < stop) & (seen.linear.view == view)).astype(np.float64)
-    extra = np.zeros((2, 2, len(inside)))
-    extra[0, 0] = extra[1, 1] = inside
-    cost = price(seen.linear.views) + SCALE
-    return Explanation(STRIP, view, extra, np.full(2, sigma), cost, where)
+def fade(seen: Seen, interval: Interval) -> Explanation | None:
+    """Rows of an image that lie off at an end of an interval, and less and less from there."""
+    if interval.axis == 0:
+        return None
+    size, view = float(seen.size[1, interval.view]), interval.view
+    tried = []
+    for length in (interval.stop - interval.start) * _LENGTHS:
+        for origin, sign in ((interval.start, 1.0), (interval.stop, -1.0)):
+            start, stop = (origin, size) if sign > 0 else (0.0, origin)
+            ends = _open_ended(start, stop, size)
+            one = _local(FADE, seen, view, (1, *ends, origin, sign / float(length)), _STRIP)
+            cost = first_guess(seen.linear, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
+            tried.append((cost - _untouched(seen, one), one))
+    return min(tried, key=lambda row: row[0])[1]
+
+
+def _untouched(seen: Seen, one: Explanation) -> float:
+    """The cost of the same tracks without it: others may be touched by another."""
+    nothing = np.full(2, 1e18)
+    return first_guess(seen.linear, seen.base, seen.extra, one.extra, nothing)[2]
+
+
+def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Explanation:
+    axis, *shape = where
+    part = np.where(seen.linear.view == view, profile(seen.place[axis], *map(np.asarray, shape)), 0.0)
+    extra = np.zeros((2, 2, len(part)))
+    extra[0, 0] = extra[1, 1] = part
+    cost = price(seen.linear.views) + SCALE * (2.0 if kind == FADE else 1.0)
+    return Explanation(kind, view, extra, np.full(2, sigma), cost, where)
 
 
 def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explanation:
@@ -65,8 +96,10 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
     `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
     """
     assert one.where is not None
-    axis = one.where[0]
-    moved = found.extra[-2:]
+    axis, moved = one.where[0], found.extra[-2:]
+    sigma = float(np.clip(np.sqrt((moved**2).mean()), _STRIP / 30.0, _STRIP * 30.0))
+    if one.kind == FADE:
+        return _faded(seen, one, sigma)
     rows = np.flatnonzero((seen.linear.view == one.view) & (found.right + 1.0 > 0.0))
     rows = rows[np.argsort(seen.place[axis, rows], kind="stable")]
     left = seen.linear.left(found.step) + others / seen.linear.sigma
@@ -77,9 +110,21 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
     place, size = seen.place[axis, rows], float(seen.size[axis, one.view])
     start = -np.inf if first == 0 else 0.5 * (place[first - 1] + place[first])
     stop = np.inf if last == len(rows) - 1 else 0.5 * (place[last] + place[last + 1])
-    where = axis, *_open_ended(max(start, 0.0), min(stop, size), size)
-    sigma = float(np.clip(np.sqrt((moved**2).mean()), _STRIP / 30.0, _STRIP * 30.0))
-    return _strip(seen, one.view, where, sigma)
+    ends = _open_ended(max(start, 0.0), min(stop, size), size)
+    return _local(STRIP, seen, one.view, (axis, *ends, 0.0, 0.0), sigma)
+
+
+def _faded(seen: Seen, one: Explanation, sigma: float) -> Explanation:
+    """A fade over the length at which tracks are off by least."""
+    assert one.where is not None
+    axis, start, stop, origin, rate = one.where
+    tried = []
+    for factor in np.geomspace(0.5, 2.0, 7):
+        again = _local(FADE, seen, one.view, (axis, start, stop, origin, rate * float(factor)), sigma)
+        tried.append(
+            (first_guess(seen.linear, seen.base, seen.extra, again.extra, again.sigma**-2.0)[2], again)
+        )
+    return min(tried, key=lambda row: row[0])[1]
 
 
 def _open_ended(start: float, stop: float, size: float) -> tuple[float, float]:
@@ -117,8 +162,9 @@ def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sig
     return Explanation(kind, view, extra, np.full(2 * len(basis), sigma), float(np.log(seen.linear.views)))
 
 
-EXPLANATIONS: dict[str, Callable[[Seen, Interval], Explanation]] = {
+EXPLANATIONS: dict[str, Callable[[Seen, Interval], Explanation | None]] = {
     STRIP: strip,
+    FADE: fade,
     WANDER: wander,
     AFFINE: affine,
 }
@@ -130,11 +176,9 @@ def proposed(seen: Seen, intervals: list[Interval]) -> Iterator[Explanation]:
     known = set()
     for interval in intervals:
         for kind, make in EXPLANATIONS.items():
-            key = (
-                kind,
-                interval.view,
-                *((interval.axis, interval.start, interval.stop) if kind == STRIP else ()),
-            )
-            if key not in known:
-                known.add(key)
-                yield make(seen, interval)
+            place = (interval.axis, interval.start, interval.stop) if kind in LOCAL else ()
+            if (kind, interval.view, *place) not in known:
+                known.add((kind, interval.view, *place))
+                one = make(seen, interval)
+                if one is not None:
+                    yield one

@@ -8,7 +8,7 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
-from barpc.ba.explanations import STRIP
+from barpc.ba.explanations import LOCAL
 from barpc.ba.heldout import is_better
 from barpc.ba.judge import judge
 from barpc.ba.rounds import Rounds, revived
@@ -53,12 +53,12 @@ def without_strips(found: Solution, block: Block, outer: Block, options: AdjustO
     Refused where it makes tracks worse that took no part.
     """
     findings = judge(found.outcome, block, options.noise_floor)
-    strips = [one for one in findings if one.kind == STRIP]
+    strips = [one for one in findings if one.kind in LOCAL]
     found = replace(found, findings=tuple(findings))
     if not strips or options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
         return found
     own = [[one for one in strips if one.view == v] for v in range(len(block.views))]
-    places = np.full((len(own), max(map(len, own)), 3), np.inf)
+    places = np.full((len(own), max(map(len, own)), 5), np.inf)
     params = np.zeros((len(own), 2, places.shape[1]))
     for v, of_view in enumerate(own):
         for n, one in enumerate(of_view):

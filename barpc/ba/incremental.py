@@ -48,7 +48,7 @@ class BlockPrior:
         Camera centres [m], ECEF.
     less : (m, n q)
         Rows B of B^T B that is still to be taken off a sparse matrix: what heights have in common.
-    splines, edges, strips : int, (n, C), (n, M, 3)
+    splines, edges, strips : int, (n, C), (n, M, 5)
         Layout of the unknowns in the image (see `barpc.ba.waves`).
     radars : tuple of str
         Those of its views whose unknowns are of a radar's clocks.
@@ -84,7 +84,7 @@ class BlockPrior:
 
     @property
     def _strips(self) -> Array:
-        return np.zeros((len(self.names), 0, 3)) if self.strips is None else self.strips
+        return np.zeros((len(self.names), 0, 5)) if self.strips is None else self.strips
 
     def save(self, path: Path) -> None:
         """Write the prior to an .npz file."""
@@ -125,7 +125,7 @@ class BlockPrior:
             splines, edges = int(file.get("splines", 0)), file.get("edges", np.zeros((len(names), 0)))
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
             radars = tuple(str(name) for name in file.get("radars", ()))
-            strips = file.get("strips", np.zeros((len(names), 0, 3)))
+            strips = file.get("strips", np.zeros((len(names), 0, 5)))
             prior = cls(names, *known, splines, edges, radars, strips)
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
@@ -147,7 +147,7 @@ class BlockPrior:
             and bool((self.information.diagonal() > 0).all())
             and self._edges.ndim == 2
             and len(self._edges) == n
-            and self._strips.shape[::2] == (n, 3)
+            and self._strips.shape[::2] == (n, 5)
             and self._strips.dtype == np.float64
             and (self.splines == 0 or 4 <= self.splines <= q)
             and (

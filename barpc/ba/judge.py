@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.block import Block
-from barpc.ba.explanations import STRIP, Explanation, Seen, proposed, sharpened
+from barpc.ba.explanations import LOCAL, Explanation, Seen, Where, proposed, sharpened
 from barpc.ba.mixture import Fit, fit, linearise, settled
 from barpc.ba.rounds import Outcome, revived
 from barpc.ba.scan import SURE, Interval, scan
@@ -31,7 +31,7 @@ class Finding:
 
     kind: str  # a name of `barpc.ba.explanations.EXPLANATIONS`
     view: int
-    where: tuple[int, float, float] | None  # axis, start and stop [px]
+    where: Where | None
     size: (
         Array  # (2,) root mean square displacement of what it moves, col and row, with sign for a strip [px]
     )
@@ -75,7 +75,10 @@ def judge(outcome: Outcome, block: Block, floor: float) -> list[Finding]:
     low, high = block.alt_range
     linear = linearise(problem, state, use, block.sigma, high - low)
     size = np.array([view.size for view in block.views], dtype=np.float64).T
-    return _Search(Seen(linear, block.xy, size), first, floor / float(np.median(block.sigma))).run()
+    nothing = np.zeros((2, 0, len(block.view)))
+    return _Search(
+        Seen(linear, block.xy, size, fit(linear), nothing), first, floor / float(np.median(block.sigma))
+    ).run()
 
 
 def _numbers(block: Block, use: BoolArray) -> float:
@@ -89,13 +92,13 @@ class _Search:
     def __init__(self, seen: Seen, first: list[Interval], floor: float) -> None:
         self.seen, self.first, self.floor = seen, first, floor
         self.taken: list[Explanation] = []
-        self.best = fit(seen.linear)
+        self.best = seen.base
 
     def run(self) -> list[Finding]:
         found: list[tuple[Explanation, float, float, str]] = []
         while len(found) < _MOST:
             tried = [(one, made, self._worth(one, made)) for one, made in self._tried()]
-            tried.sort(key=lambda row: -row[2])
+            tried.sort(key=lambda row: _part(row[0], self.seen) - row[2])
             if not tried or not tried[0][2] > SURE:
                 break
             one, made, gain = tried[0]
@@ -104,15 +107,17 @@ class _Search:
             found.append((one, gain, gain - max(other[1], 0.0), other[0]))
             self.taken.append(one)
             self.best = made
-            if one.kind != STRIP:  # what is smooth is followed by other means
+            extra = np.concatenate([self.seen.extra, one.extra], axis=1)
+            self.seen = replace(self.seen, base=made, extra=extra)
+            if one.kind not in LOCAL:  # what is smooth is followed by other means
                 break
         return [Finding(*self._said(n), *row[1:]) for n, row in enumerate(found)]
 
-    def _said(self, n: int) -> tuple[str, int, tuple[int, float, float] | None, Array]:
+    def _said(self, n: int) -> tuple[str, int, Where | None, Array]:
         one = self.taken[n]
         start = sum(len(other.sigma) for other in self.taken[:n])
         of_one = self.best.extra[start : start + len(one.sigma)]
-        if one.kind == STRIP:
+        if one.kind in LOCAL:
             return one.kind, one.view, one.where, of_one
         rows = self.seen.linear.view == one.view
         moved = np.einsum("cek,e->ck", one.extra[:, :, rows], of_one)
@@ -136,7 +141,7 @@ class _Search:
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
         made = [(one, self._fit(one)) for one in proposed(self.seen, out)]
         made.sort(key=lambda row: row[0].price - row[1].evidence)
-        strips = [n for n, row in enumerate(made) if row[0].kind == STRIP][:_SHARPENED]
+        strips = [n for n, row in enumerate(made) if row[0].kind in LOCAL][:_SHARPENED]
         for n in strips:
             made[n] = self._sharpened(*made[n])
         return made
@@ -180,11 +185,18 @@ def _same(one: Interval, other: Interval) -> bool:
     return (one.view, one.axis) == (other.view, other.axis) and 2.0 * common > either
 
 
+def _part(one: Explanation, seen: Seen) -> float:
+    """The part of its image that it moves: of two that explain as much it is the smaller one."""
+    rows = seen.linear.view == one.view
+    return float(one.extra[:, :, rows].any(axis=(0, 1)).mean())
+
+
 def _differs(one: Explanation, other: Explanation) -> bool:
     """Whether two explanations say something else: of one view's rows, overlapping strips are the same."""
     if (one.kind, one.view) != (other.kind, other.view):
         return True
     if one.where is None or other.where is None:
         return False
-    (axis, start, stop), (axis2, start2, stop2) = one.where, other.where
+    axis, start, stop = one.where[:3]
+    axis2, start2, stop2 = other.where[:3]
     return axis != axis2 or stop <= start2 or stop2 <= start

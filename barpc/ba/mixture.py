@@ -203,6 +203,40 @@ def settled(linear: Linear, residual: Array, found: Fit) -> Array:
     return out
 
 
+def first_guess(
+    linear: Linear, found: Fit, extra: Array, new: Array, precision: Array
+) -> tuple[Array, float, float]:
+    """Unknowns (e,) that move observations by `new` (2, e, K), beside a fit's with its `extra`.
+
+    They have the least sum of what all tracks are off by, not of its squares; also the median of that, and the sum over
+    the noise. Their prior's precisions are the last of `precision`.
+    """
+    left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra)
+    prior = np.diag(precision[len(precision) - new.shape[1] :])
+    parts = []
+    for tracks in linear.tracks:
+        count, n = tracks.rows.shape
+        beside = new[:, :, tracks.rows].transpose(2, 3, 0, 1).reshape(count, 2 * n, -1)
+        some = np.flatnonzero(beside.any(axis=(1, 2)))
+        off = tracks.project[some, 0] @ left[:, tracks.rows[some]].transpose(1, 2, 0).reshape(
+            len(some), 2 * n, 1
+        )
+        parts.append((off, tracks.project[some, 0] @ beside[some]))
+    moved, far = np.zeros(new.shape[1]), [np.zeros(0)]
+    for _ in range(_BEGINNINGS):
+        matrix, gradient, far = prior.copy(), prior @ moved, []
+        for off, turned in parts:
+            now = off + turned @ moved[:, None]
+            far.append(np.sqrt((now**2).sum(axis=(1, 2)) + found.noise**2))
+            weight = turned / far[-1][:, None, None]
+            matrix += (np.swapaxes(weight, 1, 2) @ turned).sum(axis=0)
+            gradient = gradient + (np.swapaxes(weight, 1, 2) @ now).sum(axis=0)[:, 0]
+        moved = moved - np.linalg.solve(matrix, gradient)
+    distances = np.concatenate(far)
+    middle = float(np.median(distances)) if len(distances) else 0.0
+    return moved, middle, float(distances.sum()) / found.noise
+
+
 @dataclass(frozen=True, eq=False)
 class _Expected:
     log: Array  # (T,) log-likelihood of a track
@@ -247,34 +281,11 @@ class _Mixture:
             self.x[:known] = *warm.step.ravel(), *warm.extra
             self.noise, self.eps = warm.noise, warm.eps
             if known < len(self.x):
-                self._begin(known)
-
-    def _begin(self, known: int) -> None:
-        """Unknowns after the first `known`: the least sum of what all tracks are off by, not of its squares."""
-        linear = self.linear
-        step, extra = np.split(self.x, [linear.precision.size])
-        left = linear.left(step.reshape(linear.shape)) + np.einsum("cek,e->ck", self.extra, extra)
-        new = self.extra[:, known - linear.precision.size :]
-        moved = np.zeros(new.shape[1])
-        spread = self.noise
-        for _ in range(_BEGINNINGS):
-            matrix, gradient, squares = np.diag(self.precision[known:]), self.precision[known:] * moved, []
-            for tracks in linear.tracks:
-                count, n = tracks.rows.shape
-                beside = new[:, :, tracks.rows].transpose(2, 3, 0, 1).reshape(count, 2 * n, -1)
-                some = np.flatnonzero(beside.any(axis=(1, 2)))
-                beside, project = beside[some], tracks.project[some, 0]
-                r = left[:, tracks.rows[some]].transpose(1, 2, 0).reshape(len(some), 2 * n, 1)
-                off = project @ (r + beside @ moved[:, None])
-                square = (off**2).sum(axis=(1, 2))
-                weight = 1.0 / np.sqrt(square + spread**2)[:, None, None]
-                matrix += (np.swapaxes(beside, 1, 2) @ (weight * (project @ beside))).sum(axis=0)
-                gradient = gradient + (np.swapaxes(beside, 1, 2) @ (weight * off)).sum(axis=0)[:, 0]
-                squares.append(square)
-            moved = moved - np.linalg.solve(matrix, gradient)
-        self.x[known:] = moved
-        if squares:
-            self.noise = max(self.noise, float(np.sqrt(np.median(np.concatenate(squares)))))
+                new = self.extra[:, len(warm.extra) :]
+                self.x[known:], far = first_guess(linear, warm, self.extra[:, : len(warm.extra)], new, own)[
+                    :2
+                ]
+                self.noise = max(self.noise, far)
 
     def run(self) -> Fit:
         """Expect and maximise until nothing changes."""

@@ -16,7 +16,7 @@ import scipy.linalg as la
 
 from barpc.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import RowSpline, bsplines
+from barpc.sensor.splined import RowSpline, bsplines, profile
 
 FIRST_SIGMA = 0.3  # px: a prior's standard deviation before anything is known
 _DEGREE = 2  # of the polynomials of the row that are the drift's
@@ -30,9 +30,8 @@ class Waves:
     count: int  # B-splines over the rows of an image; 0: none
     # (N, C) columns where another detector begins [px], ascending; infinite where a view has fewer
     edges: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    # (N, M, 3) axis (0: columns, 1: rows), first and last place [px] of strips that lie off; infinite where a view has
-    # fewer
-    strips: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    # (N, M, 5) strips that lie off, as `RowSpline` has them; infinite where a view has fewer
+    strips: Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
 
     @cached_property
     def _of_splines(self) -> Array:
@@ -92,9 +91,8 @@ class Waves:
             steps = self._of_steps.T[:, (seen[0][:, None] >= self.edges[index]).sum(axis=1)]
             found.append(steps * np.isfinite(self.edges[index, 0]))
         if self.strips.shape[1]:
-            axis, start, stop = np.moveaxis(self.strips, -1, 0)[:, index]  # (n, M) each
-            place = np.where(axis == 0.0, seen[0][:, None], seen[1][:, None])
-            found.append(((place >= start) & (place < stop)).T.astype(np.float64))
+            axis, *shape = np.moveaxis(self.strips, -1, 0)[:, index]  # (n, M) each
+            found.append(profile(np.where(axis == 0.0, seen[0][:, None], seen[1][:, None]), *shape).T)
         return found
 
     def displaced(self, params: Array, index: IntArray, basis: list[Array]) -> Array:

@@ -47,6 +47,13 @@ def bsplines(u: Array, count: int) -> Array:
     return basis
 
 
+def profile(place: Array, start: Array, stop: Array, origin: Array, rate: Array) -> Array:
+    """How much of a strip's displacement there is at places [px]: see `RowSpline.strips`."""
+    with np.errstate(invalid="ignore"):
+        inside = (place >= start) & (place < stop)
+        return np.asarray(np.where(inside, np.exp(-np.maximum((place - origin) * rate, 0.0)), 0.0))
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class RowSpline(Frozen):
     """A displacement of image points: where a point is seen, less where a model without it projects it.
@@ -61,10 +68,12 @@ class RowSpline(Frozen):
         Columns at which another detector begins [px], ascending.
     steps : (C + 1, 2)
         Displacement of each detector, (col, row) [px]; without any detector (0, 2).
-    strips : (M, 3)
-        Axis (0: columns, 1: rows), first and last place [px] of what lies off by itself; they may overlap.
+    strips : (M, 5)
+        What lies off by itself: axis (0: columns, 1: rows), first and last place, and the origin from
+        which, and the rate at which, that fades as exp(-(x - origin) rate) [px, 1/px]; rate 0: it does not. They may
+        overlap.
     moved : (M, 2)
-        By how much each of them, (col, row) [px].
+        By how much each of them, (col, row) [px]; where it fades, at first.
     """
 
     coeffs: Array
@@ -72,15 +81,18 @@ class RowSpline(Frozen):
     row_scale: float = 1.0
     edges: Array = field(default_factory=lambda: np.zeros(0))
     steps: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    strips: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    strips: Array = field(default_factory=lambda: np.zeros((0, 5)))
     moved: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
-        shapes = (("coeffs", (None, 2)), ("edges", (None,)), ("steps", (None, 2)), ("strips", (None, 3)))
+        shapes = (("coeffs", (None, 2)), ("edges", (None,)), ("steps", (None, 2)), ("strips", (None, 5)))
         for name, shape in (*shapes, ("moved", (None, 2))):
             self._array(name, shape, RpcError)
-        if len(self.strips) != len(self.moved) or not np.isin(self.strips[:, 0], (0.0, 1.0)).all():
-            raise RpcError("strips: each has an axis (0 or 1), two ends and a displacement")
+        fine = np.isin(self.strips[:, 0], (0.0, 1.0)).all()
+        if len(self.strips) != len(self.moved) or not fine:
+            raise RpcError(
+                "strips: each has an axis (0 or 1), two ends, an origin, a rate and a displacement"
+            )
         if 0 < len(self.coeffs) < 4:
             raise RpcError(f"a cubic spline has at least 4 coefficients, found {len(self.coeffs)}")
         if (
@@ -103,14 +115,18 @@ class RowSpline(Frozen):
             out += self.steps[
                 np.searchsorted(self.edges, image[..., 0], side="right").clip(0, len(self.edges))
             ]
-        for (axis, start, stop), moved in zip(self.strips, self.moved, strict=True):
-            place = image[..., int(axis)]
-            out += ((place >= start) & (place < stop))[..., None] * moved
+        for strip, moved in zip(self.strips, self.moved, strict=True):
+            out += profile(image[..., int(strip[0])], *strip[1:])[..., None] * moved
         return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
 
     def rate(self, row: Array) -> Array:
         """Its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
-        return self._along(row, rate=True) / self.row_scale
+        out = self._along(row, rate=True) / self.row_scale
+        for (axis, start, stop, origin, rate), moved in zip(self.strips, self.moved, strict=True):
+            if axis == 1.0:
+                fading = ((row - origin) * rate > 0.0) * rate
+                out -= (profile(row, start, stop, origin, rate) * fading)[..., None] * moved
+        return out
 
     def _along(self, row: Array, rate: bool) -> Array:
         u = (np.asarray(row, dtype=np.float64) - self.row_offset) / self.row_scale

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.explanations import AFFINE, STRIP, WANDER
+from barpc.ba.explanations import AFFINE, FADE, STRIP, WANDER
 from barpc.ba.scan import Interval
 from barpc.report.records import Number, Record, said
 
 AXES = "columns", "rows"
 _WORDS = {
     STRIP: "{axis} {first:.0f}-{last:.0f} of {image} lie {size:.2f} px off the rest of it",
+    FADE: "rows of {image} lie {size:.2f} px off at row {origin:.0f}, which fades within {length:.0f} rows",
     WANDER: "rows of {image} wander by {size:.2f} px",
     AFFINE: "{image} is turned, stretched or bent by {size:.2f} px otherwise than its camera says",
 }
@@ -53,14 +54,16 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
     for one in adjustment.findings:
         image, size = adjustment.names[one.view], float(np.hypot(*one.size))
         place: dict[str, Any] = {}
+        words: dict[str, Any] = {"image": image, "size": size}
         if one.where is not None:
-            axis, start, stop = one.where
+            axis, start, stop, origin, rate = one.where
+            words |= {"origin": origin, "length": 1.0 / max(abs(rate), 1e-9)}
             last = 2.0 * adjustment.cameras.unknowns.half[axis, one.view] - 1.0
             ends = float(np.clip(np.ceil(start), 0.0, last)), float(np.clip(np.ceil(stop) - 1.0, 0.0, last))
             place = dict(zip(("axis", "first", "last"), (AXES[axis], *ends), strict=True))
-        words = _WORDS[one.kind].format(image=image, size=size, **place)
+        sentence = _WORDS[one.kind].format(**words, **place)
         numbers = one.gain, one.gap, one.runner_up or None
-        found.append(ExplanationEntry(one.kind, words, image, *numbers, **place, size_px=size))
+        found.append(ExplanationEntry(one.kind, sentence, image, *numbers, **place, size_px=size))
     return tuple(found)
 
 
