@@ -20,7 +20,8 @@ _LOG = logging.getLogger(__name__)
 
 _MOST = 6  # explanations of one block
 _TRIED = 3  # intervals a round
-_SHARPENED = 2
+_LOCAL = 3  # explanations of parts of an image whose ends are looked for, a round
+_SHARPENED = 6  # times
 _UNKNOWNS = 400  # of all views, up to which explanations are tried
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
 
@@ -98,11 +99,12 @@ class _Search:
         found: list[tuple[Explanation, float, float, str]] = []
         while len(found) < _MOST:
             tried = [(one, made, self._worth(one, made)) for one, made in self._tried()]
-            tried.sort(key=lambda row: _part(row[0], self.seen) - row[2])
+            tried.sort(key=lambda row: -row[2])
             if not tried or not tried[0][2] > SURE:
                 break
-            one, made, gain = tried[0]
-            other = next(((t[0].kind, t[2]) for t in tried[1:] if _differs(t[0], one)), ("", 0.0))
+            same = [row for row in tried if row[2] > tried[0][2] - SURE and _of_one_image(row[0], tried[0][0])]
+            one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
+            other = next(((t[0].kind, t[2]) for t in tried if t[0] is not one and _differs(t[0], one)), ("", 0.0))
             _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
             found.append((one, gain, gain - max(other[1], 0.0), other[0]))
             self.taken.append(one)
@@ -141,7 +143,7 @@ class _Search:
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
         made = [(one, self._fit(one)) for one in proposed(self.seen, out)]
         made.sort(key=lambda row: row[0].price - row[1].evidence)
-        strips = [n for n, row in enumerate(made) if row[0].kind in LOCAL][:_SHARPENED]
+        strips = [n for n, row in enumerate(made) if row[0].kind in LOCAL][:_LOCAL]
         for n in strips:
             made[n] = self._sharpened(*made[n])
         return made
@@ -183,6 +185,11 @@ def _same(one: Interval, other: Interval) -> bool:
     common = min(one.stop, other.stop) - max(one.start, other.start)
     either = max(one.stop, other.stop) - min(one.start, other.start)
     return (one.view, one.axis) == (other.view, other.axis) and 2.0 * common > either
+
+
+def _of_one_image(one: Explanation, other: Explanation) -> bool:
+    """Whether two explanations may be a part of an image and its complement."""
+    return one is other or (one.view == other.view and one.kind in LOCAL and other.kind in LOCAL)
 
 
 def _part(one: Explanation, seen: Seen) -> float:
