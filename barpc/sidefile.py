@@ -189,7 +189,8 @@ def plain_path(path: str | os.PathLike[str]) -> Place:
 # --- JSON -------------------------------------------------------------------------------------------------
 
 _DIGITS = 18  # of a whole number: more do not fit 64 bits
-_LARGEST = 1e100  # no number of a side file comes near, and its square is finite
+LARGEST = 1e100
+"""No number of a side file comes near, and its square is finite."""
 
 
 def read_json(path: Path | str, kind: Kind) -> Any:
@@ -221,8 +222,8 @@ def _whole(digits: str) -> int:
 
 def _finite(text: str) -> float:
     value = float(text)
-    if not math.fabs(value) <= _LARGEST:
-        raise ValueError(f"{text[:40]} is beyond {_LARGEST:g}")
+    if not math.fabs(value) <= LARGEST:
+        raise ValueError(f"{text[:40]} is beyond {LARGEST:g}")
     return value
 
 
