@@ -365,16 +365,10 @@ def _use_answer(path: Path) -> object:
 
 # --- values -----------------------------------------------------------------------------------------------
 
-_MAY_BE_NONE = {"sigma", "xy_sigma"}
-
 
 def not_finite(value: object) -> str | None:
     """Where a record that a reader hands out holds a number that is none; of other values nothing is asked."""
-    if not is_dataclass(value) or type(value).__name__ not in {
-        "RPC",
-        "Tracks",
-        "GroundPoints",
-    }:
+    if not is_dataclass(value) or type(value).__name__ not in ("RPC", "Tracks"):  # others say more, later
         return None
     for field in fields(value):
         found = getattr(value, field.name)
