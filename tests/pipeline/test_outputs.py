@@ -134,7 +134,10 @@ def test_a_file_that_cannot_be_read_back_ends_the_run(tmp_path, view, fit, monke
         write_view(run, view, fit, make_rpc(), "none", ("txt",))
 
 
-@pytest.mark.parametrize(("consumer", "ends"), [("barpc", True), ("gdal", True), ("other", False)])
+@pytest.mark.parametrize(
+    ("consumer", "ends"),
+    [("barpc", True), ("gdal", True), ("gdal, beside an image", True), ("other", False)],
+)
 def test_only_what_the_tool_itself_and_gdal_say_ends_the_run(
     tmp_path, view, fit, monkeypatch, consumer, ends
 ) -> None:
