@@ -183,6 +183,8 @@ def _readings(path: Path, ground: Array, image: Array) -> list[Reading]:
     try:
         with _lent(path) as lent:
             found = [_reading(path, lent, name, ground, image) for name in names]
+    except OutputError:  # of `_unread`
+        raise
     except Exception as failure:  # noqa: BLE001 - what cannot be lent is read by none
         found = [_unread(path, name, failure) for name in names]
     return [*found, _reading(path, path, "barpc", ground, image)]
