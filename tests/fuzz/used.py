@@ -8,6 +8,7 @@ import socket
 import tempfile
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import cache, partial
 from importlib.util import find_spec
@@ -198,8 +199,10 @@ def mutate_hdf5(data: bytes, rng: Rng) -> bytes:
             file.visit(names.append)
             if not names:
                 break
-            name = str(pick(rng, names))
-            _edit(file, name, rng, h5py)
+            with suppress(
+                OSError, RuntimeError, ValueError, KeyError, TypeError
+            ):  # of what an edit before has left
+                _edit(file, str(pick(rng, names)), rng, h5py)
     return memory.getvalue()
 
 
