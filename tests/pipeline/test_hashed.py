@@ -99,6 +99,10 @@ def test_small_files_go_together_up_to_64_mebibytes(files, monkeypatch) -> None:
         monkeypatch.setattr(hashed, "_TOGETHER", together)
         assert [len(group) for (group,) in hashed._groups(names)] == groups
         assert [name for (group,) in hashed._groups(names) for name in group] == names
+    monkeypatch.setattr(hashed, "_TOGETHER", 2 * size + 1)
+    assert [len(group) for (group,) in hashed._groups(2 * names)] == [3, 3]  # each counts from nothing
+    monkeypatch.setattr(hashed, "_TOGETHER", size + 1)
+    assert len(hashed._groups([AT, names[0], AT, names[1]])) == 1  # what is elsewhere is not read
     monkeypatch.setattr(hashed, "_TOGETHER", size)
     assert hashed._groups([AT, names[0], AT, names[1]]) == [((AT, names[0]),), ((AT, names[1]),)]
     assert hashed._groups([]) == []
