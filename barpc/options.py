@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from barpc.errors import InputError
 from barpc.remote import BUCKET, HOST
-from barpc.sidefile import OPTIONS, TABLE, read_text
+from barpc.sidefile import NUMBER, OPTIONS, TABLE, read_text
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound="Options")
@@ -33,8 +33,8 @@ Model = Literal["auto", "rotation+translation", "rotation", "translation", "shif
 HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
 _MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
 _REAL = 1e30  # no option is larger, or smaller and not 0: squares, and squares of them, are numbers then
-MOST_POINTS = (TABLE.most or 0) // (5 * 8)
-"""Control points of a fit: as many as a table of them may hold, five numbers of 8 bytes each."""
+MOST_POINTS = (TABLE.most or 0) // (5 * NUMBER)
+"""Control points of a fit: as many as a table of them may hold, five numbers each."""
 _SHORT = reprlib.Repr()
 _SHORT.maxstring, _SHORT.maxother = 60, 200
 

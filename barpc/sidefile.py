@@ -27,6 +27,8 @@ from barpc.remote import BLOCK, Place, Remote, RemoteFile, pinned, place
 logger = logging.getLogger(__name__)
 
 MB = 1 << 20
+NUMBER = 8
+"""Bytes of what an element of a file becomes in memory, however small it is kept there."""
 MAX_XML = 32 * MB  # the largest in use, a day of precise orbits, has 5 MB
 _FLAGS = os.O_RDONLY
 for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # not every system has all

@@ -52,7 +52,7 @@ def rows() -> list[tuple[str, str]]:
     """What is read, and what of it is refused beyond."""
     bounded = (sidefile.RPC_FILE, sidefile.GEOJSON, sidefile.OPTIONS, sidefile.SUMMARY)
     sides = {terrasar._MOST, dimap._MOST, maxar._MOST}
-    unpacked = f"packed, unpacked, and as numbers of {frozen._NUMBER} bytes"
+    unpacked = f"packed, unpacked, and as numbers of {sidefile.NUMBER} bytes"
     return [
         *((f"{kind.words}", size(kind.most)) for kind in bounded),
         (
@@ -66,10 +66,18 @@ def rows() -> list[tuple[str, str]]:
         ),
         (
             hloc._CONTENT.words,
-            f"{size(hloc._CONTENT.most)} as numbers of {hloc._NUMBER} bytes; {many(hloc._MOST)} objects, groups "
+            f"{size(hloc._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes; {many(hloc._MOST)} objects, groups "
             f"{hloc._DEEPEST} deep; an array {many(hloc._DEFLATE)} times its stored bytes",
         ),
-        ("a COLMAP database", f"{many(colmap._STEPS)} times 100,000 instructions of SQLite"),
+        (
+            f"{colmap._CONTENT.words} (COLMAP)",
+            f"{size(colmap._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes; {many(colmap._STEPS)} times "
+            "100,000 instructions of SQLite",
+        ),
+        (
+            "a localisation or correction grid",
+            f"{size(sidefile.TABLE.most)} as numbers of {sidefile.NUMBER} bytes",
+        ),
         (sidefile.NAMES.words, f"{size(sidefile.NAMES.most)}, {many(sidefile._LINE)} characters a line"),
         ("a VRT", size(vrt._MAX_BYTES)),
         ("a raster read as a DEM or geoid", f"{many(dem._MAX_CELLS)} cells"),

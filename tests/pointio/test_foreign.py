@@ -14,6 +14,7 @@ import pytest
 
 from barpc.errors import InputError
 from barpc.pointio.matches import read_links, read_matches
+from barpc.sidefile import Kind
 
 NAMES = ["a", "b", "c"]
 KEYPOINTS = {
@@ -439,3 +440,19 @@ def test_without_h5py_it_is_said_what_is_missing(tmp_path: Path, monkeypatch: py
     (tmp_path / "m.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
     with pytest.raises(InputError, match=r"m\.h5: HDF5 is read with h5py, .*pip install h5py$"):
         read_links(tmp_path / "m.h5", NAMES)
+
+
+def test_a_database_is_held_to_what_its_numbers_become(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Coordinates and numbers are kept in four bytes and worked on in eight."""
+    path = colmap(tmp_path)
+    keypoints = sum(4 * len(KEYPOINTS[name]) for name in "ab")
+    most = 8 * (keypoints + 2 * len(MATCHES["a", "b"]))
+    for limit, refused in ((most, False), (most - 1, True)):
+        monkeypatch.setattr("barpc.pointio.colmap._CONTENT", Kind("what it holds", limit))
+        if refused:
+            with pytest.raises(InputError, match=f"{most} bytes, too large for what it holds"):
+                read_matches(path, ["a", "b"])
+        else:
+            assert len(read_matches(path, ["a", "b"])) > 0
