@@ -17,7 +17,7 @@ from numpy.lib import format as npy
 
 from barpc.errors import BarpcError, InputError
 from barpc.remote import Remote
-from barpc.sidefile import ARRAYS, Kind, opened
+from barpc.sidefile import ARRAYS, NUMBER, Kind, opened
 
 
 class Frozen:
@@ -180,7 +180,6 @@ def _decode(frame: Any, arrays: Mapping[str, npt.NDArray[Any]], sent: bool = Fal
 
 _DEFLATE = 1032  # bytes at most that one byte of a deflated stream stands for
 _HEADER = 1 << 12
-_NUMBER = 8  # bytes of what an element becomes, however small it is kept
 
 
 def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
@@ -198,7 +197,7 @@ def unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
         with zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             kind.check(f"{path}, unpacked", sum(member.file_size for member in members))
-            kind.check(f"{path}, as numbers", _NUMBER * sum(_header(archive, m)[0] for m in members))
+            kind.check(f"{path}, as numbers", NUMBER * sum(_header(archive, m)[0] for m in members))
             return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
     except BarpcError:
         raise

@@ -7,6 +7,7 @@ image and its altitudes. A vendor's file beside an image, which would be read in
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import tempfile
@@ -161,6 +162,13 @@ def unverified(paths: Sequence[Path | str]) -> list[str]:
     ]
 
 
+_MACHINE = frozenset(
+    getattr(errno, name)
+    for name in ("EIO", "ENOSPC", "EDQUOT", "EMFILE", "ENFILE", "EROFS")
+    if hasattr(errno, name)
+)
+
+
 def _readers(path: Path) -> dict[str, bool]:
     """The tools besides barpc that read a file, and whether they are installed."""
     if path.name.endswith((GRID, CORRECTION)):
@@ -175,6 +183,8 @@ def _readings(path: Path, ground: Array, image: Array) -> list[Reading]:
     try:
         with _lent(path) as lent:
             found = [_reading(path, lent, name, ground, image) for name in names]
+    except OutputError:  # of `_unread`
+        raise
     except Exception as failure:  # noqa: BLE001 - what cannot be lent is read by none
         found = [_unread(path, name, failure) for name in names]
     return [*found, _reading(path, path, "barpc", ground, image)]
@@ -191,6 +201,9 @@ def _reading(path: Path, lent: Path, name: str, ground: Array, image: Array) -> 
 
 
 def _unread(path: Path, name: str, failure: Exception) -> Reading:
+    """What a reader says; OutputError where it is the machine that says it, of which no file is to blame."""
+    if isinstance(failure, OSError) and failure.errno in _MACHINE:
+        raise OutputError(f"{path}: cannot be opened as {name} does ({failure.strerror})") from failure
     return Reading(path, name, float("nan"), " ".join(f"{type(failure).__name__}: {failure}".split()))
 
 

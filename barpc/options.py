@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from barpc.errors import InputError
 from barpc.remote import BUCKET, HOST
-from barpc.sidefile import OPTIONS, read_text
+from barpc.sidefile import NUMBER, OPTIONS, TABLE, read_text
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound="Options")
@@ -33,6 +33,8 @@ Model = Literal["auto", "rotation+translation", "rotation", "translation", "shif
 HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
 _MOST = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
 _REAL = 1e30  # no option is larger, or smaller and not 0: squares, and squares of them, are numbers then
+MOST_POINTS = (TABLE.most or 0) // (5 * NUMBER)
+"""Control points of a fit: as many as a table of them may hold, five numbers each."""
 _SHORT = reprlib.Repr()
 _SHORT.maxstring, _SHORT.maxother = 60, 200
 
@@ -190,8 +192,13 @@ def _plain(kind: Any, rule: Rule, value: Any) -> Any:
     if isinstance(value, Integral) and abs(int(value)) >= _MOST:
         return None
     number = kind(value)
-    beyond = kind is float and number != 0 and not 1 / _REAL <= abs(number) <= _REAL
+    beyond = kind is float and number != 0 and not _is_plain(number)
     return number if rule.holds(number) and not beyond else None
+
+
+def _is_plain(number: float) -> bool:
+    """Whether a number that is not 0 has a size that options have."""
+    return 1 / _REAL <= abs(number) <= _REAL
 
 
 # --- the records ------------------------------------------------------------------------------------------
@@ -352,7 +359,7 @@ class AdjustOptions(Options):
             rows = float(self.jitter)
         except ValueError:
             return 0.0
-        return rows if math.isfinite(rows) else 0.0
+        return rows if _is_plain(rows) else 0.0
 
     @property
     def first_model(self) -> str:
@@ -406,6 +413,13 @@ class FitOptions(Options):
         """Accept points that show the ground mirrored (as radar images do) without suspecting that two columns are
         swapped.""",
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (count := math.prod(self.grid)) > MOST_POINTS:
+            raise InputError(
+                f"grid {list(self.grid)}: {count} control points, at most {MOST_POINTS} are fitted to"
+            )
 
 
 @dataclass(frozen=True, repr=False)

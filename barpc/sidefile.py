@@ -29,6 +29,8 @@ from barpc.remote import BLOCK, Place, Remote, RemoteFile, pinned, place
 logger = logging.getLogger(__name__)
 
 MB = 1 << 20
+NUMBER = 8
+"""Bytes of what an element of a file becomes in memory, however small it is kept there."""
 MAX_XML = 32 * MB  # the largest in use, a day of precise orbits, has 5 MB
 _FLAGS = os.O_RDONLY
 for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # not every system has all
@@ -191,7 +193,9 @@ def plain_path(path: str | os.PathLike[str]) -> Place:
 # --- JSON -------------------------------------------------------------------------------------------------
 
 _DIGITS = 18  # of a whole number: more do not fit 64 bits
-_LARGEST = 1e100  # no number of a side file comes near, and its square is finite
+LARGEST = 1e100
+"""No number of a side file comes near, and its square is finite."""
+
 _MAX_DEPTH = 100  # levels of JSON and of XML
 _NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down or up, as signed bytes
@@ -235,8 +239,8 @@ def _whole(digits: str) -> int:
 
 def _finite(text: str) -> float:
     value = float(text)
-    if not math.fabs(value) <= _LARGEST:
-        raise ValueError(f"{text[:40]} is beyond {_LARGEST:g}")
+    if not math.fabs(value) <= LARGEST:
+        raise ValueError(f"{text[:40]} is beyond {LARGEST:g}")
     return value
 
 

@@ -146,6 +146,7 @@ class Workspace:
         self._keep = frozenset(path.resolve() for path in keep)
         self._adds = adds
         self.outputs: dict[str, str] = {}
+        self._noted = False  # whether an output was on its way to its name
         self.stages: list[dict[str, Any]] = []
         self.worker_seconds = 0.0  # of CPU, spent for this run in other processes
         self._check_free(overwrite, names)
@@ -224,15 +225,27 @@ class Workspace:
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         try:
-            self._save_state("done" if error is None else "failed")
+            self._end("done" if error is None else "failed")
         finally:
             if isinstance(error, BarpcError) and time.perf_counter() - self._start < KEEP_AFTER:
                 self._discard()
             self._lock.release()
 
+    def _end(self, status: str) -> None:
+        """Save the last state; where that fails, the same command is to go on and not to find a finished run."""
+        try:
+            self._save_state(status)
+        except BarpcError:
+            if status == "done":  # it may say so, and only the disk was not told
+                with suppress(BarpcError):
+                    self._save_state("failed")
+            raise
+
     def _discard(self) -> None:
         """Take away what this run made, where it was refused before it made anything worth keeping."""
-        if self.outputs or self.folder / STATE not in self._made:
+        if (
+            self._noted or self.folder / STATE not in self._made
+        ):  # an output may have its name, whatever came then
             return
         shutil.rmtree(self.folder / STATE, ignore_errors=True)
         for made in self._made[1:]:  # innermost first; only what this run made, and only when empty
@@ -283,10 +296,11 @@ class Workspace:
             self._refuse_foreign(name)
             if name not in self._named:
                 self._refuse_hiding([name])
-            sha = _digest(partial)
+            sha = _content(partial)
             if sha is None:
-                raise OutputError(f"{self.folder / name}: cannot be written (its temporary file is gone)")
+                raise OutputError(f"{self.folder / name}: cannot be written (it is no regular file)")
             _note(self.folder, name, sha)
+            self._noted = True
         self.outputs[name] = sha
 
     def write_text(self, name: str, text: str) -> Path:
@@ -302,25 +316,34 @@ class Workspace:
                 (self.folder / name).unlink()
 
     def _save_state(self, status: str) -> None:
-        """Write state.json with all that is known of the outputs: the notes of single ones have done."""
+        """Write state.json with all that is known of the outputs: the notes of single ones have done.
+
+        Not where a run failed: an output may have its name, and the run no word that it has.
+        """
         earlier = {} if status == "done" and not self._adds else self._earlier
         outputs = dict(sorted((earlier | self.outputs).items()))
         state = {"barpc": __version__, "status": status, "stages": self.stages, "outputs": outputs}
         with replacing(self.folder / STATE / STATE_FILE, overwrite=True, room=self.partial) as partial:
             partial.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
-        (self.folder / STATE / NOTES).unlink(missing_ok=True)
+        if status != "failed":
+            (self.folder / STATE / NOTES).unlink(missing_ok=True)
 
 
 # --- which files are barpc's own --------------------------------------------------------------------------
 
 
+def _content(path: Path) -> str | None:
+    """The sha256 of a regular file; None for anything else, OSError where it cannot be read. No link is followed."""
+    if not stat.S_ISREG(path.lstat().st_mode):
+        return None
+    with open(os.open(path, os.O_RDONLY | _CAREFUL), "rb") as file:  # noqa: PTH123  (no link)
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def _digest(path: Path) -> str | None:
-    """The sha256 of a regular file; None for anything else. No link is followed, no FIFO waited for."""
+    """As `_content`; None also where there is nothing, or it cannot be read. No FIFO is waited for."""
     try:
-        if not stat.S_ISREG(path.lstat().st_mode):
-            return None
-        with open(os.open(path, os.O_RDONLY | _CAREFUL), "rb") as file:  # noqa: PTH123  (no link)
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return _content(path)
     except (OSError, ValueError):
         return None
 

@@ -1,7 +1,9 @@
-"""The longer sweeps behind docs/reliability.md: kills, damaged input, what a task costs on its way, memory.
+"""The longer sweeps behind docs/reliability.md: kills, faults, damaged input, what tasks and hashes cost, memory.
 
     python benchmarks/reliability.py kill --trials 200 --jobs 1     # SIGKILL, the same command, same bytes
     python benchmarks/reliability.py fuzz --runs 1000000            # damaged files of every kind
+    python benchmarks/reliability.py faults --every 5               # the n-th open, write, ... fails (needs strace)
+    python benchmarks/reliability.py identity                       # what knowing the inputs costs
     python benchmarks/reliability.py task                           # a task in a pool and over dask, by batch
     python benchmarks/reliability.py memory IMAGE IMAGE --jobs 4    # peak memory of a run with its workers
 
@@ -16,9 +18,13 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
+from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -71,6 +77,105 @@ def cost_of_a_task() -> None:
         measure("dask, 2 workers", client.get_executor(), 2000)
 
 
+class Spent:
+    """CPU seconds and calls of some functions."""
+
+    def __init__(self) -> None:
+        self.seconds, self.calls = 0.0, 0
+
+    def timed(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, counted."""
+
+        def wrapped(*args: object) -> Any:
+            began = time.process_time()
+            try:
+                return function(*args)
+            finally:
+                self.seconds += time.process_time() - began
+                self.calls += 1
+
+        return wrapped
+
+
+def identity_of_a_run(side: int = 1000) -> None:
+    """What a whole run of three images spends on hashing its inputs, and on asking whether they are still the same."""
+    import numpy as np
+    import rasterio
+
+    import barpc
+    from barpc import identity
+    from barpc.options import RunOptions
+    from barpc.pipeline import hashed
+
+    hashing, asking = Spent(), Spent()
+    ask = asking.timed(identity.Input.ask)
+    with tempfile.TemporaryDirectory() as folder:
+        images = []
+        for source in sorted((ROOT / "data_samples").glob("*.tif")):
+            with rasterio.open(source) as image:
+                pixels, rpcs = image.read(1), image.rpcs
+            images.append(Path(folder) / source.name)
+            shape = {"width": side, "height": side, "count": 1, "dtype": pixels.dtype, "rpcs": rpcs}
+            with rasterio.open(images[-1], "w", driver="GTiff", **shape) as out:  # what is missing is black
+                whole = np.zeros((side, side), pixels.dtype)
+                whole[: pixels.shape[0], : pixels.shape[1]] = pixels[:side, :side]
+                out.write(whole, 1)
+        barpc.adjust(images, Path(folder) / "warm", RunOptions(pictures=False))
+        with (
+            mock.patch.object(hashed, "hashed", hashing.timed(hashed.hashed)),
+            mock.patch.object(identity.Input, "ask", lambda one: ask(one)),
+        ):
+            began = time.process_time()
+            barpc.adjust(images, Path(folder) / "out", RunOptions(pictures=False))
+            seconds = time.process_time() - began
+    print(
+        f"a run of {len(images)} x {side**2 / 1e6:.1f} Mpx: {seconds:.2f} CPU s, of which hashing "
+        f"{hashing.seconds:.4f} ({hashing.calls} files), {asking.calls} questions {asking.seconds:.4f}"
+    )
+
+
+def identity_of_sparse_images(count: int = 100, side: int = 4000) -> None:
+    """What hashing costs of files that are nearly all holes, which read as zeros, beside reading their pixels."""
+    import rasterio
+
+    from barpc.raster import hashed
+
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / f"{number}.tif" for number in range(count)]
+        shape = {"width": side, "height": side, "count": 1, "dtype": "uint16", "tiled": True}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with rasterio.open(Path(folder) / "whole.tif", "w", driver="GTiff", **shape):
+                pass
+        data = (Path(folder) / "whole.tif").read_bytes()
+        for path in paths:
+            with path.open("wb") as file:  # what is zero becomes a hole of the disk
+                for start in range(0, len(data), 1 << 16):
+                    if (part := data[start : start + (1 << 16)]).strip(b"\0"):
+                        file.seek(start)
+                        file.write(part)
+                file.truncate(len(data))
+        began = time.process_time()
+        found = [hashed(path) for path in paths]
+        hashing = time.process_time() - began
+        began = time.process_time()
+        for one in found:
+            one.ask()
+        asking = time.process_time() - began
+        began = time.process_time()
+        for path in paths:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                with rasterio.open(path) as image:
+                    image.read(1)
+        reading = time.process_time() - began
+        size = sum(path.stat().st_size for path in paths)
+    print(
+        f"{count} sparse images of {side} x {side} px, {size / 1e9:.1f} GB: hashing {hashing:.2f} CPU s, asking "
+        f"{asking:.4f}, reading their pixels {reading:.2f}"
+    )
+
+
 def resident(pid: int) -> int:
     """Proportional set size [bytes] of a process and all that it has started: shared pages count once."""
     total = 0
@@ -104,6 +209,10 @@ def main() -> None:
     kill.add_argument("--trials", type=int, default=200)
     kill.add_argument("--jobs", type=int, default=1)
     verbs.add_parser("fuzz").add_argument("--runs", type=int, default=1_000_000)
+    verbs.add_parser("faults").add_argument(
+        "--every", type=int, default=5, help="each so many-th call of a kind"
+    )
+    verbs.add_parser("identity")
     verbs.add_parser("task")
     peak = verbs.add_parser("memory")
     peak.add_argument("images", nargs="+")
@@ -113,6 +222,11 @@ def main() -> None:
         run_module("tests.reliability.trials", given.trials, "--jobs", given.jobs)
     elif given.verb == "fuzz":
         run_module("tests.fuzz", given.runs)
+    elif given.verb == "faults":
+        run_module("tests.reliability.injected", "--every", given.every)
+    elif given.verb == "identity":
+        identity_of_a_run()
+        identity_of_sparse_images()
     elif given.verb == "task":
         cost_of_a_task()
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -102,6 +103,24 @@ def test_a_file_that_a_tool_cannot_read_is_reported_with_its_reason(tmp_path):
         assert np.isnan(reading.max_error)
         assert reading.note
         assert "\n" not in reading.note
+
+
+@pytest.mark.parametrize(
+    ("code", "refused"), [(errno.ENOSPC, True), (errno.EIO, True), (errno.ENOENT, False)]
+)
+def test_a_fault_of_the_machine_is_no_finding_about_a_file(image, tmp_path, monkeypatch, code, refused):
+    """Else a run would end well whose file nobody has looked at."""
+    path = write(make_rpc(), image, tmp_path / "out", "a_RPC.TXT")
+
+    def copy(*_: object) -> None:
+        raise OSError(code, "so it is")
+
+    monkeypatch.setattr("barpc.handoff.shutil.copy", copy)
+    if refused:
+        with pytest.raises(OutputError, match=r"a_RPC\.TXT: cannot be opened as gdal.* does \(so it is\)"):
+            verify([path], make_rpc(), SIZE, ALTITUDES)
+    else:
+        assert [reading.passed for reading in verify([path], make_rpc(), SIZE, ALTITUDES)].count(False) == 1
 
 
 def test_a_new_format_is_one_row_written_verified_and_offered(image, tmp_path, monkeypatch, capsys):

@@ -246,6 +246,12 @@ def test_records_print_what_differs_from_the_defaults() -> None:
         ({"adjust": {"robust_threshold": -1}}, r"here \[adjust\]: robust_threshold must be a number above 0"),
         ({"adjust": {"center_method": "foo"}}, r"here \[adjust\]: unknown option 'center_method'"),
         ({"adjust": {"model": "shift", "drift": 1}}, "drift 1 needs a model with a rotation"),
+        ({"adjust": {"jitter": "5e-324"}}, "jitter '5e-324' is not auto, off or a number of rows"),
+        ({"adjust": {"jitter": "1e31"}}, "jitter '1e31' is not auto, off or a number of rows"),
+        (
+            {"fit": {"grid": [4, 4, 2**24]}},
+            r"grid \[4, 4, 16777216\]: 268435456 control points, at most 26843545",
+        ),
     ],
 )
 def test_a_message_says_where_and_what(values: dict[str, Any], message: str) -> None:

@@ -20,7 +20,7 @@ from barpc.ba.waves import Waves
 from barpc.errors import InputError
 from barpc.frozen import load_npz
 from barpc.geodesy import Array
-from barpc.sidefile import ARRAYS
+from barpc.sidefile import ARRAYS, LARGEST
 
 if TYPE_CHECKING:
     from barpc.ba.result import Adjustment
@@ -143,16 +143,14 @@ class BlockPrior:
             and len(set(self.names)) == n
             and all(array.shape == shape for array, shape in zip(arrays, shapes.values(), strict=True))
             and all(array.dtype == np.float64 for array in arrays)
-            and all(np.isfinite(getattr(a, "data" if sp.issparse(a) else "real")).all() for a in arrays)
+            and all(_is_plain(array) for array in arrays)
             and bool((self.information.diagonal() > 0).all())
             and self._edges.ndim == 2
             and len(self._edges) == n
             and self._strips.shape[::2] == (n, 5)
             and self._strips.dtype == np.float64
             and (self.splines == 0 or 4 <= self.splines <= q)
-            and (
-                self.less is None or (self.less.shape[1:] == (n * q,) and bool(np.isfinite(self.less).all()))
-            )
+            and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_plain(self.less)))
         )
 
     def dense(self) -> Array:
@@ -168,10 +166,30 @@ class BlockPrior:
         return matrix if self.less is None else matrix - self.less.T @ self.less
 
 
+def _is_plain(array: Array | sp.csr_array) -> bool:
+    """Whether all numbers are finite, and their squares."""
+    numbers = array.data if sp.issparse(array) else array
+    return bool((np.abs(np.asarray(numbers)) <= LARGEST).all())
+
+
 def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
-    matrix = sp.csr_array(tuple(file[name] for name in _SPARSE), shape=(size, size))
+    data, indices, bounds = (file[name] for name in _SPARSE)
+    # scipy's own check takes differences, which wrap round for numbers at the ends: what it then reads is not its own
+    ends = bounds.shape == (size + 1,) and bounds[0] == 0 and bounds[-1] == len(indices) == len(data)
+    if not (ends and _within(bounds, len(indices)) and (bounds[1:] >= bounds[:-1]).all()):
+        raise ValueError("the bounds of its rows do not go together")
+    if not _within(indices, size - 1):
+        raise ValueError("a column beyond its size")
+    matrix = sp.csr_array((data, indices, bounds), shape=(size, size))
     matrix.check_format()
     return matrix
+
+
+def _within(numbers: Array, most: int) -> bool:
+    """Whether all are whole, and from 0 to `most`."""
+    return bool(
+        numbers.ndim == 1 and numbers.dtype.kind in "iu" and ((numbers >= 0) & (numbers <= most)).all()
+    )
 
 
 def block_prior(adjustment: Adjustment) -> BlockPrior:

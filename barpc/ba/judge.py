@@ -102,9 +102,13 @@ class _Search:
             tried.sort(key=lambda row: -row[2])
             if not tried or not tried[0][2] > SURE:
                 break
-            same = [row for row in tried if row[2] > tried[0][2] - SURE and _of_one_image(row[0], tried[0][0])]
+            same = [
+                row for row in tried if row[2] > tried[0][2] - SURE and _of_one_image(row[0], tried[0][0])
+            ]
             one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
-            other = next(((t[0].kind, t[2]) for t in tried if t[0] is not one and _differs(t[0], one)), ("", 0.0))
+            other = next(
+                ((t[0].kind, t[2]) for t in tried if t[0] is not one and _differs(t[0], one)), ("", 0.0)
+            )
             _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
             found.append((one, gain, gain - max(other[1], 0.0), other[0]))
             self.taken.append(one)

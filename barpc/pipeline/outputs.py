@@ -100,13 +100,15 @@ def verify_files(paths: Sequence[str], view: View, fit: RpcFit, model: SensorMod
     """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads another camera."""
     largest = float(np.linalg.norm(fit.max_ckp)) + REOPENED
     written: Written = {Path(path).name: {} for path in paths}
-    for reading in verify([Path(path) for path in paths], model, view.size, view.alt_range):
-        own = reading.consumer in ("barpc", "gdal")
+    readings = verify([Path(path) for path in paths], model, view.size, view.alt_range)
+    for reading in sorted(readings, key=lambda one: one.consumer != "barpc"):  # what barpc finds says more
+        own = reading.consumer.partition(",")[0] in ("barpc", "gdal")  # which reads texts beside an image
         if own and not reading.max_error <= 2 * largest:
             raise OutputError(
                 f"{reading.path}: {reading.consumer} reads it {reading.max_error:.3g} px off ({reading.note}); "
                 "is the disk full, or another RPC file beside it?"
             )
+    for reading in readings:
         written[reading.path.name][reading.consumer] = reading.note or reading.max_error
     return written
 

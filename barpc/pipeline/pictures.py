@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
-from contextlib import ExitStack, suppress
+import logging
+from collections.abc import Iterable
+from contextlib import ExitStack
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -20,6 +22,8 @@ from barpc.report import Run
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import epipolar_offset
 
+logger = logging.getLogger(__name__)
+
 SIDE = 360  # px of a quick-look at most
 TIES = 10  # tie points with the largest residuals, and as many at random
 HALF = 24  # px: a patch reaches so far to each side
@@ -33,15 +37,23 @@ Pixels = npt.NDArray[np.uint8]
 def pictures(run: Run, band: int) -> str:
     """The pictures of a run as JSON; an image that lies on another host, or cannot be read, has none."""
     views = [view for view in run.views if not isinstance(view.path, Remote) and view.path]
-    looks = {}
+    looks, left_out = {}, dict[str, None]()
     for view in views[:: max(1, -(-len(views) // MOST))]:
         try:
             look = _quicklook(view.path, band)
-        except ImageError:
+        except ImageError as error:
+            left_out[str(error)] = None
             continue
         if look is not None:
             looks[view.name] = _text(look)
+    _say(left_out)
     return json.dumps({"quicklooks": looks, "ties": _ties(run, band)})
+
+
+def _say(left_out: Iterable[str]) -> None:
+    """What the report cannot show is no reason to end a run that has done its work."""
+    for error in left_out:
+        logger.warning("%s; the report does not show it", error)
 
 
 def _text(pixels: Pixels) -> str:
@@ -102,6 +114,7 @@ def _ties(run: Run, band: int) -> list[dict[str, Any]]:
     """
     chosen = [_pair(run, kind, track) for kind, track in _chosen(run)]
     shown: dict[_Tie, dict[str, Any]] = {}
+    left_out: dict[str, None] = {}
     with ExitStack() as stack:
         opened = cache(lambda view: stack.enter_context(open_raster(run.views[view].path)))
         for a, b in sorted({tie.views for tie in chosen}):
@@ -115,7 +128,7 @@ def _ties(run: Run, band: int) -> list[dict[str, Any]]:
             corners = np.rint(xy[:, 0])
             there = [_brought(*two, corners, alts) for two, (_, alts) in zip(cameras, seen, strict=True)]
             for n, tie in enumerate(ties):
-                with suppress(ImageError):
+                try:
                     patches = [_patch(opened(a), band, _grid() + corners[n])]
                     patches += [_patch(opened(b), band, places[n]) for places in there]
                     texts = [_text(_stretched(patch)) for patch in patches if patch is not None]
@@ -127,6 +140,9 @@ def _ties(run: Run, band: int) -> list[dict[str, Any]]:
                             "offset_px": [float(offset[n]) for offset, _ in seen],
                             "patches": texts,
                         }
+                except ImageError as error:
+                    left_out[str(error)] = None
+    _say(left_out)
     return [shown[tie] for tie in chosen if tie in shown]
 
 

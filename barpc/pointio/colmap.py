@@ -20,7 +20,7 @@ from barpc.geodesy import Array
 from barpc.pointio.links import PairPoints, index_pairs
 from barpc.pointio.names import ViewNames
 from barpc.scene import IntArray
-from barpc.sidefile import MB, Kind, opened, read_head
+from barpc.sidefile import MB, NUMBER, Kind, opened, read_head
 
 MAGIC = b"SQLite format 3\0"
 _DATABASE = Kind("a COLMAP database", None)  # most of it are descriptors, which are not read
@@ -84,7 +84,7 @@ class _Tables:
         if found is None or not found[0]:
             return None
         data = found[2] or b""
-        self._bytes += len(data)
+        self._bytes += NUMBER * (len(data) // np.dtype(dtype).itemsize)
         _CONTENT.check(self._path, self._bytes)
         return np.frombuffer(data, dtype).reshape(found[0], found[1])
 

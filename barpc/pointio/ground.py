@@ -22,7 +22,7 @@ from barpc.pointio.names import ViewNames, from_cell
 from barpc.raster import driver_of, open_raster
 from barpc.remote import Place
 from barpc.scene import GroundPoints
-from barpc.sidefile import GEOJSON, TABLE, Kind, read_head, read_json, read_text
+from barpc.sidefile import GEOJSON, NUMBER, TABLE, Kind, read_head, read_json, read_text
 
 GROUND_SIGMA = 1.0  # east, north, up standard deviation [m] of a GCP whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px] where the file states none
@@ -408,7 +408,7 @@ def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspo
     """
     with open_raster(path) as dataset:
         Kind("a localisation grid", TABLE.most).check(
-            f"{path}, read", 8 * dataset.count * dataset.width * dataset.height
+            f"{path}, read", NUMBER * dataset.count * dataset.width * dataset.height
         )
         bands = np.real(dataset.read()).astype(np.float64)
         to_image, tags = dataset.transform, dataset.tags()

@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 
 from barpc.errors import BarpcError, InputError
+from barpc.geodesy import Array
 from barpc.pointio.links import PairPoints, index_pairs
 from barpc.pointio.names import ViewNames
-from barpc.sidefile import MB, Kind, opened
+from barpc.sidefile import MB, NUMBER, Kind, opened
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _FILE = Kind("an HDF5 file", None)  # most of it are descriptors, which are not read
 _CONTENT = Kind("the keypoints and matches of an HDF5 file", 1024 * MB)
 _KEYPOINTS, _MATCHES = "keypoints", "matches0"
-_DEFLATE, _HEADER, _NUMBER = 1032, 1 << 12, 8  # as of `barpc.frozen`
+_DEFLATE, _HEADER = 1032, 1 << 12  # as of `barpc.frozen`
 _MOST, _DEEPEST = 2_000_000, 32  # objects, and groups in each other
 _FEATURES = ("features.h5", "keypoints.h5")
 
@@ -98,7 +99,7 @@ class _Datasets:
             raise ValueError(f"{found.name} lies in another file")
         if found.nbytes > _DEFLATE * found.id.get_storage_size() + _HEADER:
             raise ValueError(f"{found.name} claims more bytes than it can hold")
-        self._bytes += found.size * max(_NUMBER, found.dtype.itemsize)
+        self._bytes += found.size * max(NUMBER, found.dtype.itemsize)
         _CONTENT.check(self._path, self._bytes)
         return np.asarray(found[()])
 
@@ -112,10 +113,17 @@ def _matches(matches: _Datasets, keypoints: _Datasets, views: ViewNames) -> Iter
         if not known.keys() >= set(ends) or known[ends[0]] == known[ends[1]]:
             continue
         for name in set(ends) - points.keys():
-            points[name] = keypoints.array(keypoints.keypoints[name])[:, :2].astype(np.float64)
+            points[name] = _coordinates(name, keypoints.array(keypoints.keypoints[name]))
         first, second = (points[name] for name in ends)
         rows = index_pairs(matches.array(numbers), (len(first), len(second)))
         yield known[ends[0]], known[ends[1]], first[rows[:, 0]], second[rows[:, 1]]
+
+
+def _coordinates(name: str, found: Any) -> Array:
+    """Columns and rows (N, 2) [px] of keypoints (N, 2 or more); ValueError for an array of anything else."""
+    if found.ndim != 2 or found.shape[1] < 2 or found.dtype.kind not in "fiu":
+        raise ValueError(f"keypoints of {name} of shape {found.shape} and type {found.dtype}")
+    return np.asarray(found[:, :2], dtype=np.float64)
 
 
 def _view(name: str, keypoints: _Datasets, views: ViewNames) -> int | None:

@@ -26,7 +26,7 @@ from barpc.rpcio.tiff import printable, put_tag, read_tag
 from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import Kind
+from barpc.sidefile import NUMBER, Kind
 
 GRID, CORRECTION = "_grid.tif", "_correction.tif"
 """Ends of the names of localisation and correction grids."""
@@ -62,7 +62,7 @@ def write_correction(grid: CorrectionGrid, rpc: RPC, path: Path | str, *, overwr
 def read_correction(path: Place) -> tuple[RPC, CorrectionGrid]:
     """The RPC and the displacements of a correction grid; RpcFormatError where the file is none."""
     with open_raster(path) as dataset:
-        _TABLE.check(f"{path}, read", 4 * dataset.count * dataset.width * dataset.height)
+        _TABLE.check(f"{path}, read", NUMBER * dataset.count * dataset.width * dataset.height)
         if dataset.count != 2 or dataset.tags().get("CORRECTION") != SIGN:
             raise RpcFormatError(f"{path}: no correction grid: it lacks the tag CORRECTION or its two bands")
         shift = np.moveaxis(np.real(dataset.read()), 0, -1).astype(np.float64)

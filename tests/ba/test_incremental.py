@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 
 from barpc.ba.incremental import BlockPrior, apply_prior, block_prior
 from barpc.ba.priors import CameraPrior
@@ -64,6 +65,8 @@ def changed(name: str, change: Any) -> BlockPrior:
         ("information", lambda x: np.where(np.eye(6) * (np.arange(6) == 4), 0.0, x)),
         ("information", lambda x: np.where(np.eye(6) * (np.arange(6) == 4), -1.0, x)),
         ("information", lambda x: np.where(x == x[0, 1], np.inf, x)),
+        ("information", lambda x: np.where(x == x[0, 1], 1e101, x)),
+        ("params", lambda x: np.where(x == x[1, 2], -1e308, x)),
         ("information", lambda x: x.astype(int)),
         ("center", lambda x: x[:1]),
         ("center", lambda x: x[:, :2]),
@@ -140,6 +143,36 @@ def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(monkeypatch, tm
         replace(read, **{name: damaged}).save(tmp_path / "damaged.npz")
         with pytest.raises(InputError, match="do not go together"):
             BlockPrior.load(tmp_path / "damaged.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("indptr", lambda x: np.array([0, 2**63 - 1, -(2**63), *x[3:]])),  # whose differences wrap round
+        ("indptr", lambda x: np.array([0, -2, *x[2:]])),
+        ("indptr", lambda x: np.array([1, *x[1:]])),
+        ("indptr", lambda x: np.array([*x[:-1], x[-1] + 1])),
+        ("indptr", lambda x: np.array([*x[:1], x[2], x[1], *x[3:]])),
+        ("indptr", lambda x: x[:-1]),
+        ("indptr", lambda x: x.astype(float)),
+        ("indices", lambda x: np.where(np.arange(len(x)) == 3, 6, x)),
+        ("indices", lambda x: np.where(np.arange(len(x)) == 3, -1, x)),
+        ("indices", lambda x: np.where(np.arange(len(x)) == 3, 2**40, x.astype(np.int64))),
+        ("indices", lambda x: x[:-1]),
+        ("data", lambda x: x[:-1]),
+        ("data", lambda x: x[:, None]),
+        ("data", lambda x: np.where(np.arange(len(x)) == 3, 1e101, x)),
+    ],
+)
+def test_a_sparse_matrix_reads_nothing_but_its_own(tmp_path, name: str, change: Any) -> None:
+    stored = replace(prior_of(), information=sp.csr_array(prior_of().information))
+    stored.save(tmp_path / "prior.npz")
+    assert (BlockPrior.load(tmp_path / "prior.npz").dense() == prior_of().information).all()
+    with np.load(tmp_path / "prior.npz") as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "prior.npz", **{**arrays, name: change(arrays[name])})
+    with pytest.raises(InputError, match=r"prior\.npz: not the prior of an adjusted block"):
+        BlockPrior.load(tmp_path / "prior.npz")
 
 
 @pytest.mark.parametrize(("views", "refused"), [(10_000, False), (10_001, True)])

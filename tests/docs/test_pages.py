@@ -82,6 +82,15 @@ def test_the_page_of_the_summary_is_what_its_records_say():
     )
 
 
+def test_the_limits_are_those_of_the_code():
+    generator = script("generate_limits")
+    text = (DOCS / "reliability.md").read_text(encoding="utf-8")
+    assert generator.page(text) == text
+    told = dict(generator.rows())
+    assert told["an XML file"] == "32 MiB, 100 levels, 2,000,000 elements"
+    assert len(told) == len(generator.rows())
+
+
 def test_the_page_of_the_report_names_every_table_of_a_run():
     text = (DOCS / "report.md").read_text(encoding="utf-8")
     assert all(f"`{name}`" in text for name in TABLES)

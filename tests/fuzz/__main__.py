@@ -13,6 +13,8 @@ and a first byte chooses the reader.
 from __future__ import annotations
 
 import argparse
+import faulthandler
+import logging
 import resource
 import sys
 import time
@@ -58,6 +60,8 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="a folder for the files that show what was found")
     given = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (6 << 30, 6 << 30))  # a bomb fails instead of filling the machine
+    faulthandler.enable()  # what ends the process in C says where
+    logging.disable()  # what an adjustment warns of
     kinds = [kind for kind in SAMPLES if given.only in kind]
     total, began, places = 0, time.process_time(), 0
     shares = sum(SAMPLES[kind].share for kind in kinds)

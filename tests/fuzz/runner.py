@@ -11,8 +11,10 @@ import numpy as np
 
 from barpc.errors import BarpcError
 
+from .ends import mutate_ends
 from .mutate import mutate_bytes
 from .samples import SAMPLES
+from .used import not_finite
 
 LONGEST = 10.0
 """No file of a sample's size takes so many CPU seconds."""
@@ -35,7 +37,9 @@ def check(kind: str, data: bytes, folder: Path) -> bool:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            sample.read(path)
+            value = sample.read(path)
+        if (odd := not_finite(value)) is not None:
+            raise AssertionError(f"accepted with {odd}")
     except BarpcError as error:
         refused = error
     except Exception as error:
@@ -66,7 +70,8 @@ def scratch() -> tempfile.TemporaryDirectory[str]:
 
 
 def sweep(kind: str, runs: int, seed: int, found: dict[str, bytes] | None = None) -> int:
-    """So many damaged files of a kind, every third in its bytes alone; how many were accepted.
+    """So many damaged files of a kind: a quarter in bytes, a quarter at the ends of numbers, the others in their
+    structure; how many were accepted.
 
     Parameters
     ----------
@@ -82,8 +87,9 @@ def sweep(kind: str, runs: int, seed: int, found: dict[str, bytes] | None = None
     with scratch() as place:
         folder = prepared(kind, place)
         for k in range(runs):
-            by_structure = mutations and k % 3
-            mutate = mutations[int(rng.integers(len(mutations)))] if by_structure else mutate_bytes
+            general = (mutate_bytes, mutate_ends)
+            by_structure = mutations and k % 4 > 1
+            mutate = mutations[int(rng.integers(len(mutations)))] if by_structure else general[k % 2]
             mutant = mutate(data, rng)
             try:
                 accepted += check(kind, mutant, folder)

@@ -9,7 +9,6 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
@@ -57,6 +56,8 @@ from tests.sensor.linescan_files import Flight, dimap, isd
 from tests.sensor.radar_documents import document, nitf
 from tests.sensor.s1_product import Product
 
+from .ends import mutate_npz_ends
+from .kinds import Sample
 from .mutate import (
     Mutate,
     mutate_header,
@@ -66,36 +67,9 @@ from .mutate import (
     mutate_values,
     mutate_xml,
 )  # fmt: skip
+from .used import USED
 
 NAMES = ("left", "right")
-
-
-@dataclass(frozen=True)
-class Sample:
-    """A kind of file.
-
-    Parameters
-    ----------
-    name : str
-        What the file is called, which its errors must name.
-    read : callable
-        Its reader, and whatever meets the values first.
-    data : callable
-        The bytes of a good file.
-    mutations : tuple of callable
-        Beside damage to bytes.
-    beside : callable
-        Puts what the file needs beside it into a folder, once.
-    share : float
-        Part of a sample's usual runs, for slow readers.
-    """
-
-    name: str
-    read: Callable[[Path], object]
-    data: Callable[[], bytes]
-    mutations: tuple[Mutate, ...] = ()
-    beside: Callable[[Path], object] = lambda folder: None
-    share: float = 1.0
 
 
 # --- RPC files --------------------------------------------------------------------------------------------
@@ -490,7 +464,7 @@ SAMPLES: dict[str, Sample] = {
         lambda: _npz(
             names=np.array(NAMES), view=np.array([0, 1]), track=np.array([0, 0]), xy=np.ones((2, 2))
         ),
-        (mutate_npz,),
+        (mutate_npz, mutate_npz_ends),
     ),
     "matches asp": Sample(
         "run-left__right.txt",
@@ -511,7 +485,7 @@ SAMPLES: dict[str, Sample] = {
         "left__right.npz",
         lambda path: read_matches(path, NAMES),
         lambda: _npz(keypoints0=np.eye(2), keypoints1=9 * np.eye(2), matches=np.array([[0, 1], [1, 0]])),
-        (mutate_npz,),
+        (mutate_npz, mutate_npz_ends),
     ),
     "points csv": Sample(
         "p.csv",
@@ -524,7 +498,7 @@ SAMPLES: dict[str, Sample] = {
         "p.npz",
         read_correspondences,
         lambda: _npz(ground=np.ones((3, 3)), image=np.ones((3, 2))),
-        (mutate_npz,),
+        (mutate_npz, mutate_npz_ends),
     ),
     "points of a verb": Sample(
         "p.txt",
@@ -578,12 +552,12 @@ SAMPLES: dict[str, Sample] = {
         (_mutate_transform(_correction), mutate_header),
         share=0.2,
     ),
-    "prior": Sample("block.npz", _use_prior, _prior, (mutate_npz,)),
+    "prior": Sample("block.npz", _use_prior, _prior, (mutate_npz, mutate_npz_ends)),
     "record": Sample(
         "kept.npz",
         _use_record,
         lambda: _npz(**to_arrays((make_rpc(), {"a": [1.5, None]}, np.arange(3)))),
-        (mutate_npz,),
+        (mutate_npz, mutate_npz_ends),
     ),
     "summary": _run_sample("summary.json", _report, mutate_json, mutate_values, mutate_values, share=0.6),
     "comparison": _run_sample("summary.json", _compare, mutate_json, mutate_values, mutate_values, share=0.6),
@@ -622,5 +596,6 @@ SAMPLES: dict[str, Sample] = {
     "dimap model": Sample("DIM_image.XML", _use_linescan, lambda: dimap(_FLIGHT)[0].encode(), (mutate_xml,)),
     "product zip": Sample("S1A.zip", _use_product, _safe, (), share=0.2),
     "orbit": Sample("S1A.EOF", _use_orbit, _BURSTS.eof, (mutate_xml,), _beside_orbit, share=0.2),
+    **USED,
 }
 """Kind -> sample."""

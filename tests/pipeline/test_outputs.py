@@ -134,13 +134,16 @@ def test_a_file_that_cannot_be_read_back_ends_the_run(tmp_path, view, fit, monke
         write_view(run, view, fit, make_rpc(), "none", ("txt",))
 
 
-@pytest.mark.parametrize(("consumer", "ends"), [("barpc", True), ("gdal", True), ("other", False)])
+@pytest.mark.parametrize(
+    ("consumer", "ends"),
+    [("barpc", True), ("gdal", True), ("gdal, beside an image", True), ("other", False)],
+)
 def test_only_what_the_tool_itself_and_gdal_say_ends_the_run(
     tmp_path, view, fit, monkeypatch, consumer, ends
 ) -> None:
     def says(paths, *_):
-        return [Reading(path, name, 9.0 if name == consumer else 0.0) for path in paths for name in
-                ("barpc", "gdal", "other")]  # fmt: skip
+        names = dict.fromkeys(("barpc", "gdal", "other", consumer))
+        return [Reading(path, name, 9.0 if name == consumer else 0.0) for path in paths for name in names]
 
     monkeypatch.setattr(outputs, "verify", says)
     with Workspace(tmp_path / "out") as run:

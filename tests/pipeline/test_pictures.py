@@ -76,10 +76,12 @@ def test_no_pixel_leaves_where_that_is_not_wanted(corner, tmp_path):
     assert "data:image/jpeg" not in (tmp_path / "out/report.html").read_text()
 
 
-def test_an_image_that_is_gone_has_no_pictures(adjusted):
+def test_an_image_that_is_gone_has_no_pictures_and_that_is_said(adjusted, caplog):
     run = adjusted[0].run
     gone = replace(run.views[0], path="/nowhere/at/all.tif")
     found = json.loads(pictures(replace(run, views=(gone, *run.views[1:])), 1))
+    assert 1 <= len(caplog.messages) <= 2
+    assert all("/nowhere/at/all.tif" in line and "does not show it" in line for line in caplog.messages)
     assert set(found["quicklooks"]) == {view.name for view in run.views[1:]}
     assert found["ties"]
     assert all(gone.name not in (tie["a"], tie["b"]) for tie in found["ties"])

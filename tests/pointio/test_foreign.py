@@ -14,6 +14,7 @@ import pytest
 
 from barpc.errors import InputError
 from barpc.pointio.matches import read_links, read_matches
+from barpc.sidefile import Kind
 
 NAMES = ["a", "b", "c"]
 KEYPOINTS = {
@@ -215,6 +216,17 @@ def outside(h5py, file, folder: Path) -> None:
     group.create_dataset("matches0", (3,), "i8", external=[(str(folder / "secret"), 0, 24)])
 
 
+def odd(shape: tuple[int, ...], kind: str = "f4"):
+    """The keypoints of an image are another array."""
+
+    def fill(h5py, file, folder: Path) -> None:
+        with h5py.File(folder / "feats.h5", "a") as features:
+            del features["sub/a.tif/keypoints"]
+            features["sub/a.tif/keypoints"] = np.ones(shape, kind)
+
+    return fill
+
+
 def linked(h5py, file, folder: Path) -> None:
     del file["sub-a.tif"], file["sub-b.tif"]
     (folder / "other").mkdir()
@@ -273,6 +285,9 @@ LIES = {
     "text for an HDF5 file": (file("m.h5", b"\x89HDF\r\n\x1a\n and no more"), "HDF5|superblock"),
     "no keypoints beside an HDF5 file": (h5(lambda *_: None, features=False), r"looked for beside it as feats\.h5"),
     "matches that lie elsewhere": (h5(outside), "in another file"),
+    "keypoints of another shape": (h5(odd((2, 3, 2))), r"keypoints of sub-a\.tif of shape \(2, 3, 2\)"),
+    "keypoints of one number": (h5(odd((3, 1))), r"keypoints of sub-a\.tif of shape \(3, 1\)"),
+    "keypoints that are complex": (h5(odd((3, 2), "c16")), "and type complex128"),
     "a link to another file": (h5(linked), "no track is seen in two"),
 }  # fmt: skip
 
@@ -439,3 +454,19 @@ def test_without_h5py_it_is_said_what_is_missing(tmp_path: Path, monkeypatch: py
     (tmp_path / "m.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
     with pytest.raises(InputError, match=r"m\.h5: HDF5 is read with h5py, .*pip install h5py$"):
         read_links(tmp_path / "m.h5", NAMES)
+
+
+def test_a_database_is_held_to_what_its_numbers_become(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Coordinates and numbers are kept in four bytes and worked on in eight."""
+    path = colmap(tmp_path)
+    keypoints = sum(4 * len(KEYPOINTS[name]) for name in "ab")
+    most = 8 * (keypoints + 2 * len(MATCHES["a", "b"]))
+    for limit, refused in ((most, False), (most - 1, True)):
+        monkeypatch.setattr("barpc.pointio.colmap._CONTENT", Kind("what it holds", limit))
+        if refused:
+            with pytest.raises(InputError, match=f"{most} bytes, too large for what it holds"):
+                read_matches(path, ["a", "b"])
+        else:
+            assert len(read_matches(path, ["a", "b"])) > 0

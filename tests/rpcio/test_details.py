@@ -40,6 +40,7 @@ from barpc.rpcio.tiff import (
 from barpc.sensor.correction_grid import CorrectionGrid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.rpc import RPC
+from barpc.sidefile import Kind
 from tests.rpcio.conftest import dimap_v2, grid, make_rpc, write_image, yaml
 
 # --- TIFF ------------------------------------------------------------------------------------------------------
@@ -684,3 +685,19 @@ def test_the_sun_of_an_image_is_the_median_of_what_its_files_say(tmp_path: Path)
 def test_no_image_was_taken_before_there_were_satellites(day: str, stated: bool, tmp_path: Path) -> None:
     (tmp_path / "a.IMD").write_text(f"firstLineTime = {day}T00:00:00Z;")
     assert light_of(str(tmp_path / "a.tif")).time == (f"{day}T00:00:00Z" if stated else None)
+
+
+def test_a_correction_grid_is_held_to_what_its_numbers_become(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nodes are kept in four bytes and worked on in eight."""
+    path = tmp_path / "a_correction.tif"
+    write_correction(correction(), make_rpc(), path)
+    most = 8 * correction().shift.size
+    for limit, refused in ((most, False), (most - 1, True)):
+        monkeypatch.setattr("barpc.rpcio.grids._TABLE", Kind("a correction grid", limit, RpcFormatError))
+        if refused:
+            with pytest.raises(RpcFormatError, match=f"{most} bytes, too large for a correction grid"):
+                read_correction(path)
+        else:
+            assert read_correction(path)[0] == make_rpc()

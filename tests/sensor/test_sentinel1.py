@@ -341,6 +341,13 @@ def test_a_product_opens_as_folder_manifest_or_zip(
     assert open_product(safe / "annotation" / IW["IW1"].name) == model
 
 
+def test_a_polarisation_that_there_is_not_is_refused(safe: Path, tmp_path: Path) -> None:
+    xml = (safe / "annotation" / IW["IW1"].name).read_text()
+    (tmp_path / "odd.xml").write_text(xml.replace("<polarisation>VV<", "<polarisation>VV VV<"))
+    with pytest.raises(RpcFormatError, match=r"odd\.xml: polarisation vv vv is none of vv, hh, vh, hv"):
+        open_product(tmp_path / "odd.xml")
+
+
 def test_a_wrong_choice_lists_what_there_is(safe: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="choose one of iw1, iw2, iw3, mosaic"):
         open_product(safe)

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError
+from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError, visible
 from barpc.geodesy import Array
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.document import seconds
@@ -189,7 +189,11 @@ def _annotations(path: Path) -> list[_File]:
         files = [_named(path, name) for name in names if PurePosixPath(name).parent.name == "annotation"]
     else:
         annotation = read_annotation(path)
-        files = [_File(annotation.swath.lower(), annotation.polarisation.lower(), path)]
+        if (polarisation := annotation.polarisation.lower()) not in _POLARISATIONS:
+            raise RpcFormatError(
+                f"{path}: polarisation {visible(polarisation[:60])} is none of {', '.join(_POLARISATIONS)}"
+            )
+        files = [_File(annotation.swath.lower(), polarisation, path)]
     return sorted(file for file in files if file is not None)
 
 

@@ -1,0 +1,150 @@
+"""Write the table of limits of docs/reliability.md from the constants of the code.
+
+python docs/generate_limits.py            # writes it
+python docs/generate_limits.py --print    # prints it
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+from barpc import dem, frozen, options, raster, scene, sidefile, vrt, workspace
+from barpc.ba import incremental
+from barpc.fit import points
+from barpc.pointio import colmap, ground, hloc, names
+from barpc.remote import _KEPT as HELD
+from barpc.remote import _LONGEST as REQUEST
+from barpc.remote import BLOCK, web
+from barpc.report import tables
+from barpc.rpcio import acquisition, grids, text, tiff
+from barpc.sensor import document as metadata
+from barpc.sensor import terrasar
+from barpc.sensor.linescan import dimap, maxar
+from barpc.sensor.sicd import document as sicd
+from barpc.tie import pairs
+
+PAGE = Path(__file__).with_name("reliability.md")
+BEGIN = "<!-- Limits: written by docs/generate_limits.py. Edit the constants beside the readers, then run it again. -->"
+END = "<!-- End of the limits. -->"
+
+
+def size(value: int | None) -> str:
+    """Bytes, in the largest unit that leaves a whole number."""
+    assert value is not None
+    for power, unit in ((30, "GiB"), (20, "MiB"), (10, "KiB")):
+        if value >= 1 << power and value % (1 << power) == 0:
+            return f"{value >> power} {unit}"
+    return f"{value} bytes"
+
+
+def many(value: float) -> str:
+    """A number: counts with commas, sizes of numbers in powers of ten."""
+    return (
+        f"{value:,}"
+        if isinstance(value, int)
+        else re.sub(r"e([+-])0*", r"e\1", f"{value:g}").replace("e+", "e")
+    )
+
+
+def rows() -> list[tuple[str, str]]:
+    """What is read, and what of it is refused beyond."""
+    bounded = (sidefile.RPC_FILE, sidefile.GEOJSON, sidefile.OPTIONS, sidefile.SUMMARY)
+    sides = {terrasar._MOST, dimap._MOST, maxar._MOST}
+    unpacked = f"packed, unpacked, and as numbers of {sidefile.NUMBER} bytes"
+    return [
+        *((f"{kind.words}", size(kind.most)) for kind in bounded),
+        (
+            sidefile.XML.words,
+            f"{size(sidefile.XML.most)}, {sidefile._MAX_DEPTH} levels, {many(sidefile._MAX_ELEMENTS)} elements",
+        ),
+        (sidefile.TABLE.words, size(sidefile.TABLE.most)),
+        (
+            f"{sidefile.ARRAYS.words} (`.npz`)",
+            f"{size(sidefile.ARRAYS.most)} {unpacked}; a member {many(frozen._DEFLATE)} times its stored bytes",
+        ),
+        (
+            hloc._CONTENT.words,
+            f"{size(hloc._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes; {many(hloc._MOST)} objects, groups "
+            f"{hloc._DEEPEST} deep; an array {many(hloc._DEFLATE)} times its stored bytes",
+        ),
+        (
+            f"{colmap._CONTENT.words} (COLMAP)",
+            f"{size(colmap._CONTENT.most)} as numbers of {sidefile.NUMBER} bytes; {many(colmap._STEPS)} times "
+            "100,000 instructions of SQLite",
+        ),
+        (
+            "a localisation or correction grid",
+            f"{size(sidefile.TABLE.most)} as numbers of {sidefile.NUMBER} bytes",
+        ),
+        (sidefile.NAMES.words, f"{size(sidefile.NAMES.most)}, {many(sidefile._LINE)} characters a line"),
+        ("a VRT", size(vrt._MAX_BYTES)),
+        ("a raster read as a DEM or geoid", f"{many(dem._MAX_CELLS)} cells"),
+        ("RPC tags of a TIFF", f"{many(tiff._MAX_ENTRIES)} entries, {size(tiff._MAX_VALUES)} of values"),
+        ("an RPC in a NITF", f"the first {size(text._SCAN_LIMIT)}"),
+        ("a file of acquisition metadata", f"the first {size(acquisition._HEAD)}"),
+        ("a run's state", f"{size(workspace._MAX_STATE)}; larger ones count as missing"),
+        (
+            "a file of a web server or store",
+            f"{size(BLOCK)} to {size(REQUEST)} a request, {size(HELD)} held a process",
+        ),
+        (
+            "an answer of a web server",
+            f"{web.TIMEOUT:g} s, and 1 s for {web._SLOWEST:,} bytes; {web._MOVES} redirects",
+        ),
+        ("rasters open at a time", many(raster._MOST_OPEN)),
+        ("an image of a product's metadata", f"{many(*sides)} rows or columns"),
+        ("a polynomial of a SICD", f"degree {sicd._ORDER}"),
+        ("a name of an image", f"{names.MAX_NAME} bytes"),
+        ("control points of a fit", many(options.MOST_POINTS)),
+        ("unknowns of an earlier block", many(incremental._LARGEST)),
+        ("an area", f"{many(pairs._MOST_CROSSED)} times that its outline crosses itself"),
+        (
+            "numbers of JSON and `block.npz`",
+            f"{many(sidefile.LARGEST)}; whole ones of JSON {sidefile._DIGITS} digits",
+        ),
+        (
+            "numbers of options",
+            f"{many(1 / options._REAL)} to {many(options._REAL)}, and 0; whole ones below {many(options._MOST)}",
+        ),
+        ("numbers of metadata of a camera", many(metadata.LARGEST)),
+        (
+            "points of a fit, of a table, of a grid",
+            " and ".join(sorted({f"{many(far)} px" for far in (points._FARTHEST, ground._FAR, grids._FAR)})),
+        ),
+        ("numbers of a run's tables", many(tables._FAR)),
+        ("coordinates of a DEM", many(dem._FAR)),
+        ("standard deviations of ground points", " to ".join(map(many, scene.SIGMA_RANGE))),
+    ]
+
+
+def table() -> str:
+    """The table between its marks."""
+    lines = ["| what | at most |", "|---|---|", *(f"| {what} | {limit} |" for what, limit in rows())]
+    return "\n".join([BEGIN, "", *lines, "", END])
+
+
+def page(text: str) -> str:
+    """The page with the table in its place; ValueError where it has none."""
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"{PAGE}: no place for the limits")
+    return before + table() + after
+
+
+def main() -> None:
+    """Write or print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--print", action="store_true", dest="show", help="print instead of writing")
+    if parser.parse_args().show:
+        print(table())
+    else:
+        PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""The inputs of a run, hashed: which they are, under which name, in which groups, and that none changed meanwhile."""
+
+from __future__ import annotations
+
+import os
+from hashlib import sha256
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from barpc.errors import InputError
+from barpc.identity import Stamp, take
+from barpc.options import RunOptions, TieOptions
+from barpc.pipeline import hashed
+from barpc.pipeline.hashed import hash_files, hash_inputs
+from barpc.remote import Remote
+from tests.rpcio.conftest import write_image
+
+AT = Remote("https://a.org/x.tif", 10, "one")
+
+
+def run_of(*paths: str | Path) -> Any:
+    return SimpleNamespace(
+        views=[SimpleNamespace(path=p if isinstance(p, Remote) else str(p)) for p in paths]
+    )
+
+
+def digest(path: Path) -> str:
+    return sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    found = {name: tmp_path / name for name in ("a.tif", "b.tif", "c.tif", "gcps.csv", "beside.txt")}
+    for path in found.values():
+        path.write_bytes(b"II*\0" + path.name.encode() * 3)
+    return found
+
+
+def test_images_references_side_files_and_what_options_name_are_inputs(files, monkeypatch, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = RunOptions(
+        gcp=("gcps.csv", "nowhere.csv"),
+        dem=str(files["b.tif"]),
+        reference=("c.tif",),
+        fixed_run=str(tmp_path),
+    )
+    seen = {str(files["beside.txt"]): Stamp.of(files["beside.txt"].stat())}
+    found = hash_inputs(run_of(files["a.tif"], files["a.tif"]), options, seen)
+    assert list(found) == [str(files[n]) for n in ("a.tif", "c.tif", "beside.txt", "gcps.csv", "b.tif")]
+    for name, one in found.items():
+        assert (one.path, one.sha256, one.parts) == (name, digest(Path(name)), ())
+
+
+def test_a_vrt_counts_with_its_image(tmp_path) -> None:
+    from barpc.rpcio import write_rpc_vrt
+    from tests.rpcio.conftest import make_rpc
+
+    image = write_image(tmp_path / "a.tif", shape=(1, 4, 4))
+    write_rpc_vrt(make_rpc(), image, tmp_path / "a.vrt")
+    (found,) = hash_inputs(run_of(tmp_path / "a.vrt"), RunOptions(), {}).values()
+    assert [part.path for part in found.every()] == [str(tmp_path / "a.vrt"), str(image)]
+    with pytest.raises(InputError, match=r"a\.tif: was changed or replaced"):
+        hash_inputs(run_of(tmp_path / "a.vrt"), RunOptions(), {str(image): Stamp.of(tmp_path.stat())})
+
+
+def test_a_file_that_is_another_than_was_read_ends_the_run(files) -> None:
+    path = files["a.tif"]
+    seen = {str(path): Stamp.of(path.stat())}
+    assert hash_inputs(run_of(path), RunOptions(), seen)
+    os.utime(path, ns=(1, 1))
+    with pytest.raises(InputError, match=r"a\.tif: was changed or replaced"):
+        hash_inputs(run_of(path), RunOptions(), seen)
+
+
+def test_a_file_elsewhere_is_its_version(monkeypatch) -> None:
+    found = hash_inputs(run_of(AT), RunOptions(), {str(AT): Stamp(1, 1, 1, 1, 1, "x")})
+    assert found == {str(AT): take(AT)}
+    assert found[str(AT)].stamp is None
+
+
+def test_a_matcher_counts_with_its_files_under_its_name(files, monkeypatch) -> None:
+    code = [files["a.tif"], files["b.tif"], files["c.tif"]]
+    monkeypatch.setattr(hashed, "hook_files", lambda name: code if name == "mine:match" else [])
+    options = RunOptions(tie=TieOptions(matcher="mine:match"))
+    found = hash_inputs(run_of(), options, {})["mine:match"]
+    assert [(one.path, one.sha256) for one in found.every()] == [(str(p), digest(p)) for p in code]
+    assert (found.size, found.stamp) == (code[0].stat().st_size, Stamp.of(code[0].stat()))
+    assert hash_inputs(run_of(), RunOptions(), {}) == {}
+
+
+def test_small_files_go_together_up_to_64_mebibytes(files, monkeypatch) -> None:
+    assert hashed._TOGETHER == 64 << 20
+    names = [str(files[name]) for name in ("a.tif", "b.tif", "c.tif")]
+    size = files["a.tif"].stat().st_size
+    for together, groups in ((1, [1, 1, 1]), (2 * size, [2, 1]), (2 * size + 1, [3]), (3 * size, [3])):
+        monkeypatch.setattr(hashed, "_TOGETHER", together)
+        assert [len(group) for (group,) in hashed._groups(names)] == groups
+        assert [name for (group,) in hashed._groups(names) for name in group] == names
+    monkeypatch.setattr(hashed, "_TOGETHER", 2 * size + 1)
+    assert [len(group) for (group,) in hashed._groups(2 * names)] == [3, 3]  # each counts from nothing
+    monkeypatch.setattr(hashed, "_TOGETHER", size + 1)
+    assert len(hashed._groups([AT, names[0], AT, names[1]])) == 1  # what is elsewhere is not read
+    monkeypatch.setattr(hashed, "_TOGETHER", size)
+    assert hashed._groups([AT, names[0], AT, names[1]]) == [((AT, names[0]),), ((AT, names[1]),)]
+    assert hashed._groups([]) == []
+
+
+def test_the_work_goes_to_the_executor_under_its_stage_in_order(files, monkeypatch) -> None:
+    asked: list[Any] = []
+
+    def ordered(executor: Any, function: Any, tasks: Any, stage: str, progress: Any) -> list[Any]:
+        asked.append((executor, function, stage, progress))
+        return [function(*task) for task in tasks]
+
+    monkeypatch.setattr(hashed, "ordered", ordered)
+    monkeypatch.setattr(hashed, "_TOGETHER", 1)
+    pool, progress = object(), object()
+    found = hash_inputs(run_of(files["b.tif"], files["a.tif"]), RunOptions(), {}, pool, progress)  # type: ignore[arg-type]
+    assert asked == [(pool, hash_files, "hash", progress)]
+    assert [Path(name).name for name in found] == ["b.tif", "a.tif"]
+    assert [one.sha256 for one in found.values()] == [digest(files["b.tif"]), digest(files["a.tif"])]
