@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barpc.ba.mixture import Fit, Linear, first_guess, log_likelihoods
-from barpc.ba.scan import Interval, price
+from barpc.ba.scan import BINS, Interval, price
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import bsplines, profile
@@ -16,10 +16,10 @@ from barpc.sensor.splined import bsplines, profile
 STRIP = "strip"
 FADE = "fade"
 WANDER = "wander"
-AFFINE = "affine"
 LOCAL = STRIP, FADE
 """Those of a part of an image: they follow each other, and the adjustment follows them."""
 _LENGTHS = 2.0 ** np.arange(-4.0, 1.0)  # of an interval: over what it may fade
+_A_BIN = 5  # places of a bin at which a curve is looked at
 _SPLINES = 14  # over the rows of an image
 _WANDER = 0.5  # px
 _STRIP = 1.0  # px, before it is known; then its own size, for which a scale of x 30 is paid
@@ -148,12 +148,20 @@ def wander(seen: Seen, interval: Interval) -> Explanation:
     return _on_both(seen, WANDER, view, rows, bsplines(u, _SPLINES), _WANDER)
 
 
-def affine(seen: Seen, interval: Interval) -> Explanation:
-    """An image that was turned, stretched or bent otherwise than its camera says."""
-    view = interval.view
-    rows = np.flatnonzero(seen.linear.view == view)
-    u, v = 2.0 * seen.place[:, rows] / seen.size[:, view, None] - 1.0
-    return _on_both(seen, AFFINE, view, rows, np.stack([u, v, u * u, u * v, v * v]), 1.0)
+def boxed(seen: Seen, one: Explanation, found: Fit) -> Explanation:
+    """The strip that a view's wandering rows look most like, apart from what a drift follows."""
+    u = (np.arange(BINS * _A_BIN) + 0.5) / (BINS * _A_BIN) * 2.0 - 1.0
+    curve = found.extra[-2 * _SPLINES :].reshape(2, _SPLINES) @ bsplines(u, _SPLINES)
+    drift = np.linalg.qr(np.vander(u, 3))[0]
+    ends = np.stack(np.triu_indices(BINS + 1, 1)) * _A_BIN
+    place = np.arange(len(u))[:, None]
+    boxes = ((place >= ends[0]) & (place < ends[1])).astype(np.float64)
+    boxes -= drift @ (drift.T @ boxes)
+    curve = curve - (curve @ drift) @ drift.T
+    alike = ((curve @ boxes) ** 2).sum(axis=0) / np.maximum((boxes**2).sum(axis=0), 0.1)
+    start, stop = (ends[:, int(alike.argmax())] / len(u) * seen.size[1, one.view]).tolist()
+    reach = _open_ended(start, stop, float(seen.size[1, one.view]))
+    return _local(STRIP, seen, one.view, (1, *reach, 0.0, 0.0), _STRIP)
 
 
 def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sigma: float) -> Explanation:
@@ -166,7 +174,6 @@ EXPLANATIONS: dict[str, Callable[[Seen, Interval], Explanation | None]] = {
     STRIP: strip,
     FADE: fade,
     WANDER: wander,
-    AFFINE: affine,
 }
 """Name -> unknowns, proposed where an interval of an image stands out."""
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from barpc.ba.block import Block
-from barpc.ba.explanations import LOCAL, Explanation, Seen, Where, proposed, sharpened
+from barpc.ba.explanations import LOCAL, WANDER, Explanation, Seen, Where, boxed, proposed, sharpened
 from barpc.ba.mixture import Fit, fit, linearise, settled
 from barpc.ba.rounds import Outcome, revived
 from barpc.ba.scan import SURE, Interval, scan
@@ -20,7 +22,8 @@ _LOG = logging.getLogger(__name__)
 
 _MOST = 6  # explanations of one block
 _TRIED = 3  # intervals a round
-_LOCAL = 3  # explanations of parts of an image whose ends are looked for, a round
+_PARTS = 3  # of images that may explain together what something else does alone
+_LOCAL = 2  # explanations of parts of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
 _UNKNOWNS = 400  # of all views, up to which explanations are tried
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
@@ -87,74 +90,100 @@ def _numbers(block: Block, use: BoolArray) -> float:
     return float((np.where(count <= 4, 2.0**count, count + 1.0) * 4.0 * count**2).sum())
 
 
+_Tried = tuple[Explanation, Fit, float]
+
+
 class _Search:
     """Taking one explanation after the other."""
 
     def __init__(self, seen: Seen, first: list[Interval], floor: float) -> None:
         self.seen, self.first, self.floor = seen, first, floor
-        self.taken: list[Explanation] = []
-        self.best = seen.base
+        self.taken: list[tuple[Explanation, float, float, str]] = []  # with gain, gap and runner-up
 
     def run(self) -> list[Finding]:
-        found: list[tuple[Explanation, float, float, str]] = []
-        while len(found) < _MOST:
-            tried = [(one, made, self._worth(one, made)) for one, made in self._tried()]
-            tried.sort(key=lambda row: -row[2])
-            if not tried or not tried[0][2] > SURE:
+        """All that were taken."""
+        tried = self._tried()
+        while tried and tried[0][2] > SURE and len(self.taken) < _MOST:
+            self._take(tried)
+            if self.taken[-1][0].kind not in LOCAL:  # what is smooth is followed by other means
                 break
-            same = [
-                row for row in tried if row[2] > tried[0][2] - SURE and _of_one_image(row[0], tried[0][0])
-            ]
-            one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
-            other = next(
-                ((t[0].kind, t[2]) for t in tried if t[0] is not one and _differs(t[0], one)), ("", 0.0)
-            )
-            _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
-            found.append((one, gain, gain - max(other[1], 0.0), other[0]))
-            self.taken.append(one)
-            self.best = made
-            extra = np.concatenate([self.seen.extra, one.extra], axis=1)
-            self.seen = replace(self.seen, base=made, extra=extra)
-            if one.kind not in LOCAL:  # what is smooth is followed by other means
-                break
-        return [Finding(*self._said(n), *row[1:]) for n, row in enumerate(found)]
+            tried = self._tried()
+        return [Finding(*self._said(n), *row[1:]) for n, row in enumerate(self.taken)]
+
+    def _take(self, tried: list[_Tried]) -> None:
+        """The best, or several parts of images where these explain more together than it does alone."""
+        best = tried[0]
+        if best[0].kind not in LOCAL:
+            parts, left = copy(self), [row for row in tried if row[0].kind in LOCAL]
+            parts.taken = list(self.taken)
+            total = 0.0
+            for more in range(_PARTS, 0, -1):
+                if (
+                    not left or not left[0][2] > SURE or total + more * left[0][2] < best[2]
+                ):  # each gains less
+                    break
+                total += left[0][2]
+                parts._add(left)
+                left = [row for row in parts._tried() if row[0].kind in LOCAL]
+            if total > best[2] + SURE:
+                self.taken, self.seen = parts.taken, parts.seen
+                return
+        self._add(tried)
+
+    def _add(self, tried: list[_Tried]) -> None:
+        best = tried[0]
+        same = [row for row in tried if row[2] > best[2] - SURE and _of_one_image(row[0], best[0])]
+        one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
+        other = next(((t[0].kind, t[2]) for t in tried if t[0] is not one and _differs(t[0], one)), ("", 0.0))
+        _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
+        self.taken.append((one, gain, gain - max(other[1], 0.0), other[0]))
+        extra = np.concatenate([self.seen.extra, one.extra], axis=1)
+        self.seen = replace(self.seen, base=made, extra=extra)
 
     def _said(self, n: int) -> tuple[str, int, Where | None, Array]:
-        one = self.taken[n]
-        start = sum(len(other.sigma) for other in self.taken[:n])
-        of_one = self.best.extra[start : start + len(one.sigma)]
+        one = self.taken[n][0]
+        start = sum(len(row[0].sigma) for row in self.taken[:n])
+        of_one = self.seen.base.extra[start : start + len(one.sigma)]
         if one.kind in LOCAL:
             return one.kind, one.view, one.where, of_one
         rows = self.seen.linear.view == one.view
         moved = np.einsum("cek,e->ck", one.extra[:, :, rows], of_one)
         return one.kind, one.view, one.where, np.sqrt((moved**2).mean(axis=1))
 
-    def _worth(self, one: Explanation, made: Fit) -> float:
-        return made.evidence - self.best.evidence - one.price
-
-    def _tried(self) -> list[tuple[Explanation, Fit]]:
-        """Explanations of what stands out now, each fitted beside those that were taken."""
-        linear = self.seen.linear
+    def _tried(self) -> list[_Tried]:
+        """Explanations of what stands out now, fitted beside those taken, with their gains; the best first."""
+        seen, linear = self.seen, self.seen.linear
         rows = np.zeros(len(linear.view), dtype=bool)
         for tracks in linear.tracks:
             rows[tracks.rows] = True
-        left = linear.left(self.best.step) + self._moved(self.best.extra) / linear.sigma
-        wrong = (1.0 - self.best.right)[rows]
-        off = settled(linear, left, self.best)[:, rows]
-        floor = self.floor / self.best.noise
-        out = scan(linear.view[rows], self.seen.place[:, rows], self.seen.size, wrong, off, floor)
+        left = (
+            linear.left(seen.base.step) + np.einsum("cek,e->ck", seen.extra, seen.base.extra) / linear.sigma
+        )
+        wrong, off = (1.0 - seen.base.right)[rows], settled(linear, left, seen.base)[:, rows]
+        out = scan(
+            linear.view[rows], seen.place[:, rows], seen.size, wrong, off, self.floor / seen.base.noise
+        )
         out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
-        made = [(one, self._fit(one)) for one in proposed(self.seen, out)]
-        made.sort(key=lambda row: row[0].price - row[1].evidence)
-        strips = [n for n, row in enumerate(made) if row[0].kind in LOCAL][:_LOCAL]
-        for n in strips:
-            made[n] = self._sharpened(*made[n])
-        return made
+        made = self._sorted((one, self._fit(one)) for one in proposed(seen, out))
+        if made and made[0][0].kind == WANDER:
+            box = boxed(seen, *made[0][:2])
+            made = self._sorted([*(row[:2] for row in made), (box, self._fit(box))])
+        local = [row for row in made if row[0].kind in LOCAL]
+        sharp = [self._sharpened(*row[:2]) for row in local[:_LOCAL]]
+        rest = [row[:2] for row in made if row[0].kind not in LOCAL] + [row[:2] for row in local[_LOCAL:]]
+        return self._sorted([*sharp, *rest])
+
+    def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
+        base = self.seen.base.evidence
+        return sorted(
+            ((*row, row[1].evidence - base - row[0].price) for row in made), key=lambda row: -row[2]
+        )
 
     def _sharpened(self, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
         for _ in range(_SHARPENED):
-            again = sharpened(self.seen, one, found, self._moved(found.extra[: -len(one.sigma)]))
+            others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
+            again = sharpened(self.seen, one, found, others)
             better = self._fit(again)
             if not better.evidence > found.evidence:
                 break
@@ -162,18 +191,9 @@ class _Search:
         return one, found
 
     def _fit(self, one: Explanation) -> Fit:
-        both = [*self.taken, one]
-        extra = np.concatenate([each.extra for each in both], axis=1)
-        return fit(self.seen.linear, extra, np.concatenate([each.sigma for each in both]), self.best)
-
-    def _moved(self, extra: Array) -> Array:
-        """What those that were taken move (2, K) [px]."""
-        out, start = np.zeros_like(self.seen.place), 0
-        for one in self.taken:
-            stop = start + len(one.sigma)
-            out += np.einsum("cek,e->ck", one.extra, extra[start:stop])
-            start = stop
-        return out
+        sigma = np.concatenate([*(row[0].sigma for row in self.taken), one.sigma])
+        extra = np.concatenate([self.seen.extra, one.extra], axis=1)
+        return fit(self.seen.linear, extra, sigma, self.seen.base)
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.explanations import AFFINE, FADE, STRIP, WANDER
+from barpc.ba.explanations import FADE, STRIP, WANDER
 from barpc.ba.scan import Interval
 from barpc.report.records import Number, Record, said
 
@@ -17,7 +17,6 @@ _WORDS = {
     STRIP: "{axis} {first:.0f}-{last:.0f} of {image} lie {size:.2f} px off the rest of it",
     FADE: "rows of {image} lie {size:.2f} px off at row {origin:.0f}, which fades within {length:.0f} rows",
     WANDER: "rows of {image} wander by {size:.2f} px",
-    AFFINE: "{image} is turned, stretched or bent by {size:.2f} px otherwise than its camera says",
 }
 
 
