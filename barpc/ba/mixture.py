@@ -206,17 +206,21 @@ def settled(linear: Linear, residual: Array, found: Fit) -> Array:
 def first_guess(
     linear: Linear, found: Fit, extra: Array, new: Array, precision: Array
 ) -> tuple[Array, float, float]:
-    """Unknowns (e,) that move observations by `new` (2, e, K), beside a fit's with its `extra`.
+    """Unknowns (e,) that move observations by `new` (2, e, K) [px], beside a fit's with its `extra` [px].
 
     They have the least sum of what all tracks are off by, not of its squares; also the median of that, and the sum over
     the noise. Their prior's precisions are the last of `precision`.
     """
-    left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra)
+    left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
     prior = np.diag(precision[len(precision) - new.shape[1] :])
     parts = []
     for tracks in linear.tracks:
         count, n = tracks.rows.shape
-        beside = new[:, :, tracks.rows].transpose(2, 3, 0, 1).reshape(count, 2 * n, -1)
+        beside = (
+            (new[:, :, tracks.rows] / linear.sigma[tracks.rows])
+            .transpose(2, 3, 0, 1)
+            .reshape(count, 2 * n, -1)
+        )
         some = np.flatnonzero(beside.any(axis=(1, 2)))
         off = tracks.project[some, 0] @ left[:, tracks.rows[some]].transpose(1, 2, 0).reshape(
             len(some), 2 * n, 1
@@ -280,11 +284,9 @@ class _Mixture:
             known = warm.step.size + len(warm.extra)
             self.x[:known] = *warm.step.ravel(), *warm.extra
             self.noise, self.eps = warm.noise, warm.eps
-            if known < len(self.x):
-                new = self.extra[:, len(warm.extra) :]
-                self.x[known:], far = first_guess(linear, warm, self.extra[:, : len(warm.extra)], new, own)[
-                    :2
-                ]
+            if extra is not None and known < len(self.x):
+                old, new = np.split(extra, [len(warm.extra)], axis=1)
+                self.x[known:], far, _ = first_guess(linear, warm, old, new, own)
                 self.noise = max(self.noise, far)
 
     def run(self) -> Fit:
@@ -292,7 +294,7 @@ class _Mixture:
         linear, last = self.linear, -np.inf
         right, matrix, log = np.zeros(len(linear.sigma)), np.zeros((0, 0)), 0.0
         for _ in range(_ITERATIONS):
-            matrix, gradient = np.diag(self.precision), self.precision * (self.offset + self.x)
+            normal = _Normal(*linear.shape, self.extra.shape[1])
             wrong, count = np.zeros(linear.views), np.zeros(linear.views)
             log = squares = freedom = 0.0
             for tracks, found in self._expected():
@@ -302,7 +304,10 @@ class _Mixture:
                 count += np.bincount(tracks.view.ravel(), minlength=linear.views)
                 squares += float((found.of_subset * found.square).sum())
                 freedom += float((found.of_subset * (2 * tracks.subsets.sum(axis=1) - 3)).sum())
-                self._add(tracks, found, matrix, gradient)
+                self._add(tracks, found, normal)
+            matrix = normal.whole(self.precision)
+            gradient = self.precision * (self.offset + self.x)
+            gradient += np.concatenate([normal.pull.ravel(), normal.pull_beside])
             inverse = np.linalg.inv(matrix)
             self.x = self.x - inverse @ gradient
             known = len(self.x) - float(inverse.diagonal() @ self.precision)
@@ -327,27 +332,45 @@ class _Mixture:
         for tracks in self.linear.tracks:
             yield tracks, _expect(self.linear, tracks, self.left, self.noise, self.eps)
 
-    def _add(self, tracks: _Tracks, found: _Expected, matrix: Array, gradient: Array) -> None:
+    def _add(self, tracks: _Tracks, found: _Expected, normal: _Normal) -> None:
         """Add the normal matrix and gradient of some tracks."""
-        (views, q), (count, n) = self.linear.shape, tracks.rows.shape
+        count, n = tracks.rows.shape
         weight = np.einsum("ts,tsij->tij", found.of_subset, tracks.project) / self.noise**2
         residual = self.left[:, tracks.rows].transpose(1, 2, 0).reshape(count, 2 * n, 1)
-        pull = (weight @ residual).reshape(count, n, 2)
-        place = tracks.view[..., None] * q + np.arange(q)
-        parts, places = tracks.by_unknown, place
-        if e := self.extra.shape[1]:
-            beside = self.extra[:, :, tracks.rows].transpose(2, 3, 0, 1)
-            parts = np.concatenate([parts, beside], axis=-1)
-            places = np.concatenate(
-                [place, np.broadcast_to(views * q + np.arange(e), (count, n, e))], axis=-1
-            )
-        np.add.at(gradient, places, np.einsum("tna,tnap->tnp", pull, parts))
+        pull, parts = weight @ residual, tracks.by_unknown
+        np.add.at(normal.pull, tracks.view, np.einsum("tna,tnap->tnp", pull.reshape(count, n, 2), parts))
         turned = np.ascontiguousarray(np.swapaxes(parts, 2, 3))
+        first = tracks.view[tracks.sets]
         for j in range(n):
             of_all = weight[:, :, 2 * j : 2 * j + 2] @ parts[:, j]
             for i in range(j + 1):
                 sums = np.add.reduceat(turned[:, i] @ of_all[:, 2 * i : 2 * i + 2], tracks.sets, axis=0)
-                for first, one in zip(tracks.sets.tolist(), sums, strict=True):
-                    matrix[np.ix_(places[first, i], places[first, j])] += one
-                    if i < j:
-                        matrix[np.ix_(places[first, j], places[first, i])] += one.T
+                np.add.at(normal.blocks, (first[:, i], first[:, j]), sums)
+                if i < j:
+                    np.add.at(normal.blocks, (first[:, j], first[:, i]), np.swapaxes(sums, 1, 2))
+        if self.extra.shape[1]:
+            beside = self.extra[:, :, tracks.rows].transpose(2, 3, 0, 1).reshape(count, 2 * n, -1)
+            some = np.flatnonzero(beside.any(axis=(1, 2)))
+            beside = beside[some]
+            weighted = weight[some] @ beside
+            normal.beside += np.einsum("tie,tif->ef", beside, weighted, optimize=True)
+            normal.pull_beside += (beside * pull[some]).sum(axis=(0, 1))
+            cross = turned[some] @ weighted.reshape(len(some), n, 2, beside.shape[2])
+            np.add.at(normal.cross, tracks.view[some], cross)
+
+
+class _Normal:
+    """Sums of a normal matrix, view by view."""
+
+    def __init__(self, views: int, q: int, extra: int) -> None:
+        self.blocks, self.pull = np.zeros((views, views, q, q)), np.zeros((views, q))
+        self.cross, self.beside = np.zeros((views, q, extra)), np.zeros((extra, extra))
+        self.pull_beside = np.zeros(extra)
+
+    def whole(self, precision: Array) -> Array:
+        """The matrix, with the precisions of the priors."""
+        size = self.pull.size
+        cross = self.cross.reshape(size, -1)
+        out = np.block([[np.swapaxes(self.blocks, 1, 2).reshape(size, size), cross], [cross.T, self.beside]])
+        out[np.diag_indices(len(out))] += precision
+        return out

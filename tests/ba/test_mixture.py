@@ -1,0 +1,125 @@
+"""The mixture of a linearised block, against likelihoods worked out otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from barpc.ba import mixture
+from barpc.ba.block import join
+from barpc.ba.mixture import Fit, Linear, fit, linearise, log_likelihoods, settled
+from barpc.ba.starting import first_state, make_problem
+from barpc.options import AdjustOptions
+from barpc.simulate import simulate_block
+
+SPAN = 800.0
+
+
+def linear_of(views: int = 3, tracks: int = 200, seed: int = 1, **options: object) -> Linear:
+    """A block at its delivered cameras."""
+    made = simulate_block(views, tracks, seed=seed, **options)
+    block = join(made.views, made.tracks, None, AdjustOptions())
+    problem = make_problem(block, AdjustOptions(), None, None)
+    state, _ = first_state(problem, block, AdjustOptions(), None)
+    return linearise(problem, state, block.use, block.sigma, SPAN)
+
+
+@pytest.fixture(scope="module")
+def linear() -> Linear:
+    return linear_of()
+
+
+def test_all_subsets_of_few_views_and_all_but_one_of_many() -> None:
+    count = [len(mixture._subsets(n)) for n in (2, 3, 4, 5, 12)]
+    assert count == [1, 4, 11, 6, 13]
+    assert all(subset.sum() >= 2 for n in (2, 3, 4, 7) for subset in mixture._subsets(n))
+    assert len(np.unique(mixture._subsets(4), axis=0)) == 11
+
+
+def test_what_the_ground_point_follows_is_taken_away(linear: Linear) -> None:
+    for tracks in linear.tracks:
+        project = tracks.project[:, 0]
+        np.testing.assert_allclose(project @ project, project, atol=1e-6)
+        free = 2 * tracks.rows.shape[1] - 3
+        np.testing.assert_allclose(np.trace(project, axis1=1, axis2=2), free, atol=1e-6)
+
+
+def test_a_track_s_likelihood_is_the_integral_over_its_ground_point(linear: Linear) -> None:
+    """A normal prior on the point, as wide as can be, in place of the integral."""
+    tracks = linear.tracks[-1]
+    n, noise, eps = tracks.rows.shape[1], 1.3, np.array([0.1, 0.2, 0.3])
+    rng = np.random.default_rng(0)
+    residual = linear.residual * 0.0
+    residual[:, tracks.rows[0]] = rng.normal(size=(2, n))
+    r = residual[:, tracks.rows[0]].T.ravel()
+    found = mixture._expect(linear, tracks, residual, noise, eps)
+    full = tracks.project[0, 0]
+    # what is left over of the identity is the space that the point spans
+    ground = np.linalg.svd(np.eye(2 * n) - full)[0][:, :3] * 1e4
+    marginal = multivariate_normal(np.zeros(2 * n), noise**2 * np.eye(2 * n) + ground @ ground.T).logpdf(r)
+    flat = marginal + 0.5 * np.linalg.slogdet(2.0 * np.pi * (ground.T @ ground))[1]
+    expected = flat + tracks.volume[0, 0] + np.log1p(-eps)[tracks.view[0]].sum()
+    square = r @ full @ r
+    said = (
+        np.log1p(-eps)[tracks.view[0]].sum() + tracks.volume[0, 0] - square / (2 * noise**2)
+        - 0.5 * (2 * n - 3) * np.log(2 * np.pi * noise**2)
+    )  # fmt: skip
+    assert said == pytest.approx(expected, abs=1e-4)
+    assert found.square[0, 0] == pytest.approx(square)
+    assert found.log[0] >= said - 1e-9
+    np.testing.assert_allclose(found.of_subset.sum(axis=1) <= 1.0 + 1e-12, True)
+
+
+def test_the_true_noise_and_the_true_share_of_outliers_are_found() -> None:
+    found = fit(linear_of(3, 1500, outliers=0.2))
+    assert found.noise == pytest.approx(1.0, rel=0.05)
+    assert found.eps.mean() == pytest.approx(0.2, abs=0.04)
+    assert 0.75 < found.right.mean() < 0.85
+
+
+def test_an_unknown_that_explains_nothing_costs_the_room_that_it_takes(linear: Linear) -> None:
+    base = fit(linear)
+    extra = np.zeros((2, 1, len(linear.view)))
+    extra[0, 0, linear.view == 1] = np.where(np.arange((linear.view == 1).sum()) % 2, 1.0, -1.0)
+    costs = [base.evidence - fit(linear, extra, np.array([sigma])).evidence for sigma in (1.0, 10.0, 100.0)]
+    np.testing.assert_allclose(np.diff(costs), np.log(10.0), atol=0.02)
+    assert costs[0] > 2.0
+
+
+def test_what_was_put_in_comes_out_warm_or_cold(linear: Linear) -> None:
+    rows = (linear.view == 0) & (np.arange(len(linear.view)) % 3 == 0)
+    extra = np.zeros((2, 2, len(rows)))
+    extra[0, 0] = extra[1, 1] = rows
+    moved = replace(linear, residual=linear.residual - rows * np.array([[8.0], [-5.0]]))
+    found = [fit(moved, extra, np.full(2, 1.0), warm) for warm in (None, fit(moved))]
+    for one in found:
+        np.testing.assert_allclose(one.extra, np.array([8.0, -5.0]) * 0.1, atol=0.05)
+    assert found[0].evidence == pytest.approx(found[1].evidence, abs=0.5)
+    assert found[0].evidence > fit(moved).evidence + 100.0
+
+
+def test_settled_residuals_have_the_spread_that_is_stated_and_none_where_all_is_wrong(linear: Linear) -> None:
+    found = fit(linear)
+    off = settled(linear, linear.left(found.step), found)
+    assert off[:, found.right > 0.9].std() == pytest.approx(1.0, abs=0.15)
+    none = settled(linear, linear.left(found.step), replace(found, eps=np.full(3, 1.0 - 1e-12)))
+    assert np.abs(none).max() < 1e-3
+
+
+def test_a_track_s_likelihood_falls_where_it_is_displaced(linear: Linear) -> None:
+    found = fit(linear)
+    left = linear.left(found.step)
+    away = left.copy()
+    away[:, linear.view == 0] += 20.0
+    change = log_likelihoods(linear, away, found) - log_likelihoods(linear, left, found)
+    assert (change[linear.view == 0] < 1e-6).mean() > 0.95
+
+
+def test_the_same_block_gives_the_same_bits(linear: Linear) -> None:
+    one, other = fit(linear), fit(linear)
+    assert isinstance(one, Fit)
+    assert (one.step == other.step).all()
+    assert one.evidence == other.evidence

@@ -1,0 +1,84 @@
+"""Scans for rows and columns that stand out: found where they are, never by chance, never below the floor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc.ba.scan import BINS, SURE, price, scan
+
+SIZE = np.array([[8000.0, 4000.0], [12000.0, 6000.0]])  # of two images, columns and rows
+
+
+def ties(seed: int, wrong: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    view = np.repeat([0, 1], [1500, 1000])
+    place = rng.uniform(0.0, 1.0, (2, len(view))) * SIZE[:, view]
+    return view, place, (rng.uniform(size=len(view)) < wrong).astype(float), rng.normal(size=(2, len(view)))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_stretch_with_more_wrong_ties_is_found_where_it_is(axis: int) -> None:
+    view, place, wrong, off = ties(1)
+    inside = (view == 1) & (place[axis] > 0.5 * SIZE[axis, 1]) & (place[axis] < 0.6 * SIZE[axis, 1])
+    found = scan(view, place, SIZE, np.where(inside, 0.6, wrong), np.where(wrong > 0.5, 0.0, off))[0]
+    assert (found.view, found.axis, found.by_share) == (1, axis, True)
+    assert (found.start, found.stop) == pytest.approx((0.5 * SIZE[axis, 1], 0.6 * SIZE[axis, 1]))
+    assert found.share == pytest.approx(0.6)
+    assert found.gain > 5.0 * SURE
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, -1.0), (0.7, 0.7)])
+def test_a_stretch_that_is_off_is_found_by_what_it_shares(direction: tuple[float, float]) -> None:
+    view, place, wrong, off = ties(2, wrong=0.0)
+    inside = (view == 0) & (place[1] < 0.25 * SIZE[1, 0])
+    found = scan(view, place, SIZE, wrong, off + inside * np.array(direction)[:, None])[0]
+    assert (found.view, found.axis, found.by_share) == (0, 1, False)
+    # of two parts that lie apart either may be named
+    assert 0.25 * SIZE[1, 0] in (pytest.approx(found.start), pytest.approx(found.stop))
+    assert found.off == pytest.approx(1.0, abs=0.15) or found.start > 0
+
+
+def test_chance_and_outliers_that_lie_anywhere_stand_out_nowhere() -> None:
+    """An image alike all over gains 5 nats once in 150 scans, at most: the price is what the choice costs."""
+    gains = []
+    for seed in range(80):
+        for share in (0.0, 0.1, 0.4):
+            view, place, wrong, off = ties(seed, share)
+            gains.append(scan(view, place, SIZE, wrong, off * (1.0 - wrong))[0].gain)
+    assert np.mean(np.array(gains) > SURE) <= 0.0125
+    assert max(gains) < SURE + 3.0
+    assert np.median(gains) > -price(2)
+
+
+def test_what_lies_below_the_floor_is_let_be() -> None:
+    view, place, wrong, off = ties(3, wrong=0.0)
+    off = off + (place[1] < 0.3 * SIZE[1, view]) * 0.25
+    assert scan(view, place, SIZE, wrong, off)[0].gain > SURE
+    assert scan(view, place, SIZE, wrong, off, floor=0.2)[0].gain < SURE
+
+
+def test_the_share_s_likelihood_is_that_of_two_binomials() -> None:
+    rng = np.random.default_rng(4)
+    view = np.zeros(40, dtype=np.int64)
+    place = np.tile((np.arange(40) + 0.5) * 8000.0 / BINS, (2, 1))  # one in each bin
+    wrong = (rng.uniform(size=40) < np.where(np.arange(40) < 12, 0.8, 0.1)).astype(float)
+
+    def log(k: float, n: float) -> float:
+        return sum(x * np.log(x / n) for x in (k, n - k) if x > 0)
+
+    best = max(
+        log(wrong[a:b].sum(), b - a) + log(wrong.sum() - wrong[a:b].sum(), 40 - b + a) - log(wrong.sum(), 40)
+        for a in range(40)
+        for b in range(a + 1, 41)
+        if b - a < 40 and wrong[a:b].mean() > wrong.mean()
+    )
+    found = scan(view, place, np.full((2, 1), 8000.0), wrong, np.zeros((2, 40)))[0]
+    assert found.gain + price(1) == pytest.approx(best)
+
+
+def test_one_residual_that_is_far_off_is_one_residual() -> None:
+    view, place, wrong, off = ties(5, wrong=0.0)
+    off[:, 7] = 1e6
+    assert scan(view, place, SIZE, wrong, off)[0].gain < SURE + 0.5 * 8.0**2 * 2
+    assert np.isfinite([one.gain for one in scan(view, place, SIZE, wrong, off)]).all()
