@@ -69,7 +69,7 @@ class BlockPrior:
     def waves(self, names: tuple[str, ...]) -> Waves | None:
         """The unknowns in the image of views that go on from the block; a new one has no detectors and strips."""
         edges, strips = self._edges, self._strips
-        if not (self.splines or edges.size or strips.size):
+        if self.edges is None or not (self.splines or edges.size or strips.size):
             return None
         place = {name: i for i, name in enumerate(self.names)}
         old = np.array([place.get(name, len(place)) for name in names])
@@ -218,7 +218,7 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
         if isinstance(matrix, np.ndarray) or reduced.common is None
         else reduced.common.by_camera[:, free],
         waves.count if waves else 0,
-        waves.edges[views] if waves and waves.edges.size else None,
+        waves.edges[views] if waves else None,
         tuple(adjustment.names[v] for v in adjustment.cameras.unknowns.radars if v in views),
         waves.strips[views] if waves and waves.strips.size else None,
     )

@@ -29,7 +29,9 @@ def profile_of(tracks: Tracks, where: Displaced, size: tuple[int, int]) -> np.nd
     return (inside * faded * where["px"])[:, None] * np.array([np.cos(angle), np.sin(angle)])
 
 
-def flawed(views: int, tracks: int, *all_of: Displaced, seed: int = 0, **options: Any) -> tuple[Block, Tracks]:
+def flawed(
+    views: int, tracks: int, *all_of: Displaced, seed: int = 0, **options: Any
+) -> tuple[Block, Tracks]:
     block = simulate_block(views, tracks, seed=seed, attitude=10e-6, position=2.0, **options)
     xy = block.tracks.xy.copy()
     for where in all_of:
@@ -46,7 +48,9 @@ MIDDLE = {"view": 1, "axis": 1, "start": 0.4, "stop": 0.6, "px": 0.8}
 DETECTOR = {"view": 2, "axis": 0, "start": 0.25, "stop": 0.375, "px": 1.0}
 
 
-@pytest.mark.parametrize("where", rest_slow([MIDDLE, ROWS, DETECTOR], keep=2), ids=["middle", "end", "detector"])
+@pytest.mark.parametrize(
+    "where", rest_slow([MIDDLE, ROWS, DETECTOR], keep=2), ids=["middle", "end", "detector"]
+)
 def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) -> None:
     block, tracks = flawed(3, 1500, where)
     found = adjusted(block, tracks)
@@ -69,7 +73,11 @@ def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) 
     assert isinstance(sensor, Splined)
     assert len(sensor.correction.strips) == 1
     assert np.sqrt((found.residuals[inside & ~found.held_out] ** 2).sum(axis=1).mean()) < 0.16
-    assert not any(isinstance(s, Splined) and s.correction.moved.any() for v, s in enumerate(found.sensors) if v != one.view)
+    assert not any(
+        isinstance(s, Splined) and s.correction.moved.any()
+        for v, s in enumerate(found.sensors)
+        if v != one.view
+    )
 
 
 def test_two_of_them_in_two_images_are_both_found() -> None:

@@ -54,6 +54,45 @@ def test_a_detector_begins_at_its_edge() -> None:
     assert np.isnan(spline.spacing)
 
 
+STRIPS = [[1.0, 4000.0, 9000.0, 0.0, 0.0], [0.0, -500.0, 700.0, 0.0, 0.0], [1.0, -20.0, 19100.0, 300.0, 1e-3]]
+MOVED = [[0.5, -0.25], [0.0, 0.125], [2.0, 1.0]]
+
+
+def test_strips_move_what_is_seen_in_them_and_add_up() -> None:
+    spline = RowSpline(np.zeros((0, 2)), strips=STRIPS[:2], moved=MOVED[:2])
+    image = np.array([[800.0, 3999.9], [800.0, 4000.0], [699.0, 8999.9], [699.0, 9000.0], [np.nan, 5000.0]])
+    expected = [[0.0, 0.0], [0.5, -0.25], [0.5, -0.125], [0.0, 0.125], [np.nan, np.nan]]
+    np.testing.assert_array_equal(spline.at(image), expected)
+    np.testing.assert_array_equal(spline.rate(image[:, 1]), 0.0)
+
+
+@pytest.mark.parametrize("rate", [1e-3, -2e-3])
+def test_what_fades_begins_at_its_origin_and_has_its_rate(rate: float) -> None:
+    strip = [[1.0, -20.0, 19100.0, 9000.0, rate]]
+    spline = RowSpline(np.zeros((0, 2)), strips=strip, moved=MOVED[2:])
+    away = np.sign(rate) * np.array([-500.0, 0.0, 1.0 / abs(rate), 3000.0])
+    image = np.column_stack([away * 0.0, 9000.0 + away])
+    factor = np.exp(-np.maximum(away * rate, 0.0))
+    np.testing.assert_allclose(spline.at(image), factor[:, None] * MOVED[2], rtol=1e-12)
+    row = 9000.0 + away[2:]
+    slope = (
+        spline.at(np.column_stack([row, row + 0.01])) - spline.at(np.column_stack([row, row - 0.01]))
+    ) / 0.02
+    np.testing.assert_allclose(spline.rate(row), slope, rtol=1e-6, atol=1e-12)
+    assert (spline.rate(9000.0 + away[:1]) == 0).all()
+
+
+def test_a_camera_behind_strips_is_the_same_both_ways_and_has_its_jacobian() -> None:
+    model = Splined(make_rpc(), RowSpline(COEFFS, 9499.5, 9500.0, strips=STRIPS, moved=MOVED))
+    image = np.array([[3000.0, 5000.0], [300.0, 350.0], [12000.0, 17000.0], [600.0, 8000.0]])
+    ground = model.localize(image, np.full(4, 300.0))
+    np.testing.assert_allclose(model.project(ground), image, rtol=0, atol=1e-6)
+    step = np.array([1e-7, 1e-7, 1e-2])
+    numeric = [(model.project(ground + h) - model.project(ground - h)) / (2 * h.sum()) for h in np.diag(step)]
+    found = model.project_jacobian(ground)[1]
+    np.testing.assert_allclose(found, np.stack(numeric, axis=-1), rtol=1e-4, atol=1e-2)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -64,6 +103,10 @@ def test_a_detector_begins_at_its_edge() -> None:
         {"coeffs": COEFFS, "edges": [5.0, 5.0], "steps": np.zeros((3, 2))},
         {"coeffs": COEFFS, "steps": np.zeros((1, 2))},
         {"coeffs": COEFFS * np.nan},
+        {"coeffs": COEFFS, "strips": STRIPS, "moved": MOVED[:2]},
+        {"coeffs": COEFFS, "strips": [[2.0, 0.0, 1.0, 0.0, 0.0]], "moved": MOVED[:1]},
+        {"coeffs": COEFFS, "strips": [[1.0, 0.0, np.inf, 0.0, 0.0]], "moved": MOVED[:1]},
+        {"coeffs": COEFFS, "strips": [[1.0, 0.0, 1.0]], "moved": MOVED[:1]},
     ],
 )
 def test_what_is_no_spline_is_refused(wrong: dict[str, object]) -> None:

@@ -1,0 +1,65 @@
+"""What is said of causes: sentences with the numbers that they stand for, and reasons only where they matter."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba.explanations import EXPLANATIONS, FADE, STRIP, WANDER
+from barpc.ba.judge import Finding
+from barpc.ba.scan import Interval
+from barpc.report import verdict
+from barpc.report.summary.causes import _WORDS, explanations, left_over
+
+NAMES = "west", "east"
+
+
+def adjustment(findings: Any = (), left: Any = ()) -> Any:
+    half = np.array([[4000.0, 2000.0], [6000.0, 3000.0]])
+    cameras = SimpleNamespace(unknowns=SimpleNamespace(half=half))
+    return SimpleNamespace(names=NAMES, findings=findings, left=left, cameras=cameras)
+
+
+def test_every_explanation_has_its_words() -> None:
+    assert set(EXPLANATIONS) == set(_WORDS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "view", "where", "size", "sentence", "ends"),
+    [
+        (STRIP, 1, (1, 4999.4, 12000.0, 0.0, 0.0), (3.0, 4.0), "rows 5000-5999 of east lie 5.00 px off the rest of it", (5000.0, 5999.0)),
+        (STRIP, 0, (0, -8000.0, 100.0, 0.0, 0.0), (0.0, -0.5), "columns 0-99 of west lie 0.50 px off the rest of it", (0.0, 99.0)),
+        (FADE, 0, (1, -12000.0, 24000.0, 0.0, 1 / 400.0), (2.0, 0.0), "rows of west lie 2.00 px off at row 0, which fades within 400 rows", (0.0, 11999.0)),
+        (WANDER, 1, None, (0.3, 0.4), "rows of east wander by 0.50 px", (None, None)),
+    ],
+)  # fmt: skip
+def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sentence, ends) -> None:
+    (found,) = explanations(adjustment([Finding(kind, view, where, np.array(size), 42.0, 7.0, "")]))
+    assert found.sentence == sentence
+    assert (found.name, found.image, found.gain, found.gap, found.runner_up) == (
+        kind,
+        NAMES[view],
+        42.0,
+        7.0,
+        None,
+    )
+    assert (found.first, found.last) == ends
+    assert found.size_px == pytest.approx(np.hypot(*size))
+
+
+def interval(view: int, share: float, off: float) -> Interval:
+    return Interval(view, 1, 100.0, 400.0, 30.0, share, off, share > 0.3)
+
+
+def test_what_is_left_is_a_reason_where_it_is_much() -> None:
+    left = [interval(0, 0.8, 0.0), interval(0, 0.4, 0.0), interval(1, 0.02, 0.09)]
+    run: Any = SimpleNamespace(adjustment=adjustment(left=left))
+    first, second = verdict._left_reasons(run)
+    assert first == "Rows 100-399 of west stand out: 80 % of their tie points contradict the others."
+    assert second == "Rows 100-399 of east stand out: their tie points are left with 0.09 px in common."
+    assert [one.last for one in left_over(run.adjustment)] == [399.0] * 3
+    quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]))
+    assert verdict._left_reasons(quiet) == []
