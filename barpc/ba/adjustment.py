@@ -228,7 +228,8 @@ def _place(found: Solution, block: Block, covariance: Covariance) -> tuple[Gauge
     """Where the scene went and how well that is known, and what holds it."""
     placed = found.seen & (np.arange(len(found.seen)) < block.num_known)
     counted = placed if placed.any() else found.seen
-    gauge = gauge_report(covariance, found.final.points, found.first_points(block), counted)
     known, outcome = (block.num_tracks, block.num_known), found.outcome
+    prior = outcome.problem.camera_prior.sigma
+    gauge = gauge_report(covariance, found.final.points, found.first_points(block), counted, prior)
     shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, *known)
     return gauge, shares

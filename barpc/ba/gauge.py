@@ -6,7 +6,7 @@ best-fitting tilts, turn and scale are linear in dp: seven numbers with a covari
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg as la
@@ -43,10 +43,17 @@ class GaugeReport:
     # RMS distance of the points from their middle [m]: where tilts, turn and scale are measured
     radius: float
     by_unknown: Array = field(repr=False)  # (7, N q) the motions by the unknowns of the cameras
+    # (3,) how far off the delivered cameras let the scene be, east, north, up [m]; NaN where that is not known
+    delivered_sigma: Array = field(default_factory=lambda: np.full(3, np.nan))
 
 
-def gauge_report(covariance: Covariance, points: Array, before: Array, use: BoolArray) -> GaugeReport:
-    """The report for points (P, 3), ECEF [m], after and before an adjustment; those that count in `use` (P,)."""
+def gauge_report(
+    covariance: Covariance, points: Array, before: Array, use: BoolArray, prior: Array | None = None
+) -> GaugeReport:
+    """The report for points (P, 3), ECEF [m], after and before an adjustment; those that count in `use` (P,).
+
+    `prior` (N, q) are the standard deviations of the cameras' unknowns as delivered; infinite ones do not count.
+    """
     shift_of_all = (points[use] - before[use]).mean(axis=0)
     index = np.flatnonzero(use)
     use = np.zeros_like(use)
@@ -58,7 +65,11 @@ def gauge_report(covariance: Covariance, points: Array, before: Array, use: Bool
     by_unknown, own = _motion_by_unknowns(covariance, local / radius, enu, use, use.sum() / len(index))
     motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
-    return GaugeReport(enu @ shift_of_all, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown)
+    found = GaugeReport(enu @ shift_of_all, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown)
+    if prior is None:
+        return found
+    variance = np.where(np.isfinite(prior), prior, 0.0).ravel() ** 2
+    return replace(found, delivered_sigma=np.sqrt(by_unknown[:3] ** 2 @ variance))
 
 
 def _motion_by_unknowns(

@@ -111,10 +111,10 @@ class _Search:
         return [Finding(*self._said(n), *row[1:]) for n, row in enumerate(self.taken)]
 
     def _take(self, tried: list[_Tried]) -> None:
-        """The best, or several parts of images where these explain more together than it does alone."""
+        """The best, or several parts of its image where these explain more together than it does alone."""
         best = tried[0]
         if best[0].kind not in LOCAL:
-            parts, left = copy(self), [row for row in tried if row[0].kind in LOCAL]
+            parts, left = copy(self), _parts_of(best[0].view, tried)
             parts.taken = list(self.taken)
             total = 0.0
             for more in range(_PARTS, 0, -1):
@@ -124,7 +124,7 @@ class _Search:
                     break
                 total += left[0][2]
                 parts._add(left)
-                left = [row for row in parts._tried() if row[0].kind in LOCAL]
+                left = _parts_of(best[0].view, parts._tried())
             if total > best[2] + SURE:
                 self.taken, self.seen = parts.taken, parts.seen
                 return
@@ -194,6 +194,11 @@ class _Search:
         sigma = np.concatenate([*(row[0].sigma for row in self.taken), one.sigma])
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
         return fit(self.seen.linear, extra, sigma, self.seen.base)
+
+
+def _parts_of(view: int, tried: list[_Tried]) -> list[_Tried]:
+    """Explanations of parts of an image."""
+    return [row for row in tried if row[0].kind in LOCAL and row[0].view == view]
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:

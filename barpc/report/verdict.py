@@ -26,7 +26,9 @@ SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
 NOISE_LIMIT = 2.5  # Tie points that scatter by more than so many times what the matcher states need a look
 _MOST_NAMED = 5  # images in a sentence
-MOVED = 3.0  # A scene that moved by more than so many of its own standard deviations needs a look
+MOVED = (
+    3.0  # A scene that moved by more than so many times what its cameras' accuracies let expect needs a look
+)
 
 GOOD = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
 """Kind of a run -> the status of a view without reservation."""
@@ -189,11 +191,11 @@ def _block_reasons(run: Run) -> list[str]:
             "cannot follow."
         )
     with np.errstate(all="ignore"):
-        moved = np.abs(gauge.shift) / gauge.sigma
+        moved = np.abs(gauge.shift) / gauge.delivered_sigma
     if _place_is_free(run) and (moved[np.isfinite(moved)] > MOVED).any():
         out.append(
-            f"The scene moved by {_enu(gauge.shift)}, more than {MOVED:g} standard deviations: something is not as "
-            "stated; control points or a DEM would tell."
+            f"The scene moved by {_enu(gauge.shift)}, more than {MOVED:g} times what the accuracies of its "
+            "cameras let expect: something is not as stated; control points or a DEM would tell."
         )
     return out
 

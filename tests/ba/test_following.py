@@ -378,13 +378,17 @@ def test_what_was_found_before_is_looked_for_anew(exact) -> None:
 
 def test_unknowns_of_waves_are_about_as_large_within_half_an_octave() -> None:
     bands = Waves(13, np.zeros((2, 3))).bands
-    m, s = Waves(13, np.zeros((2, 3))).parts
+    m, s, strips = Waves(13, np.zeros((2, 3))).parts
+    assert strips == 0
     assert (m, s) == (10, 2)  # a shift and a scale of the columns are not theirs
     # of 3, 4, 5, ... half waves: between powers of the root of two
     expected = [0, 1, 1, 2, 2, 3, 3, 3, 3, 4]
     assert bands.tolist() == [*expected, *expected, *[5] * 2 * s]
     assert Waves(0, np.zeros((1, 1))).bands.tolist() == [0, 0]
-    assert Waves(0, np.zeros((1, 1))).parts == (0, 1)
+    assert Waves(0, np.zeros((1, 1))).parts == (0, 1, 0)
+    both = Waves(13, np.zeros((2, 3)), np.zeros((2, 4, 5)))  # strips are as large as each other
+    assert both.bands.tolist() == [*expected, *expected, *[5] * 2 * s, *[6] * 8]
+    assert Waves(0, np.zeros((2, 0)), np.zeros((2, 4, 5))).bands.tolist() == [0] * 8
     assert Waves(9).size == 2 * 6
 
 
@@ -401,7 +405,7 @@ def test_steps_leave_a_shift_and_a_scale_to_others(count: int) -> None:
 def test_a_view_without_edges_has_no_steps_and_one_with_fewer_its_own() -> None:
     waves = Waves(0, np.array([[5.0, 9.0], [7.0, np.inf], [np.inf, np.inf]]))
     col, index = np.tile([4.9, 5.0, 8.0, 9.5], 3), np.repeat([0, 1, 2], 4)
-    (basis,) = waves.basis(np.zeros(12), col, index)
+    (basis,) = waves.basis(np.zeros(12), np.stack([col, col * 0.0]), index)
     levels = waves._of_steps.T
     place = [0, 1, 1, 2, 0, 0, 1, 1]
     np.testing.assert_allclose(basis[:, :8], levels[:, place])

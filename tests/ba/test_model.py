@@ -446,6 +446,7 @@ def followed(
 
     monkeypatch.setattr(adjustment, "solve_block", solve_block)
     monkeypatch.setattr(adjustment, "follow", follow)
+    monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
     found, left = adjustment._choose_model(None, None, AdjustOptions(), None, None, prior)  # type: ignore[arg-type]
     return found.name, left
 

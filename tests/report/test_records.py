@@ -132,7 +132,7 @@ def described(schema: Any) -> Iterator[str]:
             yield from described(part)
 
 
-UNITS = {"px", "m", "deg", "MB", "m above the ellipsoid", "px/px", "urad", "ms"}
+UNITS = {"px", "m", "deg", "MB", "m above the ellipsoid", "px/px", "urad", "ms", "nats"}
 
 
 def test_what_is_said_of_a_value_ends_with_its_unit():
