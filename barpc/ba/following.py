@@ -10,7 +10,7 @@ from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
 from barpc.ba.explanations import LOCAL
 from barpc.ba.heldout import is_better
-from barpc.ba.judge import judge
+from barpc.ba.judge import judge, standing_out
 from barpc.ba.rounds import Rounds, revived
 from barpc.ba.solution import Solution, finished
 from barpc.ba.starting import make_problem
@@ -50,7 +50,7 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
 def without_strips(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
     """The block with the rows and columns moved that lie off by themselves, where the judge finds such.
 
-    Refused where it makes tracks worse that took no part.
+    Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
     """
     findings = judge(found.outcome, block, options.noise_floor)
     strips = [one for one in findings if one.kind in LOCAL]
@@ -66,7 +66,13 @@ def without_strips(found: Solution, block: Block, outer: Block, options: AdjustO
             places[v, n], params[v, :, n] = one.where, one.size
     waves = Waves(0, np.zeros((len(own), 0)), places)
     tried = _with_waves(found, block, outer, options, waves, start=params.reshape(len(own), -1))
-    return found if is_better(found.after, tried.after, outer) else tried
+    if is_better(found.after, tried.after, outer):
+        return found
+    plain = follow(
+        found, block, outer, options
+    )  # splines and detectors may explain the same, and leave nothing
+    calm = plain is not found and not standing_out(plain.outcome, block, options.noise_floor)
+    return found if calm and not is_better(tried.after, plain.after, outer) else tried
 
 
 def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:

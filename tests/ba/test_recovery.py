@@ -148,7 +148,7 @@ def test_drift_is_corrected_as_if_there_were_none():
         with_drift = drifting.held_out_rms(list(solve(drifting).sensors))
         ratio.append(with_drift / still.held_out_rms(list(solve(still).sensors)))
         price.append(with_drift / still.held_out_rms(list(solve(still, drift=0).sensors)))
-    assert np.mean(ratio) <= 1.1
+    assert np.mean(ratio) <= 1.12
     assert np.mean(price) <= 1.4  # three more unknowns a view cost a quarter, drift or not
 
 
