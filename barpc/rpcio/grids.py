@@ -100,7 +100,8 @@ def _write(
     names: Sequence[str] = (),
 ) -> None:
     profile = {**_TIFF, "count": len(layers), "dtype": layers.dtype.name}
-    profile |= {"height": layers.shape[1], "width": layers.shape[2]}
+    # one strip a band: the places of many would push the tags out of the file's head, by which it is known
+    profile |= {"height": layers.shape[1], "width": layers.shape[2], "blockysize": layers.shape[1]}
     profile["transform"] = rasterio.Affine(steps[0], 0.0, origin[0], 0.0, steps[1], origin[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)

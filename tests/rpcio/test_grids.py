@@ -120,6 +120,17 @@ def test_a_correction_grid_is_a_camera(folder, camera):
     assert left < LINEAR < 0.2 < bare
 
 
+@pytest.mark.parametrize(("width", "height"), [(2, 2), (700, 1025)])
+def test_a_correction_grid_is_known_however_many_nodes_it_has(tmp_path, width, height):
+    """By a tag in the file's head: the places of many strips would push it out of there."""
+    shift = np.random.default_rng(width).normal(size=(height, width, 2)).astype(np.float32).astype(np.float64)
+    grid = CorrectionGrid(np.linspace(-0.5, 5999.5, width), np.linspace(-0.5, 8999.5, height), shift)
+    write_correction(grid, make_rpc(), tmp_path / f"a{CORRECTION}")
+    found = open_camera(tmp_path / f"a{CORRECTION}").model
+    assert isinstance(found, GridCorrected)
+    np.testing.assert_array_equal(found.correction.shift, shift)
+
+
 def test_consumers_find_the_error_of_a_grid_and_not_less(folder, camera, sample, tmp_path):
     """A grid of the RPC alone misses by the jitter; one whose columns are moved by half a pixel, as by another idea of
     where pixels begin, by half a pixel more."""
