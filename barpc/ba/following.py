@@ -54,6 +54,8 @@ def without_strips(found: Solution, block: Block, outer: Block, options: AdjustO
 
     Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
     """
+    if options.loss == "linear":  # who wants least squares has no observation that may be wrong
+        return found
     findings = judge(found.outcome, block, options.noise_floor)
     strips = [one for one in findings if one.kind in LOCAL]
     found = replace(found, findings=tuple(findings))
