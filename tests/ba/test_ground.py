@@ -38,15 +38,15 @@ def placed(east: Any, north: Any, alt: Any) -> np.ndarray:
         *(np.atleast_1d(np.asarray(x, dtype=float)) for x in (east, north, alt))
     )
     n = len(east)
-    lon, lat, _ = GEOD.fwd(
-        np.full(n, LON), np.full(n, LAT), np.degrees(np.arctan2(east, north)), np.hypot(east, north)
-    )
+    azimuth, distance = np.degrees(np.arctan2(east, north)), np.hypot(east, north)
+    lon, lat, _ = GEOD.fwd([LON] * n, [LAT] * n, azimuth.tolist(), distance.tolist())  # one of each is not a number
     return ecef_from_ground(np.column_stack([lon, lat, alt]))
 
 
 def hill(lon: Any, lat: Any) -> np.ndarray:
     """Rises by 0.2 m a metre to the east, 0.1 m a metre to the south; unknown west of 2 km."""
-    azimuth, _, distance = GEOD.inv(np.full(len(lon), LON), np.full(len(lat), LAT), lon, lat)
+    n = len(lon)
+    azimuth, _, distance = map(np.array, GEOD.inv([LON] * n, [LAT] * n, lon.tolist(), lat.tolist()))
     east, north = distance * np.sin(np.radians(azimuth)), distance * np.cos(np.radians(azimuth))
     return np.where(east > -2000.0, 300.0 + 0.2 * east - 0.1 * north, np.nan)
 
@@ -75,7 +75,7 @@ def test_a_terrain_is_met_along_its_normal() -> None:
 
 def _ground(points: np.ndarray) -> np.ndarray:
     to_ground = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
-    return np.stack(to_ground.transform(*points.T), axis=-1)
+    return np.stack(to_ground.transform(*points.T.tolist()), axis=-1)  # lists: one point is not a number
 
 
 def test_slopes_are_taken_over_thirty_metres() -> None:
