@@ -39,7 +39,9 @@ def placed(east: Any, north: Any, alt: Any) -> np.ndarray:
     )
     n = len(east)
     azimuth, distance = np.degrees(np.arctan2(east, north)), np.hypot(east, north)
-    lon, lat, _ = GEOD.fwd([LON] * n, [LAT] * n, azimuth.tolist(), distance.tolist())  # one of each is not a number
+    lon, lat, _ = GEOD.fwd(
+        [LON] * n, [LAT] * n, azimuth.tolist(), distance.tolist()
+    )  # one of each is not a number
     return ecef_from_ground(np.column_stack([lon, lat, alt]))
 
 
