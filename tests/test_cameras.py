@@ -158,6 +158,7 @@ def _nodes(grid):
     return Correspondences(ground.reshape(-1, 3), np.stack([col, row], axis=-1).reshape(-1, 2))
 
 
+@pytest.mark.slow
 def test_a_radar_product_and_a_vendor_s_grid_go_through_the_verbs(shared_data, tmp_path, capsys):
     radar = sorted((shared_data / "sar").glob("s1a-iw1-slc-vv-20210216*.xml"))[0]
     grid = shared_data / "physical" / "GRID_P1BP--2017092838284574CP.tif"

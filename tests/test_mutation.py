@@ -38,6 +38,7 @@ def test_every_listed_mutant_has_its_place_and_its_tests(mutation) -> None:
         assert mutation.parts()[mutant.part]
 
 
+@pytest.mark.slow
 def test_mutants_are_programs_that_differ(mutation, every) -> None:
     assert {mutant.part for mutant in every} == set(mutation.parts())
     for mutant in random.Random(0).sample(every, 60):
@@ -95,6 +96,7 @@ def small(mutation, tmp_path, monkeypatch) -> ModuleType:
     return mutation
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_what_tests_see_is_caught_and_what_they_do_not_see_survives(small, tmp_path, capfd) -> None:
     rows = list(small.run(small.mutants(["ba"]), 2))

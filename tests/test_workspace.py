@@ -484,7 +484,7 @@ with Workspace(sys.argv[1], overwrite=sys.argv[4] == "overwrite", names=["a", "b
 @pytest.mark.parametrize(
     ("mode", "numbers"),
     [
-        ("overwrite", [3]),
+        pytest.param("overwrite", [3], marks=pytest.mark.slow),
         pytest.param("fresh", range(1, 6), marks=pytest.mark.nightly),
         pytest.param("overwrite", range(1, 6), marks=pytest.mark.nightly),
     ],

@@ -50,9 +50,8 @@ def shaken(made, view, wave):
     return replace(made, tracks=moved(made.tracks), check=moved(made.check))
 
 
-@pytest.mark.parametrize(
-    ("seeds", "tracks"), [((1,), 1500), pytest.param(SEEDS, 3000, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("seeds", "tracks"), [((1,), 1500), (SEEDS, 3000)])
 def test_jitter_is_followed_to_the_noise_and_heights_are_not_bent(seeds, tracks):
     name, many = "jitter 0.5 at 1 Hz", {"tracks": tracks}
     assert medians(name, lambda j: j.across, seeds, jitter="off", **many) > 0.4
@@ -67,6 +66,7 @@ def test_jitter_is_followed_to_the_noise_and_heights_are_not_bent(seeds, tracks)
         assert (np.abs(after.move) < 4 * found.gauge.sigma).all()
 
 
+@pytest.mark.slow
 def test_a_spline_that_is_subtracted_makes_it_worse():
     made = scene("jitter 0.5 at 1 Hz", 1, tracks=1500)
     found, after = solved("jitter 0.5 at 1 Hz", 1, tracks=1500)

@@ -103,7 +103,7 @@ def test_the_smaller_part_is_said_to_lie_off() -> None:
     assert found.where[1] < 0.0 < found.where[2] < 0.2 * block.views[found.view].size[1]
 
 
-@pytest.mark.parametrize("seed", rest_slow(range(8), keep=2))
+@pytest.mark.parametrize("seed", rest_slow(range(8)))
 @pytest.mark.parametrize("outliers", [0.0, 0.1, 0.3])
 def test_nothing_is_found_where_nothing_is(seed: int, outliers: float) -> None:
     block, tracks = flawed(2 + seed % 3, 800, seed=100 + seed, outliers=outliers)
@@ -123,7 +123,8 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
     assert not any(one.kind in LOCAL for one in found.findings)
 
 
-@pytest.mark.parametrize("options", rest_slow([{"jitter": "off"}, {"drift": 0}]), ids=str)
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"jitter": "off"}, {"drift": 0}], ids=str)
 def test_who_asked_for_no_such_unknowns_is_told_and_gets_none(options: dict[str, Any]) -> None:
     block, tracks = flawed(3, 1500, MIDDLE)
     found = adjusted(block, tracks, **options)

@@ -23,7 +23,7 @@ from barpc.options import AdjustOptions
 from barpc.scene import GroundPoints, Tracks
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import INDEPENDENT, centers_of
-from tests.lanes import diagonal, rest_slow
+from tests.lanes import diagonal
 
 
 def _sites(columns: int, rows: int, a_site: int = 3) -> tuple[np.ndarray, np.ndarray]:
@@ -114,6 +114,7 @@ def test_who_is_parted_is_tied_through_the_border_only(turn) -> None:
             assert (np.diff(order.rank[front.border]) > 0).all()
 
 
+@pytest.mark.slow
 def test_little_fills_in() -> None:
     """A line across a square of 24 sites of 3 is 72 views; a strip fills as many blocks a view however long it is."""
     pairs, place = _sites(24, 24)
@@ -250,8 +251,9 @@ def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(monkeypa
     assert np.abs(both[0][0].reshape(48, 9, 48, 9)[2, :, 45]).max() > 1.0
 
 
-@pytest.mark.parametrize("n", rest_slow([24, 110]))
-@pytest.mark.parametrize("options", rest_slow([{"dem_for_all": True}, {}]), ids=["terrain", "alone"])
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [24, 110])
+@pytest.mark.parametrize("options", [{"dem_for_all": True}, {}], ids=["terrain", "alone"])
 def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, options, n) -> None:
     """Rounds, variances and covariance: nothing else may change. Heights held by a terrain are wrong together."""
     made = simulate_block(n, 20 * n, seed=4, num_checks=0)

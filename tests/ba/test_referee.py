@@ -72,7 +72,8 @@ def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, sha
     )  # right tie points
 
 
-@pytest.mark.parametrize("seeds", rest_slow([SEEDS[:1], SEEDS]))
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [SEEDS[:1], SEEDS])
 def test_without_a_drift_in_the_model_the_same_scene_is_not_met(seeds):
     assert median(verdicts("drift 1", seeds, drift=0), lambda v: v.after.across) > 0.15
 

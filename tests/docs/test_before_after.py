@@ -18,6 +18,7 @@ def ventoux(shared_data, tmp_path_factory):
     return images, out
 
 
+@pytest.mark.slow
 def test_adjusted_cameras_bring_a_pair_onto_its_epipolar_lines(ventoux):
     images, out = ventoux
     before = stereo.measure(images, images, out)

@@ -193,6 +193,7 @@ def test_a_small_hole_is_said_and_a_large_one_refused(camera: Camera) -> None:
         fit_rpc(camera.model, (0, 5), camera.alt_range)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_points(camera: Camera) -> None:
     ground, image = control_points(camera.model, camera.size, camera.alt_range, FitOptions(grid=(80, 80, 32)))
     ground, image = ground.reshape(-1, 3)[:200_000], image.reshape(-1, 2)[:200_000]

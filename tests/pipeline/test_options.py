@@ -340,8 +340,12 @@ def test_every_option_has_a_row() -> None:
     assert set(ROWS) == {field.name for field in fields(RunOptions)}
 
 
-ELSEWHERE = ("overlap_list", "aoi", "gcp", "check_points", "geoid", "num_passes", "grids", "tiles")
-"""Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids and tests/test_dem."""
+ELSEWHERE = (
+    "overlap_list", "aoi", "gcp", "check_points", "geoid", "num_passes", "grids", "tiles", "allow_remote", "dem",
+    "keep_going", "images",
+)  # fmt: skip
+"""Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids, tests/test_dem,
+tests/remote and tests/reliability."""
 
 
 @pytest.mark.parametrize(

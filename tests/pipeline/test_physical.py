@@ -60,6 +60,7 @@ def images(folder):
     return [f"{path},model=physical" for path in sorted(folder.glob("*.tif"))]
 
 
+@pytest.mark.slow
 def test_an_adjustment_on_physical_models(folder, tmp_path):
     models = [open_camera(image).model for image in images(folder)]
     rng = np.random.default_rng(8)

@@ -63,7 +63,10 @@ def as_jp2(path: Path) -> Path:
 
 @pytest.mark.parametrize(
     ("images", "levels"),
-    [("vrt", 3), *(pytest.param(how, 9, marks=pytest.mark.nightly) for how in ("vrt", "copy", "converted"))],
+    [
+        pytest.param("vrt", 3, marks=pytest.mark.slow),
+        *(pytest.param(how, 9, marks=pytest.mark.nightly) for how in ("vrt", "copy", "converted")),
+    ],
 )
 def test_a_disk_that_is_full_at_any_point_is_told_in_one_line(crops, tmp_path, small_disk, images, levels):
     if images == "converted":

@@ -444,9 +444,9 @@ def scene(crops, tmp_path) -> Scene:
     return Scene(tmp_path / "in", *crops)
 
 
-AT_WORK = (  # told or borne after much work
+AT_WORK = (  # told or borne after much work or waiting
     "nine wrong tie points in ten", "an RPC that is wrong by 500 px", "images from nearly the same place",
-    "all views fixed", "nothing but noise",
+    "all views fixed", "nothing but noise", "no scheduler at the address",
 )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ import pytest
 
 from barpc.errors import OutputError
 from barpc.workspace import Workspace
+from tests.lanes import rest_slow
 
 from .injected import CALLS, ERRORS, Fault, Scene, faults, missing, sweep
 from .trials import SAMPLES, crop
@@ -58,7 +59,7 @@ def failing(
     [(os, "fsync", 15), (Path, "replace", 8), (os, "open", 15), (Path, "open", 8), (Path, "mkdir", 8)],
     ids=["fsync", "rename", "open of a descriptor", "open", "mkdir"],
 )
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+@pytest.mark.parametrize("code", rest_slow([errno.ENOSPC, errno.EIO]))
 def test_a_call_of_a_run_folder_that_fails_loses_nothing(tmp_path, monkeypatch, where, name, least, code):
     met = 0
     for when in range(1, 1000):

@@ -69,6 +69,7 @@ SELDOM = (
     "an area",
     "an earlier run",
     "a bad file",
+    "the defaults",
 )
 
 
@@ -184,6 +185,7 @@ def test_the_same_pixels_in_other_dress_are_found(scene, tmp_path, how):
             load_views(order)
 
 
+@pytest.mark.slow
 def test_a_vrt_with_an_rpc_of_its_own_is_the_same_image(scene, tmp_path):
     images = images_of(scene, "")
     twin = tmp_path / "twin.vrt"

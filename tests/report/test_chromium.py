@@ -66,6 +66,7 @@ def width(request):
     return request.param
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixture", ["block_run", "check_run", "antimeridian_run"])
 def test_it_opens_without_errors_and_nothing_overflows_or_overlaps(fixture, width, request, tmp_path):
     finished = request.getfixturevalue(fixture)
@@ -80,6 +81,7 @@ def test_it_opens_without_errors_and_nothing_overflows_or_overlaps(fixture, widt
     assert found["overlaps"] == []
 
 
+@pytest.mark.slow
 def test_tables_sort_up_and_down_and_say_so(block_run, tmp_path):
     found = probe((block_run.folder / "report.html").read_text(encoding="utf-8"), 1280, tmp_path)
     counts = sorted(view["num_observations"] for view in block_run.summary["views"])
@@ -92,6 +94,7 @@ def test_tables_sort_up_and_down_and_say_so(block_run, tmp_path):
     assert 0 <= found["sticky"] < 3  # the heads stay on top
 
 
+@pytest.mark.slow
 def test_it_is_light_by_day_and_dark_by_night(block_run, tmp_path):
     html = (block_run.folder / "report.html").read_text(encoding="utf-8")
     day, night = (probe(html, 600, tmp_path, dark)["colors"] for dark in (False, True))

@@ -10,6 +10,7 @@ import pytest
 from barpc.ba.consensus import TwoGroups
 from barpc.report.summary import STATUS_WORDS, measure
 from barpc.report.verdict import GOOD, block_verdict
+from tests.lanes import diagonal
 from tests.report.conftest import summarize
 
 ADVICE = {"weak": "only 3 tie points", "doubtful": "tie points are left with 2 px", "failed": "not tied"}
@@ -22,8 +23,7 @@ def verdict(run, status, kind="adjust", **changes):
     return block_verdict(replace(run, kind=kind, **changes), views)
 
 
-@pytest.mark.parametrize("kind", GOOD)
-@pytest.mark.parametrize("status", STATUS_WORDS)
+@pytest.mark.parametrize(("kind", "status"), diagonal(GOOD, STATUS_WORDS))
 def test_every_status_of_an_image_decides_the_whole(status, kind, block_run):
     found = verdict(block_run.run, status, kind)
     assert found["status"] == OVERALL.get(status, "good")

@@ -162,6 +162,7 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num", rest_slow([300, 1000]))
 def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_run, monkeypatch, num):
     files = many_times(page.read_tables(block_run.record, block_run.folder), -(-num // 9))

@@ -97,6 +97,7 @@ def test_a_camera_that_is_wrong_by_hundreds_of_pixels_does_not_refuse_them(rende
     assert typical(scene, result.tracks, 0, 1) <= 0.1
 
 
+@pytest.mark.slow
 def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
     """No patch has the grey values of its other; edges are where they were."""
     scene = render(views=3, size=(300, 300))
