@@ -202,6 +202,7 @@ def test_the_same_tracks_give_the_same_bytes():
     assert first.splines == again.splines
 
 
+@pytest.mark.slow
 def test_the_covariance_counts_the_splines():
     found, _ = solved("jitter 0.5 at 1 Hz", 1, tracks=1500)
     q = found.params.shape[1]
