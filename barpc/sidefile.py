@@ -11,6 +11,7 @@ import json
 import logging
 import math
 import os
+import re
 import stat
 import unicodedata
 from array import array
@@ -46,6 +47,9 @@ class Kind:
     words: str  # what a message calls it
     most: int | None  # larger files are refused [bytes]; None for images, which are never read whole
     error: type[BarpcError] = InputError
+    between: bytes = (
+        b""  # what stands between the numbers of a text: as many are refused as would be larger in memory
+    )
 
     def check(self, path: Path | str, size: int) -> None:
         """Raise if a file of `size` bytes is too large."""
@@ -54,18 +58,40 @@ class Kind:
                 f"{path}: {size} bytes, too large for {self.words} (at most {self.most} are read)"
             )
 
+    def check_numbers(self, path: Path | str, file: BinaryIO) -> None:
+        """Raise if a text holds more numbers than `most` bytes can; short ones take more in memory than in the file."""
+        limit = (self.most or 0) // NUMBER
+        if self.between and file.seek(0, os.SEEK_END) > limit:
+            file.seek(0)
+            count = sum(_count(part, self.between) for part in iter(lambda: file.read(MB), b""))
+            if count > limit:
+                raise self.error(
+                    f"{path}: {count} numbers, too many for {self.words} (at most {limit} are read)"
+                )
+        if self.between:
+            file.seek(0)
+
+
+def _count(text: bytes, between: bytes) -> int:
+    """How many values stand in a text: the signs between them, of blanks one of each row of them."""
+    one_each = sum(text.count(sign) for sign in between if sign != _BLANK)
+    return one_each + (len(re.findall(rb" (?! )", text)) if _BLANK in between else 0)
+
+
+_BLANK = ord(" ")
+_OF_JSON, _OF_TABLE = b",:", b",;\t\n "
 
 IMAGE = Kind("an image", None, ImageError)
 PRODUCT = Kind("a product", None, RpcFormatError)
 GRID = Kind("a height grid", None)
 RPC_FILE = Kind("an RPC file", 32 * MB, RpcFormatError)
 XML = Kind("an XML file", MAX_XML, RpcFormatError)
-TABLE = Kind("a table of points", 1024 * MB)
+TABLE = Kind("a table of points", 1024 * MB, between=_OF_TABLE)
 ARRAYS = Kind("an archive of arrays", 1024 * MB)
-GEOJSON = Kind("a GeoJSON file", 256 * MB)
+GEOJSON = Kind("a GeoJSON file", 256 * MB, between=_OF_JSON)
 OPTIONS = Kind("an options file", MB)
 NAMES = Kind("a list of names", 16 * MB)
-SUMMARY = Kind("a run's summary", 512 * MB)
+SUMMARY = Kind("a run's summary", 512 * MB, between=_OF_JSON)
 
 
 @contextmanager
@@ -130,6 +156,7 @@ def opened_text(path: Path | str, kind: Kind, newline: str | None = None) -> Ite
 
 @contextmanager
 def _utf8(file: BinaryIO, path: Path | str, kind: Kind, newline: str | None = None) -> Iterator[TextIO]:
+    kind.check_numbers(path, file)
     try:
         with io.TextIOWrapper(file, encoding="utf-8-sig", newline=newline) as text:
             yield text

@@ -48,18 +48,24 @@ def many(value: float) -> str:
     )
 
 
+def _numbers(kind: sidefile.Kind) -> str:
+    """How many numbers a text may hold."""
+    return f", {many((kind.most or 0) // sidefile.NUMBER)} numbers" if kind.between else ""
+
+
 def rows() -> list[tuple[str, str]]:
     """What is read, and what of it is refused beyond."""
     bounded = (sidefile.RPC_FILE, sidefile.GEOJSON, sidefile.OPTIONS, sidefile.SUMMARY)
     sides = {terrasar._MOST, dimap._MOST, maxar._MOST}
     unpacked = f"packed, unpacked, and as numbers of {sidefile.NUMBER} bytes"
     return [
-        *((f"{kind.words}", size(kind.most)) for kind in bounded),
+        *((kind.words, size(kind.most) + _numbers(kind)) for kind in bounded),
         (
             sidefile.XML.words,
             f"{size(sidefile.XML.most)}, {sidefile._MAX_DEPTH} levels, {many(sidefile._MAX_ELEMENTS)} elements",
         ),
-        (sidefile.TABLE.words, size(sidefile.TABLE.most)),
+        (sidefile.TABLE.words, size(sidefile.TABLE.most) + _numbers(sidefile.TABLE)),
+        ("JSON", f"{sidefile._MAX_DEPTH} levels"),
         (
             f"{sidefile.ARRAYS.words} (`.npz`)",
             f"{size(sidefile.ARRAYS.most)} {unpacked}; a member {many(frozen._DEFLATE)} times its stored bytes",

@@ -7,9 +7,11 @@ import contextlib
 import io
 import json
 import os
+import re
 import time
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,9 +26,12 @@ from barpc.rpcio.fields import ReadOptions
 from barpc.rpcio.formats import parse
 from barpc.sidefile import (
     ARRAYS,
+    GEOJSON,
     NAMES,
+    TABLE,
     Kind,
     opened,
+    opened_text,
     parse_json,
     read_bytes,
     read_head,
@@ -301,3 +306,39 @@ def test_no_module_opens_a_file_by_itself():
 )  # fmt: skip
 def test_a_new_reader_that_goes_around_is_found(line):
     assert direct_opens(line)
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [("1,2,3\n4,5,6\n", 6), ("1  2   3\n4 5 6\n", 6),
+     ("1;2;3;4;5;6\n", 6), (",,,,,\n", 6), ("1\n" * 6, 6), ("1\t" * 6, 6)],
+    ids=["commas", "blanks", "semicolons", "nothing between", "lines", "tabs"],
+)  # fmt: skip
+def test_a_text_of_more_numbers_than_memory_is_meant_for_is_refused(text, numbers, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    kind = replace(TABLE, most=8 * numbers)
+    assert read_text(path, kind) == text
+    with opened_text(path, kind) as file:
+        assert file.read() == text
+    fewer = replace(TABLE, most=8 * numbers - 8)
+    said = f"{path}: {numbers} numbers, too many for a table of points (at most {numbers - 1} are read)"
+    with pytest.raises(InputError, match=re.escape(said)):
+        read_text(path, fewer)
+    with pytest.raises(InputError, match=re.escape(said)), opened_text(path, fewer):
+        pass
+
+
+def test_what_a_json_holds_is_counted_before_it_is_parsed(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({"a": [1] * 30}))
+    assert len(read_json(path, replace(GEOJSON, most=256))["a"]) == 30
+    with pytest.raises(InputError, match="30 numbers, too many for a GeoJSON file"):
+        read_json(path, replace(GEOJSON, most=232))
+
+
+def test_large_files_of_few_numbers_are_read(tmp_path):
+    """Texts of a table, such as names, may be as long as the table may."""
+    path = tmp_path / "a.csv"
+    path.write_text("n" * 100 + ",1\n")
+    assert read_text(path, replace(TABLE, most=128)).startswith("nnn")
