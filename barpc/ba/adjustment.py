@@ -20,6 +20,8 @@ from barpc.ba.heldout import enu_offsets, keep_out
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import standing_out
 from barpc.ba.result import Adjustment
+from barpc.ba.rounds import Outcome
+from barpc.ba.scan import neighbours_alike
 from barpc.ba.snooping import MOST_TESTED, image_test
 from barpc.ba.solution import Solution, solve_block
 from barpc.errors import AdjustError
@@ -183,6 +185,7 @@ def _adjustment(
         asked=found.asked,
         findings=found.findings,
         left=tuple(standing_out(outcome, block, options.noise_floor)),
+        alike=_alike(block, outcome, is_tie),
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],
@@ -191,6 +194,13 @@ def _adjustment(
         **_control(found, block, covariance, inlier[ties.stop :]),
         seconds=time.process_time() - start,
         options=options,
+    )
+
+
+def _alike(block: Block, outcome: Outcome, is_tie: BoolArray) -> Array:
+    wrong = is_tie & block.use & ~outcome.inlier & np.isfinite(outcome.residual).all(axis=0)
+    return neighbours_alike(
+        block.view[wrong], block.xy[:, wrong], outcome.residual[:, wrong], len(block.views)
     )
 
 

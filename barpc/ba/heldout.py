@@ -1,8 +1,8 @@
 """What takes no part in the solve, and measures it: known check points, and tie points that are kept out.
 
 Survivors of a rejection agree because the others were cut. A tenth of the tracks, drawn from all alike, is kept out
-before; triangulated by the adjusted cameras they tell what those are worth, wrong matches and all, so their
-figures are medians.
+before; triangulated by the adjusted cameras they tell what those are worth, wrong matches and all: their figures are
+those of a mixture of right ones, which scatter, and wrong ones, which lie anywhere.
 """
 
 from __future__ import annotations
@@ -12,11 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import expit, gammaln
 
 from barpc.ba.block import Block
+from barpc.ba.mixture import NEAR_LIMIT, WRONG
 from barpc.ba.problem import Problem
 from barpc.ba.structure import make_structure
-from barpc.ba.weights import MEDIAN, Observations, geman_mcclure
+from barpc.ba.weights import Observations, geman_mcclure
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.scene import BoolArray, GroundPoints, IntArray
@@ -31,6 +33,10 @@ _ROBUST_STEPS = 3
 _WIDE = 4.0  # sigmas
 _LESS = 0.99  # of the error, at most
 _SURELY = 3.0  # standard deviations
+_START = 0.2  # of the observations, the nearest: where even of many wrong ones right ones are
+_ITERATIONS = 100
+_SAME = 1e-4
+_NOTHING = 1e-12  # of a variance: residuals may be exactly zero
 _FEW = 20  # observations of a view that tell nothing by themselves
 
 
@@ -110,9 +116,34 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     noise, rms = np.full(views, np.nan), np.full(views, np.nan)
     for v in np.flatnonzero(np.bincount(block.view, minlength=views) >= _FEW):
         rows = slice(*part.structure.bounds[v : v + 2])
-        noise[v] = np.sqrt(np.median(squared[rows]) / MEDIAN)
+        noise[v] = scatter(squared[rows], expected[rows] / block.sigma[rows] ** 2)
         rms[v] = noise[v] * np.sqrt(expected[rows].mean())
     return HeldOut(residual, index, points, noise, rms)
+
+
+def scatter(squared: Array, freedom: Array) -> float:
+    """Observed over stated standard deviation of the right ones among observations, half of which may be wrong.
+
+    Parameters
+    ----------
+    squared : (n,), |r|^2 over its expectation under the stated deviations, at least one
+    freedom : (n,), degrees of freedom of each
+
+    Expectation and maximisation of a chi-square about zero, and of a uniform density of residuals as far as the
+    farthest goes; it is `NEAR_LIMIT` nats lower at least, or what is right would count as wrong by its tails.
+    """
+    half = 0.5 * np.maximum(freedom, 1.0)  # of two views all scatter across the epipolar line
+    far, middle = max(float(squared.max()), _NOTHING), float(np.quantile(squared, _START))
+    variance, wrong = max(middle / _START, _NOTHING), WRONG[0] / WRONG[1]
+    for _ in range(_ITERATIONS):
+        peak = np.maximum(half * np.log(half * far / variance) - gammaln(half + 1.0), NEAR_LIMIT)
+        odds = np.log(wrong / (1.0 - wrong)) + half * squared / variance - peak
+        right = expit(-odds)
+        before, variance = variance, max(float((right @ squared) / max(right.sum(), 1e-300)), _NOTHING)
+        wrong = float((WRONG[0] + (1.0 - right).sum()) / (WRONG[1] + len(right)))
+        if abs(variance - before) < _SAME * before:
+            break
+    return float(np.sqrt(variance))
 
 
 def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:

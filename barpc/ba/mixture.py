@@ -27,12 +27,12 @@ _LEAST_NOISE = 0.2  # of what is stated
 _ITERATIONS = 60
 _BEGINNINGS = 6  # reweightings of a first guess
 _STANDS = 1e-3, 0.05  # change of the noise (logarithm) and of the log-likelihood at the end
-_WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
+WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
 _EPS = 1e-3, 0.98
 _MOST_SUBSETS = (
     4  # views of a track up to which every subset may be right; of more, all of them or all but one
 )
-_NEAR_LIMIT = (
+NEAR_LIMIT = (
     4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
 )
 
@@ -253,7 +253,7 @@ def _expect(linear: Linear, tracks: _Tracks, residual: Array, noise: float, eps:
     count, n = tracks.rows.shape
     r = residual[:, tracks.rows].transpose(1, 2, 0).reshape(count, 1, 2 * n, 1)
     square = (r * (tracks.project @ r))[..., 0].sum(axis=-1)
-    area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(_NEAR_LIMIT))
+    area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(NEAR_LIMIT))
     right, wrong = np.log1p(-eps)[tracks.view], np.log(eps)[tracks.view]
     subsets, members = tracks.subsets.astype(np.float64), tracks.subsets.sum(axis=1)
     log = right @ subsets.T + wrong @ (1.0 - subsets).T + tracks.volume - square / (2.0 * noise**2)
@@ -279,7 +279,7 @@ class _Mixture:
         self.offset = np.concatenate([linear.offset, np.zeros(len(own))])
         self.x = np.zeros(len(self.precision))
         self.left = linear.residual
-        self.noise, self.eps = _HOTTEST, np.full(linear.views, _WRONG[0] / _WRONG[1])
+        self.noise, self.eps = _HOTTEST, np.full(linear.views, WRONG[0] / WRONG[1])
         if warm is not None:
             known = warm.step.size + len(warm.extra)
             self.x[:known] = *warm.step.ravel(), *warm.extra
@@ -313,7 +313,7 @@ class _Mixture:
             known = len(self.x) - float(inverse.diagonal() @ self.precision)
             seen = max(np.sqrt(squares / max(freedom - known, 1.0)), _LEAST_NOISE)
             noise = seen if self.noise <= seen else max(seen, _COOLED * self.noise)
-            self.eps = np.clip((wrong + _WRONG[0]) / (count + _WRONG[1]), *_EPS)
+            self.eps = np.clip((wrong + WRONG[0]) / (count + WRONG[1]), *_EPS)
             settled = abs(np.log(noise / self.noise)) < _STANDS[0] and abs(log - last) < _STANDS[1]
             self.noise, last = float(noise), log
             if settled:

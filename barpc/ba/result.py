@@ -79,6 +79,9 @@ class Adjustment:
         What explains tie points beside the cameras' errors as stated, the first taken first.
     left : tuple of Interval
         Rows and columns in which ties were cut, or are off, more than elsewhere and chance allow, at the end.
+    alike : (N,)
+        How surely neighbours among a view's rejected tie points lie off in the same direction, which wrong matches do
+        not (`barpc.ba.scan.neighbours_alike`) [nats].
     in_space_rms : float or None
         Where the data chose an affine in the image: what rotations, translations and drifts leave of the tracks
         that took no part [px].
@@ -131,6 +134,7 @@ class Adjustment:
     asked: Mapping[str, SmoothTest]
     findings: tuple[Finding, ...]
     left: tuple[Interval, ...]
+    alike: Array
     in_space_rms: float | None
     two_groups: tuple[TwoGroups, ...]
     held: BoolArray

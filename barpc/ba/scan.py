@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import entr
 
 from barpc.geodesy import Array
 from barpc.scene import IntArray
@@ -73,6 +74,30 @@ def scan(
                 worth = float(gain[v, i, j]) - price(views)
                 found.append(Interval(v, axis, *at, worth, share, common, bool(by_share)))
     return sorted(found, key=lambda one: -one.gain)
+
+
+def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) -> Array:
+    """How surely neighbours lie off in the same direction (N,) [nats], what the choice among all tests costs taken off.
+
+    Of wrong matches that lie anywhere they do so in half of the cases; of what moves, bends or shakes, in more.
+
+    Parameters
+    ----------
+    view : (K,), place : (2, K) [px], residual : (2, K) of observations that are wrong
+    views : int, N
+    """
+    out = np.full(views, -np.inf)
+    for v in range(views):
+        rows = np.flatnonzero(view == v)
+        if len(rows) < 2:
+            continue
+        for axis in (0, 1):
+            signs = residual[:, rows[np.argsort(place[axis, rows], kind="stable")]] > 0.0
+            alike, count = (signs[:, 1:] == signs[:, :-1]).sum(axis=1), float(len(rows) - 1)
+            share = np.maximum(alike / count, 0.5)
+            found = count * (np.log(2.0) - entr(share) - entr(1.0 - share))
+            out[v] = max(out[v], float(found.max()))
+    return out - float(np.log(4 * views))
 
 
 def _means(count: Array, col: Array, row: Array, floor: float) -> Array:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
+from barpc.ba.scan import SURE
 from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import Run
@@ -19,7 +20,7 @@ from barpc.tie.reference import PEAK
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
 FEW_OBSERVATIONS = 30  # A view with fewer is called weakly tied, unless control points hold it
 ENOUGH_GCPS = 3  # Control points that hold a view without any tie point
-MANY_REJECTED = 0.3  # A view that lost a larger share of its observations is called doubtful
+MANY_REJECTED = 0.3  # A view that lost a larger share of its observations, not at random, is called doubtful
 
 WORST_LEFT = 0.15  # px: an image with more anywhere is called doubtful
 SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
@@ -88,13 +89,21 @@ def _doubt(view: ViewEntry, run: Run) -> str:
         if run.kind == "check":
             return f"tie points disagree by {error:.2f} px: adjust the cameras"
         return f"tie points are left with {error:.2f} px: look for wrong matches and moving things"
-    lost = view.num_rejected / max(view.num_rejected + view.num_observations, 1)
-    if lost > MANY_REJECTED:
+    if (lost := _lost(view)) > MANY_REJECTED and not _anywhere(view, run):
         return (
-            f"{100 * lost:.0f} % of its tie points were rejected, scattered around what is smooth: look for clouds, "
+            f"{100 * lost:.0f} % of its tie points were rejected, neighbours in the same direction: look for clouds, "
             "water, change"
         )
     return ""
+
+
+def _lost(view: ViewEntry) -> float:
+    return view.num_rejected / max(view.num_rejected + view.num_observations, 1)
+
+
+def _anywhere(view: ViewEntry, run: Run) -> bool:
+    """Whether the tie points of a view that were rejected lie anywhere, as wrong matches do."""
+    return run.adjustment is not None and bool(run.adjustment.alike[run.number[view.name]] <= SURE)
 
 
 def _oddity(i: int, adjustment: Adjustment) -> str:
@@ -306,6 +315,11 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         sizes = f"{_lengths(prior.drift_sigma)} at the first and last row"
         lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
     lines += _jitter_lines(views) + _radar_lines(views)
+    if many := [view.name for view in views if _lost(view) > MANY_REJECTED and _anywhere(view, run)]:
+        lines.append(
+            f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, all over and in "
+            "any direction: wrong matches."
+        )
     lines += [f"{one.sentence[0].upper()}{one.sentence[1:]}." for one in explanations(run.adjustment)]
     if len(run.tracks) or run.gcps is not None:
         lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")

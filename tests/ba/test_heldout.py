@@ -11,7 +11,7 @@ import pytest
 
 from barpc.ba import AdjustOptions
 from barpc.ba.block import Block, join
-from barpc.ba.heldout import HeldOut, _scrambled, is_better, keep_out, measure
+from barpc.ba.heldout import HeldOut, _scrambled, is_better, keep_out, measure, scatter
 from barpc.ba.starting import make_problem
 from barpc.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
@@ -229,3 +229,25 @@ def test_squares_are_to_be_less_by_three_standard_deviations_of_chance(deviation
         low, high = (share, high) if sure < deviations else (low, share)
     assert sure == pytest.approx(deviations, abs=1e-6)
     assert compared(own, other, (0.9, noise)) == better
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.1, 0.3, 0.5])
+@pytest.mark.parametrize("freedom", [1.0, 2.0])
+def test_wrong_matches_do_not_change_how_right_ones_scatter(freedom: float, wrong: float) -> None:
+    """Residuals of two views lie along a line, of many in the plane; wrong ones anywhere up to 200 deviations."""
+    rng = np.random.default_rng(8)
+    found = []
+    for _ in range(40):
+        squared = 9.0 * rng.chisquare(freedom, 400) / freedom  # three times as large as stated
+        far = rng.uniform(size=400) < wrong
+        squared[far] = (200.0 * rng.uniform(size=far.sum()) ** (1.0 / freedom)) ** 2
+        found.append(scatter(squared, np.full(400, freedom)))
+    assert np.mean(found) == pytest.approx(3.0, rel=0.05)
+    assert np.std(found) < 0.3
+
+
+def test_errors_that_half_of_the_ties_share_are_no_wrong_matches() -> None:
+    rng = np.random.default_rng(9)
+    squared = (rng.normal(size=400) + np.repeat([0.0, 2.5], 200)) ** 2
+    assert scatter(squared, np.ones(400)) > 1.6
+    assert scatter(np.zeros(20), np.ones(20)) < 1e-5

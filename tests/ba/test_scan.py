@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.ba.scan import BINS, SURE, price, scan
+from barpc.ba.scan import BINS, SURE, neighbours_alike, price, scan
 
 SIZE = np.array([[8000.0, 4000.0], [12000.0, 6000.0]])  # of two images, columns and rows
 
@@ -82,3 +82,30 @@ def test_one_residual_that_is_far_off_is_one_residual() -> None:
     off[:, 7] = 1e6
     assert scan(view, place, SIZE, wrong, off)[0].gain < SURE + 0.5 * 8.0**2 * 2
     assert np.isfinite([one.gain for one in scan(view, place, SIZE, wrong, off)]).all()
+
+
+def test_wrong_matches_lie_in_any_direction() -> None:
+    """In none of 100 images of each of two shapes is a direction common, however few or many are wrong."""
+    rng = np.random.default_rng(4)
+    for count in (2, 20, 200, 2000):
+        view, place = np.repeat([0, 1], [count, count]), rng.uniform(0.0, 9000.0, (2, 2 * count))
+        for _ in range(50):
+            off = rng.uniform(-30.0, 30.0, (2, 2 * count))
+            assert (neighbours_alike(view, place, off, 2) <= SURE).all()
+            along = np.outer((0.6, -0.8), off[0])  # of two views they lie along one line
+            assert (neighbours_alike(view, place, along, 2) <= SURE).all()
+            bent = off[:, view == 0] - 15.0 * np.sign(off[:, view == 0])
+            assert np.isneginf(neighbours_alike(view[view == 0], place[:, view == 0], bent, 2)[1])
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("component", [0, 1])
+def test_what_shakes_or_moves_goes_the_same_way_as_its_neighbours(axis: int, component: int) -> None:
+    rng = np.random.default_rng(5)
+    view, place = np.repeat([0, 1], [300, 300]), rng.uniform(0.0, 9000.0, (2, 600))
+    off = rng.uniform(-30.0, 30.0, (2, 600))
+    swing = 3.0 * np.sin(2.0 * np.pi * place[axis] / 700.0) + rng.normal(0.0, 0.3, 600)
+    off[component] = np.where(view == 1, swing, off[component])
+    first, second = neighbours_alike(view, place, off, 2)
+    assert first <= SURE
+    assert 20.0 < second < 300 * np.log(2.0)

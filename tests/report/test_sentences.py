@@ -28,7 +28,7 @@ def adjusted(**fields: Any) -> Any:
     """An adjustment of three images that nothing is to be said of."""
     usual = {
         "left_out": (), "names": NAMES, "noise": 1.0, "in_space_rms": None, "two_groups": (), "control": None,
-        "findings": (), "left": (),
+        "findings": (), "left": (), "alike": np.full(3, 9.0),
         "prior": SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=()),
         "smooth": SmoothTest(np.zeros(3), np.ones(3), np.full(3, NO_NUMBER), np.zeros(3)),
         "held_out_noise": np.ones(3), "held_out_rms": np.full(3, 0.2), "held": np.zeros(9, bool), "terrain": None,
@@ -92,6 +92,21 @@ def test_an_image_is_judged_at_its_limits(fields, status):
     assert view_status(a_view(**fields), run_of())["status"] == status
 
 
+def test_wrong_matches_that_lie_anywhere_are_told_and_need_no_look():
+    run = run_of(adjusted(alike=np.array([5.0, 5.1, -np.inf])))
+    lines = said(run, [a_view(name, num_observations=60, num_rejected=40) for name in NAMES])
+    told = "More than 30 % of the tie points of A, C were rejected, all over and in any direction: wrong matches."
+    assert told in lines
+    lost = {"num_observations": 60, "num_rejected": 40}
+    assert [view_status(a_view(name, **lost), run)["status"] for name in NAMES] == [
+        "adjusted",
+        "doubtful",
+        "adjusted",
+    ]
+    assert not any("in any direction" in line for line in said(run_of(adjusted(alike=np.full(3, 5.1)))))
+    assert not any("in any direction" in line for line in said(run))  # few were rejected
+
+
 def test_what_is_advised_has_its_figures():
     def advice(run=None, **fields):
         return view_status(a_view(**fields), run or run_of())["advice"]
@@ -101,6 +116,8 @@ def test_what_is_advised_has_its_figures():
     assert advice(rmse_after=0.72).startswith("tie points are left with 0.72 px: look for wrong matches")
     lost = advice(num_observations=60, num_rejected=40)
     assert lost.startswith("40 % of its tie points were rejected")
+    anywhere = run_of(adjusted(alike=np.array([5.0, 9.0, 9.0])))
+    assert advice(anywhere, num_observations=60, num_rejected=40) == ""
     check = run_of(kind="check", adjustment=None)
     assert advice(check, rmse_before=0.72) == "tie points disagree by 0.72 px: adjust the cameras"
     assert advice(check, rmse_before=0.5, rmse_after=9.0) == ""
