@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from barpc.ba.mixture import Fit, Linear, first_guess, log_likelihoods
+from barpc.ba.periods import Swing
+from barpc.ba.periods import price as price_of_period
 from barpc.ba.scan import BINS, Interval, price
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import bsplines, profile
+from barpc.sensor.splined import swing as waves_of
 
 STRIP = "strip"
 FADE = "fade"
 WANDER = "wander"
+SWING = "swing"
 LOCAL = STRIP, FADE
-"""Those of a part of an image: they follow each other, and the adjustment follows them."""
+"""Those of a part of an image."""
+FOLLOWED = *LOCAL, SWING
+"""Those that the adjustment follows; others may be beside them."""
 _LENGTHS = 2.0 ** np.arange(-4.0, 1.0)  # of an interval: over what it may fade
 _A_BIN = 5  # places of a bin at which a curve is looked at
 _SPLINES = 14  # over the rows of an image
@@ -36,6 +42,7 @@ class Explanation:
     sigma: Array = field(repr=False)  # (e,) their prior [px]
     price: float  # of the choice among places and sizes [nats]
     where: Where | None = None
+    period: float | None = None  # after which it repeats itself [px]
 
 
 Where = tuple[int, float, float, float, float]
@@ -91,13 +98,15 @@ def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Expl
 
 
 def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explanation:
-    """A strip whose ends are where ties say, and whose prior is as wide as it is large.
+    """A strip whose ends are where ties say, or a swing, whose prior is as wide as it is large.
 
     `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
     """
-    assert one.where is not None
-    axis, moved = one.where[0], found.extra[-2:]
+    moved = found.extra[-len(one.sigma) :]
     sigma = float(np.clip(np.sqrt((moved**2).mean()), _STRIP / 30.0, _STRIP * 30.0))
+    if one.where is None:
+        return replace(one, sigma=np.full(len(moved), sigma))
+    axis = one.where[0]
     if one.kind == FADE:
         return _faded(seen, one, sigma)
     rows = np.flatnonzero((seen.linear.view == one.view) & (found.right + 1.0 > 0.0))
@@ -148,6 +157,15 @@ def wander(seen: Seen, interval: Interval) -> Explanation:
     return _on_both(seen, WANDER, view, rows, bsplines(u, _SPLINES), _WANDER)
 
 
+def swing(seen: Seen, found: Swing) -> Explanation:
+    """All rows of an image that swing with one period."""
+    rows = np.flatnonzero(seen.linear.view == found.view)
+    basis = waves_of(seen.place[1, rows], np.array(found.period))
+    one = _on_both(seen, SWING, found.view, rows, basis, _WANDER)
+    costs = price_of_period(float(seen.size[1, found.view]), seen.linear.views) + SCALE
+    return replace(one, price=costs, period=found.period)
+
+
 def boxed(seen: Seen, one: Explanation, found: Fit) -> Explanation:
     """The strip that a view's wandering rows look most like, apart from what a drift follows."""
     u = (np.arange(BINS * _A_BIN) + 0.5) / (BINS * _A_BIN) * 2.0 - 1.0
@@ -175,11 +193,12 @@ EXPLANATIONS: dict[str, Callable[[Seen, Interval], Explanation | None]] = {
     FADE: fade,
     WANDER: wander,
 }
-"""Name -> unknowns, proposed where an interval of an image stands out."""
+"""Name -> unknowns, proposed where an interval of an image stands out; `SWING` is, where a period does."""
 
 
-def proposed(seen: Seen, intervals: list[Interval]) -> Iterator[Explanation]:
-    """Explanations of the intervals that stand out; those of a whole image once."""
+def proposed(seen: Seen, intervals: list[Interval], periods: list[Swing]) -> Iterator[Explanation]:
+    """Explanations of the intervals and periods that stand out; those of a whole image once."""
+    yield from (swing(seen, one) for one in periods)
     known = set()
     for interval in intervals:
         for kind, make in EXPLANATIONS.items():

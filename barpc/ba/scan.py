@@ -15,7 +15,8 @@ from barpc.scene import IntArray
 
 BINS = 40  # stretches of an image's rows or columns
 SURE = 5.0  # nats: an explanation that gains less is none
-_CLIPPED = 8.0  # standard deviations: one residual tells no more
+CLIPPED = 8.0
+"""Standard deviations: one residual tells no more."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ def scan(
     floor : float, what means are let be [the same]: no adjustment is asked to be better
     """
     views = size.shape[1]
-    off = np.clip(off, -_CLIPPED, _CLIPPED)
+    off = np.clip(off, -CLIPPED, CLIPPED)
     found = []
     for axis in (0, 1):
         bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)

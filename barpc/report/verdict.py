@@ -132,6 +132,8 @@ def _beyond(view: ViewEntry, run: Run) -> str:
     follows = "attitude jitter or steps between detectors"
     if view.correction.strip_px:
         follows = "rows or columns that lie off by themselves"
+    elif view.correction.swing_px:
+        follows = "a swing of its rows"
     return (
         f"its corrected camera follows {follows}, of which one RPC leaves "
         f"{left:.2f} px (RMS; {most:.2f} px at most): use its grids, --tiles or --resample"
@@ -141,7 +143,7 @@ def _beyond(view: ViewEntry, run: Run) -> str:
 def _follows_more(view: ViewEntry) -> bool:
     """Whether a camera was corrected by more than one RPC holds."""
     one = view.correction
-    return one is not None and bool(one.jitter_px or one.detector_px or one.strip_px)
+    return one is not None and any((one.jitter_px, one.detector_px, one.strip_px, one.swing_px))
 
 
 def _left(i: int, adjustment: Adjustment) -> str:
