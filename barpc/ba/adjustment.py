@@ -18,7 +18,7 @@ from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Terrain
 from barpc.ba.heldout import enu_offsets, keep_out
 from barpc.ba.incremental import BlockPrior
-from barpc.ba.judge import standing_out
+from barpc.ba.judge import left_over
 from barpc.ba.result import Adjustment
 from barpc.ba.snooping import MOST_TESTED, image_test
 from barpc.ba.solution import Solution, solve_block
@@ -182,7 +182,7 @@ def _adjustment(
         smooth=outcome.smooth,
         asked=found.asked,
         findings=found.findings,
-        left=tuple(standing_out(outcome, block, options.noise_floor)),
+        left=tuple(left_over(outcome, block, options.noise_floor)),
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],

@@ -60,26 +60,32 @@ class Seen:
     extra: Array  # (2, e, K) what of it is beside the cameras [px]
 
 
-def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> Explanation:
+def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> list[Explanation]:
     """Rows or columns of an image that lie off by themselves."""
     start, stop = _open_ended(interval.start, interval.stop, float(seen.size[interval.axis, interval.view]))
-    return _local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)
+    return [_local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)]
 
 
-def fade(seen: Seen, interval: Interval) -> Explanation | None:
-    """Rows of an image that lie off at an end of an interval, and less and less from there."""
+def fade(seen: Seen, interval: Interval) -> list[Explanation]:
+    """Rows of an image that lie off at an end of an interval, and less and less from there, upwards or downwards.
+
+    Either the interval lies off, or the rest of its image: what fades is tried on both sides of both ends.
+    """
     if interval.axis == 0:
-        return None
-    size, view = float(seen.size[1, interval.view]), interval.view
-    tried = []
-    for length in (interval.stop - interval.start) * _LENGTHS:
-        for origin, sign in ((interval.start, 1.0), (interval.stop, -1.0)):
+        return []
+    size = float(seen.size[1, interval.view])
+    found = []
+    for sign in (1.0, -1.0):
+        tried = []
+        for origin in (interval.start, interval.stop):
             start, stop = (origin, size) if sign > 0 else (0.0, origin)
             ends = _open_ended(start, stop, size)
-            one = _local(FADE, seen, view, (1, *ends, origin, sign / float(length)), _STRIP)
-            cost = first_guess(seen.linear, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
-            tried.append((cost - _untouched(seen, one), one))
-    return min(tried, key=lambda row: row[0])[1]
+            for length in (stop - start) * _LENGTHS if stop > start else ():
+                one = _local(FADE, seen, interval.view, (1, *ends, origin, sign / float(length)), _STRIP)
+                cost = first_guess(seen.linear, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
+                tried.append((cost - _untouched(seen, one), one))
+        found += [min(tried, key=lambda row: row[0])[1]] if tried else []
+    return found
 
 
 def _untouched(seen: Seen, one: Explanation) -> float:
@@ -97,6 +103,22 @@ def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Expl
     return Explanation(kind, view, extra, np.full(2, sigma), cost, where)
 
 
+def bent(seen: Seen, one: Explanation) -> Explanation:
+    """What fades, and two unknowns beside its own: what a change of the rate, as a logarithm, does to it."""
+    assert one.where is not None
+    _, _, _, origin, rate = one.where
+    slope = -one.extra * np.maximum((seen.place[1] - origin) * rate, 0.0)
+    return replace(one, extra=np.concatenate([one.extra, slope], axis=1), sigma=np.tile(one.sigma, 2))
+
+
+def faster(one: Explanation, found: Fit) -> Explanation:
+    """What fades with the rate that a fit of it `bent` asks for, changed by the factor e at most; only `where` is new."""
+    assert one.where is not None
+    moved, slope = np.split(found.extra[-4:], 2)
+    step = float(np.clip(moved @ slope / max(float(moved @ moved), 1e-30), -1.0, 1.0))
+    return replace(one, where=(*one.where[:4], one.where[4] * float(np.exp(step))))
+
+
 def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explanation:
     """A strip whose ends are where ties say, or a swing, whose prior is as wide as it is large.
 
@@ -107,33 +129,33 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
     if one.where is None:
         return replace(one, sigma=np.full(len(moved), sigma))
     axis = one.where[0]
-    if one.kind == FADE:
-        return _faded(seen, one, sigma)
     rows = np.flatnonzero((seen.linear.view == one.view) & (found.right + 1.0 > 0.0))
     rows = rows[np.argsort(seen.place[axis, rows], kind="stable")]
     left = seen.linear.left(found.step) + others / seen.linear.sigma
     displaced = left.copy()
-    displaced[:, rows] += moved[:, None] / seen.linear.sigma[rows]
+    everywhere = profile(seen.place[axis, rows], -np.inf, np.inf, *one.where[3:])  # type: ignore[arg-type]
+    displaced[:, rows] += moved[:, None] * everywhere / seen.linear.sigma[rows]
     gain = (log_likelihoods(seen.linear, displaced, found) - log_likelihoods(seen.linear, left, found))[rows]
-    first, last = _largest_part(gain)
     place, size = seen.place[axis, rows], float(seen.size[axis, one.view])
+    if one.kind == FADE:
+        return _begun(seen, one, gain, place, sigma)
+    first, last = _largest_part(gain)
     start = -np.inf if first == 0 else 0.5 * (place[first - 1] + place[first])
     stop = np.inf if last == len(rows) - 1 else 0.5 * (place[last] + place[last + 1])
     ends = _open_ended(max(start, 0.0), min(stop, size), size)
     return _local(STRIP, seen, one.view, (axis, *ends, 0.0, 0.0), sigma)
 
 
-def _faded(seen: Seen, one: Explanation, sigma: float) -> Explanation:
-    """A fade over the length at which tracks are off by least."""
+def _begun(seen: Seen, one: Explanation, gain: Array, place: Array, sigma: float) -> Explanation:
+    """A fade that begins where single ties say, by their gains in the order of their places (n,)."""
     assert one.where is not None
-    axis, start, stop, origin, rate = one.where
-    tried = []
-    for factor in np.geomspace(0.5, 2.0, 7):
-        again = _local(FADE, seen, one.view, (axis, start, stop, origin, rate * float(factor)), sigma)
-        tried.append(
-            (first_guess(seen.linear, seen.base, seen.extra, again.extra, again.sigma**-2.0)[2], again)
-        )
-    return min(tried, key=lambda row: row[0])[1]
+    axis, _, _, _, rate = one.where
+    size = float(seen.size[axis, one.view])
+    without = np.append(0.0, np.cumsum(gain)) * (1.0 if rate > 0.0 else -1.0)
+    between = np.concatenate([[0.0], 0.5 * (place[1:] + place[:-1]), [size]])
+    origin = float(between[int(without.argmin())])
+    ends = (origin, size) if rate > 0.0 else (0.0, origin)
+    return _local(FADE, seen, one.view, (axis, *_open_ended(*ends, size), origin, rate), sigma)
 
 
 def _open_ended(start: float, stop: float, size: float) -> tuple[float, float]:
@@ -149,12 +171,12 @@ def _largest_part(gain: Array) -> tuple[int, int]:
     return int(sums[: last + 1].argmin()), last
 
 
-def wander(seen: Seen, interval: Interval) -> Explanation:
+def wander(seen: Seen, interval: Interval) -> list[Explanation]:
     """Rows of an image that wander: splines."""
     view = interval.view
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
-    return _on_both(seen, WANDER, view, rows, bsplines(u, _SPLINES), _WANDER)
+    return [_on_both(seen, WANDER, view, rows, bsplines(u, _SPLINES), _WANDER)]
 
 
 def swing(seen: Seen, found: Swing) -> Explanation:
@@ -188,7 +210,7 @@ def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sig
     return Explanation(kind, view, extra, np.full(2 * len(basis), sigma), float(np.log(seen.linear.views)))
 
 
-EXPLANATIONS: dict[str, Callable[[Seen, Interval], Explanation | None]] = {
+EXPLANATIONS: dict[str, Callable[[Seen, Interval], list[Explanation]]] = {
     STRIP: strip,
     FADE: fade,
     WANDER: wander,
@@ -205,6 +227,4 @@ def proposed(seen: Seen, intervals: list[Interval], periods: list[Swing]) -> Ite
             place = (interval.axis, interval.start, interval.stop) if kind in LOCAL else ()
             if (kind, interval.view, *place) not in known:
                 known.add((kind, interval.view, *place))
-                one = make(seen, interval)
-                if one is not None:
-                    yield one
+                yield from make(seen, interval)

@@ -10,7 +10,7 @@ from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
 from barpc.ba.explanations import FOLLOWED, LOCAL, SWING
 from barpc.ba.heldout import is_better
-from barpc.ba.judge import Finding, judge, standing_out
+from barpc.ba.judge import Finding, Judgement, judge, standing_out
 from barpc.ba.rounds import Rounds, revived
 from barpc.ba.solution import Solution, finished
 from barpc.ba.starting import make_problem
@@ -56,13 +56,13 @@ def without_strips(found: Solution, block: Block, outer: Block, options: AdjustO
     """
     if options.loss == "linear":  # who wants least squares has no observation that may be wrong
         return found
-    findings = judge(found.outcome, block, options.noise_floor)
-    parts = [one for one in findings if one.kind in FOLLOWED]
-    found = replace(found, findings=tuple(findings))
+    judged = judge(found.outcome, block, options.noise_floor)
+    parts = [one for one in judged.findings if one.kind in FOLLOWED]
+    found = replace(found, findings=judged.findings)
     if not parts or options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
         return found
     waves, params = _waves_of(parts, len(block.views))
-    tried = _with_waves(found, block, outer, options, waves, start=params)
+    tried = _with_waves(_judged(found, judged, block), block, outer, options, waves, start=params)
     has_strips = any(one.kind in LOCAL for one in parts)
     if is_better(found.after, tried.after, outer) or (has_strips and _is_half(found, tried, block, options)):
         return replace(found, findings=())
@@ -73,6 +73,17 @@ def without_strips(found: Solution, block: Block, outer: Block, options: AdjustO
     )  # splines and detectors may explain the same, and leave nothing
     calm = plain is not found and not standing_out(plain.outcome, block, options.noise_floor)
     return found if calm and not is_better(tried.after, plain.after, outer) else tried
+
+
+def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
+    """The block where the judge leaves it: cameras, and tracks that meet where its right observations do."""
+    outcome, is_tie = found.outcome, block.point < block.num_tracks
+    inlier = np.where(is_tie, block.use & (judged.right > _HALF), outcome.inlier)
+    ended = outcome.minimum.state
+    moved = replace(ended, params=ended.params + judged.step)
+    return replace(
+        found, outcome=replace(outcome, inlier=inlier, minimum=replace(outcome.minimum, state=moved))
+    )
 
 
 def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
@@ -168,6 +179,10 @@ def _with_waves(
             ended.params[:, unknowns.in_waves], unknowns.waves
         )
     outcome, weight = found.outcome, block.use / block.sigma
-    there, _ = revived(bent, replace(ended, params=params), outcome.residual, outcome.inlier, weight)
+    known = outcome.inlier
+    if start is not None:  # the cameras have moved: every point is seen anew, where any are right by these
+        count = np.bincount(block.point[known], minlength=bent.structure.num_points)
+        weight, known = weight * (known | (count < 2)[block.point]), np.zeros_like(known)
+    there, _ = revived(bent, replace(ended, params=params), outcome.residual, known, weight)
     outcome = Rounds(bent, block, there, options, found.heights, block.use, outcome).run(once)
     return finished(found, bent, block, outer, options, outcome)

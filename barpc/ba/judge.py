@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.explanations import (
+    FADE,
     FOLLOWED,
     LOCAL,
     SWING,
@@ -18,7 +19,9 @@ from barpc.ba.explanations import (
     Explanation,
     Seen,
     Where,
+    bent,
     boxed,
+    faster,
     proposed,
     sharpened,
 )
@@ -35,7 +38,7 @@ _LOG = logging.getLogger(__name__)
 _MOST = 6  # explanations of one block
 _TRIED = 3  # intervals a round, and periods
 _PARTS = 3  # of images that may explain together what something else does alone
-_LOCAL = 2  # explanations of parts of an image whose ends are looked for, a round
+_LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
 _UNKNOWNS = 400  # of all views, up to which explanations are tried
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
@@ -61,6 +64,17 @@ class Finding:
     ] = ()  # other views that may be meant: their evidence is within `SURE` of the view's
 
 
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What was taken, and where cameras and observations are with it."""
+
+    findings: tuple[Finding, ...] = ()
+    step: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (N, q) of the cameras' unknowns
+    right: Array = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (K,) probability that an observation of a tie is
+
+
 def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
     """Intervals of images in which ties were cut, or are off, more than elsewhere and chance allow.
 
@@ -71,6 +85,28 @@ def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]
     pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
     found = scan(block.view[rows], block.xy[:, rows], _sizes(block), wrong, off, floor / pixel)
     return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
+
+
+def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
+    """What stands out at the end, with what the ties that were cut there are off by.
+
+    As their tracks see it that are triangulated with all that may be seen, where all of one was cut.
+    """
+    found = standing_out(outcome, block, floor)
+    if not any(one.by_share for one in found):
+        return found
+    state, weight = outcome.minimum.state, block.use / block.sigma
+    residual = revived(outcome.problem, state, outcome.residual, outcome.inlier, weight)[1]
+    off = np.hypot(*residual)
+    cut = (block.point < block.num_tracks) & block.use & ~outcome.inlier & np.isfinite(off)
+    inside = [
+        cut & (block.view == one.view) & (block.xy[one.axis] >= one.start) & (block.xy[one.axis] < one.stop)
+        for one in found
+    ]
+    return [
+        replace(one, apart=float(np.median(off[rows])) if rows.any() else 0.0)
+        for one, rows in zip(found, inside, strict=True)
+    ]
 
 
 def swinging(outcome: Outcome, block: Block) -> list[Swing]:
@@ -96,20 +132,20 @@ def _sizes(block: Block) -> Array:
     return np.array([view.size for view in block.views], dtype=np.float64).T
 
 
-def judge(outcome: Outcome, block: Block, floor: float) -> list[Finding]:
+def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
     """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out."""
     problem = outcome.problem
     if problem.free.size > _UNKNOWNS:
-        return []
+        return Judgement()
     first = standing_out(outcome, block, floor)
     if not (first or swinging(outcome, block)):
-        return []
+        return Judgement()
     state, _ = revived(
         problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
     )
     use = block.use & (block.point < block.num_tracks)
     if _numbers(block, use) > _NUMBERS:
-        return []
+        return Judgement()
     low, high = block.alt_range
     linear = linearise(problem, state, use, block.sigma, high - low)
     nothing = np.zeros((2, 0, len(block.view)))
@@ -140,8 +176,9 @@ class _Search:
     def __init__(self, seen: Seen, first: list[Interval], floor: float, sigma: float) -> None:
         self.seen, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
         self.taken: list[_Taken] = []
+        self.followed = seen.base  # the last fit of what the adjustment follows
 
-    def run(self) -> list[Finding]:
+    def run(self) -> Judgement:
         """All that were taken."""
         tried = self._tried()
         while tried and tried[0][2] > SURE and len(self.taken) < _MOST:
@@ -149,11 +186,15 @@ class _Search:
             if self.taken[-1].one.kind not in FOLLOWED:  # what is smooth is followed by other means
                 break
             tried = self._tried()
-        return [self._said(n) for n in range(len(self.taken))]
+        followed = sum(row.one.kind in FOLLOWED for row in self.taken)
+        base = self.seen.base if followed == len(self.taken) else self.followed
+        return Judgement(tuple(self._said(n) for n in range(len(self.taken))), base.step, base.right)
 
     def _take(self, tried: list[_Tried]) -> None:
         """The best, or several parts of its image where these explain more together than it does alone."""
         best = tried[0]
+        if best[0].kind == WANDER and self._took_swing(tried):
+            return
         if best[0].kind not in LOCAL:
             parts, left = copy(self), _parts_of(best[0].view, tried)
             parts.taken = list(self.taken)
@@ -167,9 +208,24 @@ class _Search:
                 parts._add(left)
                 left = _parts_of(best[0].view, parts._tried())
             if total > best[2] + SURE:
-                self.taken, self.seen = parts.taken, parts.seen
+                self.taken, self.seen, self.followed = parts.taken, parts.seen, parts.followed
                 return
         self._add(tried)
+
+    def _took_swing(self, tried: list[_Tried]) -> bool:
+        """Whether what wanders explains more with a swing beside it, which is then taken first."""
+        best = tried[0]
+        first = next((row for row in tried if row[0].kind == SWING and row[2] > SURE), None)
+        if first is None:
+            return False
+        parts = copy(self)
+        parts.taken = list(self.taken)
+        parts._add([first, *(row for row in tried if row is not first and row[0] is not best[0])])
+        beside = max((row[2] for row in parts._tried() if row[0].kind == WANDER), default=0.0)
+        if not first[2] + beside > best[2] + SURE:
+            return False
+        self.taken, self.seen, self.followed = parts.taken, parts.seen, parts.followed
+        return True
 
     def _add(self, tried: list[_Tried]) -> None:
         best = tried[0]
@@ -180,6 +236,7 @@ class _Search:
         close = [row[0] for row in others if row[2] > gain - SURE]
         or_of = tuple(sorted({row.view for row in close if one.kind == row.kind == SWING}))
         _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
+        self.followed = made if one.kind in FOLLOWED else self.followed
         self.taken.append(_Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of))
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
         self.seen = replace(self.seen, base=made, extra=extra)
@@ -217,7 +274,7 @@ class _Search:
         if made and made[0][0].kind == WANDER:
             box = boxed(seen, *made[0][:2])
             made = self._sorted([*(row[:2] for row in made), (box, self._fit(box))])
-        local = [row[0] for row in made if row[0].kind in LOCAL][:_LOCAL]
+        local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:_LOCAL]]
         sharp = [
             self._sharpened(one, found) if one in local or one.kind == SWING else (one, found)
             for one, found, _ in made
@@ -238,11 +295,14 @@ class _Search:
     def _sharpened(self, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
         for _ in range(_SHARPENED):
             others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
-            again = sharpened(self.seen, one, found, others)
-            better = self._fit(again)
+            tried = [one, faster(one, self._fit(bent(self.seen, one)))] if one.kind == FADE else [one]
+            again = [sharpened(self.seen, shape, found, others) for shape in tried]
+            better, made = max(
+                ((self._fit(shape), shape) for shape in again), key=lambda row: row[0].evidence
+            )
             if not better.evidence > found.evidence:
                 break
-            one, found = again, better
+            one, found = made, better
         return one, found
 
     def _fit(self, one: Explanation) -> Fit:

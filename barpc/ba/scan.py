@@ -31,6 +31,7 @@ class Interval:
     share: float  # of its observations that are wrong
     off: float  # what the others have in common, in the units of the residuals
     by_share: bool  # whether the share stands out, or what they have in common
+    apart: float = 0.0  # half of those that are wrong are farther off than this, where it was measured
 
 
 def price(views: int) -> float:

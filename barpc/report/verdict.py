@@ -208,7 +208,10 @@ def _left_reasons(run: Run) -> list[str]:
     worst: dict[str, str] = {}
     for one in left_over(run.adjustment):
         if one.rejected > MANY_REJECTED:
-            what = f"{100 * one.rejected:.0f} % of their tie points contradict the others"
+            what = (
+                f"{100 * one.rejected:.0f} % of their tie points contradict the others, half of these by more than "
+                f"{one.apart_px:.2f} px"
+            )
         elif one.off_px > SMOOTH_LEFT:
             what = f"their tie points are left with {one.off_px:.2f} px in common"
         else:

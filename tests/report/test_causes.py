@@ -82,14 +82,17 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
 
 
 def interval(view: int, share: float, off: float) -> Interval:
-    return Interval(view, 1, 100.0, 400.0, 30.0, share, off, share > 0.3)
+    return Interval(view, 1, 100.0, 400.0, 30.0, share, off, share > 0.3, 2.5)
 
 
 def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     left = [interval(0, 0.8, 0.0), interval(0, 0.4, 0.0), interval(1, 0.02, 0.09)]
     run: Any = SimpleNamespace(adjustment=adjustment(left=left))
     first, second = verdict._left_reasons(run)
-    assert first == "Rows 100-399 of west stand out: 80 % of their tie points contradict the others."
+    assert first == (
+        "Rows 100-399 of west stand out: 80 % of their tie points contradict the others, half of these by more than "
+        "2.50 px."
+    )
     assert second == "Rows 100-399 of east stand out: their tie points are left with 0.09 px in common."
     assert [one.last for one in left_over(run.adjustment)] == [399.0] * 3
     quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]))

@@ -49,6 +49,7 @@ class LeftEntry(Record):
     last: float = said("The last", "px")
     rejected: float = said("Share of their tie points that was cut")
     off_px: float = said("What the others have in common", "px")
+    apart_px: float = said("Half of those that were cut contradict the others by more than this", "px")
     gain: float = said("Logarithm of the likelihood, over that of a whole image alike", "nats")
 
 
@@ -82,4 +83,4 @@ def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
 
 def _left(one: Interval, names: Sequence[str]) -> LeftEntry:
     ends = one.start, one.stop - 1.0
-    return LeftEntry(names[one.view], AXES[one.axis], *ends, one.share, one.off, one.gain)
+    return LeftEntry(names[one.view], AXES[one.axis], *ends, one.share, one.off, one.apart, one.gain)
