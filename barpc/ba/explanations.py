@@ -112,7 +112,7 @@ def bent(seen: Seen, one: Explanation) -> Explanation:
 
 
 def faster(one: Explanation, found: Fit) -> Explanation:
-    """What fades with the rate that a fit of it `bent` asks for, changed by the factor e at most; only `where` is new."""
+    """What fades with the rate that a fit of it `bent` asks for, by e at most; only `where` is new."""
     assert one.where is not None
     moved, slope = np.split(found.extra[-4:], 2)
     step = float(np.clip(moved @ slope / max(float(moved @ moved), 1e-30), -1.0, 1.0))
