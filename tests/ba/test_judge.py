@@ -105,9 +105,10 @@ def swung(
 
 
 @pytest.mark.parametrize(
-    ("px", "period"), rest_slow([(0.15, 200.0), (0.08, 200.0), (0.15, 60.0), (0.3, 600.0)]), ids=str
+    "size", rest_slow([(0.15, 200.0), (0.08, 200.0), (0.15, 60.0), (0.3, 600.0)]), ids=str
 )
-def test_rows_that_swing_are_named_with_their_period_and_followed(px: float, period: float) -> None:
+def test_rows_that_swing_are_named_with_their_period_and_followed(size: tuple[float, float]) -> None:
+    px, period = size
     block, tracks = swung(3, 1500, px, period)
     found = adjusted(block, tracks)
     (one,) = found.findings
