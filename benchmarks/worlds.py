@@ -380,8 +380,8 @@ def _want_swing(r: Result, plan: Plan) -> list[str]:
         return faults + (
             ["claims a swing"] if spoken or re.search("jitter|spline|step", _all_words(r)) else []
         )
-    if not r.files.left <= 0.03:
-        faults.append(f"left {r.files.left:.3f}")
+    if not r.adjusted.left <= 0.03:  # no RPC holds hundreds of waves: what one leaves is said of its image
+        faults.append(f"left {r.adjusted.left:.3f}")
     if r.code < 0:
         return faults
     told = [n for w in spoken for n in _numbers(w)]

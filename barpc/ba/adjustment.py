@@ -18,7 +18,7 @@ from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Terrain
 from barpc.ba.heldout import enu_offsets, keep_out
 from barpc.ba.incremental import BlockPrior
-from barpc.ba.judge import standing_out
+from barpc.ba.judge import left_over
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Outcome
 from barpc.ba.scan import neighbours_alike
@@ -184,7 +184,7 @@ def _adjustment(
         smooth=outcome.smooth,
         asked=found.asked,
         findings=found.findings,
-        left=tuple(standing_out(outcome, block, options.noise_floor)),
+        left=tuple(left_over(outcome, block, options.noise_floor)),
         alike=_alike(block, outcome, is_tie),
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),

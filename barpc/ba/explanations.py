@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from barpc.ba.mixture import Fit, Linear, first_guess, log_likelihoods
+from barpc.ba.periods import Swing
+from barpc.ba.periods import price as price_of_period
 from barpc.ba.scan import BINS, Interval, price
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import bsplines, profile
+from barpc.sensor.splined import swing as waves_of
 
 STRIP = "strip"
 FADE = "fade"
 WANDER = "wander"
+SWING = "swing"
 LOCAL = STRIP, FADE
-"""Those of a part of an image: they follow each other, and the adjustment follows them."""
+"""Those of a part of an image."""
+FOLLOWED = *LOCAL, SWING
+"""Those that the adjustment follows; others may be beside them."""
 _LENGTHS = 2.0 ** np.arange(-4.0, 1.0)  # of an interval: over what it may fade
 _A_BIN = 5  # places of a bin at which a curve is looked at
 _SPLINES = 14  # over the rows of an image
@@ -36,6 +42,7 @@ class Explanation:
     sigma: Array = field(repr=False)  # (e,) their prior [px]
     price: float  # of the choice among places and sizes [nats]
     where: Where | None = None
+    period: float | None = None  # after which it repeats itself [px]
 
 
 Where = tuple[int, float, float, float, float]
@@ -53,26 +60,32 @@ class Seen:
     extra: Array  # (2, e, K) what of it is beside the cameras [px]
 
 
-def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> Explanation:
+def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> list[Explanation]:
     """Rows or columns of an image that lie off by themselves."""
     start, stop = _open_ended(interval.start, interval.stop, float(seen.size[interval.axis, interval.view]))
-    return _local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)
+    return [_local(STRIP, seen, interval.view, (interval.axis, start, stop, 0.0, 0.0), sigma)]
 
 
-def fade(seen: Seen, interval: Interval) -> Explanation | None:
-    """Rows of an image that lie off at an end of an interval, and less and less from there."""
+def fade(seen: Seen, interval: Interval) -> list[Explanation]:
+    """Rows of an image that lie off at an end of an interval, and less and less from there, upwards or downwards.
+
+    Either the interval lies off, or the rest of its image: what fades is tried on both sides of both ends.
+    """
     if interval.axis == 0:
-        return None
-    size, view = float(seen.size[1, interval.view]), interval.view
-    tried = []
-    for length in (interval.stop - interval.start) * _LENGTHS:
-        for origin, sign in ((interval.start, 1.0), (interval.stop, -1.0)):
+        return []
+    size = float(seen.size[1, interval.view])
+    found = []
+    for sign in (1.0, -1.0):
+        tried = []
+        for origin in (interval.start, interval.stop):
             start, stop = (origin, size) if sign > 0 else (0.0, origin)
             ends = _open_ended(start, stop, size)
-            one = _local(FADE, seen, view, (1, *ends, origin, sign / float(length)), _STRIP)
-            cost = first_guess(seen.linear, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
-            tried.append((cost - _untouched(seen, one), one))
-    return min(tried, key=lambda row: row[0])[1]
+            for length in (stop - start) * _LENGTHS if stop > start else ():
+                one = _local(FADE, seen, interval.view, (1, *ends, origin, sign / float(length)), _STRIP)
+                cost = first_guess(seen.linear, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
+                tried.append((cost - _untouched(seen, one), one))
+        found += [min(tried, key=lambda row: row[0])[1]] if tried else []
+    return found
 
 
 def _untouched(seen: Seen, one: Explanation) -> float:
@@ -90,41 +103,59 @@ def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Expl
     return Explanation(kind, view, extra, np.full(2, sigma), cost, where)
 
 
+def bent(seen: Seen, one: Explanation) -> Explanation:
+    """What fades, and two unknowns beside its own: what a change of the rate, as a logarithm, does to it."""
+    assert one.where is not None
+    _, _, _, origin, rate = one.where
+    slope = -one.extra * np.maximum((seen.place[1] - origin) * rate, 0.0)
+    return replace(one, extra=np.concatenate([one.extra, slope], axis=1), sigma=np.tile(one.sigma, 2))
+
+
+def faster(one: Explanation, found: Fit) -> Explanation:
+    """What fades with the rate that a fit of it `bent` asks for, by e at most; only `where` is new."""
+    assert one.where is not None
+    moved, slope = np.split(found.extra[-4:], 2)
+    step = float(np.clip(moved @ slope / max(float(moved @ moved), 1e-30), -1.0, 1.0))
+    return replace(one, where=(*one.where[:4], one.where[4] * float(np.exp(step))))
+
+
 def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explanation:
-    """A strip whose ends are where ties say, and whose prior is as wide as it is large.
+    """A strip whose ends are where ties say, or a swing, whose prior is as wide as it is large.
 
     `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
     """
-    assert one.where is not None
-    axis, moved = one.where[0], found.extra[-2:]
+    moved = found.extra[-len(one.sigma) :]
     sigma = float(np.clip(np.sqrt((moved**2).mean()), _STRIP / 30.0, _STRIP * 30.0))
-    if one.kind == FADE:
-        return _faded(seen, one, sigma)
+    if one.where is None:
+        return replace(one, sigma=np.full(len(moved), sigma))
+    axis = one.where[0]
     rows = np.flatnonzero((seen.linear.view == one.view) & (found.right + 1.0 > 0.0))
     rows = rows[np.argsort(seen.place[axis, rows], kind="stable")]
     left = seen.linear.left(found.step) + others / seen.linear.sigma
     displaced = left.copy()
-    displaced[:, rows] += moved[:, None] / seen.linear.sigma[rows]
+    everywhere = profile(seen.place[axis, rows], -np.inf, np.inf, *one.where[3:])  # type: ignore[arg-type]
+    displaced[:, rows] += moved[:, None] * everywhere / seen.linear.sigma[rows]
     gain = (log_likelihoods(seen.linear, displaced, found) - log_likelihoods(seen.linear, left, found))[rows]
-    first, last = _largest_part(gain)
     place, size = seen.place[axis, rows], float(seen.size[axis, one.view])
+    if one.kind == FADE:
+        return _begun(seen, one, gain, place, sigma)
+    first, last = _largest_part(gain)
     start = -np.inf if first == 0 else 0.5 * (place[first - 1] + place[first])
     stop = np.inf if last == len(rows) - 1 else 0.5 * (place[last] + place[last + 1])
     ends = _open_ended(max(start, 0.0), min(stop, size), size)
     return _local(STRIP, seen, one.view, (axis, *ends, 0.0, 0.0), sigma)
 
 
-def _faded(seen: Seen, one: Explanation, sigma: float) -> Explanation:
-    """A fade over the length at which tracks are off by least."""
+def _begun(seen: Seen, one: Explanation, gain: Array, place: Array, sigma: float) -> Explanation:
+    """A fade that begins where single ties say, by their gains in the order of their places (n,)."""
     assert one.where is not None
-    axis, start, stop, origin, rate = one.where
-    tried = []
-    for factor in np.geomspace(0.5, 2.0, 7):
-        again = _local(FADE, seen, one.view, (axis, start, stop, origin, rate * float(factor)), sigma)
-        tried.append(
-            (first_guess(seen.linear, seen.base, seen.extra, again.extra, again.sigma**-2.0)[2], again)
-        )
-    return min(tried, key=lambda row: row[0])[1]
+    axis, _, _, _, rate = one.where
+    size = float(seen.size[axis, one.view])
+    without = np.append(0.0, np.cumsum(gain)) * (1.0 if rate > 0.0 else -1.0)
+    between = np.concatenate([[0.0], 0.5 * (place[1:] + place[:-1]), [size]])
+    origin = float(between[int(without.argmin())])
+    ends = (origin, size) if rate > 0.0 else (0.0, origin)
+    return _local(FADE, seen, one.view, (axis, *_open_ended(*ends, size), origin, rate), sigma)
 
 
 def _open_ended(start: float, stop: float, size: float) -> tuple[float, float]:
@@ -140,12 +171,21 @@ def _largest_part(gain: Array) -> tuple[int, int]:
     return int(sums[: last + 1].argmin()), last
 
 
-def wander(seen: Seen, interval: Interval) -> Explanation:
+def wander(seen: Seen, interval: Interval) -> list[Explanation]:
     """Rows of an image that wander: splines."""
     view = interval.view
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
-    return _on_both(seen, WANDER, view, rows, bsplines(u, _SPLINES), _WANDER)
+    return [_on_both(seen, WANDER, view, rows, bsplines(u, _SPLINES), _WANDER)]
+
+
+def swing(seen: Seen, found: Swing) -> Explanation:
+    """All rows of an image that swing with one period."""
+    rows = np.flatnonzero(seen.linear.view == found.view)
+    basis = waves_of(seen.place[1, rows], np.array(found.period))
+    one = _on_both(seen, SWING, found.view, rows, basis, _WANDER)
+    costs = price_of_period(float(seen.size[1, found.view]), seen.linear.views) + SCALE
+    return replace(one, price=costs, period=found.period)
 
 
 def boxed(seen: Seen, one: Explanation, found: Fit) -> Explanation:
@@ -170,22 +210,21 @@ def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sig
     return Explanation(kind, view, extra, np.full(2 * len(basis), sigma), float(np.log(seen.linear.views)))
 
 
-EXPLANATIONS: dict[str, Callable[[Seen, Interval], Explanation | None]] = {
+EXPLANATIONS: dict[str, Callable[[Seen, Interval], list[Explanation]]] = {
     STRIP: strip,
     FADE: fade,
     WANDER: wander,
 }
-"""Name -> unknowns, proposed where an interval of an image stands out."""
+"""Name -> unknowns, proposed where an interval of an image stands out; `SWING` is, where a period does."""
 
 
-def proposed(seen: Seen, intervals: list[Interval]) -> Iterator[Explanation]:
-    """Explanations of the intervals that stand out; those of a whole image once."""
+def proposed(seen: Seen, intervals: list[Interval], periods: list[Swing]) -> Iterator[Explanation]:
+    """Explanations of the intervals and periods that stand out; those of a whole image once."""
+    yield from (swing(seen, one) for one in periods)
     known = set()
     for interval in intervals:
         for kind, make in EXPLANATIONS.items():
             place = (interval.axis, interval.start, interval.stop) if kind in LOCAL else ()
             if (kind, interval.view, *place) not in known:
                 known.add((kind, interval.view, *place))
-                one = make(seen, interval)
-                if one is not None:
-                    yield one
+                yield from make(seen, interval)

@@ -8,9 +8,9 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
-from barpc.ba.explanations import LOCAL
+from barpc.ba.explanations import FOLLOWED, LOCAL, SWING
 from barpc.ba.heldout import is_better
-from barpc.ba.judge import judge, standing_out
+from barpc.ba.judge import Finding, Judgement, judge, standing_out
 from barpc.ba.rounds import Rounds, revived
 from barpc.ba.solution import Solution, finished
 from barpc.ba.starting import make_problem
@@ -50,33 +50,60 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
 
 
 def without_strips(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
-    """The block with the rows and columns moved that lie off by themselves, where the judge finds such.
+    """The block with the rows and columns moved that lie off by themselves, or swing, where the judge finds such.
 
     Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
     """
     if options.loss == "linear":  # who wants least squares has no observation that may be wrong
         return found
-    findings = judge(found.outcome, block, options.noise_floor)
-    strips = [one for one in findings if one.kind in LOCAL]
-    found = replace(found, findings=tuple(findings))
-    if not strips or options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
+    judged = judge(found.outcome, block, options.noise_floor)
+    parts = [one for one in judged.findings if one.kind in FOLLOWED]
+    found = replace(found, findings=judged.findings)
+    if not parts or options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
         return found
-    own = [[one for one in strips if one.view == v] for v in range(len(block.views))]
-    places = np.full((len(own), max(map(len, own)), 5), np.inf)
-    params = np.zeros((len(own), 2, places.shape[1]))
-    for v, of_view in enumerate(own):
-        for n, one in enumerate(of_view):
-            assert one.where is not None
-            places[v, n], params[v, :, n] = one.where, one.size
-    waves = Waves(0, np.zeros((len(own), 0)), places)
-    tried = _with_waves(found, block, outer, options, waves, start=params.reshape(len(own), -1))
-    if is_better(found.after, tried.after, outer) or _is_half(found, tried, block, options):
+    waves, params = _waves_of(parts, len(block.views))
+    tried = _with_waves(_judged(found, judged, block), block, outer, options, waves, start=params)
+    has_strips = any(one.kind in LOCAL for one in parts)
+    if is_better(found.after, tried.after, outer) or (has_strips and _is_half(found, tried, block, options)):
         return replace(found, findings=())
+    if not has_strips:
+        return tried
     plain = follow(
         found, block, outer, options
     )  # splines and detectors may explain the same, and leave nothing
     calm = plain is not found and not standing_out(plain.outcome, block, options.noise_floor)
     return found if calm and not is_better(tried.after, plain.after, outer) else tried
+
+
+def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
+    """The block where the judge leaves it: cameras, and tracks that meet where its right observations do."""
+    outcome, is_tie = found.outcome, block.point < block.num_tracks
+    inlier = np.where(is_tie, block.use & (judged.right > _HALF), outcome.inlier)
+    ended = outcome.minimum.state
+    moved = replace(ended, params=ended.params + judged.step)
+    return replace(
+        found, outcome=replace(outcome, inlier=inlier, minimum=replace(outcome.minimum, state=moved))
+    )
+
+
+def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
+    """The unknowns in the image that explanations are, and what these found (N, size)."""
+    own = [
+        [[one for one in parts if one.view == v and (one.kind == SWING) == swings] for v in range(views)]
+        for swings in (False, True)
+    ]
+    most = [max(map(len, of_kind)) for of_kind in own]
+    places, periods = np.full((views, most[0], 5), np.inf), np.full((views, most[1]), np.inf)
+    moved, swung = np.zeros((views, 2, most[0])), np.zeros((views, 2, 2, most[1]))
+    for v, (strips, of_swings) in enumerate(zip(*own, strict=True)):
+        for n, one in enumerate(strips):
+            assert one.where is not None
+            places[v, n], moved[v, :, n] = one.where, one.unknowns
+        for n, one in enumerate(of_swings):
+            assert one.period is not None
+            periods[v, n], swung[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
+    params = np.hstack([moved.reshape(views, -1), swung.reshape(views, -1)])
+    return Waves(0, np.zeros((views, 0)), places, periods), params
 
 
 def _is_half(found: Solution, tried: Solution, block: Block, options: AdjustOptions) -> bool:
@@ -140,8 +167,8 @@ def _with_waves(
     `start` (N, waves.size) are those unknowns, where something is known of them.
     """
     ended, unknowns = found.outcome.minimum.state, found.problem.cameras.unknowns
-    if unknowns.waves is not None:  # strips that were found stay
-        waves = replace(waves, strips=unknowns.waves.strips)
+    if unknowns.waves is not None:  # strips and swings that were found stay
+        waves = replace(waves, strips=unknowns.waves.strips, periods=unknowns.waves.periods)
     bent = make_problem(block, options, unknowns.center, None, unknowns.drift, waves)
     params = np.zeros_like(bent.camera_prior.mean)
     params[:, : unknowns.in_waves.start] = ended.params[:, : unknowns.in_waves.start]
@@ -152,6 +179,10 @@ def _with_waves(
             ended.params[:, unknowns.in_waves], unknowns.waves
         )
     outcome, weight = found.outcome, block.use / block.sigma
-    there, _ = revived(bent, replace(ended, params=params), outcome.residual, outcome.inlier, weight)
+    known = outcome.inlier
+    if start is not None:  # the cameras have moved: every point is seen anew, where any are right by these
+        count = np.bincount(block.point[known], minlength=bent.structure.num_points)
+        weight, known = weight * (known | (count < 2)[block.point]), np.zeros_like(known)
+    there, _ = revived(bent, replace(ended, params=params), outcome.residual, known, weight)
     outcome = Rounds(bent, block, there, options, found.heights, block.use, outcome).run(once)
     return finished(found, bent, block, outer, options, outcome)

@@ -48,7 +48,7 @@ class BlockPrior:
         Camera centres [m], ECEF.
     less : (m, n q)
         Rows B of B^T B that is still to be taken off a sparse matrix: what heights have in common.
-    splines, edges, strips : int, (n, C), (n, M, 5)
+    splines, edges, strips, periods : int, (n, C), (n, M, 5), (n, M)
         Layout of the unknowns in the image (see `barpc.ba.waves`).
     radars : tuple of str
         Those of its views whose unknowns are of a radar's clocks.
@@ -65,18 +65,18 @@ class BlockPrior:
     edges: Array | None = None
     radars: tuple[str, ...] = ()
     strips: Array | None = None
+    periods: Array | None = None
 
     def waves(self, names: tuple[str, ...]) -> Waves | None:
-        """The unknowns in the image of views that go on from the block; a new one has no detectors and strips."""
-        edges, strips = self._edges, self._strips
-        if self.edges is None or not (self.splines or edges.size or strips.size):
+        """The unknowns in the image of views that go on from the block; a new one has splines alone."""
+        of_views = self._edges, self._strips, self._periods
+        if self.edges is None or not (self.splines or any(one.size for one in of_views)):
             return None
         place = {name: i for i, name in enumerate(self.names)}
         old = np.array([place.get(name, len(place)) for name in names])
-        edges, strips = (
-            np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in (edges, strips)
+        return Waves(
+            self.splines, *(np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in of_views)
         )
-        return Waves(self.splines, edges, strips)
 
     @property
     def _edges(self) -> Array:
@@ -85,6 +85,10 @@ class BlockPrior:
     @property
     def _strips(self) -> Array:
         return np.zeros((len(self.names), 0, 5)) if self.strips is None else self.strips
+
+    @property
+    def _periods(self) -> Array:
+        return np.zeros((len(self.names), 0)) if self.periods is None else self.periods
 
     def save(self, path: Path) -> None:
         """Write the prior to an .npz file."""
@@ -104,6 +108,7 @@ class BlockPrior:
                 radars=np.array(self.radars, dtype=np.str_),
                 edges=self._edges,
                 strips=self._strips,
+                periods=self._periods,
                 **arrays,
             )
 
@@ -126,7 +131,8 @@ class BlockPrior:
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
             radars = tuple(str(name) for name in file.get("radars", ()))
             strips = file.get("strips", np.zeros((len(names), 0, 5)))
-            prior = cls(names, *known, splines, edges, radars, strips)
+            periods = file.get("periods", np.zeros((len(names), 0)))
+            prior = cls(names, *known, splines, edges, radars, strips, periods)
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
         if not prior._is_whole():
@@ -149,6 +155,10 @@ class BlockPrior:
             and len(self._edges) == n
             and self._strips.shape[::2] == (n, 5)
             and self._strips.dtype == np.float64
+            and self._periods.ndim == 2
+            and len(self._periods) == n
+            and self._periods.dtype == np.float64
+            and bool((self._periods > 0.0).all())
             and (self.splines == 0 or 4 <= self.splines <= q)
             and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_plain(self.less)))
         )
@@ -221,6 +231,7 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
         waves.edges[views] if waves else None,
         tuple(adjustment.names[v] for v in adjustment.cameras.unknowns.radars if v in views),
         waves.strips[views] if waves and waves.strips.size else None,
+        waves.periods[views] if waves and waves.periods.size else None,
     )
 
 

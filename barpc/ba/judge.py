@@ -5,13 +5,28 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from barpc.ba.block import Block
-from barpc.ba.explanations import LOCAL, WANDER, Explanation, Seen, Where, boxed, proposed, sharpened
+from barpc.ba.explanations import (
+    FADE,
+    FOLLOWED,
+    LOCAL,
+    SWING,
+    WANDER,
+    Explanation,
+    Seen,
+    Where,
+    bent,
+    boxed,
+    faster,
+    proposed,
+    sharpened,
+)
 from barpc.ba.mixture import Fit, fit, linearise, settled
+from barpc.ba.periods import Swing, swings
 from barpc.ba.rounds import Outcome, revived
 from barpc.ba.scan import SURE, Interval, scan
 from barpc.ba.weights import Observations
@@ -21,9 +36,9 @@ from barpc.scene import BoolArray
 _LOG = logging.getLogger(__name__)
 
 _MOST = 6  # explanations of one block
-_TRIED = 3  # intervals a round
+_TRIED = 3  # intervals a round, and periods
 _PARTS = 3  # of images that may explain together what something else does alone
-_LOCAL = 2  # explanations of parts of an image whose ends are looked for, a round
+_LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
 _UNKNOWNS = 400  # of all views, up to which explanations are tried
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
@@ -36,12 +51,28 @@ class Finding:
     kind: str  # a name of `barpc.ba.explanations.EXPLANATIONS`
     view: int
     where: Where | None
-    size: (
-        Array  # (2,) root mean square displacement of what it moves, col and row, with sign for a strip [px]
-    )
+    # (2,) displacement of what it moves, col and row [px]: a strip's with its sign, a swing's amplitude, else the root
+    # mean square
+    size: Array
     gain: float  # nats over the next without it
     gap: float  # nats over the runner-up
     runner_up: str  # its kind, or "" for none
+    unknowns: Array  # (e,) as `barpc.ba.explanations` has them [px]
+    period: float | None = None  # after which it repeats itself [px]
+    or_of: tuple[
+        int, ...
+    ] = ()  # other views that may be meant: their evidence is within `SURE` of the view's
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What was taken, and where cameras and observations are with it."""
+
+    findings: tuple[Finding, ...] = ()
+    step: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (N, q) of the cameras' unknowns
+    right: Array = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (K,) probability that an observation of a tie is
 
 
 def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
@@ -49,40 +80,77 @@ def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]
 
     A mean below `floor` [px] is none.
     """
-    problem = outcome.problem
-    is_tie = (block.point < block.num_tracks) & block.use
-    observations = Observations(problem, block.sigma, 0.0, is_tie)
-    spread = (
-        block.sigma * outcome.noise * np.sqrt(0.5 * observations.freedom(outcome.inlier.astype(np.float64)))
-    )
-    rows = is_tie & np.isfinite(outcome.residual).all(axis=0)
-    size = np.array([view.size for view in block.views], dtype=np.float64).T
+    rows, off = _whitened(outcome, block)
     wrong = (~outcome.inlier[rows]).astype(np.float64)
-    off = np.where(outcome.inlier[rows], outcome.residual[:, rows] / spread[rows], 0.0)
     pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
-    found = scan(block.view[rows], block.xy[:, rows], size, wrong, off, floor / pixel)
+    found = scan(block.view[rows], block.xy[:, rows], _sizes(block), wrong, off, floor / pixel)
     return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
 
 
-def judge(outcome: Outcome, block: Block, floor: float) -> list[Finding]:
+def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
+    """What stands out at the end, with what the ties that were cut there are off by.
+
+    As their tracks see it that are triangulated with all that may be seen, where all of one was cut.
+    """
+    found = standing_out(outcome, block, floor)
+    if not any(one.by_share for one in found):
+        return found
+    state, weight = outcome.minimum.state, block.use / block.sigma
+    residual = revived(outcome.problem, state, outcome.residual, outcome.inlier, weight)[1]
+    off = np.hypot(*residual)
+    cut = (block.point < block.num_tracks) & block.use & ~outcome.inlier & np.isfinite(off)
+    inside = [
+        cut & (block.view == one.view) & (block.xy[one.axis] >= one.start) & (block.xy[one.axis] < one.stop)
+        for one in found
+    ]
+    return [
+        replace(one, apart=float(np.median(off[rows])) if rows.any() else 0.0)
+        for one, rows in zip(found, inside, strict=True)
+    ]
+
+
+def swinging(outcome: Outcome, block: Block) -> list[Swing]:
+    """Periods with which the rows of images swing more than chance allows, one of each at most."""
+    rows, off = _whitened(outcome, block)
+    right = outcome.inlier[rows].astype(np.float64)
+    found = swings(block.view[rows], block.xy[1, rows], _sizes(block), right, off)
+    return [one for one in found if one.gain > SURE]
+
+
+def _whitened(outcome: Outcome, block: Block) -> tuple[BoolArray, Array]:
+    """Observations of tracks (K,), and residuals (2, k) of these in standard deviations, 0 of those that were cut."""
+    is_tie = (block.point < block.num_tracks) & block.use
+    freedom = Observations(outcome.problem, block.sigma, 0.0, is_tie).freedom(
+        outcome.inlier.astype(np.float64)
+    )
+    spread = block.sigma * outcome.noise * np.sqrt(0.5 * freedom)
+    rows = is_tie & np.isfinite(outcome.residual).all(axis=0)
+    return rows, np.where(outcome.inlier[rows], outcome.residual[:, rows] / spread[rows], 0.0)
+
+
+def _sizes(block: Block) -> Array:
+    return np.array([view.size for view in block.views], dtype=np.float64).T
+
+
+def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
     """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out."""
     problem = outcome.problem
+    if problem.free.size > _UNKNOWNS:
+        return Judgement()
     first = standing_out(outcome, block, floor)
-    if not first or problem.free.size > _UNKNOWNS:
-        return []
+    if not (first or swinging(outcome, block)):
+        return Judgement()
     state, _ = revived(
         problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
     )
     use = block.use & (block.point < block.num_tracks)
     if _numbers(block, use) > _NUMBERS:
-        return []
+        return Judgement()
     low, high = block.alt_range
     linear = linearise(problem, state, use, block.sigma, high - low)
-    size = np.array([view.size for view in block.views], dtype=np.float64).T
     nothing = np.zeros((2, 0, len(block.view)))
-    return _Search(
-        Seen(linear, block.xy, size, fit(linear), nothing), first, floor / float(np.median(block.sigma))
-    ).run()
+    seen = Seen(linear, block.xy, _sizes(block), fit(linear), nothing)
+    return _Search(seen, first, floor, float(np.median(block.sigma))).run()
 
 
 def _numbers(block: Block, use: BoolArray) -> float:
@@ -93,26 +161,40 @@ def _numbers(block: Block, use: BoolArray) -> float:
 _Tried = tuple[Explanation, Fit, float]
 
 
+@dataclass(frozen=True, eq=False)
+class _Taken:
+    one: Explanation
+    gain: float
+    gap: float
+    runner_up: str
+    or_of: tuple[int, ...]
+
+
 class _Search:
     """Taking one explanation after the other."""
 
-    def __init__(self, seen: Seen, first: list[Interval], floor: float) -> None:
-        self.seen, self.first, self.floor = seen, first, floor
-        self.taken: list[tuple[Explanation, float, float, str]] = []  # with gain, gap and runner-up
+    def __init__(self, seen: Seen, first: list[Interval], floor: float, sigma: float) -> None:
+        self.seen, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
+        self.taken: list[_Taken] = []
+        self.followed = seen.base  # the last fit of what the adjustment follows
 
-    def run(self) -> list[Finding]:
+    def run(self) -> Judgement:
         """All that were taken."""
         tried = self._tried()
         while tried and tried[0][2] > SURE and len(self.taken) < _MOST:
             self._take(tried)
-            if self.taken[-1][0].kind not in LOCAL:  # what is smooth is followed by other means
+            if self.taken[-1].one.kind not in FOLLOWED:  # what is smooth is followed by other means
                 break
             tried = self._tried()
-        return [Finding(*self._said(n), *row[1:]) for n, row in enumerate(self.taken)]
+        followed = sum(row.one.kind in FOLLOWED for row in self.taken)
+        base = self.seen.base if followed == len(self.taken) else self.followed
+        return Judgement(tuple(self._said(n) for n in range(len(self.taken))), base.step, base.right)
 
     def _take(self, tried: list[_Tried]) -> None:
         """The best, or several parts of its image where these explain more together than it does alone."""
         best = tried[0]
+        if best[0].kind == WANDER and self._took_swing(tried):
+            return
         if best[0].kind not in LOCAL:
             parts, left = copy(self), _parts_of(best[0].view, tried)
             parts.taken = list(self.taken)
@@ -126,29 +208,51 @@ class _Search:
                 parts._add(left)
                 left = _parts_of(best[0].view, parts._tried())
             if total > best[2] + SURE:
-                self.taken, self.seen = parts.taken, parts.seen
+                self.taken, self.seen, self.followed = parts.taken, parts.seen, parts.followed
                 return
         self._add(tried)
+
+    def _took_swing(self, tried: list[_Tried]) -> bool:
+        """Whether what wanders explains more with a swing beside it, which is then taken first."""
+        best = tried[0]
+        first = next((row for row in tried if row[0].kind == SWING and row[2] > SURE), None)
+        if first is None:
+            return False
+        parts = copy(self)
+        parts.taken = list(self.taken)
+        parts._add([first, *(row for row in tried if row is not first and row[0] is not best[0])])
+        beside = max((row[2] for row in parts._tried() if row[0].kind == WANDER), default=0.0)
+        if not first[2] + beside > best[2] + SURE:
+            return False
+        self.taken, self.seen, self.followed = parts.taken, parts.seen, parts.followed
+        return True
 
     def _add(self, tried: list[_Tried]) -> None:
         best = tried[0]
         same = [row for row in tried if row[2] > best[2] - SURE and _of_one_image(row[0], best[0])]
         one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
-        other = next(((t[0].kind, t[2]) for t in tried if t[0] is not one and _differs(t[0], one)), ("", 0.0))
+        others = [row for row in tried if row[0] is not one and _differs(row[0], one)]
+        other = next(((row[0].kind, row[2]) for row in others), ("", 0.0))
+        close = [row[0] for row in others if row[2] > gain - SURE]
+        or_of = tuple(sorted({row.view for row in close if one.kind == row.kind == SWING}))
         _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
-        self.taken.append((one, gain, gain - max(other[1], 0.0), other[0]))
+        self.followed = made if one.kind in FOLLOWED else self.followed
+        self.taken.append(_Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of))
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
         self.seen = replace(self.seen, base=made, extra=extra)
 
-    def _said(self, n: int) -> tuple[str, int, Where | None, Array]:
-        one = self.taken[n][0]
-        start = sum(len(row[0].sigma) for row in self.taken[:n])
-        of_one = self.seen.base.extra[start : start + len(one.sigma)]
-        if one.kind in LOCAL:
-            return one.kind, one.view, one.where, of_one
-        rows = self.seen.linear.view == one.view
-        moved = np.einsum("cek,e->ck", one.extra[:, :, rows], of_one)
-        return one.kind, one.view, one.where, np.sqrt((moved**2).mean(axis=1))
+    def _said(self, n: int) -> Finding:
+        taken, one = self.taken[n], self.taken[n].one
+        start = sum(len(row.one.sigma) for row in self.taken[:n])
+        size = unknowns = self.seen.base.extra[start : start + len(one.sigma)]
+        if one.kind == SWING:
+            size = _amplitude(unknowns)
+        elif one.kind not in LOCAL:
+            rows = self.seen.linear.view == one.view
+            moved = np.einsum("cek,e->ck", one.extra[:, :, rows], unknowns)
+            size = np.sqrt((moved**2).mean(axis=1))
+        said = taken.gain, taken.gap, taken.runner_up, unknowns, one.period, taken.or_of
+        return Finding(one.kind, one.view, one.where, size, *said)
 
     def _tried(self) -> list[_Tried]:
         """Explanations of what stands out now, fitted beside those taken, with their gains; the best first."""
@@ -160,19 +264,27 @@ class _Search:
             linear.left(seen.base.step) + np.einsum("cek,e->ck", seen.extra, seen.base.extra) / linear.sigma
         )
         wrong, off = (1.0 - seen.base.right)[rows], settled(linear, left, seen.base)[:, rows]
-        out = scan(
-            linear.view[rows], seen.place[:, rows], seen.size, wrong, off, self.floor / seen.base.noise
-        )
+        view, place = linear.view[rows], seen.place[:, rows]
+        periods = [one for one in swings(view, place[1], seen.size, 1.0 - wrong, off) if one.gain > SURE]
+        floor = self.floor / self.sigma / seen.base.noise
+        out = scan(view, place, seen.size, wrong, off, floor)
         out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
-        made = self._sorted((one, self._fit(one)) for one in proposed(seen, out))
+        made = self._sorted((one, self._fit(one)) for one in proposed(seen, out, periods[:_TRIED]))
         if made and made[0][0].kind == WANDER:
             box = boxed(seen, *made[0][:2])
             made = self._sorted([*(row[:2] for row in made), (box, self._fit(box))])
-        local = [row for row in made if row[0].kind in LOCAL]
-        sharp = [self._sharpened(*row[:2]) for row in local[:_LOCAL]]
-        rest = [row[:2] for row in made if row[0].kind not in LOCAL] + [row[:2] for row in local[_LOCAL:]]
-        return self._sorted([*sharp, *rest])
+        local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:_LOCAL]]
+        sharp = [
+            self._sharpened(one, found) if one in local or one.kind == SWING else (one, found)
+            for one, found, _ in made
+        ]
+        return self._sorted(row for row in sharp if not self._is_nothing(*row))
+
+    def _is_nothing(self, one: Explanation, found: Fit) -> bool:
+        """Whether a swing is smaller (root mean square) than what no adjustment is asked to find."""
+        size = float(np.hypot(*_amplitude(found.extra[-len(one.sigma) :]))) if one.kind == SWING else np.inf
+        return bool(size < self.floor * np.sqrt(2.0))
 
     def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
         base = self.seen.base.evidence
@@ -183,17 +295,26 @@ class _Search:
     def _sharpened(self, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
         for _ in range(_SHARPENED):
             others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
-            again = sharpened(self.seen, one, found, others)
-            better = self._fit(again)
+            tried = [one, faster(one, self._fit(bent(self.seen, one)))] if one.kind == FADE else [one]
+            again = [sharpened(self.seen, shape, found, others) for shape in tried]
+            better, made = max(
+                ((self._fit(shape), shape) for shape in again), key=lambda row: row[0].evidence
+            )
             if not better.evidence > found.evidence:
                 break
-            one, found = again, better
+            one, found = made, better
         return one, found
 
     def _fit(self, one: Explanation) -> Fit:
-        sigma = np.concatenate([*(row[0].sigma for row in self.taken), one.sigma])
+        sigma = np.concatenate([*(row.one.sigma for row in self.taken), one.sigma])
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
         return fit(self.seen.linear, extra, sigma, self.seen.base)
+
+
+def _amplitude(unknowns: Array) -> Array:
+    """Of a swing (2,), col and row."""
+    size: Array = np.hypot(*unknowns.reshape(2, 2).T)
+    return size
 
 
 def _parts_of(view: int, tried: list[_Tried]) -> list[_Tried]:

@@ -16,7 +16,8 @@ from barpc.scene import IntArray
 
 BINS = 40  # stretches of an image's rows or columns
 SURE = 5.0  # nats: an explanation that gains less is none
-_CLIPPED = 8.0  # standard deviations: one residual tells no more
+CLIPPED = 8.0
+"""Standard deviations: one residual tells no more."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Interval:
     share: float  # of its observations that are wrong
     off: float  # what the others have in common, in the units of the residuals
     by_share: bool  # whether the share stands out, or what they have in common
+    apart: float = 0.0  # half of those that are wrong are farther off than this, where it was measured
 
 
 def price(views: int) -> float:
@@ -52,7 +54,7 @@ def scan(
     floor : float, what means are let be [the same]: no adjustment is asked to be better
     """
     views = size.shape[1]
-    off = np.clip(off, -_CLIPPED, _CLIPPED)
+    off = np.clip(off, -CLIPPED, CLIPPED)
     found = []
     for axis in (0, 1):
         bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)

@@ -1,8 +1,10 @@
-"""What rotations, translations and drifts leave in the images: splines over the rows, steps between detectors, strips.
+"""What rotations, translations and drifts leave in the images: splines over the rows, steps between detectors, strips,
+swings.
 
 All are displacements in the image, of where a point is seen: linear unknowns of a view beside its others. What the
 drift can do is not theirs, so that their prior does not loosen it: splines are orthogonal to its polynomials of the
-row, steps to a shift and a scale of the columns. A strip of rows or columns is moved as a whole. How large all of them
+row, steps to a shift and a scale of the columns. A strip of rows or columns is moved as a whole, and all
+rows of an image swing with a period that is known. How large all of them
 are in a view is learnt (`barpc.ba.variances`).
 """
 
@@ -16,7 +18,7 @@ import scipy.linalg as la
 
 from barpc.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import RowSpline, bsplines, profile
+from barpc.sensor.splined import RowSpline, bsplines, profile, swing
 
 FIRST_SIGMA = 0.3  # px: a prior's standard deviation before anything is known
 _DEGREE = 2  # of the polynomials of the row that are the drift's
@@ -25,13 +27,15 @@ _SAMPLES = 40  # a spline, to integrate over
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """Layout of a view's unknowns in the image [px]: (col, row) of the splines, then of the steps."""
+    """Layout of a view's unknowns in the image [px]: (col, row) of splines, then of steps, strips and swings."""
 
     count: int  # B-splines over the rows of an image; 0: none
     # (N, C) columns where another detector begins [px], ascending; infinite where a view has fewer
     edges: Array = field(default_factory=lambda: np.zeros((0, 0)))
     # (N, M, 5) strips that lie off, as `RowSpline` has them; infinite where a view has fewer
     strips: Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
+    # (N, M) periods of the rows' swings [px]; infinite where a view has fewer
+    periods: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @cached_property
     def _of_splines(self) -> Array:
@@ -53,9 +57,14 @@ class Waves:
         )
 
     @property
-    def parts(self) -> tuple[int, int, int]:
-        """Unknowns of one coordinate: of splines, of steps, of strips."""
-        return self._of_splines.shape[1], self._of_steps.shape[1], self.strips.shape[1]
+    def parts(self) -> tuple[int, int, int, int]:
+        """Unknowns of one coordinate: of splines, of steps, of strips, of swings: all cosines, then all sines."""
+        return (
+            self._of_splines.shape[1],
+            self._of_steps.shape[1],
+            self.strips.shape[1],
+            2 * self.periods.shape[1],
+        )
 
     @property
     def size(self) -> int:
@@ -64,7 +73,7 @@ class Waves:
 
     @property
     def kinds(self) -> tuple[slice, ...]:
-        """The unknowns of splines, of steps and of strips: those of the columns, then those of the rows."""
+        """The unknowns of splines, steps, strips and swings: those of the columns, then those of the rows."""
         stops = 2 * np.cumsum((0, *self.parts))
         return tuple(map(slice, stops[:-1].tolist(), stops[1:].tolist()))
 
@@ -74,12 +83,25 @@ class Waves:
 
     @cached_property
     def bands(self) -> Array:
-        """Which unknowns (size,) are about as large: half an octave of waves, or steps, or strips."""
-        m, s, strips = self.parts
+        """Which unknowns (size,) are about as large: half an octave of waves, or steps, or strips, or swings."""
+        m, *others = self.parts
         octave = 2.0 * np.log2(np.arange(m) + _DEGREE + 1.0)
         rank = np.unique(np.floor(octave), return_inverse=True)[1]
-        further = rank.max(initial=-1) + 1
-        return np.concatenate([rank, rank, np.full(2 * s, further), np.full(2 * strips, further + bool(s))])
+        found, further = [rank, rank], rank.max(initial=-1) + 1
+        for count in others:
+            found.append(np.full(2 * count, further))
+            further += bool(count)
+        return np.concatenate(found)
+
+    def stretches(self, rows: float) -> float:
+        """In how many parts of images of so many rows an error that neighbours share is another to these unknowns.
+
+        A swing takes the mean of one in each half of its waves, and of each coordinate.
+        """
+        known = np.isfinite(self.periods)
+        waves = np.divide(rows, self.periods, where=known, out=np.zeros_like(self.periods)).sum(axis=1)
+        of_swings = 2 * self.parts[3]
+        return self.size - of_swings + max(4.0 * float(waves.max(initial=0.0)), of_swings)
 
     def basis(self, row: Array, seen: Array, index: IntArray) -> list[Array]:
         """What one unit of the unknowns of one coordinate adds (m, n), kind by kind, to points seen at (2, n) [px].
@@ -93,6 +115,8 @@ class Waves:
         if self.strips.shape[1]:
             axis, *shape = np.moveaxis(self.strips, -1, 0)[:, index]  # (n, M) each
             found.append(profile(np.where(axis == 0.0, seen[0][:, None], seen[1][:, None]), *shape).T)
+        if self.periods.shape[1]:
+            found.append(np.concatenate(list(swing(seen[1][:, None], self.periods[index])), axis=1).T)
         return found
 
     def displaced(self, params: Array, index: IntArray, basis: list[Array]) -> Array:
@@ -114,7 +138,7 @@ class Waves:
 
     def correction(self, params: Array, view: int, row_offset: float, row_scale: float) -> RowSpline:
         """The correction of a view with the unknowns (size,)."""
-        (m, s, num), (_, of_steps, of_strips) = self.parts, self.kinds
+        (m, s, num, swings), (_, of_steps, of_strips, of_swings) = self.parts, self.kinds
         coeffs = self._of_splines @ params[: 2 * m].reshape(2, m).T if m else np.zeros((0, 2))
         found = RowSpline(coeffs, row_offset, row_scale)
         known = np.isfinite(self.edges[view]) if s else np.zeros(0, dtype=bool)
@@ -125,12 +149,16 @@ class Waves:
             there = np.isfinite(self.strips[view, :, 1])
             moved = params[of_strips].reshape(2, num).T
             found = replace(found, strips=self.strips[view][there], moved=moved[there])
+        if swings:
+            there = np.isfinite(self.periods[view])
+            swung = params[of_swings].reshape(2, 2, -1).T  # swing, cosine or sine, coordinate
+            found = replace(found, periods=self.periods[view][there], swings=swung[there])
         return found
 
     def carried(self, params: Array, known: Waves) -> Array:
         """Unknowns (N, size) that start from those of another layout (N, known.size), kind by kind where they agree."""
         out = np.zeros((len(params), self.size))
-        same = self.count == known.count, False, bool(known.parts[2])
+        same = self.count == known.count, False, bool(known.parts[2]), self.parts[3] == known.parts[3]
         for agrees, mine, theirs in zip(same, self.kinds, known.kinds, strict=True):
             if agrees:
                 old = params[:, theirs].reshape(len(params), 2, -1)

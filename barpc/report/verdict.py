@@ -141,6 +141,8 @@ def _beyond(view: ViewEntry, run: Run) -> str:
     follows = "attitude jitter or steps between detectors"
     if view.correction.strip_px:
         follows = "rows or columns that lie off by themselves"
+    elif view.correction.swing_px:
+        follows = "a swing of its rows"
     return (
         f"its corrected camera follows {follows}, of which one RPC leaves "
         f"{left:.2f} px (RMS; {most:.2f} px at most): use its grids, --tiles or --resample"
@@ -150,7 +152,7 @@ def _beyond(view: ViewEntry, run: Run) -> str:
 def _follows_more(view: ViewEntry) -> bool:
     """Whether a camera was corrected by more than one RPC holds."""
     one = view.correction
-    return one is not None and bool(one.jitter_px or one.detector_px or one.strip_px)
+    return one is not None and any((one.jitter_px, one.detector_px, one.strip_px, one.swing_px))
 
 
 def _left(i: int, adjustment: Adjustment) -> str:
@@ -215,7 +217,10 @@ def _left_reasons(run: Run) -> list[str]:
     worst: dict[str, str] = {}
     for one in left_over(run.adjustment):
         if one.rejected > MANY_REJECTED:
-            what = f"{100 * one.rejected:.0f} % of their tie points contradict the others"
+            what = (
+                f"{100 * one.rejected:.0f} % of their tie points contradict the others, half of these by more than "
+                f"{one.apart_px:.2f} px"
+            )
         elif one.off_px > SMOOTH_LEFT:
             what = f"their tie points are left with {one.off_px:.2f} px in common"
         else:

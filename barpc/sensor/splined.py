@@ -1,8 +1,8 @@
-"""What no rotation and no RPC holds: a correction in the image, by a spline over its rows, steps and strips.
+"""What no rotation and no RPC holds: a correction in the image, by a spline over its rows, steps, strips and swings.
 
 Attitude jitter moves image rows against each other, a focal plane that is put together of detectors moves its columns,
-a jump of the attitude or of the clock a strip of rows. All are functions of where a point is *seen*, so that
-x = P(X) + s(x): localisation is explicit, projection iterates.
+a jump of the attitude or of the clock a strip of rows, a wheel out of balance swings them. All are functions of where
+a point is *seen*, so that x = P(X) + s(x): localisation is explicit, projection iterates.
 """
 
 from __future__ import annotations
@@ -54,6 +54,12 @@ def profile(place: Array, start: Array, stop: Array, origin: Array, rate: Array)
         return np.asarray(np.where(inside, np.exp(-np.maximum((place - origin) * rate, 0.0)), 0.0))
 
 
+def swing(row: Array, period: Array) -> Array:
+    """Cosine and sine (2, ...) of one period [px] at rows (...) [px]; zero where the period is infinite."""
+    phase = 2.0 * np.pi * np.asarray(row) / period
+    return np.where(np.isfinite(period), np.stack([np.cos(phase), np.sin(phase)]), 0.0)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class RowSpline(Frozen):
     """A displacement of image points: where a point is seen, less where a model without it projects it.
@@ -74,6 +80,10 @@ class RowSpline(Frozen):
         overlap.
     moved : (M, 2)
         By how much each of them, (col, row) [px]; where it fades, at first.
+    periods : (M,)
+        Rows after which a swing of all rows repeats itself [px].
+    swings : (M, 2, 2)
+        What its cosine and its sine of 2 pi row / period move, (col, row) [px].
     """
 
     coeffs: Array
@@ -83,16 +93,21 @@ class RowSpline(Frozen):
     steps: Array = field(default_factory=lambda: np.zeros((0, 2)))
     strips: Array = field(default_factory=lambda: np.zeros((0, 5)))
     moved: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    periods: Array = field(default_factory=lambda: np.zeros(0))
+    swings: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
     def __post_init__(self) -> None:
         shapes = (("coeffs", (None, 2)), ("edges", (None,)), ("steps", (None, 2)), ("strips", (None, 5)))
-        for name, shape in (*shapes, ("moved", (None, 2))):
+        further = ("moved", (None, 2)), ("periods", (None,)), ("swings", (None, 2, 2))
+        for name, shape in (*shapes, *further):
             self._array(name, shape, RpcError)
         fine = np.isin(self.strips[:, 0], (0.0, 1.0)).all()
         if len(self.strips) != len(self.moved) or not fine:
             raise RpcError(
                 "strips: each has an axis (0 or 1), two ends, an origin, a rate and a displacement"
             )
+        if len(self.periods) != len(self.swings) or not (self.periods > 0).all():
+            raise RpcError("swings: each has a period above 0 and what its cosine and sine move")
         if 0 < len(self.coeffs) < 4:
             raise RpcError(f"a cubic spline has at least 4 coefficients, found {len(self.coeffs)}")
         if (
@@ -117,6 +132,8 @@ class RowSpline(Frozen):
             ]
         for strip, moved in zip(self.strips, self.moved, strict=True):
             out += profile(image[..., int(strip[0])], *strip[1:])[..., None] * moved
+        for period, moves in zip(self.periods, self.swings, strict=True):
+            out += np.moveaxis(swing(image[..., 1], period), 0, -1) @ moves
         return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
 
     def rate(self, row: Array) -> Array:
@@ -126,6 +143,9 @@ class RowSpline(Frozen):
             if axis == 1.0:
                 fading = ((row - origin) * rate > 0.0) * rate
                 out -= (profile(row, start, stop, origin, rate) * fading)[..., None] * moved
+        for period, (by_cos, by_sin) in zip(self.periods, self.swings, strict=True):
+            cos, sin = swing(row, period)[..., None] * (2.0 * np.pi / period)
+            out += cos * by_sin - sin * by_cos
         return out
 
     def _along(self, row: Array, rate: bool) -> Array:

@@ -378,18 +378,51 @@ def test_what_was_found_before_is_looked_for_anew(exact) -> None:
 
 def test_unknowns_of_waves_are_about_as_large_within_half_an_octave() -> None:
     bands = Waves(13, np.zeros((2, 3))).bands
-    m, s, strips = Waves(13, np.zeros((2, 3))).parts
-    assert strips == 0
+    m, s, strips, swings = Waves(13, np.zeros((2, 3))).parts
+    assert strips == swings == 0
     assert (m, s) == (10, 2)  # a shift and a scale of the columns are not theirs
     # of 3, 4, 5, ... half waves: between powers of the root of two
     expected = [0, 1, 1, 2, 2, 3, 3, 3, 3, 4]
     assert bands.tolist() == [*expected, *expected, *[5] * 2 * s]
     assert Waves(0, np.zeros((1, 1))).bands.tolist() == [0, 0]
-    assert Waves(0, np.zeros((1, 1))).parts == (0, 1, 0)
+    assert Waves(0, np.zeros((1, 1))).parts == (0, 1, 0, 0)
     both = Waves(13, np.zeros((2, 3)), np.zeros((2, 4, 5)))  # strips are as large as each other
     assert both.bands.tolist() == [*expected, *expected, *[5] * 2 * s, *[6] * 8]
     assert Waves(0, np.zeros((2, 0)), np.zeros((2, 4, 5))).bands.tolist() == [0] * 8
     assert Waves(9).size == 2 * 6
+
+
+PERIODS = np.array([[200.0, 31.5], [np.inf, np.inf], [700.0, np.inf]])
+
+
+def test_swings_are_cosines_and_sines_of_the_row_seen() -> None:
+    waves = Waves(0, np.zeros((3, 0)), np.zeros((3, 0, 5)), PERIODS)
+    assert waves.parts == (0, 0, 0, 4)
+    assert waves.size == 8
+    assert waves.bands.tolist() == [0] * 8
+    row, index = np.tile([0.0, 50.0, 333.3], 3), np.repeat([0, 1, 2], 3)
+    (basis,) = waves.basis(np.zeros(9), np.stack([row * 0.0, row]), index)
+    assert not basis[:, 3:6].any()
+    params = np.arange(1.0, 9.0)
+    for view in range(3):
+        made = waves.correction(params, view, 0.0, 1.0)
+        assert made.periods.tolist() == PERIODS[view][np.isfinite(PERIODS[view])].tolist()
+        moved = made.at(np.column_stack([np.zeros(3), row[:3]]))
+        here = slice(3 * view, 3 * view + 3)
+        np.testing.assert_allclose(moved, (params.reshape(2, 4) @ basis[:, here]).T, atol=1e-12)
+    # a column's cosine of the first swing of view 0
+    np.testing.assert_allclose(basis[0, :3], np.cos(2 * np.pi * row[:3] / 200.0), atol=1e-12)
+
+
+def test_an_error_that_neighbours_share_is_another_in_every_half_of_a_wave() -> None:
+    none, strips = np.zeros((3, 0)), np.zeros((3, 0, 5))
+    assert Waves(13, none, strips).stretches(9000.0) == Waves(13).size
+    of_waves = 9000.0 / 200.0 + 9000.0 / 31.5
+    assert Waves(0, none, strips, PERIODS).stretches(9000.0) == pytest.approx(4.0 * of_waves)
+    assert Waves(13, none, strips, PERIODS).stretches(9000.0) == pytest.approx(
+        Waves(13).size + 4.0 * of_waves
+    )
+    assert Waves(0, none, strips, 1e9 * PERIODS).stretches(9000.0) == 8  # as many as there are unknowns
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])

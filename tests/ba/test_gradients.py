@@ -48,13 +48,15 @@ def ecef(views: tuple[View, ...]) -> np.ndarray:
 
 def _setup(views, model, drift, ecef, scale=5.0):
     """Cameras that see ten points each, where their corrected sensors see them."""
-    waves = (
-        Waves(9, np.array([[5000.0, 12000.0], [9000.0, np.inf], [np.inf, np.inf]])) if drift == 2 else None
-    )
+    edges = np.array([[5000.0, 12000.0], [9000.0, np.inf], [np.inf, np.inf]])
+    periods = np.array([[2000.0, 5000.0], [np.inf, np.inf], [7000.0, np.inf]])
+    waves = Waves(9, edges, np.zeros((3, 0, 5)), periods) if drift == 2 else None
     unknowns, bounds = make_unknowns(views, model, drift, waves=waves), np.array([0, 10, 20, 30])
     assert unknowns.size
     params = np.random.default_rng(3).normal(0, scale, (3, unknowns.size))
-    params[:, unknowns.in_waves] *= 0.1
+    params[:, unknowns.in_waves] *= 0.05
+    if waves is not None:  # a drift is not at the row that a swing moves to: 1e-3 px a pixel
+        params[:, unknowns.in_waves][:, waves.kinds[3]] *= 0.1
     ground = ground_from_ecef(ecef.T).reshape(3, 10, 3)
     sensors = unknowns.corrected(params, views)
     seen = np.concatenate([sensor.project(part) for sensor, part in zip(sensors, ground, strict=True)]).T

@@ -56,6 +56,20 @@ def test_strips_are_read_as_they_were_written_and_a_new_view_has_none(tmp_path) 
             BlockPrior.load(tmp_path / "prior.npz")
 
 
+def test_swings_are_read_as_they_were_written_and_a_new_view_has_none(tmp_path) -> None:
+    periods = np.array([[200.0, 80.5], [600.0, np.inf]])
+    replace(prior_of(), edges=np.zeros((2, 0)), periods=periods).save(tmp_path / "prior.npz")
+    found = BlockPrior.load(tmp_path / "prior.npz").waves(("c", "new", "a"))
+    assert found is not None
+    np.testing.assert_array_equal(found.periods[[2, 0]], periods)
+    assert np.isinf(found.periods[1]).all()
+    assert found.size == 8
+    for damaged in (periods[:1], periods[0], -periods, periods * np.nan):
+        replace(prior_of(), periods=damaged).save(tmp_path / "prior.npz")
+        with pytest.raises(InputError, match="not the prior of an adjusted block"):
+            BlockPrior.load(tmp_path / "prior.npz")
+
+
 def changed(name: str, change: Any) -> BlockPrior:
     prior = prior_of()
     return replace(prior, **{name: change(getattr(prior, name))})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.explanations import FADE, LOCAL, STRIP, WANDER
+from barpc.ba.explanations import FADE, LOCAL, STRIP, SWING, WANDER
 from barpc.scene import Tracks
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.splined import Splined
@@ -93,6 +93,71 @@ def test_what_fades_is_named_with_its_length() -> None:
     rows = block.views[1].size[1]
     assert 1.0 / found.findings[0].where[4] == pytest.approx(0.05 * rows, rel=0.25)
     assert np.hypot(*found.findings[0].size) == pytest.approx(4.0, rel=0.1)
+
+
+def swung(
+    views: int, tracks: int, px: float, period: float, view: int = 1, seed: int = 0
+) -> tuple[Block, Tracks]:
+    """Ties of a block of which the rows of a view swing."""
+    block = simulate_block(views, tracks, seed=seed, attitude=10e-6, position=2.0)
+    moved = px * np.sin(2.0 * np.pi * block.tracks.xy[:, 1] / period + 1.0) * (block.tracks.view == view)
+    return block, replace(block.tracks, xy=block.tracks.xy + moved[:, None] * np.array([0.8, 0.6]))
+
+
+@pytest.mark.parametrize(
+    "size", rest_slow([(0.15, 200.0), (0.08, 200.0), (0.15, 60.0), (0.3, 600.0)]), ids=str
+)
+def test_rows_that_swing_are_named_with_their_period_and_followed(size: tuple[float, float]) -> None:
+    px, period = size
+    block, tracks = swung(3, 1500, px, period)
+    found = adjusted(block, tracks)
+    (one,) = found.findings
+    assert (one.kind, one.view, one.where) == (SWING, 1, None)
+    rows = block.views[1].size[1]
+    assert one.period is not None
+    assert rows / one.period == pytest.approx(rows / period, abs=0.2)  # waves of the image
+    assert np.hypot(*one.size) == pytest.approx(px, abs=0.02)
+    assert one.or_of == ()
+    correction = found.sensors[1].correction  # type: ignore[attr-defined]
+    assert correction.periods.tolist() == [one.period]
+    assert not len(correction.steps)
+    row = np.linspace(0.0, rows, 2000)
+    moved = correction.at(np.column_stack([row * 0.0, row]))
+    true = px * np.sin(2.0 * np.pi * row / period + 1.0)[:, None] * np.array([0.8, 0.6])
+    # a camera's drift may take up a part of it, and ties of 0.1 px do not say more
+    assert np.sqrt(((moved - true) ** 2).sum(axis=1).mean()) < 0.02 + 0.1 * px
+    others = [s.correction for v, s in enumerate(found.sensors) if v != 1]  # type: ignore[attr-defined]
+    assert not any(len(one.periods) or len(one.steps) for one in others)
+
+
+@pytest.mark.slow
+def test_of_a_pair_a_swing_is_that_of_one_or_of_either() -> None:
+    block, tracks = swung(2, 2000, 0.2, 300.0)
+    found = adjusted(block, tracks)
+    (one,) = found.findings
+    assert one.kind == SWING
+    assert 1 in (one.view, *one.or_of)
+    assert one.period == pytest.approx(300.0, rel=0.02)
+    assert 0.03 < np.hypot(*one.size) < 0.22  # what lies along epipolar lines is not seen
+    assert np.nanmax(found.held_out_rms) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_a_swing_below_the_floor_is_none(seed: int) -> None:
+    block, tracks = swung(3, 4000, 0.02, 200.0, seed=seed)
+    found = adjusted(block, tracks)
+    assert not found.findings
+
+
+@pytest.mark.slow
+def test_what_fades_after_a_large_step_is_followed_from_where_the_judge_ends() -> None:
+    where = {"view": 0, "axis": 1, "start": 0.6, "stop": 1.1, "px": 25.0, "length": 0.8}
+    block, tracks = flawed(2, 1500, where)
+    found = adjusted(block, tracks)
+    assert found.findings[0].kind == FADE
+    assert found.inlier[~found.held_out].mean() > 0.95
+    assert np.nanmax(found.held_out_rms) < 0.16
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def observations(noise_floor: float = 0.0, waves: Waves | None = None, num: int 
     prior = PointPrior(
         held, np.zeros((len(held), 3)), np.zeros((len(held), 3, 3)), np.zeros((len(held), 3, 0))
     )
-    unknowns = SimpleNamespace(unknowns=SimpleNamespace(waves=waves))
+    unknowns = SimpleNamespace(unknowns=SimpleNamespace(waves=waves, half=np.full((2, 2), 500.0)))
     problem: Any = SimpleNamespace(structure=structure, cameras=unknowns, point_prior=prior)
     return Observations(problem, np.full(2 * num, 0.1), noise_floor, point < TRACKS, point >= KNOWN)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.explanations import EXPLANATIONS, FADE, STRIP, WANDER
+from barpc.ba.explanations import EXPLANATIONS, FADE, STRIP, SWING, WANDER
 from barpc.ba.judge import Finding
 from barpc.ba.scan import Interval
 from barpc.report import verdict
@@ -24,7 +24,7 @@ def adjustment(findings: Any = (), left: Any = ()) -> Any:
 
 
 def test_every_explanation_has_its_words() -> None:
-    assert set(EXPLANATIONS) == set(_WORDS)
+    assert {*EXPLANATIONS, SWING} == set(_WORDS)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,9 @@ def test_every_explanation_has_its_words() -> None:
     ],
 )  # fmt: skip
 def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sentence, ends) -> None:
-    (found,) = explanations(adjustment([Finding(kind, view, where, np.array(size), 42.0, 7.0, "")]))
+    (found,) = explanations(
+        adjustment([Finding(kind, view, where, np.array(size), 42.0, 7.0, "", np.zeros(2))])
+    )
     assert found.sentence == sentence
     assert (found.name, found.image, found.gain, found.gap, found.runner_up) == (
         kind,
@@ -59,15 +61,38 @@ def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sent
     assert found.size_px == pytest.approx(np.hypot(*size))
 
 
+@pytest.mark.parametrize(
+    ("names", "or_of", "sentence"),
+    [
+        (("west", "east", "north"), (), "rows of east swing by 0.10 px every 200 rows"),
+        (("west", "east", "north"), (0, 2), "rows of east or west or north swing by 0.10 px every 200 rows"),
+        # of two images nobody sees what there is along the epipolar lines
+        (("west", "east"), (0,), "rows of east or west swing by at least 0.10 px every 200 rows"),
+    ],
+)
+def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sentence) -> None:
+    size, unknowns = np.array([0.06, 0.08]), np.array([0.06, 0.0, 0.0, 0.08])
+    one = Finding(SWING, 1, None, size, 60.0, 2.0, SWING if or_of else "", unknowns, 199.6, or_of)
+    of_names = SimpleNamespace(**{**vars(adjustment([one])), "names": names})
+    (found,) = explanations(of_names)  # type: ignore[arg-type]
+    assert found.sentence == sentence
+    assert (found.image, found.period, found.first) == ("east", 199.6, None)
+    assert found.or_of == (tuple(names[v] for v in or_of) or None)
+    assert found.size_px == pytest.approx(0.1)
+
+
 def interval(view: int, share: float, off: float) -> Interval:
-    return Interval(view, 1, 100.0, 400.0, 30.0, share, off, share > 0.3)
+    return Interval(view, 1, 100.0, 400.0, 30.0, share, off, share > 0.3, 2.5)
 
 
 def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     left = [interval(0, 0.8, 0.0), interval(0, 0.4, 0.0), interval(1, 0.02, 0.09)]
     run: Any = SimpleNamespace(adjustment=adjustment(left=left))
     first, second = verdict._left_reasons(run)
-    assert first == "Rows 100-399 of west stand out: 80 % of their tie points contradict the others."
+    assert first == (
+        "Rows 100-399 of west stand out: 80 % of their tie points contradict the others, half of these by more than "
+        "2.50 px."
+    )
     assert second == "Rows 100-399 of east stand out: their tie points are left with 0.09 px in common."
     assert [one.last for one in left_over(run.adjustment)] == [399.0] * 3
     quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]))

@@ -167,7 +167,7 @@ def test_an_rpc_is_to_hold_its_camera_to_the_tolerance(largest, options, status)
     assert view_status(a_view(fit=a_fit(9.0)), run_of())["status"] == "adjusted"  # no tolerance was given
 
 
-@pytest.mark.parametrize("more", ["jitter_px", "detector_px", "strip_px"])
+@pytest.mark.parametrize("more", ["jitter_px", "detector_px", "strip_px", "swing_px"])
 @pytest.mark.parametrize(
     ("left", "most", "options", "doubted"),
     [

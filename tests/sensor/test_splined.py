@@ -93,6 +93,34 @@ def test_a_camera_behind_strips_is_the_same_both_ways_and_has_its_jacobian() -> 
     np.testing.assert_allclose(found, np.stack(numeric, axis=-1), rtol=1e-4, atol=1e-2)
 
 
+SWINGS = [[[0.1, 0.0], [0.0, -0.2]], [[0.3, 0.1], [-0.1, 0.05]]]
+
+
+def test_swings_repeat_themselves_and_have_their_slope() -> None:
+    spline = RowSpline(np.zeros((0, 2)), periods=[400.0, 90.0], swings=SWINGS)
+    row = np.array([0.0, 17.0, 1234.5])
+    image = np.column_stack([row * 0.0 + 5.0, row])
+    np.testing.assert_allclose(spline.at(image), spline.at(image + [0.0, 3600.0]), atol=1e-12)
+    alone = RowSpline(np.zeros((0, 2)), periods=[400.0], swings=SWINGS[:1])
+    expected = np.column_stack(
+        [0.1 * np.cos(2 * np.pi * row / 400.0), -0.2 * np.sin(2 * np.pi * row / 400.0)]
+    )
+    np.testing.assert_allclose(alone.at(image), expected, atol=1e-12)
+    slope = (spline.at(image + [0.0, 0.01]) - spline.at(image - [0.0, 0.01])) / 0.02
+    np.testing.assert_allclose(spline.rate(row), slope, rtol=1e-6, atol=1e-9)
+
+
+def test_a_camera_behind_swings_is_the_same_both_ways_and_has_its_jacobian() -> None:
+    model = Splined(make_rpc(), RowSpline(np.zeros((0, 2)), periods=[400.0, 90.0], swings=SWINGS))
+    image = np.array([[3000.0, 5000.0], [300.0, 350.0], [12000.0, 17000.0]])
+    ground = model.localize(image, np.full(3, 300.0))
+    np.testing.assert_allclose(model.project(ground), image, rtol=0, atol=1e-6)
+    step = np.array([1e-7, 1e-7, 1e-2])
+    numeric = [(model.project(ground + h) - model.project(ground - h)) / (2 * h.sum()) for h in np.diag(step)]
+    found = model.project_jacobian(ground)[1]
+    np.testing.assert_allclose(found, np.stack(numeric, axis=-1), rtol=1e-4, atol=1e-2)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -107,6 +135,9 @@ def test_a_camera_behind_strips_is_the_same_both_ways_and_has_its_jacobian() -> 
         {"coeffs": COEFFS, "strips": [[2.0, 0.0, 1.0, 0.0, 0.0]], "moved": MOVED[:1]},
         {"coeffs": COEFFS, "strips": [[1.0, 0.0, np.inf, 0.0, 0.0]], "moved": MOVED[:1]},
         {"coeffs": COEFFS, "strips": [[1.0, 0.0, 1.0]], "moved": MOVED[:1]},
+        {"coeffs": COEFFS, "periods": [300.0], "swings": np.zeros((2, 2, 2))},
+        {"coeffs": COEFFS, "periods": [0.0], "swings": np.zeros((1, 2, 2))},
+        {"coeffs": COEFFS, "periods": [np.inf], "swings": np.zeros((1, 2, 2))},
     ],
 )
 def test_what_is_no_spline_is_refused(wrong: dict[str, object]) -> None:

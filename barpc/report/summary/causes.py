@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.explanations import FADE, STRIP, WANDER
+from barpc.ba.explanations import FADE, STRIP, SWING, WANDER
 from barpc.ba.scan import Interval
 from barpc.report.records import Number, Record, said
 
@@ -17,6 +17,7 @@ _WORDS = {
     STRIP: "{axis} {first:.0f}-{last:.0f} of {image} lie {size:.2f} px off the rest of it",
     FADE: "rows of {image} lie {size:.2f} px off at row {origin:.0f}, which fades within {length:.0f} rows",
     WANDER: "rows of {image} wander by {size:.2f} px",
+    SWING: "rows of {image} swing by {least}{size:.2f} px every {period:.0f} rows",
 }
 
 
@@ -32,7 +33,11 @@ class ExplanationEntry(Record):
     axis: str | None = said("Whether it is of rows or of columns", default=None, enum=[*AXES, None])
     first: Number = said("Its first row or column", "px", default=None)
     last: Number = said("Its last row or column", "px", default=None)
-    size_px: Number = said("RMS displacement of what it moves", "px", default=None)
+    size_px: Number = said("RMS displacement of what it moves; the amplitude of a swing", "px", default=None)
+    period: Number = said("Rows after which a swing repeats itself", "px", default=None)
+    or_of: tuple[str, ...] | None = said(
+        "Views that may be meant as well: ties do not tell which", default=None
+    )
 
 
 class LeftEntry(Record):
@@ -44,6 +49,7 @@ class LeftEntry(Record):
     last: float = said("The last", "px")
     rejected: float = said("Share of their tie points that was cut")
     off_px: float = said("What the others have in common", "px")
+    apart_px: float = said("Half of those that were cut contradict the others by more than this", "px")
     gain: float = said("Logarithm of the likelihood, over that of a whole image alike", "nats")
 
 
@@ -52,17 +58,21 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
     found = []
     for one in adjustment.findings:
         image, size = adjustment.names[one.view], float(np.hypot(*one.size))
+        others = tuple(adjustment.names[v] for v in one.or_of)
         place: dict[str, Any] = {}
-        words: dict[str, Any] = {"image": image, "size": size}
+        words: dict[str, Any] = {"image": " or ".join([image, *others]), "size": size, "period": one.period}
+        # two images do not tell what there is along their epipolar lines
+        words["least"] = "at least " if len(adjustment.names) == 2 else ""
         if one.where is not None:
             axis, start, stop, origin, rate = one.where
             words |= {"origin": origin, "length": 1.0 / max(abs(rate), 1e-9)}
             last = 2.0 * adjustment.cameras.unknowns.half[axis, one.view] - 1.0
             ends = float(np.clip(np.ceil(start), 0.0, last)), float(np.clip(np.ceil(stop) - 1.0, 0.0, last))
-            place = dict(zip(("axis", "first", "last"), (AXES[axis], *ends), strict=True))
+            place |= dict(zip(("axis", "first", "last"), (AXES[axis], *ends), strict=True))
         sentence = _WORDS[one.kind].format(**words, **place)
         numbers = one.gain, one.gap, one.runner_up or None
-        found.append(ExplanationEntry(one.kind, sentence, image, *numbers, **place, size_px=size))
+        whole = {**place, "size_px": size, "period": one.period, "or_of": others or None}
+        found.append(ExplanationEntry(one.kind, sentence, image, *numbers, **whole))
     return tuple(found)
 
 
@@ -73,4 +83,4 @@ def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
 
 def _left(one: Interval, names: Sequence[str]) -> LeftEntry:
     ends = one.start, one.stop - 1.0
-    return LeftEntry(names[one.view], AXES[one.axis], *ends, one.share, one.off, one.gain)
+    return LeftEntry(names[one.view], AXES[one.axis], *ends, one.share, one.off, one.apart, one.gain)

@@ -75,6 +75,8 @@ class CorrectionEntry(Record):
     jitter_rows: Number = said("Rows between its knots", "px", default=None)
     detector_px: Number = said("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
     strip_px: Number = said("RMS of the strips that lie off", "px", "strips", ".2f", default=None)
+    swing_px: Number = said("Amplitude of the swings of the rows", "px", "swing", ".2f", default=None)
+    swing_rows: tuple[float, ...] | None = said("Their periods", "px", default=None)
     ellipse: EllipseEntry | None = said(
         "How well it tells where the middle of its image is, the scene's own uncertain place in it",
         default=None,
@@ -159,7 +161,7 @@ class ViewEntry(Record):
     )
     DECISIONS: ClassVar = (
         "name prior_scale num_rejected rejected smooth_px smooth_p shared_px correction.jitter_px "
-        "correction.detector_px correction.strip_px"
+        "correction.detector_px correction.strip_px correction.swing_px"
     )
     CONTROL: ClassVar = "name control_w control_w_point"
     CLOCKS: ClassVar = " correction.range_m correction.azimuth_ms"
@@ -407,6 +409,9 @@ def _in_image(spline: RowSpline | None) -> dict[str, Any]:
         found |= {"detector_px": _size(spline.steps), "detectors": tuple((spline.edges + 0.5).tolist())}
     if len(spline.strips):
         found["strip_px"] = _size(spline.moved)
+    if len(spline.swings):
+        size = float(np.sqrt((spline.swings**2).sum()))  # of all together
+        found |= {"swing_px": size, "swing_rows": tuple(spline.periods.tolist())}
     return found
 
 
