@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from barpc.ba.apart import Apart, find_apart
 from barpc.ba.block import Block, join
 from barpc.ba.consensus import two_groups
 from barpc.ba.covariance import Covariance
@@ -16,14 +17,15 @@ from barpc.ba.datum import datum_shares
 from barpc.ba.following import follow, without_strips
 from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Terrain
-from barpc.ba.heldout import enu_offsets, keep_out
+from barpc.ba.heldout import FEW, enu_offsets, keep_out
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import standing_out
+from barpc.ba.placing import median_noise, place
 from barpc.ba.result import Adjustment
 from barpc.ba.snooping import MOST_TESTED, image_test
 from barpc.ba.solution import Solution, solve_block
 from barpc.errors import AdjustError
-from barpc.geodesy import Array
+from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import AUTO, AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Reference, Tracks, View
 
@@ -84,14 +86,86 @@ def adjust_tracks(
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     inner, outer = block.without(rows), block.without(~rows)
     try:
-        found, in_space = _choose_model(inner, outer, options, dem, centers, prior)
+        first, apart = _first(inner, outer, options, dem, centers, prior)
+        parts = inner, outer
+        if apart is not None and apart.clear:
+            inner, outer = (one.without(one.view == apart.view) for one in parts)
+        found, in_space = _choose_model(inner, outer, options, dem, centers, prior, first)
         found.heights.warn()
-        return _adjustment(found, inner, outer, options, in_space, start)
+        whole = _adjustment(found, inner, outer, options, in_space, start)
+        if apart is None or not apart.clear:
+            return replace(whole, apart=apart)
+        return _with_apart(whole, apart, found, inner, parts, options.robust_threshold)
     except np.linalg.LinAlgError as error:
         raise AdjustError(
             f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "
             "point, beyond anything real?"
         ) from error
+
+
+def _first(
+    block: Block,
+    outer: Block,
+    options: AdjustOptions,
+    dem: Terrain | None,
+    centers: Array | None,
+    prior: BlockPrior | None,
+) -> tuple[Solution, Apart | None]:
+    """The block solved with the model to start with, without a view whose RPC is not its own where there is one."""
+
+    def solve(inner: Block, outer: Block) -> Solution:
+        return solve_block(inner, outer, options, dem, centers, prior)
+
+    first, failed = None, None
+    try:
+        first = solve(block, outer)
+    except (AdjustError, np.linalg.LinAlgError) as error:
+        failed = error
+    apart, without = find_apart(first, block, outer, options, solve) if prior is None else (None, None)
+    if without is not None:
+        return without, apart
+    if first is not None:
+        return first, apart
+    assert failed is not None
+    if apart is None:
+        raise failed
+    names = ", ".join(block.names[v] for v in apart.views)
+    raise AdjustError(
+        f"{failed}. Without any one of {names} the other views agree: check that their RPCs are of these images, and "
+        "leave the wrong one out"
+    ) from failed
+
+
+def _with_apart(
+    whole: Adjustment, apart: Apart, found: Solution, others: Block, parts: tuple[Block, Block], limit: float
+) -> Adjustment:
+    """What is handed out, with the view that the others were adjusted without: adjusted alone, or as delivered.
+
+    `parts` have its observations, those that might take part and those kept out; it is measured on the others' points.
+    """
+    v, params = apart.view, whole.params.copy()
+    placed = None if apart.placed is None else place(found, others, parts[0], v)
+    if placed is not None and not placed.meets:
+        placed = None
+    if placed is not None:
+        params[v] = placed.params
+    sensors = found.problem.cameras.unknowns.corrected(params, others.views)
+    names = "view", "inlier", "held_out", "residuals_before", "residuals", "held_out_rms", "held_out_noise"
+    new = {name: getattr(whole, name).copy() for name in names}
+    for part in parts:
+        ties = (part.view == v) & (part.point < part.num_tracks)
+        rows, ground = part.order[ties], ground_from_ecef(whole.points[part.point[ties]])
+        new["view"][rows], new["held_out"][rows] = v, part is parts[1]
+        new["residuals_before"][rows] = others.views[v].sensor.project(ground) - part.xy[:, ties].T
+        new["residuals"][rows] = off = sensors[v].project(ground) - part.xy[:, ties].T
+    if placed is not None:  # `off` are those kept out
+        new["inlier"][parts[0].order[placed.rows]] = placed.agree(limit)
+        sigma = parts[1].sigma[(parts[1].view == v) & (parts[1].point < parts[1].num_tracks)]
+        known = np.isfinite(off).all(axis=1)
+        if known.sum() >= FEW:
+            new["held_out_noise"][v] = noise = median_noise(((off / sigma[:, None]) ** 2).sum(axis=1)[known])
+            new["held_out_rms"][v] = noise * np.sqrt(2.0 * (sigma**2).mean())
+    return replace(whole, apart=replace(apart, placed=placed), params=params, sensors=sensors, **new)
 
 
 def _choose_model(
@@ -101,9 +175,15 @@ def _choose_model(
     dem: Terrain | None,
     centers: Array | None,
     prior: BlockPrior | None,
+    first: Solution | None = None,
 ) -> tuple[Solution, float | None]:
-    """The block solved; by an affine in the image where the data choose it, and what the model in space left [px]."""
-    found, in_space = solve_block(block, outer, options, dem, centers, prior), None
+    """The block solved; by an affine in the image where the data choose it, and what the model in space left [px].
+
+    `first` is the block solved with the model to start with, where it was.
+    """
+    found, in_space = first, None
+    if found is None:
+        found = solve_block(block, outer, options, dem, centers, prior)
     if prior is None and found.problem.cameras.unknowns.geometric:
         found = without_strips(found, block, outer, options)
     given = options.model != AUTO or options.drift is not None or prior is not None
@@ -188,6 +268,7 @@ def _adjustment(
         held=found.heights.weak[: block.num_tracks],
         terrain=found.heights.test(final.points, seen),
         left_out=block.left_out,
+        apart=None,
         **_control(found, block, covariance, inlier[ties.stop :]),
         seconds=time.process_time() - start,
         options=options,

@@ -11,7 +11,7 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.explanations import LOCAL, WANDER, Explanation, Seen, Where, boxed, proposed, sharpened
-from barpc.ba.mixture import Fit, fit, linearise, settled
+from barpc.ba.mixture import Fit, Linear, fit, linearise, settled
 from barpc.ba.rounds import Outcome, revived
 from barpc.ba.scan import SURE, Interval, scan
 from barpc.ba.weights import Observations
@@ -25,7 +25,7 @@ _TRIED = 3  # intervals a round
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # explanations of parts of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
-_UNKNOWNS = 400  # of all views, up to which explanations are tried
+UNKNOWNS = 400  # of all views, up to which explanations are tried
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
 
 
@@ -66,23 +66,28 @@ def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]
 
 def judge(outcome: Outcome, block: Block, floor: float) -> list[Finding]:
     """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out."""
-    problem = outcome.problem
     first = standing_out(outcome, block, floor)
-    if not first or problem.free.size > _UNKNOWNS:
+    linear = around(outcome, block) if first else None
+    if linear is None:
         return []
-    state, _ = revived(
-        problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
-    )
-    use = block.use & (block.point < block.num_tracks)
-    if _numbers(block, use) > _NUMBERS:
-        return []
-    low, high = block.alt_range
-    linear = linearise(problem, state, use, block.sigma, high - low)
     size = np.array([view.size for view in block.views], dtype=np.float64).T
     nothing = np.zeros((2, 0, len(block.view)))
     return _Search(
         Seen(linear, block.xy, size, fit(linear), nothing), first, floor / float(np.median(block.sigma))
     ).run()
+
+
+def around(outcome: Outcome, block: Block) -> Linear | None:
+    """All ties of a block, linearised where the rounds ended; None where they are too many to be judged."""
+    problem = outcome.problem
+    use = block.use & (block.point < block.num_tracks)
+    if problem.free.size > UNKNOWNS or _numbers(block, use) > _NUMBERS:
+        return None
+    state, _ = revived(
+        problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
+    )
+    low, high = block.alt_range
+    return linearise(problem, state, use, block.sigma, high - low)
 
 
 def _numbers(block: Block, use: BoolArray) -> float:
