@@ -17,10 +17,10 @@ from barpc.ba.datum import datum_shares
 from barpc.ba.following import follow, without_strips
 from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Terrain
-from barpc.ba.heldout import FEW, enu_offsets, keep_out
+from barpc.ba.heldout import enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import standing_out
-from barpc.ba.placing import median_noise, place
+from barpc.ba.placing import place
 from barpc.ba.result import Adjustment
 from barpc.ba.snooping import MOST_TESTED, image_test
 from barpc.ba.solution import Solution, solve_block
@@ -152,20 +152,24 @@ def _with_apart(
     sensors = found.problem.cameras.unknowns.corrected(params, others.views)
     names = "view", "inlier", "held_out", "residuals_before", "residuals", "held_out_rms", "held_out_noise"
     new = {name: getattr(whole, name).copy() for name in names}
+    new["gcp_w"] = np.where(others.gcps.view == v, np.nan, whole.gcp_w)
+    if others.reference is not None:
+        new["reference_w"] = np.where(others.reference.points.view == v, np.nan, whole.reference_w)
     for part in parts:
         ties = (part.view == v) & (part.point < part.num_tracks)
         rows, ground = part.order[ties], ground_from_ecef(whole.points[part.point[ties]])
         new["view"][rows], new["held_out"][rows] = v, part is parts[1]
         new["residuals_before"][rows] = others.views[v].sensor.project(ground) - part.xy[:, ties].T
-        new["residuals"][rows] = off = sensors[v].project(ground) - part.xy[:, ties].T
-    if placed is not None:  # `off` are those kept out
+        new["residuals"][rows] = sensors[v].project(ground) - part.xy[:, ties].T
+    if placed is not None:
         new["inlier"][parts[0].order[placed.rows]] = placed.agree(limit)
-        sigma = parts[1].sigma[(parts[1].view == v) & (parts[1].point < parts[1].num_tracks)]
-        known = np.isfinite(off).all(axis=1)
-        if known.sum() >= FEW:
-            new["held_out_noise"][v] = noise = median_noise(((off / sigma[:, None]) ** 2).sum(axis=1)[known])
-            new["held_out_rms"][v] = noise * np.sqrt(2.0 * (sigma**2).mean())
-    return replace(whole, apart=replace(apart, placed=placed), params=params, sensors=sensors, **new)
+        measured = measure(found.problem, params, parts[1])
+        new["held_out_noise"][v], new["held_out_rms"][v] = measured.noise[v], measured.rms[v]
+    scale, odd = whole.prior.scale.copy(), whole.prior.odd.copy()
+    scale[v], odd[v] = apart.scale, apart.scale > 1.0
+    tested = replace(whole.prior, scale=scale, odd=odd)
+    told = replace(apart, placed=placed)
+    return replace(whole, apart=told, params=params, sensors=sensors, prior=tested, **new)
 
 
 def _choose_model(

@@ -25,16 +25,16 @@ from barpc.ba.scan import SURE
 from barpc.ba.solution import MUCH_NOISE, Solution
 from barpc.errors import AdjustError
 from barpc.geodesy import Array
-from barpc.options import AdjustOptions
+from barpc.options import GEOMETRIC, AdjustOptions
 from barpc.scene import connected_groups
 
 _LOG = logging.getLogger(__name__)
 
 APART = "apart"
 _MOST = 0.5  # of a view's tie points
-_TELLING = 3  # views of which any two agree, but for what is across their epipolar lines: each is left out
+_TELLING = 3  # views: without one a pair is left, which agrees about much; so each of three is left out
 _TRIED = 6  # views of a block, those that lost most
-_UNKNOWNS_A_VIEW = 9
+_UNKNOWNS_A_VIEW = 9  # with a drift
 
 Solver = Callable[[Block, Block], Solution]
 
@@ -48,9 +48,7 @@ class Apart:
     others agree next best.
     """
 
-    views: tuple[
-        int, ...
-    ]  # the likeliest first; more than one: the ties do not tell, and the block is as it was
+    views: tuple[int, ...]  # the likeliest first; of more than one the ties do not tell, and nothing is done
     gain: float
     gap: float
     runner_up: int | None
@@ -83,6 +81,7 @@ class _Left:
     found: Solution
     placed: Placed
     contradicted: float
+    coherent: bool  # whether what contradicts is off as its neighbours are
 
     @property
     def usual(self) -> float:
@@ -91,8 +90,11 @@ class _Left:
 
     @property
     def strange(self) -> bool:
-        """Whether fewer than half of the view's tie points agree, of those that would in another view."""
-        return 1.0 - self.contradicted < _MOST * (1.0 - self.usual)
+        """Whether fewer than half of the view's tie points agree, of those that would in another view.
+
+        If the others lie anywhere, it is the matches that are wrong, and they are cut.
+        """
+        return self.coherent and 1.0 - self.contradicted < _MOST * (1.0 - self.usual)
 
     def gain(self, lost: float) -> float:
         """By how many nats the share that it lost is likelier as its own; the choice among views taken off."""
@@ -111,24 +113,26 @@ def find_apart(
     tells of one view. Measured on the observations of `outer`.
     """
     num, odd = len(block.views), None
-    in_space = "ation" in options.first_model  # a rotation or a translation
-    if num < 3 or num * _UNKNOWNS_A_VIEW > UNKNOWNS or options.loss == "linear" or not in_space:
+    asked_for_less = options.first_model != GEOMETRIC or options.drift == 0 or options.loss == "linear"
+    if num < 3 or num * _UNKNOWNS_A_VIEW > UNKNOWNS or asked_for_less:
         return None, None
-    if first is not None and agrees(first):
-        odd = _odd(first, block)
-        if odd is None:
-            return None, None
     lost = np.ones(num) if first is None else _lost(first, block)
-    free = [v for v in np.argsort(-lost, kind="stable").tolist() if block.names[v] not in options.fixed]
-    asked = free if first is None else free[:_TRIED]
+    gone = 1.0 - lost <= _MOST * (1.0 - np.median(lost))
+    asked = np.argsort(-lost, kind="stable")
+    if first is not None:
+        asked = asked[:_TRIED]
+        if agrees(first):
+            odd = _odd(first, block)
+            asked = asked[gone[asked]] if odd is None else np.array([odd])
+    views = [v for v in asked.tolist() if block.names[v] not in options.fixed]
     left: list[_Left] = []
-    for one in _agreeing(asked if odd is None else [odd], block, outer, options, solve):
+    for one in _agreeing(views, block, outer, options, solve):
         left.append(one)
         if one.strange and num > _TELLING:  # those that agree without it contradict it in any block with it
             break
     if odd is not None and first is not None:
         return _by_prior(left, float(first.outcome.prior.scale[odd]), block)
-    chosen = [one for one in left if one.strange or (one.placed.meets and lost[one.view] > _MOST)]
+    chosen = [one for one in left if one.strange or (one.placed.meets and gone[one.view])]
     chosen = [one for one in chosen if one.gain(lost[one.view]) > SURE]
     return _likeliest(chosen, left, lost, block) if chosen else (None, None)
 
@@ -172,7 +176,8 @@ def _agreeing(
         measured = np.isfinite(found.after.error) or np.delete(_lost(found, others), v).max() < _MOST
         placed = place(found, others, block, v) if measured and agrees(found) else None
         if placed is not None:
-            yield _Left(v, others, found, placed, placed.contradicted(options.robust_threshold))
+            limit = options.robust_threshold
+            yield _Left(v, others, found, placed, placed.contradicted(limit), placed.is_coherent(limit))
 
 
 def _is_tied(block: Block, without: int) -> bool:

@@ -31,7 +31,7 @@ _ROBUST_STEPS = 3
 _WIDE = 4.0  # sigmas
 _LESS = 0.99  # of the error, at most
 _SURELY = 3.0  # standard deviations
-FEW = 20  # observations of a view that tell nothing by themselves
+_FEW = 20  # observations of a view that tell nothing by themselves
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     squared = observations.squared(residual, counted)
     expected = block.sigma**2 * observations.freedom(counted)
     noise, rms = np.full(views, np.nan), np.full(views, np.nan)
-    for v in np.flatnonzero(np.bincount(block.view, minlength=views) >= FEW):
+    for v in np.flatnonzero(np.bincount(block.view, minlength=views) >= _FEW):
         rows = slice(*part.structure.bounds[v : v + 2])
         noise[v] = np.sqrt(np.median(squared[rows]) / MEDIAN)
         rms[v] = noise[v] * np.sqrt(expected[rows].mean())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from barpc.ba.block import Block
 from barpc.ba.cameras import Projected
@@ -34,8 +35,9 @@ class Placed:
     params: Array  # (q,)
     covariance: Array  # (q, q) with the points as they are
     rows: BoolArray  # (K,) of the block: its observations of points that the others know
+    xy: Array  # (2, n) where these are [px]
     squared: Array  # (n,) squared residuals of these over their variances
-    followed: Array  # (n,) the same where splines over the rows follow what the camera does not
+    left: Array  # (2, n) residuals where splines over the rows follow what the camera does not, over their sigmas
     noise: float  # observed over stated standard deviation of the residuals, by the median
 
     @property
@@ -49,7 +51,26 @@ class Placed:
 
     def contradicted(self, limit: float) -> float:
         """Share of its observations farther off than so many standard deviations, whatever its rows do."""
-        return float((self.followed > 2.0 * limit * limit).mean())
+        return float(self._far(limit).mean())
+
+    def is_coherent(self, limit: float) -> bool:
+        """Whether observations farther off than that are off as their neighbours are: a camera is wrong, not matches.
+
+        Errors that know nothing of each other differ by 1.4 times what they are.
+        """
+        seen = np.isfinite(self.left).all(axis=0)
+        if 2 * seen.sum() < len(seen):  # it does not see the place at all
+            return True
+        far = self._far(limit) & seen
+        if far.sum() < _FEWEST:
+            return False
+        left = self.left[:, far].T
+        nearest = cKDTree(self.xy[:, far].T).query(self.xy[:, far].T, k=2)[1][:, 1]
+        apart, size = (np.linalg.norm(x, axis=1) for x in (left - left[nearest], left))
+        return bool(np.median(apart) < np.median(size))
+
+    def _far(self, limit: float) -> BoolArray:
+        return ~np.asarray((self.left**2).sum(axis=0) <= 2.0 * limit * limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +100,10 @@ def place(found: Solution, others: Block, block: Block, view: int) -> Placed | N
         return None
     sight = _Sight(found, others, block, view, rows)
     u = (block.xy[1, rows] - unknowns.middle[1, view]) / unknowns.half[1, view]
-    params, covariance, squared = sight.fit()
-    followed = sight.fit(bsplines(u, SPLINES))[2]
-    return Placed(params, covariance, rows, squared, followed, median_noise(squared))
+    params, covariance, residual = sight.fit()
+    squared = (residual**2).sum(axis=0)
+    left = sight.fit(bsplines(u, SPLINES))[2]
+    return Placed(params, covariance, rows, sight.xy, squared, left, median_noise(squared))
 
 
 def median_noise(squared: Array) -> float:
@@ -111,7 +133,7 @@ class _Sight:
         return self.cameras.project(params, self.ecef, self.bounds)
 
     def fit(self, splines: Array | None = None) -> tuple[Array, Array, Array]:
-        """The view's unknowns (q,), their covariance, and squared residuals (n,) over their variances.
+        """The view's unknowns (q,), their covariance, and residuals (2, n) over their standard deviations.
 
         Robust, as rounds are (`barpc.ba.rounds`): beside them splines (m, n) move columns and rows.
         """
@@ -119,7 +141,7 @@ class _Sight:
         beside = np.zeros((0, self.xy.shape[1])) if splines is None else splines
         size, m = params.shape[1], len(beside)
         sigma = np.append(_WIDE * self.problem.camera_prior.sigma[self.view], np.full(2 * m, _SPLINE))
-        moved, squared, scale = np.zeros(size + 2 * m), np.zeros(0), np.inf
+        moved, residual, scale = np.zeros(size + 2 * m), np.zeros((0, 2)), np.inf
         matrix = np.diag(sigma**-2.0)
         root = np.linalg.inv(np.linalg.cholesky(self.covariance))
         for _ in range(_STEPS):
@@ -130,7 +152,8 @@ class _Sight:
             along[0, size : size + m] = along[1, size + m :] = beside
             image = projected.image + np.einsum("cqn,q->cn", along[:, size:], moved[size:])
             residual = np.einsum("ncd,dn->nc", root, image - self.xy)
-            squared = np.where(np.isfinite(residual).all(axis=1), (residual**2).sum(axis=1), np.inf)
+            residual[~np.isfinite(residual).all(axis=1)] = np.inf
+            squared = (residual**2).sum(axis=1)
             middle = median_noise(squared)
             if not np.isfinite(middle):
                 break
@@ -142,8 +165,8 @@ class _Sight:
             matrix = np.einsum("ncp,ncq->pq", weighted, rows) + np.diag(sigma**-2.0)
             gradient = np.einsum("ncq,nc->q", weighted, residual[near]) + moved / sigma**2
             moved = moved - np.linalg.solve(matrix, gradient)
-        covariance: Array = np.linalg.inv(matrix)[:size, :size]
-        return moved[:size], covariance, squared
+        covariance = np.asarray(np.linalg.inv(matrix)[:size, :size], dtype=np.float64)
+        return moved[:size], covariance, residual.T
 
 
 def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:

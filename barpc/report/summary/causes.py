@@ -78,7 +78,7 @@ def strangeness(apart: Apart) -> str:
     if look.swapped:
         return f"with its axes swapped, samples taken for lines, {met}"
     if look.offset is not None:
-        col, row = -look.offset
+        col, row = 0.0 - look.offset
         height = "" if look.height is None else f", or with its heights moved by {-look.height:+.0f} m,"
         return f"moved by {col:+.1f} columns and {row:+.1f} rows{height} {met}"
     part = "all" if apart.contradicted == 1.0 else f"more than {int(100 * apart.contradicted)} %"
