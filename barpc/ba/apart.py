@@ -122,7 +122,7 @@ def find_apart(
     if first is not None:
         asked = asked[:_TRIED]
         if agrees(first):
-            odd = _odd(first, block)
+            odd = _odd(first, block) if num > _TELLING else None
             asked = asked[gone[asked]] if odd is None else np.array([odd])
     views = [v for v in asked.tolist() if block.names[v] not in options.fixed]
     left: list[_Left] = []

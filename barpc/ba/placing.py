@@ -58,14 +58,14 @@ class Placed:
 
         Errors that know nothing of each other differ by 1.4 times what they are.
         """
-        seen = np.isfinite(self.left).all(axis=0)
-        if 2 * seen.sum() < len(seen):  # it does not see the place at all
+        seen = np.asarray(np.isfinite(self.left).all(axis=0))
+        if seen.mean() < 0.5:  # it does not see the place at all
             return True
         far = self._far(limit) & seen
         if far.sum() < _FEWEST:
             return False
         left = self.left[:, far].T
-        nearest = cKDTree(self.xy[:, far].T).query(self.xy[:, far].T, k=2)[1][:, 1]
+        nearest = np.asarray(cKDTree(self.xy[:, far].T).query(self.xy[:, far].T, k=2)[1])[:, 1]
         apart, size = (np.linalg.norm(x, axis=1) for x in (left - left[nearest], left))
         return bool(np.median(apart) < np.median(size))
 

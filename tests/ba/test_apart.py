@@ -41,7 +41,7 @@ def raised(rpc: RPC) -> RPC:
     return replace(rpc, ground_offset=rpc.ground_offset + np.array([0.0, 0.0, 100.0]))
 
 
-def block_with(view: int, change: Change, views: int = 3, tracks: int = 300, seed: int = 1) -> Block:
+def block_with(view: int, change: Change, views: int = 3, tracks: int = 200, seed: int = 1) -> Block:
     """A simulated block of which one view has an RPC that was changed."""
     made = simulate_block(views, tracks, seed=seed, attitude=5e-6, position=1.0)
     given = [replace(v, sensor=change(v.sensor)) if n == view else v for n, v in enumerate(made.views)]  # type: ignore[arg-type]
@@ -57,7 +57,7 @@ def without(block: Block, view: int) -> tuple[tuple[View, ...], Tracks]:
 
 def met(found: Adjustment, block: Block, view: int) -> float:
     """RMS [px] at which a camera meets exact check points, intersected by all."""
-    check = block.check
+    check = block.truth.check
     left = triangulate(found.sensors, check.view, check.point, check.xy).residuals[check.view == view]
     return float(np.sqrt(np.nanmean((left**2).sum(axis=1))))
 
@@ -67,7 +67,13 @@ def met(found: Adjustment, block: Block, view: int) -> float:
     [(swapped, "axes"), (shifted, "offset"), (raised, "height")],
     ids=["axes swapped", "another tile", "another datum"],
 )
-def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(change: Change, look: str) -> None:
+def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(
+    monkeypatch, change: Change, look: str
+) -> None:
+    if look != "axes":  # a prior tells of one view where the others agree, which a pair always does
+        other = block_with(2, change)
+        assert adjust_tracks(other.views, other.tracks).apart is None
+        monkeypatch.setattr(apart, "_TELLING", 2)
     block = block_with(2, change)
     found, alone = adjust_tracks(block.views, block.tracks), adjust_tracks(*without(block, 2))
     assert found.apart is not None
@@ -93,7 +99,8 @@ def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(change: Change, l
         assert found.apart.placed is not None
         assert met(found, block, 2) < 0.1
         assert 0.8 < found.held_out_noise[2] < 1.3
-        taking_part = (block.tracks.view == 2) & ~found.held_out
+        seen = np.bincount(block.tracks.point)[block.tracks.point] == 3  # by two others
+        taking_part = (block.tracks.view == 2) & ~found.held_out & seen
         assert found.inlier[taking_part].mean() > 0.9
 
 
@@ -117,7 +124,7 @@ def test_nothing_is_tried_where_the_block_agrees(monkeypatch) -> None:
 
 
 def test_a_view_of_wrong_matches_is_no_foreign_one() -> None:
-    made, rng = simulate_block(3, 300, seed=3, attitude=10e-6, position=2.0), np.random.default_rng(1)
+    made, rng = simulate_block(3, 250, seed=3, attitude=10e-6, position=2.0), np.random.default_rng(1)
     wrong = (made.tracks.view == 2) & (rng.uniform(size=len(made.tracks)) < 0.7)
     off = rng.uniform(-30.0, 30.0, made.tracks.xy.shape)
     found = adjust_tracks(made.views, replace(made.tracks, xy=made.tracks.xy + wrong[:, None] * off))
