@@ -240,7 +240,6 @@ class Variances:
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
         """By how much each view's prior is to be widened (N,), and which views are odd."""
         n = len(params)
-        tied = np.count_nonzero(np.diff(around.problem.structure.bounds))  # views that see anything
         total, freedom = self._squares(params, known)
         factor = max((_STRENGTH + total.sum()) / (_STRENGTH + freedom.sum()), 1.0)
         if self.cautious:
@@ -248,7 +247,7 @@ class Variances:
         odd = np.zeros(n, dtype=bool)
         with np.errstate(all="ignore"):
             gross = bool((total > _GROSS * freedom)[freedom > _LEAST].any())
-        if around.small and tied > 2 and gross:
+        if around.small and n > 2 and gross:
             common = np.full(n, np.sqrt(factor))
             scale, alone, evidence = self._odd(around, wide)
             together = around.under(self._prior(common, wide))[0]
@@ -256,7 +255,7 @@ class Variances:
                 return scale, alone
             both_may_be = evidence >= together - _SURE  # the priors cover both
             return (np.maximum(scale, common) if both_may_be else common), odd
-        if tied > 2 and not around.small:  # one view of many is seen at once
+        if n > 2 and not around.small:  # one view of many is seen at once
             own = np.median(total[freedom > _LEAST] / freedom[freedom > _LEAST])
             factor = max((_STRENGTH + own * freedom.sum()) / (_STRENGTH + freedom.sum()), 1.0)
             odd = np.asarray(chdtrc(np.maximum(freedom, _LEAST), total / factor) < _LEVEL / n)

@@ -41,7 +41,7 @@ def raised(rpc: RPC) -> RPC:
     return replace(rpc, ground_offset=rpc.ground_offset + np.array([0.0, 0.0, 100.0]))
 
 
-def block_with(view: int, change: Change, views: int = 3, tracks: int = 200, seed: int = 1) -> Block:
+def block_with(view: int, change: Change, views: int = 3, tracks: int = 300, seed: int = 1) -> Block:
     """A simulated block of which one view has an RPC that was changed."""
     made = simulate_block(views, tracks, seed=seed, attitude=5e-6, position=1.0)
     given = [replace(v, sensor=change(v.sensor)) if n == view else v for n, v in enumerate(made.views)]  # type: ignore[arg-type]
