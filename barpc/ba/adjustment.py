@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from barpc.ba.apart import Apart, find_apart
 from barpc.ba.block import Block, join
 from barpc.ba.consensus import two_groups
 from barpc.ba.covariance import Covariance
@@ -16,16 +17,17 @@ from barpc.ba.datum import datum_shares
 from barpc.ba.following import follow, without_strips
 from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Terrain
-from barpc.ba.heldout import enu_offsets, keep_out
+from barpc.ba.heldout import enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import left_over
+from barpc.ba.placing import place
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Outcome
 from barpc.ba.scan import neighbours_alike
 from barpc.ba.snooping import MOST_TESTED, image_test
 from barpc.ba.solution import Solution, solve_block
 from barpc.errors import AdjustError
-from barpc.geodesy import Array
+from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import AUTO, AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, Reference, Tracks, View
 
@@ -86,14 +88,90 @@ def adjust_tracks(
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     inner, outer = block.without(rows), block.without(~rows)
     try:
-        found, in_space = _choose_model(inner, outer, options, dem, centers, prior)
+        first, apart = _first(inner, outer, options, dem, centers, prior)
+        parts = inner, outer
+        if apart is not None and apart.clear:
+            inner, outer = (one.without(one.view == apart.view) for one in parts)
+        found, in_space = _choose_model(inner, outer, options, dem, centers, prior, first)
         found.heights.warn()
-        return _adjustment(found, inner, outer, options, in_space, start)
+        whole = _adjustment(found, inner, outer, options, in_space, start)
+        if apart is None or not apart.clear:
+            return replace(whole, apart=apart)
+        return _with_apart(whole, apart, found, inner, parts, options.robust_threshold)
     except np.linalg.LinAlgError as error:
         raise AdjustError(
             f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "
             "point, beyond anything real?"
         ) from error
+
+
+def _first(
+    block: Block,
+    outer: Block,
+    options: AdjustOptions,
+    dem: Terrain | None,
+    centers: Array | None,
+    prior: BlockPrior | None,
+) -> tuple[Solution, Apart | None]:
+    """The block solved with the model to start with, without a view whose RPC is not its own where there is one."""
+
+    def solve(inner: Block, outer: Block) -> Solution:
+        return solve_block(inner, outer, options, dem, centers, prior)
+
+    first, failed = None, None
+    try:
+        first = solve(block, outer)
+    except (AdjustError, np.linalg.LinAlgError) as error:
+        failed = error
+    apart, without = find_apart(first, block, outer, options, solve) if prior is None else (None, None)
+    if without is not None:
+        return without, apart
+    if first is not None:
+        return first, apart
+    assert failed is not None
+    if apart is None:
+        raise failed
+    names = ", ".join(block.names[v] for v in apart.views)
+    raise AdjustError(
+        f"{failed}. Without any one of {names} the other views agree: check that their RPCs are of these images, and "
+        "leave the wrong one out"
+    ) from failed
+
+
+def _with_apart(
+    whole: Adjustment, apart: Apart, found: Solution, others: Block, parts: tuple[Block, Block], limit: float
+) -> Adjustment:
+    """What is handed out, with the view that the others were adjusted without: adjusted alone, or as delivered.
+
+    `parts` have its observations, those that might take part and those kept out; it is measured on the others' points.
+    """
+    v, params = apart.view, whole.params.copy()
+    placed = None if apart.placed is None else place(found, others, parts[0], v)
+    if placed is not None and not placed.meets:
+        placed = None
+    if placed is not None:
+        params[v] = placed.params
+    sensors = found.problem.cameras.unknowns.corrected(params, others.views)
+    names = "view", "inlier", "held_out", "residuals_before", "residuals", "held_out_rms", "held_out_noise"
+    new = {name: getattr(whole, name).copy() for name in names}
+    new["gcp_w"] = np.where(others.gcps.view == v, np.nan, whole.gcp_w)
+    if others.reference is not None:
+        new["reference_w"] = np.where(others.reference.points.view == v, np.nan, whole.reference_w)
+    for part in parts:
+        ties = (part.view == v) & (part.point < part.num_tracks)
+        rows, ground = part.order[ties], ground_from_ecef(whole.points[part.point[ties]])
+        new["view"][rows], new["held_out"][rows] = v, part is parts[1]
+        new["residuals_before"][rows] = others.views[v].sensor.project(ground) - part.xy[:, ties].T
+        new["residuals"][rows] = sensors[v].project(ground) - part.xy[:, ties].T
+    if placed is not None:
+        new["inlier"][parts[0].order[placed.rows]] = placed.agree(limit)
+        measured = measure(found.problem, params, parts[1])
+        new["held_out_noise"][v], new["held_out_rms"][v] = measured.noise[v], measured.rms[v]
+    scale, odd = whole.prior.scale.copy(), whole.prior.odd.copy()
+    scale[v], odd[v] = apart.scale, apart.scale > 1.0
+    tested = replace(whole.prior, scale=scale, odd=odd)
+    told = replace(apart, placed=placed)
+    return replace(whole, apart=told, params=params, sensors=sensors, prior=tested, **new)
 
 
 def _choose_model(
@@ -103,9 +181,15 @@ def _choose_model(
     dem: Terrain | None,
     centers: Array | None,
     prior: BlockPrior | None,
+    first: Solution | None = None,
 ) -> tuple[Solution, float | None]:
-    """The block solved; by an affine in the image where the data choose it, and what the model in space left [px]."""
-    found, in_space = solve_block(block, outer, options, dem, centers, prior), None
+    """The block solved; by an affine in the image where the data choose it, and what the model in space left [px].
+
+    `first` is the block solved with the model to start with, where it was.
+    """
+    found, in_space = first, None
+    if found is None:
+        found = solve_block(block, outer, options, dem, centers, prior)
     if prior is None and found.problem.cameras.unknowns.geometric:
         found = without_strips(found, block, outer, options)
     given = options.model != AUTO or options.drift is not None or prior is not None
@@ -191,6 +275,7 @@ def _adjustment(
         held=found.heights.weak[: block.num_tracks],
         terrain=found.heights.test(final.points, seen),
         left_out=block.left_out,
+        apart=None,
         **_control(found, block, covariance, inlier[ties.stop :]),
         seconds=time.process_time() - start,
         options=options,

@@ -25,7 +25,7 @@ from barpc.ba.explanations import (
     proposed,
     sharpened,
 )
-from barpc.ba.mixture import Fit, fit, linearise, settled
+from barpc.ba.mixture import Fit, Linear, fit, linearise, settled
 from barpc.ba.periods import Swing, swings
 from barpc.ba.rounds import Outcome, revived
 from barpc.ba.scan import SURE, Interval, scan
@@ -40,7 +40,7 @@ _TRIED = 3  # intervals a round, and periods
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
-_UNKNOWNS = 400  # of all views, up to which explanations are tried
+UNKNOWNS = 400  # of all views, up to which explanations are tried
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
 
 
@@ -134,23 +134,28 @@ def _sizes(block: Block) -> Array:
 
 def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
     """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out."""
-    problem = outcome.problem
-    if problem.free.size > _UNKNOWNS:
+    if outcome.problem.free.size > UNKNOWNS:
         return Judgement()
     first = standing_out(outcome, block, floor)
-    if not (first or swinging(outcome, block)):
+    linear = around(outcome, block) if first or swinging(outcome, block) else None
+    if linear is None:
         return Judgement()
-    state, _ = revived(
-        problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
-    )
-    use = block.use & (block.point < block.num_tracks)
-    if _numbers(block, use) > _NUMBERS:
-        return Judgement()
-    low, high = block.alt_range
-    linear = linearise(problem, state, use, block.sigma, high - low)
     nothing = np.zeros((2, 0, len(block.view)))
     seen = Seen(linear, block.xy, _sizes(block), fit(linear), nothing)
     return _Search(seen, first, floor, float(np.median(block.sigma))).run()
+
+
+def around(outcome: Outcome, block: Block) -> Linear | None:
+    """All ties of a block, linearised where the rounds ended; None where they are too many to be judged."""
+    problem = outcome.problem
+    use = block.use & (block.point < block.num_tracks)
+    if problem.free.size > UNKNOWNS or _numbers(block, use) > _NUMBERS:
+        return None
+    state, _ = revived(
+        problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
+    )
+    low, high = block.alt_range
+    return linearise(problem, state, use, block.sigma, high - low)
 
 
 def _numbers(block: Block, use: BoolArray) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from barpc.ba.apart import Apart
 from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import TwoGroups
 from barpc.ba.covariance import Covariance
@@ -93,6 +94,10 @@ class Adjustment:
         What a terrain did; None without one.
     left_out : tuple of str
         Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
+    apart : Apart or None
+        A view whose RPC is not its own: the others were adjusted without it, it alone against their points, or not at
+        all. Its points, residuals and observations kept are by these; in the covariance it is as its prior. Where it
+        may be one of several, nothing was done.
     control : ControlTest or None
         Ground control points against each other and the cameras.
     gcp_w, reference_w : (M,), (R,)
@@ -140,6 +145,7 @@ class Adjustment:
     held: BoolArray
     terrain: TerrainTest | None
     left_out: tuple[str, ...]
+    apart: Apart | None
     control: ControlTest | None
     gcp_w: Array
     reference_w: Array

@@ -27,7 +27,7 @@ from barpc.scene import BoolArray
 
 SMOOTH_LEAST = 0.06  # smooth residuals below this [px] are left alone: two views share what one is wrong by
 _TREND = 0.03  # px: another model is tried
-_MUCH_NOISE = 1.5  # times what is stated
+MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
 _MANY_KEPT = 0.99  # of the observations: the others do not tell in a mean
@@ -77,7 +77,7 @@ class Solution:
     def has_trend(self) -> bool:
         """Whether something is left that another model may follow: smooth, or in what was cut."""
         left = bool(self.outcome.smooth.found(_TREND).any())
-        return left or self.after.error > _MUCH_NOISE * self.outcome.noise
+        return left or self.after.error > MUCH_NOISE * self.outcome.noise
 
     @property
     def has_waves(self) -> bool:
@@ -177,4 +177,4 @@ def _tested(
 def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
     """Whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
     had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
-    return outcome.noise > _MUCH_NOISE or bool((kept < _MUCH_LOST * had).any())
+    return outcome.noise > MUCH_NOISE or bool((kept < _MUCH_LOST * had).any())

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
+from barpc.ba.apart import APART, Apart
 from barpc.ba.scan import SURE
 from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
-from barpc.report.summary.causes import explanations, left_over
+from barpc.report.summary.causes import explanations, left_over, strangeness
 from barpc.tie.reference import PEAK
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
@@ -57,10 +58,21 @@ def _failure(view: ViewEntry, run: Run) -> str:
     tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
     if run.adjustment is not None and view.name in run.adjustment.left_out:
         return "not tied to the other images: its camera was left as it was"
+    if (apart := _apart(view, run)) is not None and apart.placed is None:
+        return (
+            f"its RPC is not its own: {strangeness(apart)}. They were adjusted without it, and its camera was left as "
+            "it was: check that the RPC belongs to this image"
+        )
     beyond = _follows_more(view) or getattr(run.options, "grids", False)  # grids hold what the RPC does not
     if view.fit is not None and not beyond and not all(_known(v) <= tolerance for v in view.fit.max_px):
         return f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range"
     return ""
+
+
+def _apart(view: ViewEntry, run: Run) -> Apart | None:
+    """What is known of a view if its RPC is not its own."""
+    apart = None if run.adjustment is None else run.adjustment.apart
+    return apart if apart is not None and apart.is_view(run.number[view.name]) else None
 
 
 def _weakness(view: ViewEntry, run: Run) -> str:
@@ -81,6 +93,14 @@ def _doubt(view: ViewEntry, run: Run) -> str:
         return f"shows the same pixels as {run.copies[view.name]}: give each image once"
     if run.adjustment is not None:
         i = run.number[view.name]
+        if (apart := _apart(view, run)) is not None:
+            stated = (
+                f"{apart.scale:.0f} times farther off than stated" if apart.scale > 1.0 else "not its own"
+            )
+            return (
+                f"its RPC is {stated}: {strangeness(apart)}. It was adjusted alone, against points of the other "
+                "images: check that the RPC belongs to this image"
+            )
         found = _oddity(i, run.adjustment) or _left(i, run.adjustment) or _beyond(view, run)
         if found:
             return found
@@ -187,6 +207,12 @@ def _block_reasons(run: Run) -> list[str]:
             f"{tilts} (east, north) only."
         )
     names = run.adjustment.names
+    if (apart := run.adjustment.apart) is not None and not apart.clear:
+        out.append(
+            f"One RPC among those of {listed([names[v] for v in apart.views])} is not its own: without any one of "
+            "these images the others agree, with all they do not. The tie points do not tell which: check the RPCs, "
+            "or add an image."
+        )
     out += _left_reasons(run)
     for group in run.adjustment.two_groups:
         i, j = group.views
@@ -312,7 +338,8 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     assert run.adjustment is not None
     before, after = (median([getattr(view, key) for view in views]) for key in ("rmse_before", "rmse_after"))
     gauge, prior = run.adjustment.gauge, run.adjustment.prior
-    lines = [f"Tie points of {len(views)} images agree to {after:.3f} px (before: {before:.3f} px)."]
+    tied = sum(view.num_observations > 0 for view in views)
+    lines = [f"Tie points of {tied} images agree to {after:.3f} px (before: {before:.3f} px)."]
     if not len(run.tracks):
         lines = ["There are no tie points: the cameras are held by control alone."]
     drift = f"drift of degree {run.adjustment.cameras.unknowns.drift}"
@@ -325,7 +352,11 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
             f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, all over and in "
             "any direction: wrong matches."
         )
-    lines += [f"{one.sentence[0].upper()}{one.sentence[1:]}." for one in explanations(run.adjustment)]
+    lines += [
+        f"{one.sentence[0].upper()}{one.sentence[1:]}."
+        for one in explanations(run.adjustment)
+        if one.name != APART
+    ]
     if len(run.tracks) or run.gcps is not None:
         lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
     lines += _reference_lines(run)

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from barpc.ba.apart import APART, Apart
 from barpc.ba.explanations import EXPLANATIONS, FADE, STRIP, SWING, WANDER
 from barpc.ba.judge import Finding
+from barpc.ba.placing import Look
 from barpc.ba.scan import Interval
 from barpc.report import verdict
-from barpc.report.summary.causes import _WORDS, explanations, left_over
+from barpc.report.summary.causes import _WORDS, explanations, left_over, strangeness
 
 NAMES = "west", "east"
 
 
-def adjustment(findings: Any = (), left: Any = ()) -> Any:
+def adjustment(findings: Any = (), left: Any = (), apart: Any = None) -> Any:
     half = np.array([[4000.0, 2000.0], [6000.0, 3000.0]])
     cameras = SimpleNamespace(unknowns=SimpleNamespace(half=half))
-    return SimpleNamespace(names=NAMES, findings=findings, left=left, cameras=cameras)
+    return SimpleNamespace(names=NAMES, findings=findings, left=left, cameras=cameras, apart=apart)
 
 
 def test_every_explanation_has_its_words() -> None:
@@ -97,3 +100,39 @@ def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     assert [one.last for one in left_over(run.adjustment)] == [399.0] * 3
     quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]))
     assert verdict._left_reasons(quiet) == []
+
+
+def apart_of(look: Look, **given: Any) -> Apart:
+    return Apart((1,), 420.0, 17.0, 0, 0.987, look, None, **given)
+
+
+@pytest.mark.parametrize(
+    ("look", "share", "said"),
+    [
+        (Look(swapped=True), 1.0, "with its axes swapped, samples taken for lines, it would agree"),
+        (Look(np.array([400.0, -9.0])), 1.0, "moved by -400.0 columns and +9.0 rows it would agree"),
+        (
+            Look(np.array([0.0, 9.0]), -48.0), 1.0,
+            "moved by +0.0 columns and -9.0 rows, or with its heights moved by +48 m, it would agree",
+        ),
+        (Look(), 0.987, "more than 98 % of its tie points contradict"),
+        (Look(), 1.0, "all of its tie points contradict"),
+    ],
+)  # fmt: skip
+def test_a_strange_rpc_is_said_with_what_it_looks_like(look, share, said) -> None:
+    assert strangeness(replace(apart_of(look), contradicted=share)).startswith(said)
+
+
+def test_a_strange_rpc_is_an_explanation_where_it_is_clear() -> None:
+    clear = apart_of(Look(swapped=True))
+    (one,) = explanations(adjustment(apart=clear))
+    assert (one.name, one.image, one.gain, one.gap, one.runner_up) == (
+        APART,
+        "east",
+        420.0,
+        17.0,
+        "apart: west",
+    )
+    assert one.sentence == f"the RPC of east is not its own: {strangeness(clear)}"
+    for other in (replace(clear, views=(1, 0)), replace(clear, gain=np.nan)):  # several; its prior told
+        assert not explanations(adjustment(apart=other))

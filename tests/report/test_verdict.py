@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from barpc.ba import adjust_tracks
+from barpc.ba.apart import Apart
 from barpc.ba.gauge import MOTIONS, Mode
+from barpc.ba.placing import Look
 from barpc.errors import BarpcWarning
 from barpc.fit import FitOptions
 from barpc.options import RunOptions
@@ -57,6 +60,52 @@ def test_a_view_without_tie_points_to_the_others_is_not_adjusted(block_run):
     assert summary["headline"] == "1 image is not adjusted (of 9)."
     assert summary["status"] == "bad"
     assert not summary["passed"]
+
+
+@pytest.mark.parametrize(
+    ("placed", "scale", "status", "said"),
+    [
+        (None, 1.0, "failed", "its RPC is not its own: with its axes swapped"),
+        (
+            SimpleNamespace(covariance=0.04 * np.eye(9)),
+            1.0,
+            "doubtful",
+            "its RPC is not its own: with its axes",
+        ),
+        (
+            SimpleNamespace(covariance=0.04 * np.eye(9)),
+            33.0,
+            "doubtful",
+            "its RPC is 33 times farther off than",
+        ),
+    ],
+)
+def test_a_view_whose_rpc_is_not_its_own_is_named(block_run, placed, scale, status, said):
+    run = block_run.run
+    told = Apart((2,), 400.0, 400.0, None, 1.0, Look(swapped=True), placed, scale)
+    summary = summarize(replace(run, adjustment=replace(run.adjustment, apart=told)))
+    view = summary["views"][2]
+    assert view["status"] == status
+    assert view["advice"].startswith(said)
+    alone = "was left as it was" if placed is None else "adjusted alone, against points of the other images"
+    assert alone in view["advice"]
+    assert summary["status"] == ("bad" if placed is None else "look")
+    assert not summary["passed"]
+    assert [one["name"] for one in summary["scene"]["explanations"]] == ["apart"]
+    assert view["correction"]["center_sigma_px"] is view["correction"].get("ellipse") is None
+    if placed is not None:  # with the others' points as they are
+        assert view["correction"]["sigma"] == pytest.approx([0.2] * 9)
+
+
+def test_a_view_among_several_whose_rpc_may_be_strange_needs_a_look(block_run):
+    run = block_run.run
+    told = Apart((2, 0), 400.0, 9.0, None, 1.0, Look(), None)
+    summary = summarize(replace(run, adjustment=replace(run.adjustment, apart=told)))
+    assert summary["status"] == "look"
+    names = f"{summary['views'][2]['name']}, {summary['views'][0]['name']}"
+    assert any(f"One RPC among those of {names} is not its own" in line for line in summary["reasons"])
+    assert {view["status"] for view in summary["views"]} == {"adjusted"}
+    assert not summary["scene"]["explanations"]
 
 
 def test_an_rpc_that_misses_its_tolerance_fails_its_view(block_run):

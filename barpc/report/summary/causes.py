@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment
+from barpc.ba.apart import APART, Apart
 from barpc.ba.explanations import FADE, STRIP, SWING, WANDER
 from barpc.ba.scan import Interval
 from barpc.report.records import Number, Record, said
@@ -24,7 +25,7 @@ _WORDS = {
 class ExplanationEntry(Record):
     """Something that explains tie points, those that were cut among them, better than its rivals."""
 
-    name: str = said("What it is", enum=list(_WORDS))
+    name: str = said("What it is", enum=[*_WORDS, APART])
     sentence: str = said("The same in words", minLength=1)
     image: str = said("View")
     gain: float = said("Logarithm of the evidence, over that without it", "nats")
@@ -56,6 +57,11 @@ class LeftEntry(Record):
 def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
     """What was taken, the first first."""
     found = []
+    if (apart := adjustment.apart) is not None and apart.clear and np.isfinite(apart.gain):
+        other = None if apart.runner_up is None else f"{APART}: {adjustment.names[apart.runner_up]}"
+        image = adjustment.names[apart.view]
+        sentence = f"the RPC of {image} is not its own: {strangeness(apart)}"
+        found.append(ExplanationEntry(APART, sentence, image, apart.gain, apart.gap, other))
     for one in adjustment.findings:
         image, size = adjustment.names[one.view], float(np.hypot(*one.size))
         others = tuple(adjustment.names[v] for v in one.or_of)
@@ -74,6 +80,22 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
         whole = {**place, "size_px": size, "period": one.period, "or_of": others or None}
         found.append(ExplanationEntry(one.kind, sentence, image, *numbers, **whole))
     return tuple(found)
+
+
+def strangeness(apart: Apart) -> str:
+    """What is known of a view whose RPC is not its own."""
+    look, met = apart.look, "it would agree with the other images as well as is stated of it"
+    if look.swapped:
+        return f"with its axes swapped, samples taken for lines, {met}"
+    if look.offset is not None:
+        col, row = 0.0 - look.offset
+        height = "" if look.height is None else f", or with its heights moved by {-look.height:+.0f} m,"
+        return f"moved by {col:+.1f} columns and {row:+.1f} rows{height} {met}"
+    part = "all" if apart.contradicted == 1.0 else f"more than {int(100 * apart.contradicted)} %"
+    return (
+        f"{part} of its tie points contradict those of the other images, wherever it is moved or turned to, and these "
+        "agree without it"
+    )
 
 
 def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:

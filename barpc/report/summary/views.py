@@ -49,7 +49,10 @@ class CorrectionEntry(Record):
 
     model: str = said("Unknowns of the adjustment")
     unknowns: tuple[float, ...] = said("In metres (rotation: angle x distance), or px in the image")
-    sigma: tuple[float, ...] = said("Their posterior standard deviations, in the same units")
+    sigma: tuple[float, ...] = said(
+        "Their posterior standard deviations, in the same units; of an image that was adjusted alone, with the others' "
+        "points as they are"
+    )
     center_shift_px: Pixel | None = said(
         "Move of the ground point in the middle, col, row", "px", "shift col, row", "+.2f", adjusted=True
     )
@@ -354,7 +357,10 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
     """The correction of a view, at the ground point (3,) in the middle of its image."""
     whole, model = adjustment.sensors[i], adjustment.cameras.unknowns.model
     sensor, spline = (whole.sensor, whole.correction) if isinstance(whole, Splined) else (whole, None)
-    covariance = adjustment.covariance.view(i)
+    covariance, apart = adjustment.covariance.view(i), adjustment.apart
+    strange = apart is not None and apart.is_view(i)  # what its place is known to, its prior does not tell
+    if strange and apart is not None and apart.placed is not None:
+        covariance = apart.placed.covariance
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     common = (model, adjustment.params[i].tolist(), sigma)
     if isinstance(sensor, Timed):
@@ -379,17 +385,17 @@ def _correction(adjustment: Adjustment, i: int, middle: Array) -> CorrectionEntr
         return CorrectionEntry(*common, None, None, shift_px=shift, slope=slope)
     assert isinstance(sensor, Corrected)
     moved, uncertain = shift_in_image(sensor, covariance, model, middle)
-    place = ellipse(sensor, covariance, model, middle)
+    known_to = None if strange else ellipse(sensor, covariance, model, middle)
     return CorrectionEntry(
         *common,
         moved.tolist(),
-        uncertain.tolist(),
+        None if strange else uncertain.tolist(),
         rotation_urad=(correction.rotation * 1e6).tolist(),
         angle_urad=float(np.linalg.norm(correction.rotation)) * 1e6,
         translation_m=correction.translation.tolist(),
         translation_norm_m=float(np.linalg.norm(correction.translation)),
         drift_urad=(correction.drift * 1e6).tolist(),
-        ellipse=place,
+        ellipse=known_to,
         **_in_image(spline),
     )
 

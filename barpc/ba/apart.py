@@ -1,0 +1,234 @@
+"""A view whose RPC is not its own: found by leaving views out, then placed by what the others see.
+
+A camera of another date, with its axes swapped, cut from another tile or above another height surface bends the whole
+block. Its mark: without it the others agree to the noise, with it they do not. So where a block does not agree it is
+solved without each of its views; where the others agree then, the one left out is placed alone against their points
+(`barpc.ba.placing`). If more than half of its tie points contradict them wherever its camera is, it is the camera of
+another image and stays as delivered. If they agree, though the block had to let go of them, or though the priors
+leave no doubt that it is this view, it keeps the place found alone and bends the others no more. Where more than half
+agree and the rest does not, parts of its image lie off (`barpc.ba.judge`), and the camera is its own.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barpc.ba.block import Block
+from barpc.ba.judge import UNKNOWNS, around
+from barpc.ba.mixture import fit
+from barpc.ba.placing import Look, Placed, look, place
+from barpc.ba.scan import SURE
+from barpc.ba.solution import MUCH_NOISE, Solution
+from barpc.errors import AdjustError
+from barpc.geodesy import Array
+from barpc.options import GEOMETRIC, AdjustOptions
+from barpc.scene import connected_groups
+
+_LOG = logging.getLogger(__name__)
+
+APART = "apart"
+_MOST = 0.5  # of a view's tie points
+_TELLING = 3  # views: without one a pair is left, which agrees about much; so each of three is left out
+_TRIED = 6  # views of a block, those that lost most
+_UNKNOWNS_A_VIEW = 9  # with a drift
+
+Solver = Callable[[Block, Block], Solution]
+
+
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """A view that the others contradict, or several of which that may be so.
+
+    `gain` is by how many nats its share of contradicted tie points is likelier as its own than as that of the others
+    (Kulldorff 1997; NaN where its prior told), `gap` the evidence over the runner-up, the view without which the
+    others agree next best.
+    """
+
+    views: tuple[int, ...]  # the likeliest first; of more than one the ties do not tell, and nothing is done
+    gain: float
+    gap: float
+    runner_up: int | None
+    contradicted: float  # share of its tie points that contradict the others', wherever its camera is
+    look: Look
+    placed: Placed | None  # where it was found alone; None: it is left as delivered
+    scale: float = 1.0  # by how much its prior had to be widened, where that told
+
+    @property
+    def view(self) -> int:
+        """The likeliest."""
+        return self.views[0]
+
+    @property
+    def clear(self) -> bool:
+        """Whether it is this view and no other."""
+        return len(self.views) == 1
+
+    def is_view(self, view: int) -> bool:
+        """Whether it is clear, and that view."""
+        return self.views == (view,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Left:
+    """A block whose views agree without one."""
+
+    view: int
+    block: Block
+    found: Solution
+    placed: Placed
+    contradicted: float
+    coherent: bool  # whether what contradicts is off as its neighbours are
+
+    @property
+    def usual(self) -> float:
+        """The share of their tie points that the others lose."""
+        return float(np.median(np.delete(_lost(self.found, self.block), self.view)))
+
+    @property
+    def strange(self) -> bool:
+        """Whether fewer than half of the view's tie points agree, of those that would in another view.
+
+        If the others lie anywhere, it is the matches that are wrong, and they are cut.
+        """
+        return self.coherent and 1.0 - self.contradicted < _MOST * (1.0 - self.usual)
+
+    def gain(self, lost: float) -> float:
+        """By how many nats the share that it lost is likelier as its own; the choice among views taken off."""
+        rates = np.clip([max(lost, self.contradicted), self.usual], 1e-3, 1.0 - 1e-3)
+        own, usual = np.array([rates, 1.0 - rates]).T
+        seen = len(self.placed.squared)
+        return float(seen * (own * np.log(own / usual)).sum() - np.log(len(self.block.views)))
+
+
+def find_apart(
+    first: Solution | None, block: Block, outer: Block, options: AdjustOptions, solve: Solver
+) -> tuple[Apart | None, Solution | None]:
+    """The view whose RPC is not its own where a block shows one, and the block solved without it.
+
+    `first` is the block solved with all views; None: it has no solution. Nothing is tried where it agrees and no prior
+    tells of one view. Measured on the observations of `outer`.
+    """
+    num, odd = len(block.views), None
+    asked_for_less = options.first_model != GEOMETRIC or options.drift == 0 or options.loss == "linear"
+    if num < 3 or num * _UNKNOWNS_A_VIEW > UNKNOWNS or asked_for_less:
+        return None, None
+    lost = np.ones(num) if first is None else _lost(first, block)
+    gone = 1.0 - lost <= _MOST * (1.0 - np.median(lost))
+    asked = np.argsort(-lost, kind="stable")
+    if first is not None:
+        asked = asked[:_TRIED]
+        if agrees(first):
+            odd = _odd(first, block) if num > _TELLING else None
+            asked = asked[gone[asked]] if odd is None else np.array([odd])
+    views = [v for v in asked.tolist() if block.names[v] not in options.fixed]
+    left: list[_Left] = []
+    for one in _agreeing(views, block, outer, options, solve):
+        left.append(one)
+        if one.strange and num > _TELLING:  # those that agree without it contradict it in any block with it
+            break
+    if odd is not None and first is not None:
+        return _by_prior(left, float(first.outcome.prior.scale[odd]), block)
+    chosen = [one for one in left if one.strange or (one.placed.meets and gone[one.view])]
+    chosen = [one for one in chosen if one.gain(lost[one.view]) > SURE]
+    return _likeliest(chosen, left, lost, block) if chosen else (None, None)
+
+
+def agrees(found: Solution) -> bool:
+    """Whether the views of a block agree to the noise of their ties."""
+    return found.outcome.noise < MUCH_NOISE and not found.has_trend and not found.is_skew
+
+
+def _odd(found: Solution, block: Block) -> int | None:
+    """The one view that is farther off than stated, where the priors tell of one and no control point is in it."""
+    odd = np.flatnonzero(found.outcome.prior.odd)
+    if len(odd) != 1 or (block.view[block.point >= block.num_tracks] == odd[0]).any():
+        return None
+    return int(odd[0])
+
+
+def _lost(found: Solution, block: Block) -> Array:
+    """Share (N,) of each view's tie points that were cut; of a view without any all."""
+    ties = block.use & (block.point < block.num_tracks)
+    had, kept = (
+        np.bincount(block.view[rows], minlength=len(block.views))
+        for rows in (ties, ties & found.outcome.inlier)
+    )
+    return np.asarray(1.0 - kept / np.maximum(had, 1))
+
+
+def _agreeing(
+    views: Sequence[int], block: Block, outer: Block, options: AdjustOptions, solve: Solver
+) -> Iterator[_Left]:
+    """The block without one view after the other, where the rest is tied together and agrees."""
+    for v in views:
+        others = block.without(block.view == v)
+        if not _is_tied(others, v):
+            continue
+        try:
+            found = solve(others, outer.without(outer.view == v))
+        except (AdjustError, np.linalg.LinAlgError) as error:
+            _LOG.info("without %s: %s", block.names[v], error)
+            continue
+        measured = np.isfinite(found.after.error) or np.delete(_lost(found, others), v).max() < _MOST
+        placed = place(found, others, block, v) if measured and agrees(found) else None
+        if placed is not None:
+            limit = options.robust_threshold
+            yield _Left(v, others, found, placed, placed.contradicted(limit), placed.is_coherent(limit))
+
+
+def _is_tied(block: Block, without: int) -> bool:
+    """Whether the views of a block are tied to each other but for one."""
+    order = np.lexsort((block.view, block.point))
+    order = order[(block.use & (block.point < block.num_tracks))[order]]
+    view, point = block.view[order], block.point[order]
+    pairs = np.unique(np.stack([view[:-1], view[1:]])[:, point[1:] == point[:-1]], axis=1)
+    groups = connected_groups(len(block.views), [(int(i), int(j)) for i, j in pairs.T])
+    return len(groups) == 2 and any(list(group) == [without] for group in groups)
+
+
+def _by_prior(left: list[_Left], scale: float, block: Block) -> tuple[Apart | None, Solution | None]:
+    """The view that its prior tells of, if it meets the others' points where it is found alone."""
+    if not left or not left[0].placed.meets:
+        return None, None
+    (one,) = left
+    said = look(one.found, block, one.placed, one.view)
+    told = Apart((one.view,), np.nan, np.inf, None, one.contradicted, said, one.placed, scale)
+    return told, one.found
+
+
+def _likeliest(
+    chosen: list[_Left], left: list[_Left], lost: Array, block: Block
+) -> tuple[Apart | None, Solution | None]:
+    """Which of the views `chosen` it is, by the evidence of all ties; `left` are all without which the rest agrees."""
+    evidence = {one.view: _evidence(one, block) for one in left} if len(left) > 1 else {chosen[0].view: 0.0}
+    chosen = sorted(chosen, key=lambda one: -evidence[one.view])
+    best = chosen[0]
+    views = tuple(one.view for one in chosen if evidence[one.view] > evidence[best.view] - SURE)
+    rest = sorted(((e, v) for v, e in evidence.items() if v not in views), reverse=True)
+    gain = best.gain(lost[best.view])
+    gap, runner_up = (evidence[best.view] - rest[0][0], rest[0][1]) if rest else (gain, None)
+    said, placed = look(best.found, block, best.placed, best.view), best.placed if best.placed.meets else None
+    told = Apart(views, gain, gap, runner_up, best.contradicted, said, placed)
+    _LOG.info("%s against the others: %.0f nats", ", ".join(block.names[v] for v in views), gain)
+    return told, best.found if told.clear else None
+
+
+def _evidence(left: _Left, block: Block) -> float:
+    """Logarithm of the evidence of all ties of a block, of which those without one view are explained.
+
+    Others lie anywhere in their images, as what is wrong does here: how far off a strange camera sees is not known. A
+    part that is too large to be judged explains nothing.
+    """
+    ties = int((block.use & (block.point < block.num_tracks)).sum())
+    size = np.array([view.size for view in block.views], dtype=np.float64)
+    area = float(np.median(size.prod(axis=1)) / np.median(block.sigma) ** 2)
+    problem = replace(left.found.outcome.problem, camera_prior=left.found.problem.camera_prior)  # as stated
+    linear = around(replace(left.found.outcome, problem=problem), left.block)
+    if linear is None:
+        return -ties * float(np.log(area))
+    covered = sum(tracks.rows.size for tracks in linear.tracks)
+    return fit(replace(linear, area=area, image=area)).evidence - (ties - covered) * float(np.log(area))

@@ -1,0 +1,223 @@
+"""One camera that belongs to another image: found, named, and the others as without it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment, apart
+from barpc.ba.apart import find_apart
+from barpc.errors import AdjustError
+from barpc.scene import Tracks, View
+from barpc.sensor.geometry import triangulate
+from barpc.sensor.rpc import RPC
+from barpc.simulate import Block, simulate_block
+from benchmarks.worlds import judge
+from benchmarks.worlds_families import World, make
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
+Change = Callable[[RPC], RPC]
+OFFSET = np.array([400.0, -900.0])
+
+
+def swapped(rpc: RPC) -> RPC:
+    """Line for sample."""
+    turned = {name: getattr(rpc, name)[::-1] for name in ("image_offset", "image_scale")}
+    return replace(rpc, coeffs=rpc.coeffs[[2, 3, 0, 1]], **turned)
+
+
+def shifted(rpc: RPC) -> RPC:
+    """Of another tile."""
+    return replace(rpc, image_offset=rpc.image_offset + OFFSET)
+
+
+def raised(rpc: RPC) -> RPC:
+    """Heights above a surface 100 m lower."""
+    return replace(rpc, ground_offset=rpc.ground_offset + np.array([0.0, 0.0, 100.0]))
+
+
+def block_with(view: int, change: Change, views: int = 3, tracks: int = 300, seed: int = 1) -> Block:
+    """A simulated block of which one view has an RPC that was changed."""
+    made = simulate_block(views, tracks, seed=seed, attitude=5e-6, position=1.0)
+    given = [replace(v, sensor=change(v.sensor)) if n == view else v for n, v in enumerate(made.views)]  # type: ignore[arg-type]
+    return replace(made, views=tuple(given))
+
+
+def without(block: Block, view: int) -> tuple[tuple[View, ...], Tracks]:
+    tracks = block.tracks.select(block.tracks.view != view)
+    views = tuple(v for n, v in enumerate(block.views) if n != view)
+    number = np.cumsum(np.arange(len(block.views)) != view) - 1
+    return views, Tracks(number[tracks.view], tracks.point, tracks.xy, tracks.sigma)
+
+
+def met(found: Adjustment, block: Block, view: int) -> float:
+    """RMS [px] at which a camera meets exact check points, intersected by all."""
+    check = block.truth.check
+    left = triangulate(found.sensors, check.view, check.point, check.xy).residuals[check.view == view]
+    return float(np.sqrt(np.nanmean((left**2).sum(axis=1))))
+
+
+@pytest.mark.parametrize(
+    ("change", "look"),
+    [(swapped, "axes"), (shifted, "offset"), (raised, "height")],
+    ids=["axes swapped", "another tile", "another datum"],
+)
+def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(
+    monkeypatch, change: Change, look: str
+) -> None:
+    if look != "axes":  # a prior tells of one view where the others agree, which a pair always does
+        other = block_with(2, change)
+        assert adjust_tracks(other.views, other.tracks).apart is None
+        monkeypatch.setattr(apart, "_TELLING", 2)
+    block = block_with(2, change)
+    found, alone = adjust_tracks(block.views, block.tracks), adjust_tracks(*without(block, 2))
+    assert found.apart is not None
+    assert found.apart.views == (2,)
+    assert found.in_space_rms is None
+    assert not found.findings
+    np.testing.assert_allclose(found.params[:2], alone.params, atol=0.25)
+    np.testing.assert_allclose(found.rmse()[:2], alone.rmse(), atol=0.01)
+    said = found.apart.look
+    if look == "axes":
+        assert said.swapped
+        assert found.apart.placed is None
+        assert not found.params[2].any()
+        assert not found.inlier[block.tracks.view == 2].any()
+        assert found.apart.gain > 100.0
+    else:
+        assert said.offset is not None
+        if look == "offset":
+            np.testing.assert_allclose(said.offset, OFFSET, atol=20.0)
+            assert said.height is None
+        else:
+            assert said.height == pytest.approx(-100.0, abs=20.0)
+        assert found.apart.placed is not None
+        assert met(found, block, 2) < 0.1
+        assert 0.8 < found.held_out_noise[2] < 1.3
+        seen = np.bincount(block.tracks.point)[block.tracks.point] == 3  # by two others
+        taking_part = (block.tracks.view == 2) & ~found.held_out & seen
+        assert found.inlier[taking_part].mean() > 0.9
+
+
+def test_nothing_is_tried_where_the_block_agrees(monkeypatch) -> None:
+    def no_solve(*_: Any) -> Any:
+        raise AssertionError
+
+    tried: list[Any] = []
+
+    def watched(first: Any, block: Any, outer: Any, options: Any, solve: Any) -> Any:
+        tried.append(find_apart(first, block, outer, options, no_solve))
+        return tried[-1]
+
+    monkeypatch.setattr(adjustment, "find_apart", watched)
+    made = simulate_block(3, 400, seed=3, attitude=10e-6, position=2.0)
+    wrong = np.random.default_rng(1).uniform(size=len(made.tracks)) < 0.1
+    noisy = replace(made.tracks, xy=made.tracks.xy + wrong[:, None] * [9.0, -14.0])
+    for tracks in (made.tracks, noisy):
+        assert adjust_tracks(made.views, tracks).apart is None
+    assert tried == [(None, None)] * 2
+
+
+def test_a_view_of_wrong_matches_is_no_foreign_one() -> None:
+    made, rng = simulate_block(3, 250, seed=3, attitude=10e-6, position=2.0), np.random.default_rng(1)
+    wrong = (made.tracks.view == 2) & (rng.uniform(size=len(made.tracks)) < 0.7)
+    off = rng.uniform(-30.0, 30.0, made.tracks.xy.shape)
+    found = adjust_tracks(made.views, replace(made.tracks, xy=made.tracks.xy + wrong[:, None] * off))
+    assert found.apart is None
+    assert found.inlier[(made.tracks.view == 2) & ~wrong & ~found.held_out].mean() > 0.9
+
+
+@pytest.mark.parametrize("given", [{"loss": "linear"}, {"model": "affine"}, {"drift": 0}])
+def test_who_asks_for_less_than_cameras_have_gets_it_of_all(given) -> None:
+    block: Any = SimpleNamespace(views=(None,) * 4)
+    assert find_apart(None, block, block, AdjustOptions(**given), pytest.fail) == (None, None)
+
+
+def scripted(monkeypatch, evidence: list[float], contradicted: list[float]) -> Any:
+    """What is found where each view's leaving makes the others agree with so much evidence."""
+    num = len(evidence)
+    placed = SimpleNamespace(meets=False, squared=np.zeros(200))
+
+    def agreeing(views: Any, *_: Any) -> Any:
+        for v in views:
+            one = apart._Left(
+                v, SimpleNamespace(views=(None,) * num), "solved", placed, contradicted[v], True
+            )  # type: ignore[arg-type]
+            yield one
+
+    monkeypatch.setattr(apart, "_agreeing", agreeing)
+    monkeypatch.setattr(apart._Left, "usual", 0.02)
+    monkeypatch.setattr(apart, "_evidence", lambda one, block: evidence[one.view])
+    monkeypatch.setattr(apart, "look", lambda *_: "looked")
+    block: Any = SimpleNamespace(views=(None,) * num, names=tuple("abcdef"[:num]))
+    return find_apart(None, block, block, AdjustOptions(), pytest.fail)
+
+
+def test_of_two_views_as_likely_none_is_taken_out(monkeypatch) -> None:
+    found, solved = scripted(monkeypatch, [-100.0, -96.0, -300.0], [0.9, 0.9, 0.1])
+    assert (found.views, found.clear, solved) == ((1, 0), False, None)
+    assert (found.gap, found.runner_up) == (204.0, 2)
+    found, solved = scripted(monkeypatch, [-100.0, -94.0, -300.0], [0.9, 0.9, 0.1])
+    assert (found.views, found.clear, solved) == ((1,), True, "solved")
+    assert (found.gap, found.runner_up) == (6.0, 0)
+
+
+def test_a_view_of_which_half_agrees_is_its_own(monkeypatch) -> None:
+    assert scripted(monkeypatch, [0.0, 0.0, 0.0], [0.50, 0.3, 0.02]) == (None, None)
+    assert scripted(monkeypatch, [0.0, -9.0, -9.0], [0.52, 0.3, 0.02])[0].views == (0,)
+
+
+def test_a_block_of_which_one_of_several_is_wrong_is_refused_with_their_names(monkeypatch) -> None:
+    def fails(*_: Any) -> Any:
+        raise AdjustError("no step lowers the cost")
+
+    told: Any = SimpleNamespace(views=(0, 2), clear=False)
+    monkeypatch.setattr(adjustment, "solve_block", fails)
+    monkeypatch.setattr(adjustment, "find_apart", lambda *_: (told, None))
+    made = simulate_block(3, 60, seed=3)
+    with pytest.raises(AdjustError, match=f"Without any one of {made.views[0].name}, {made.views[2].name} "):
+        adjust_tracks(made.views, made.tracks)
+
+
+# --- cameras that are not barpc's simulator's -----------------------------------------------------------------------
+
+
+def beside(world: World, odd: int) -> tuple[Adjustment, float, float]:
+    """A world adjusted, and by how much the others' check points [px] and their shape [m] are worse than without it."""
+    rest = world.without(odd)
+    found, alone = adjust_tracks(world.views, world.tracks), adjust_tracks(rest.views, rest.tracks)
+    kept = [sensor for v, sensor in enumerate(found.sensors) if v != odd]
+    one, other = judge(rest, kept), judge(rest, alone.sensors)
+    return found, float(np.max(np.subtract(one.rms, other.rms))), one.shape - other.shape
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 4, 5, 10], ids=["date of 3", "axes of 3", "tile of 4", "date of 5"])
+def test_a_foreign_rpc_leaves_the_others_as_without_it(seed: int) -> None:
+    world = make("foreign", seed)
+    (odd,) = world.plan.deliver
+    found, worse, shape = beside(world, odd)
+    assert found.apart is not None
+    assert found.apart.views == (odd,)
+    assert found.in_space_rms is None
+    assert abs(worse) < 0.005
+    assert abs(shape) < 0.02
+    assert found.apart.look.swapped == (seed == 4)
+    assert (found.apart.look.offset is not None) == (seed == 5)
+    assert (found.apart.placed is not None) == (seed == 5)
+    if seed == 5:  # adjusted alone it is as good as the others
+        assert judge(world, found.sensors).rms[odd] < 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("family", "seed"), [("cloud", 1), ("local", 4), ("clean", 9), ("wander", 3), ("priors", 0)]
+)
+def test_what_is_wrong_otherwise_is_no_foreign_rpc(family: str, seed: int) -> None:
+    world = make(family, seed)
+    assert adjust_tracks(world.views, world.tracks).apart is None
