@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,12 +16,13 @@ from barpc.ba.datum import datum_shares
 from barpc.ba.following import follow, without_strips
 from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Terrain
-from barpc.ba.heldout import enu_offsets, keep_out
+from barpc.ba.heldout import enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior
-from barpc.ba.judge import standing_out
+from barpc.ba.judge import Finding, standing_out
 from barpc.ba.result import Adjustment
 from barpc.ba.snooping import MOST_TESTED, image_test
 from barpc.ba.solution import Solution, solve_block
+from barpc.ba.standing import Parts, without_moving
 from barpc.errors import AdjustError
 from barpc.geodesy import Array
 from barpc.options import AUTO, AdjustOptions
@@ -82,11 +83,11 @@ def adjust_tracks(
     options = AdjustOptions() if options is None else options
     block = join(tuple(views), tracks, gcps, options, keep_largest, reference)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
-    inner, outer = block.without(rows), block.without(~rows)
+    parts = Parts(block, rows, np.zeros(len(rows), dtype=np.int64))
     try:
-        found, in_space = _choose_model(inner, outer, options, dem, centers, prior)
+        found, in_space, parts = _choose_model(parts, options, dem, centers, prior)
         found.heights.warn()
-        return _adjustment(found, inner, outer, options, in_space, start)
+        return _adjustment(found, parts, options, in_space, start)
     except np.linalg.LinAlgError as error:
         raise AdjustError(
             f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "
@@ -95,22 +96,31 @@ def adjust_tracks(
 
 
 def _choose_model(
-    block: Block,
-    outer: Block,
+    parts: Parts,
     options: AdjustOptions,
     dem: Terrain | None,
     centers: Array | None,
     prior: BlockPrior | None,
-) -> tuple[Solution, float | None]:
-    """The block solved; by an affine in the image where the data choose it, and what the model in space left [px]."""
-    found, in_space = solve_block(block, outer, options, dem, centers, prior), None
+) -> tuple[Solution, float | None, Parts]:
+    """The block solved; by an affine in the image where the data choose it, and what the model in space left [px].
+
+    Without ties that move.
+    """
+
+    def solve(parts: Parts) -> Solution:
+        return solve_block(parts.inner, parts.outer, options, dem, centers, prior)
+
+    found, in_space = solve(parts), None
+    block, outer = parts.inner, parts.outer
     if prior is None and found.problem.cameras.unknowns.geometric:
+        found, parts = without_moving(found, parts, options, solve)
+        block, outer = parts.inner, parts.outer
         found = without_strips(found, block, outer, options)
     given = options.model != AUTO or options.drift is not None or prior is not None
     skew, chosen = found.is_skew, found
     trend = skew or found.has_trend or found.has_waves
     if trend and not given and _bent_by_control(found, block, outer, options, dem, centers):
-        return found, None
+        return found, None, parts
     if (skew or found.has_trend) and not given:
         in_image = solve_block(block, outer, replace(options, model="affine"), dem, None, None)
         better = in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error
@@ -119,8 +129,8 @@ def _choose_model(
     if prior is None and found.problem.cameras.unknowns.geometric:
         followed = follow(found, block, outer, options)
         if chosen is found or followed.after.error < _MUCH_BETTER * chosen.after.error:
-            return followed, None
-    return chosen, in_space
+            return followed, None, parts
+    return chosen, in_space, parts
 
 
 def _bent_by_control(
@@ -139,22 +149,31 @@ def _bent_by_control(
 
 
 def _adjustment(
-    found: Solution, block: Block, outer: Block, options: AdjustOptions, in_space: float | None, start: float
+    found: Solution, parts: Parts, options: AdjustOptions, in_space: float | None, start: float
 ) -> Adjustment:
     """What is handed out, in the order of the tracks given."""
+    block, outer, apart = parts.inner, parts.outer, parts.apart
     outcome, final, seen = found.outcome, found.final, found.seen
+    delivered = found.problem.camera_prior.mean
+    moved = [measure(found.problem, params, apart) for params in (delivered, final.params)]
     covariance = outcome.minimum.covariance(found.problem.free)
     projected = found.problem.project_points(final.params, final.points)
     cameras = found.problem.cameras
     points = np.where(seen[:, None], final.points, np.nan)
-    points[found.after.index] = found.after.points
+    for one in (found.after, moved[1]):
+        points[one.index] = one.points
     inlier = block.in_order(outcome.inlier)
     ties = slice(0, len(inlier) - (block.point >= block.num_tracks).sum())
     is_tie = found.problem.structure.point < block.num_tracks
-    view = np.maximum(block.in_order(block.view), outer.in_order(outer.view))[ties]
+    view = parts.block.in_order(parts.block.view)[ties]
     before, after = (
-        (block.in_order(inside.T) + outer.in_order(outside.residual.T))[ties]
-        for inside, outside in ((found.before, found.start), (outcome.residual, found.after))
+        (block.in_order(inside.T) + outer.in_order(outside.residual.T) + apart.in_order(gone.residual.T))[
+            ties
+        ]
+        for inside, outside, gone in (
+            (found.before, found.start, moved[0]),
+            (outcome.residual, found.after, moved[1]),
+        )
     )
     gauge, shares = _place(found, block, covariance)
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
@@ -181,7 +200,8 @@ def _adjustment(
         prior=outcome.prior,
         smooth=outcome.smooth,
         asked=found.asked,
-        findings=found.findings,
+        findings=tuple(_said(found.findings, parts, points)),
+        moving=parts.block.in_order(parts.group > 0)[ties],
         left=tuple(standing_out(outcome, block, options.noise_floor)),
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),
@@ -192,6 +212,17 @@ def _adjustment(
         seconds=time.process_time() - start,
         options=options,
     )
+
+
+def _said(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[Finding]:
+    """Findings without what the judge worked with."""
+    number = 0
+    for one in findings:
+        if one.moved is None:
+            yield one
+        else:
+            number += 1
+            yield replace(one, moved=None, motion=parts.motion(number, one.moved, points))
 
 
 def _control(found: Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:

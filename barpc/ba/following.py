@@ -10,7 +10,7 @@ from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
 from barpc.ba.explanations import LOCAL
 from barpc.ba.heldout import is_better
-from barpc.ba.judge import judge, standing_out
+from barpc.ba.judge import standing_out
 from barpc.ba.rounds import Rounds, revived
 from barpc.ba.solution import Solution, finished
 from barpc.ba.starting import make_problem
@@ -23,8 +23,6 @@ _PER_SPLINE = 30  # observations of a view
 _FEWEST = 7  # splines
 _LOOKS = 2  # for detectors
 _MISSES = 2  # one after the other
-_HALF = 0.5  # of what was cut
-_MUCH = 0.3  # of a stretch, as `barpc.report.verdict.MANY_REJECTED`
 _MOST_SPLINES = 4000  # of all views: what a block of 300 takes is 2.6 times as long
 
 
@@ -50,15 +48,11 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
 
 
 def without_strips(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
-    """The block with the rows and columns moved that lie off by themselves, where the judge finds such.
+    """The block with the rows and columns moved that lie off by themselves, where the judge found such.
 
     Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
     """
-    if options.loss == "linear":  # who wants least squares has no observation that may be wrong
-        return found
-    findings = judge(found.outcome, block, options.noise_floor)
-    strips = [one for one in findings if one.kind in LOCAL]
-    found = replace(found, findings=tuple(findings))
+    strips = [one for one in found.findings if one.kind in LOCAL]
     if not strips or options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
         return found
     own = [[one for one in strips if one.view == v] for v in range(len(block.views))]
@@ -70,23 +64,13 @@ def without_strips(found: Solution, block: Block, outer: Block, options: AdjustO
             places[v, n], params[v, :, n] = one.where, one.size
     waves = Waves(0, np.zeros((len(own), 0)), places)
     tried = _with_waves(found, block, outer, options, waves, start=params.reshape(len(own), -1))
-    if is_better(found.after, tried.after, outer) or _is_half(found, tried, block, options):
-        return replace(found, findings=())
+    if is_better(found.after, tried.after, outer):
+        return replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
     plain = follow(
         found, block, outer, options
     )  # splines and detectors may explain the same, and leave nothing
     calm = plain is not found and not standing_out(plain.outcome, block, options.noise_floor)
     return found if calm and not is_better(tried.after, plain.after, outer) else tried
-
-
-def _is_half(found: Solution, tried: Solution, block: Block, options: AdjustOptions) -> bool:
-    """Whether strips bring back less than half of what was cut, and stretches remain in which much is.
-
-    A cloud looks like some of them, and is none.
-    """
-    cut, still = (float((block.use & ~one.outcome.inlier).sum()) for one in (found, tried))
-    left = standing_out(tried.outcome, block, options.noise_floor)
-    return still > _HALF * cut and any(one.by_share and one.share > _MUCH for one in left)
 
 
 def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:

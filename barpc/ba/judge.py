@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from barpc.ba.block import Block
-from barpc.ba.explanations import LOCAL, WANDER, Explanation, Seen, Where, boxed, proposed, sharpened
+from barpc.ba.explanations import LOCAL, MOVING, WANDER, Explanation, Seen, Where, boxed, proposed, sharpened
 from barpc.ba.mixture import Fit, fit, linearise, settled
+from barpc.ba.moving import Found, Ground, Motion, group_of
 from barpc.ba.rounds import Outcome, revived
 from barpc.ba.scan import SURE, Interval, scan
 from barpc.ba.weights import Observations
@@ -34,7 +35,7 @@ class Finding:
     """An explanation that was taken."""
 
     kind: str  # a name of `barpc.ba.explanations.EXPLANATIONS`
-    view: int
+    view: int  # -1: of none
     where: Where | None
     size: (
         Array  # (2,) root mean square displacement of what it moves, col and row, with sign for a strip [px]
@@ -42,6 +43,8 @@ class Finding:
     gain: float  # nats over the next without it
     gap: float  # nats over the runner-up
     runner_up: str  # its kind, or "" for none
+    moved: Found | None = field(default=None, repr=False)
+    motion: Motion | None = None  # what is said of it at the end
 
 
 def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
@@ -81,7 +84,9 @@ def judge(outcome: Outcome, block: Block, floor: float) -> list[Finding]:
     size = np.array([view.size for view in block.views], dtype=np.float64).T
     nothing = np.zeros((2, 0, len(block.view)))
     return _Search(
-        Seen(linear, block.xy, size, fit(linear), nothing), first, floor / float(np.median(block.sigma))
+        Seen(linear, Ground.of(problem, state), block.xy, size, fit(linear), nothing, np.zeros(0)),
+        first,
+        floor / float(np.median(block.sigma)),
     ).run()
 
 
@@ -99,6 +104,7 @@ class _Search:
     def __init__(self, seen: Seen, first: list[Interval], floor: float) -> None:
         self.seen, self.first, self.floor = seen, first, floor
         self.taken: list[tuple[Explanation, float, float, str]] = []  # with gain, gap and runner-up
+        self.group: list[Explanation] = []  # looked for once
 
     def run(self) -> list[Finding]:
         """All that were taken."""
@@ -108,13 +114,13 @@ class _Search:
             if self.taken[-1][0].kind not in LOCAL:  # what is smooth is followed by other means
                 break
             tried = self._tried()
-        return [Finding(*self._said(n), *row[1:]) for n, row in enumerate(self.taken)]
+        return [self._finding(n) for n in range(len(self.taken))]
 
     def _take(self, tried: list[_Tried]) -> None:
         """The best, or several parts of its image where these explain more together than it does alone."""
         best = tried[0]
         if best[0].kind not in LOCAL:
-            parts, left = copy(self), _parts_of(best[0].view, tried)
+            parts, left = copy(self), _parts_of(best[0], tried)
             parts.taken = list(self.taken)
             total = 0.0
             for more in range(_PARTS, 0, -1):
@@ -124,7 +130,7 @@ class _Search:
                     break
                 total += left[0][2]
                 parts._add(left)
-                left = _parts_of(best[0].view, parts._tried())
+                left = _parts_of(best[0], parts._tried())
             if total > best[2] + SURE:
                 self.taken, self.seen = parts.taken, parts.seen
                 return
@@ -138,17 +144,25 @@ class _Search:
         _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
         self.taken.append((one, gain, gain - max(other[1], 0.0), other[0]))
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
-        self.seen = replace(self.seen, base=made, extra=extra)
+        sigma = np.append(self.seen.sigma, one.sigma)
+        self.seen = replace(self.seen, base=made, extra=extra, sigma=sigma)
 
-    def _said(self, n: int) -> tuple[str, int, Where | None, Array]:
+    def _finding(self, n: int) -> Finding:
+        one, seen = self.taken[n][0], self.seen
+        moved = None if one.group is None else group_of(seen.linear, seen.ground, one.group, seen.base)
+        return Finding(one.kind, one.view, one.where, self._size(n), *self.taken[n][1:], moved)
+
+    def _size(self, n: int) -> Array:
         one = self.taken[n][0]
+        if one.group is not None:
+            return np.zeros(2)
         start = sum(len(row[0].sigma) for row in self.taken[:n])
-        of_one = self.seen.base.extra[start : start + len(one.sigma)]
+        of_one: Array = self.seen.base.extra[start : start + len(one.sigma)]
         if one.kind in LOCAL:
-            return one.kind, one.view, one.where, of_one
+            return of_one
         rows = self.seen.linear.view == one.view
         moved = np.einsum("cek,e->ck", one.extra[:, :, rows], of_one)
-        return one.kind, one.view, one.where, np.sqrt((moved**2).mean(axis=1))
+        return np.asarray(np.sqrt((moved**2).mean(axis=1)))
 
     def _tried(self) -> list[_Tried]:
         """Explanations of what stands out now, fitted beside those taken, with their gains; the best first."""
@@ -165,7 +179,7 @@ class _Search:
         )
         out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
-        made = self._sorted((one, self._fit(one)) for one in proposed(seen, out))
+        made = self._sorted((one, self._fit(one)) for one in self._proposed(out))
         if made and made[0][0].kind == WANDER:
             box = boxed(seen, *made[0][:2])
             made = self._sorted([*(row[:2] for row in made), (box, self._fit(box))])
@@ -173,6 +187,13 @@ class _Search:
         sharp = [self._sharpened(*row[:2]) for row in local[:_LOCAL]]
         rest = [row[:2] for row in made if row[0].kind not in LOCAL] + [row[:2] for row in local[_LOCAL:]]
         return self._sorted([*sharp, *rest])
+
+    def _proposed(self, out: list[Interval]) -> list[Explanation]:
+        """Explanations of intervals; the group is looked for once and then tried beside what was taken."""
+        known = (MOVING,) if self.group else ()
+        found = [*self.group, *proposed(self.seen, out, known)]
+        self.group = [one for one in found if one.kind == MOVING]
+        return found
 
     def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
         base = self.seen.base.evidence
@@ -191,14 +212,14 @@ class _Search:
         return one, found
 
     def _fit(self, one: Explanation) -> Fit:
-        sigma = np.concatenate([*(row[0].sigma for row in self.taken), one.sigma])
+        sigma = np.append(self.seen.sigma, one.sigma)
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
-        return fit(self.seen.linear, extra, sigma, self.seen.base)
+        return fit(self.seen.linear, extra, sigma, self.seen.base, one.group)
 
 
-def _parts_of(view: int, tried: list[_Tried]) -> list[_Tried]:
-    """Explanations of parts of an image."""
-    return [row for row in tried if row[0].kind in LOCAL and row[0].view == view]
+def _parts_of(best: Explanation, tried: list[_Tried]) -> list[_Tried]:
+    """Explanations of parts of an image, or of any beside what is of none."""
+    return [row for row in tried if row[0].kind in LOCAL and best.view in (row[0].view, -1)]
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:
@@ -224,7 +245,7 @@ def _of_one_image(one: Explanation, other: Explanation) -> bool:
 def _part(one: Explanation, seen: Seen) -> float:
     """The part of its image that it moves: of two that explain as much it is the smaller one."""
     rows = seen.linear.view == one.view
-    return float(one.extra[:, :, rows].any(axis=(0, 1)).mean())
+    return float(one.extra[:, :, rows].any(axis=(0, 1)).sum() / max(rows.sum(), 1))
 
 
 def _differs(one: Explanation, other: Explanation) -> bool:

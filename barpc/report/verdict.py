@@ -88,6 +88,12 @@ def _doubt(view: ViewEntry, run: Run) -> str:
         if run.kind == "check":
             return f"tie points disagree by {error:.2f} px: adjust the cameras"
         return f"tie points are left with {error:.2f} px: look for wrong matches and moving things"
+    moving = view.num_moving / max(view.num_moving + view.num_rejected + view.num_observations, 1)
+    if moving > MANY_REJECTED:
+        return (
+            f"{100 * moving:.0f} % of its tie points move together and took no part: check that the others are the "
+            "ground that stands still"
+        )
     lost = view.num_rejected / max(view.num_rejected + view.num_observations, 1)
     if lost > MANY_REJECTED:
         return (

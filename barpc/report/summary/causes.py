@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.explanations import FADE, STRIP, WANDER
+from barpc.ba.explanations import FADE, MOVING, STRIP, WANDER
+from barpc.ba.judge import Finding
+from barpc.ba.moving import Motion
 from barpc.ba.scan import Interval
 from barpc.report.records import Number, Record, said
 
@@ -17,6 +19,8 @@ _WORDS = {
     STRIP: "{axis} {first:.0f}-{last:.0f} of {image} lie {size:.2f} px off the rest of it",
     FADE: "rows of {image} lie {size:.2f} px off at row {origin:.0f}, which fades within {length:.0f} rows",
     WANDER: "rows of {image} wander by {size:.2f} px",
+    MOVING: "{share} % of the tie points{side} move together (a cloud, water or shadows?), by {metres} from {first} to "
+    "{second} beside what may be their height, and took no part",
 }
 
 
@@ -25,7 +29,7 @@ class ExplanationEntry(Record):
 
     name: str = said("What it is", enum=list(_WORDS))
     sentence: str = said("The same in words", minLength=1)
-    image: str = said("View")
+    image: str | None = said("View; null for what is of no single one")
     gain: float = said("Logarithm of the evidence, over that without it", "nats")
     gap: float = said("The same, over the runner-up", "nats")
     runner_up: str | None = said("What explains next as much; null for nothing", default=None)
@@ -33,6 +37,14 @@ class ExplanationEntry(Record):
     first: Number = said("Its first row or column", "px", default=None)
     last: Number = said("Its last row or column", "px", default=None)
     size_px: Number = said("RMS displacement of what it moves", "px", default=None)
+    share: Number = said("Tie points that move together: part of all of them", default=None)
+    moved_m: Number = said(
+        "How far they move on the ground, beside what may be their height", "m", default=None
+    )
+    between: tuple[str, ...] | None = said("From the first of these views to the second", default=None)
+    box: tuple[float, ...] | None = said(
+        "Where nine in ten of them lie, each way: west, south, east, north", "deg", default=None
+    )
 
 
 class LeftEntry(Record):
@@ -51,6 +63,9 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
     """What was taken, the first first."""
     found = []
     for one in adjustment.findings:
+        if one.motion is not None:
+            found.append(_moving(one, one.motion, adjustment.names))
+            continue
         image, size = adjustment.names[one.view], float(np.hypot(*one.size))
         place: dict[str, Any] = {}
         words: dict[str, Any] = {"image": image, "size": size}
@@ -64,6 +79,23 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
         numbers = one.gain, one.gap, one.runner_up or None
         found.append(ExplanationEntry(one.kind, sentence, image, *numbers, **place, size_px=size))
     return tuple(found)
+
+
+def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEntry:
+    between = names[motion.between[0]], names[motion.between[1]]
+    side = f", in the {motion.side} of the block," if motion.side else ""
+    share, metres = f"{100.0 * motion.share:.0f}", f"{motion.metres:.2g} m"
+    sentence = _WORDS[one.kind].format(
+        share=share, side=side, metres=metres, first=between[0], second=between[1]
+    )
+    numbers = one.gain, one.gap, one.runner_up or None
+    place: dict[str, Any] = {
+        "share": motion.share,
+        "moved_m": motion.metres,
+        "between": between,
+        "box": motion.box,
+    }
+    return ExplanationEntry(one.kind, sentence, None, *numbers, **place)
 
 
 def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
