@@ -201,13 +201,13 @@ def proposed(
 
     None of the kinds that are known.
     """
-    known = {(kind,) for kind in known_kinds}
+    known = set[tuple[object, ...]]()
     for interval in intervals:
-        for kind, make in EXPLANATIONS.items():
+        for kind in [kind for kind in EXPLANATIONS if kind not in known_kinds]:
             place = (interval.axis, interval.start, interval.stop) if kind in LOCAL else ()
             place = () if kind in _OF_BLOCK else (interval.view, *place)
             if (kind, *place) not in known:
                 known.add((kind, *place))
-                one = make(seen, interval)
+                one = EXPLANATIONS[kind](seen, interval)
                 if one is not None:
                     yield one

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from copy import copy
 from dataclasses import dataclass, field, replace
 
@@ -26,6 +26,7 @@ _TRIED = 3  # intervals a round
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # explanations of parts of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
+_HELD_IN = 4  # images of which a part may hold what moves
 _UNKNOWNS = 400  # of all views, up to which explanations are tried
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
 
@@ -180,6 +181,8 @@ class _Search:
         out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
         made = self._sorted((one, self._fit(one)) for one in self._proposed(out))
+        more = [one for row in made if row[0].group and row[2] > SURE for one in self._members(row[1], rows)]
+        made = self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
         if made and made[0][0].kind == WANDER:
             box = boxed(seen, *made[0][:2])
             made = self._sorted([*(row[:2] for row in made), (box, self._fit(box))])
@@ -194,6 +197,14 @@ class _Search:
         found = [*self.group, *proposed(self.seen, out, known)]
         self.group = [one for one in found if one.kind == MOVING]
         return found
+
+    def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
+        """Parts of images that hold what a group does: rows of one image that lie off move on the ground, too."""
+        seen, none = self.seen, np.zeros((2, int(rows.sum())))
+        places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none)
+        best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
+        intervals = sorted(best.values(), key=lambda one: -one.gain)[:_HELD_IN]
+        return proposed(seen, intervals, (MOVING, WANDER))
 
     def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
         base = self.seen.base.evidence

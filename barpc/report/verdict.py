@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
+from barpc.ba.scan import SURE
 from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
-from barpc.report.summary.causes import explanations, left_over
+from barpc.report.summary.causes import RIVALS, explanations, left_over
 from barpc.tie.reference import PEAK
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
@@ -182,7 +183,7 @@ def _block_reasons(run: Run) -> list[str]:
             f"{tilts} (east, north) only."
         )
     names = run.adjustment.names
-    out += _left_reasons(run)
+    out += _left_reasons(run) + _ambiguous(run.adjustment)
     for group in run.adjustment.two_groups:
         i, j = group.views
         if not (_oddity(i, run.adjustment) or _oddity(j, run.adjustment)):
@@ -220,6 +221,16 @@ def _left_reasons(run: Run) -> list[str]:
         place = f"{one.axis} {one.first:.0f}-{one.last:.0f} of {one.image}"
         worst.setdefault(one.image, f"{place[0].upper()}{place[1:]} stand out: {what}.")
     return list(worst.values())
+
+
+def _ambiguous(adjustment: Adjustment) -> list[str]:
+    """Groups that move, where something else explains tie points as well."""
+    rivals = [one.runner_up for one in adjustment.findings if one.motion is not None and one.gap < SURE]
+    return [
+        f"That tie points move together explains them no better than that {RIVALS[rival]}: look at where they are."
+        for rival in dict.fromkeys(rivals)
+        if rival
+    ]
 
 
 def _place_is_free(run: Run) -> bool:

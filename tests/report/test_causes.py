@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.explanations import EXPLANATIONS, FADE, STRIP, WANDER
+from barpc.ba.explanations import EXPLANATIONS, FADE, MOVING, STRIP, WANDER
 from barpc.ba.judge import Finding
+from barpc.ba.moving import Motion
 from barpc.ba.scan import Interval
 from barpc.report import verdict
 from barpc.report.summary.causes import _WORDS, explanations, left_over
@@ -57,6 +58,40 @@ def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sent
     )
     assert (found.first, found.last) == ends
     assert found.size_px == pytest.approx(np.hypot(*size))
+
+
+@pytest.mark.parametrize(
+    ("side", "said"),
+    [
+        ("north-west", "35 % of the tie points, in the north-west of the block, move together"),
+        ("", "35 % of the tie points move together"),
+    ],
+)
+def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: str) -> None:
+    motion = Motion(1.14, (1, 0), 0.354, (5.0, 43.0, 5.1, 43.2), side)
+    finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, 7.0, STRIP, motion=motion)
+    (found,) = explanations(adjustment([finding]))
+    assert found.sentence == (
+        f"{said} (a cloud, water or shadows?), by 1.1 m from east to west beside what may be their height, and took no "
+        "part"
+    )
+    assert (found.image, found.share, found.moved_m, found.between) == (None, 0.354, 1.14, ("east", "west"))
+    assert found.box == (5.0, 43.0, 5.1, 43.2)
+    assert (found.axis, found.first, found.size_px, found.runner_up) == (None, None, None, STRIP)
+    assert type(found).read({**vars(found), "box": [5.0, 43.0, 5.1, 43.2]}) == found
+
+
+@pytest.mark.parametrize(("gap", "told"), [(4.9, True), (5.1, False)])
+def test_what_else_a_group_may_be_is_a_reason_where_ties_cannot_tell(gap: float, told: bool) -> None:
+    motion = Motion(1.0, (0, 1), 0.2, (5.0, 43.0, 5.1, 43.2), "")
+    finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, gap, STRIP, motion=motion)
+    said = verdict._ambiguous(adjustment([finding]))
+    assert bool(said) == told
+    if told:
+        assert said == [
+            "That tie points move together explains them no better than that rows or columns of an image lie off: look "
+            "at where they are."
+        ]
 
 
 def interval(view: int, share: float, off: float) -> Interval:

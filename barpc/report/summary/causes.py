@@ -22,6 +22,12 @@ _WORDS = {
     MOVING: "{share} % of the tie points{side} move together (a cloud, water or shadows?), by {metres} from {first} to "
     "{second} beside what may be their height, and took no part",
 }
+RIVALS = {
+    STRIP: "rows or columns of an image lie off",
+    FADE: "rows of an image lie off and less and less",
+    WANDER: "rows of an image wander",
+    MOVING: "tie points move together",
+}
 
 
 class ExplanationEntry(Record):
