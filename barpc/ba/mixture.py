@@ -188,15 +188,13 @@ def fit(
     sigma: Array | None = None,
     warm: Fit | None = None,
     group: Group | None = None,
-    steps: int = _ITERATIONS,
 ) -> Fit:
     """The block with cameras and, beside them, unknowns of which each moves observations by `extra` (2, e, K) [px].
 
     Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, whose unknowns may be fewer, it
-    is cooled again only from where the further ones begin; with a `group` that moves from the top, in so many
-    steps at most.
+    is cooled again only from where the further ones begin; with a `group` that moves from the top.
     """
-    return _Mixture(linear, extra, sigma, warm, group).run(steps)
+    return _Mixture(linear, extra, sigma, warm, group).run()
 
 
 def thinned(linear: Linear, most: int) -> Linear:
@@ -393,12 +391,12 @@ class _Mixture:
             self.beside = np.concatenate([self.extra, group.by_move / linear.sigma], axis=1)
             self.moved = _Moved(linear.residual, group.share, self.noise)
 
-    def run(self, steps: int) -> Fit:
+    def run(self) -> Fit:
         """Expect and maximise until nothing changes."""
         linear, last, size = self.linear, -np.inf, self.extra.shape[1]
         right, matrix, log = np.zeros(len(linear.sigma)), np.zeros((0, 0)), 0.0
         moving = np.zeros(len(linear.sigma) if self.group is not None else 0)
-        for _ in range(steps):
+        for _ in range(_ITERATIONS):
             normal = _Normal(*linear.shape, len(self.x) - linear.precision.size)
             wrong, count = np.zeros(linear.views), np.zeros(linear.views)
             sums, log = np.zeros((2, 2)), 0.0  # squares and freedom, of what stands still and what moves

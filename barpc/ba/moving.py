@@ -26,7 +26,6 @@ CELLS = 6  # a side of the ground: the group's share is free in each
 _STARTS = 4  # a side of the ground, of which each moves in turn
 _LIKELY = 0.95  # that a track moves where the group is looked for, and that it stands far from there
 _FEW = 500  # tracks that are looked at from every start
-_STEPS = 25  # of each
 _SIGMA = 30.0  # px on the ground: a displacement from view to view, before it is known
 
 
@@ -111,7 +110,7 @@ def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Arr
     best: tuple[Group, Fit] | None = None
     for share in _first_shares(ground, rows, base.right):
         start = replace(group, share=share)
-        found = fit(few, extra, sigma, base, start, _STEPS)
+        found = fit(few, extra, sigma, base, start)
         if best is None or found.evidence > best[1].evidence:
             best = start, found
     assert best is not None
