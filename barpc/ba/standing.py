@@ -62,9 +62,10 @@ class Parts:
 
     def motion(self, number: int, one: Found, points: Array) -> Motion:
         """What is said of a group, of the points (P, 3) [m] of all tracks."""
-        of_group = np.unique(self.block.point[self.group == number])
-        every = np.unique(self.block.point[self.block.point < self.block.num_tracks])
-        every = every[np.isfinite(points[every, 0])]
+        placed = self.block.point[self.block.point < self.block.num_tracks]
+        placed = placed[np.isfinite(points[placed, 0])]
+        every, of_group = np.unique(placed), np.unique(self.block.point[self.group == number])
+        of_group = np.intersect1d(every, of_group)
         ground, all_of = ground_from_ecef(points[of_group]), ground_from_ecef(points[every])
         center = float(all_of[0, 0])
         place, whole = (np.column_stack([wrap_longitude(g[:, 0], center), g[:, 1]]) for g in (ground, all_of))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +17,9 @@ from barpc.ba.mixture import Group, fit, linearise, thinned
 from barpc.ba.moving import CELLS, Ground, group_of
 from barpc.ba.problem import Problem
 from barpc.ba.solve import State
+from barpc.ba.standing import Parts
 from barpc.ba.starting import first_state, make_problem
-from barpc.geodesy import Array, ground_from_ecef, metres_per_unit
+from barpc.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.scene import BoolArray, Tracks
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import Block, simulate_block
@@ -114,6 +117,30 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     few = thinned(linear, 100)
     assert 80 <= sum(len(part.rows) for part in few.tracks) <= 110
     assert fit(few, group=group).noise == pytest.approx(found.noise, rel=0.15)
+
+
+def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:
+    made, tracks, moves = drifting(3, 300, 0.1, 1.0)
+    block = join(made.views, tracks, None, AdjustOptions())
+    none, points = np.zeros(len(block.view), dtype=bool), ecef_from_ground(made.truth.ground)
+    found: Any = SimpleNamespace(metres=1.0, between=(0, 2))
+    parts = Parts(block, none, moves[block.order].astype(np.int64))
+    said = parts.motion(1, found, points)
+    assert said.side == "north-west"
+    inside = made.truth.ground[corner(made, 0.1)]
+    assert said.share == pytest.approx(0.1, abs=0.01)
+    low, high = inside[:, :2].min(axis=0), inside[:, :2].max(axis=0)
+    assert low[0] <= said.box[0] < said.box[2] <= high[0]
+    assert low[1] <= said.box[1] < said.box[3] <= high[1]
+    everywhere = replace(parts, group=(block.point % 5 == 0).astype(np.int64)).motion(1, found, points)
+    assert everywhere.side == ""
+    assert everywhere.share == pytest.approx(0.2, abs=0.01)
+    assert parts.is_tied()
+    assert [len(part.view) for part in (parts.inner, parts.apart)] == [int((~moves).sum()), int(moves.sum())]
+    lost = replace(parts, group=(block.view == 1).astype(np.int64))
+    assert not lost.is_tied()
+    alone = replace(parts, group=np.isin(block.point, block.point[block.view == 0]) & (block.view > 0))
+    assert not alone.is_tied()
 
 
 CASES = [(3, 0.35, 2.0, 0, 0.02), (2, 0.2, 2.0, 1, 0.02), (4, 0.45, 1.5, 2, 0.05), (3, 0.25, 6.0, 3, 0.1)]
