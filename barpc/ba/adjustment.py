@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,13 +19,14 @@ from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Terrain
 from barpc.ba.heldout import enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior
-from barpc.ba.judge import left_over
+from barpc.ba.judge import Finding, left_over
 from barpc.ba.placing import place
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Outcome
 from barpc.ba.scan import neighbours_alike
 from barpc.ba.snooping import MOST_TESTED, image_test
 from barpc.ba.solution import Solution, solve_block
+from barpc.ba.standing import Parts, without_moving
 from barpc.errors import AdjustError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import AUTO, AdjustOptions
@@ -86,18 +87,18 @@ def adjust_tracks(
     options = AdjustOptions() if options is None else options
     block = join(tuple(views), tracks, gcps, options, keep_largest, reference)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
-    inner, outer = block.without(rows), block.without(~rows)
+    parts = Parts(block, rows, np.zeros(len(rows), dtype=np.int64))
     try:
-        first, apart = _first(inner, outer, options, dem, centers, prior)
-        parts = inner, outer
+        first, apart = _first(parts.inner, parts.outer, options, dem, centers, prior)
+        given = parts.inner, parts.outer
         if apart is not None and apart.clear:
-            inner, outer = (one.without(one.view == apart.view) for one in parts)
-        found, in_space = _choose_model(inner, outer, options, dem, centers, prior, first)
+            parts = parts.without_view(apart.view)
+        found, in_space, parts = _choose_model(parts, options, dem, centers, prior, first)
         found.heights.warn()
-        whole = _adjustment(found, inner, outer, options, in_space, start)
+        whole = _adjustment(found, parts, options, in_space, start)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
-        return _with_apart(whole, apart, found, inner, parts, options.robust_threshold)
+        return _with_apart(whole, apart, found, parts.inner, given, options.robust_threshold)
     except np.linalg.LinAlgError as error:
         raise AdjustError(
             f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "
@@ -175,28 +176,32 @@ def _with_apart(
 
 
 def _choose_model(
-    block: Block,
-    outer: Block,
+    parts: Parts,
     options: AdjustOptions,
     dem: Terrain | None,
     centers: Array | None,
     prior: BlockPrior | None,
     first: Solution | None = None,
-) -> tuple[Solution, float | None]:
+) -> tuple[Solution, float | None, Parts]:
     """The block solved; by an affine in the image where the data choose it, and what the model in space left [px].
 
-    `first` is the block solved with the model to start with, where it was.
+    Without ties that move. `first` is the block solved with the model to start with, where it was.
     """
-    found, in_space = first, None
-    if found is None:
-        found = solve_block(block, outer, options, dem, centers, prior)
+
+    def solve(parts: Parts) -> Solution:
+        return solve_block(parts.inner, parts.outer, options, dem, centers, prior)
+
+    found, in_space = solve(parts) if first is None else first, None
+    block, outer = parts.inner, parts.outer
     if prior is None and found.problem.cameras.unknowns.geometric:
-        found = without_strips(found, block, outer, options)
+        found, parts, judged = without_moving(found, parts, options, solve)
+        block, outer = parts.inner, parts.outer
+        found = without_strips(found, judged, block, outer, options)
     given = options.model != AUTO or options.drift is not None or prior is not None
     skew, chosen = found.is_skew, found
     trend = skew or found.has_trend or found.has_waves
     if trend and not given and _bent_by_control(found, block, outer, options, dem, centers):
-        return found, None
+        return found, None, parts
     if (skew or found.has_trend) and not given:
         in_image = solve_block(block, outer, replace(options, model="affine"), dem, None, None)
         better = in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error
@@ -205,8 +210,8 @@ def _choose_model(
     if prior is None and found.problem.cameras.unknowns.geometric:
         followed = follow(found, block, outer, options)
         if chosen is found or followed.after.error < _MUCH_BETTER * chosen.after.error:
-            return followed, None
-    return chosen, in_space
+            return followed, None, parts
+    return chosen, in_space, parts
 
 
 def _bent_by_control(
@@ -225,22 +230,31 @@ def _bent_by_control(
 
 
 def _adjustment(
-    found: Solution, block: Block, outer: Block, options: AdjustOptions, in_space: float | None, start: float
+    found: Solution, parts: Parts, options: AdjustOptions, in_space: float | None, start: float
 ) -> Adjustment:
     """What is handed out, in the order of the tracks given."""
+    block, outer, apart = parts.inner, parts.outer, parts.apart
     outcome, final, seen = found.outcome, found.final, found.seen
+    delivered = found.problem.camera_prior.mean
+    moved = [measure(found.problem, params, apart) for params in (delivered, final.params)]
     covariance = outcome.minimum.covariance(found.problem.free)
     projected = found.problem.project_points(final.params, final.points)
     cameras = found.problem.cameras
     points = np.where(seen[:, None], final.points, np.nan)
-    points[found.after.index] = found.after.points
+    for one in (found.after, moved[1]):
+        points[one.index] = one.points
     inlier = block.in_order(outcome.inlier)
     ties = slice(0, len(inlier) - (block.point >= block.num_tracks).sum())
     is_tie = found.problem.structure.point < block.num_tracks
-    view = np.maximum(block.in_order(block.view), outer.in_order(outer.view))[ties]
+    view = parts.block.in_order(parts.block.view)[ties]
     before, after = (
-        (block.in_order(inside.T) + outer.in_order(outside.residual.T))[ties]
-        for inside, outside in ((found.before, found.start), (outcome.residual, found.after))
+        (block.in_order(inside.T) + outer.in_order(outside.residual.T) + apart.in_order(gone.residual.T))[
+            ties
+        ]
+        for inside, outside, gone in (
+            (found.before, found.start, moved[0]),
+            (outcome.residual, found.after, moved[1]),
+        )
     )
     gauge, shares = _place(found, block, covariance)
     status = f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {covariance.factor.method} factorisation"
@@ -267,7 +281,8 @@ def _adjustment(
         prior=outcome.prior,
         smooth=outcome.smooth,
         asked=found.asked,
-        findings=found.findings,
+        findings=tuple(_said(found.findings, parts, points)),
+        moving=parts.block.in_order(parts.group > 0)[ties],
         left=tuple(left_over(outcome, block, options.noise_floor)),
         alike=_alike(block, outcome, is_tie),
         in_space_rms=in_space,
@@ -287,6 +302,17 @@ def _alike(block: Block, outcome: Outcome, is_tie: BoolArray) -> Array:
     return neighbours_alike(
         block.view[wrong], block.xy[:, wrong], outcome.residual[:, wrong], len(block.views)
     )
+
+
+def _said(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[Finding]:
+    """Findings without what the judge worked with."""
+    number = 0
+    for one in findings:
+        if one.moved is None:
+            yield one
+        else:
+            number += 1
+            yield replace(one, moved=None, motion=parts.motion(number, one.moved, points))
 
 
 def _control(found: Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:

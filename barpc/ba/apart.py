@@ -227,8 +227,9 @@ def _evidence(left: _Left, block: Block) -> float:
     size = np.array([view.size for view in block.views], dtype=np.float64)
     area = float(np.median(size.prod(axis=1)) / np.median(block.sigma) ** 2)
     problem = replace(left.found.outcome.problem, camera_prior=left.found.problem.camera_prior)  # as stated
-    linear = around(replace(left.found.outcome, problem=problem), left.block)
-    if linear is None:
+    known = around(replace(left.found.outcome, problem=problem), left.block)
+    if known is None:
         return -ties * float(np.log(area))
+    linear, _ = known
     covered = sum(tracks.rows.size for tracks in linear.tracks)
     return fit(replace(linear, area=area, image=area)).evidence - (ties - covered) * float(np.log(area))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from barpc.ba.mixture import Fit, Linear, first_guess, log_likelihoods
+from barpc.ba import moving
+from barpc.ba.mixture import Fit, Group, Linear, first_guess, log_likelihoods
 from barpc.ba.periods import Swing
 from barpc.ba.periods import price as price_of_period
 from barpc.ba.scan import BINS, Interval, price
@@ -20,6 +21,7 @@ STRIP = "strip"
 FADE = "fade"
 WANDER = "wander"
 SWING = "swing"
+MOVING = "moving"
 LOCAL = STRIP, FADE
 """Those of a part of an image."""
 FOLLOWED = *LOCAL, SWING
@@ -34,15 +36,16 @@ SCALE = float(np.log(2.0 * np.log(30.0)))
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Unknowns of one view that may explain what the cameras do not."""
+    """Unknowns, of one view or of a group of ties, that may explain what the cameras do not."""
 
     kind: str  # a name of `EXPLANATIONS`
-    view: int
+    view: int  # -1: of none
     extra: Array = field(repr=False)  # (2, e, K) how a unit of each moves observations [px]
     sigma: Array = field(repr=False)  # (e,) their prior [px]
     price: float  # of the choice among places and sizes [nats]
     where: Where | None = None
     period: float | None = None  # after which it repeats itself [px]
+    group: Group | None = field(default=None, repr=False)
 
 
 Where = tuple[int, float, float, float, float]
@@ -54,10 +57,12 @@ class Seen:
     """Observations as explanations see them."""
 
     linear: Linear
+    ground: moving.Ground
     place: Array  # (2, K) [px]
     size: Array  # (2, N) of the images [px]
     base: Fit  # what was found so far
     extra: Array  # (2, e, K) what of it is beside the cameras [px]
+    sigma: Array  # (e,) its prior [px]
 
 
 def strip(seen: Seen, interval: Interval, sigma: float = _STRIP) -> list[Explanation]:
@@ -210,21 +215,38 @@ def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sig
     return Explanation(kind, view, extra, np.full(2 * len(basis), sigma), float(np.log(seen.linear.views)))
 
 
+def group(seen: Seen, _interval: Interval) -> list[Explanation]:
+    """Ties of a part of the ground that moves."""
+    one = moving.proposal(seen.linear, seen.ground, seen.base, seen.extra, seen.sigma)
+    if one is None:
+        return []
+    none = np.zeros((2, 0, len(seen.linear.view)))
+    return [Explanation(MOVING, -1, none, np.zeros(0), moving.price(seen.linear, one.cell), group=one)]
+
+
 EXPLANATIONS: dict[str, Callable[[Seen, Interval], list[Explanation]]] = {
     STRIP: strip,
     FADE: fade,
     WANDER: wander,
+    MOVING: group,
 }
 """Name -> unknowns, proposed where an interval of an image stands out; `SWING` is, where a period does."""
+_OF_BLOCK = (MOVING,)
 
 
-def proposed(seen: Seen, intervals: list[Interval], periods: list[Swing]) -> Iterator[Explanation]:
-    """Explanations of the intervals and periods that stand out; those of a whole image once."""
+def proposed(
+    seen: Seen, intervals: list[Interval], periods: list[Swing], known_kinds: Collection[str] = ()
+) -> Iterator[Explanation]:
+    """Explanations of the intervals and periods that stand out; those of a whole image, or of the block, once.
+
+    None of the kinds that are known.
+    """
     yield from (swing(seen, one) for one in periods)
-    known = set()
+    known = set[tuple[object, ...]]()
     for interval in intervals:
-        for kind, make in EXPLANATIONS.items():
+        for kind in [kind for kind in EXPLANATIONS if kind not in known_kinds]:
             place = (interval.axis, interval.start, interval.stop) if kind in LOCAL else ()
-            if (kind, interval.view, *place) not in known:
-                known.add((kind, interval.view, *place))
-                yield from make(seen, interval)
+            place = () if kind in _OF_BLOCK else (interval.view, *place)
+            if (kind, *place) not in known:
+                known.add((kind, *place))
+                yield from EXPLANATIONS[kind](seen, interval)

@@ -10,7 +10,7 @@ from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
 from barpc.ba.explanations import FOLLOWED, LOCAL, SWING
 from barpc.ba.heldout import is_better
-from barpc.ba.judge import Finding, Judgement, judge, standing_out
+from barpc.ba.judge import Finding, Judgement, standing_out
 from barpc.ba.rounds import Rounds, revived
 from barpc.ba.solution import Solution, finished
 from barpc.ba.starting import make_problem
@@ -23,8 +23,6 @@ _PER_SPLINE = 30  # observations of a view
 _FEWEST = 7  # splines
 _LOOKS = 2  # for detectors
 _MISSES = 2  # one after the other
-_HALF = 0.5  # of what was cut
-_MUCH = 0.3  # of a stretch, as `barpc.report.verdict.MANY_REJECTED`
 _MOST_SPLINES = 4000  # of all views: what a block of 300 takes is 2.6 times as long
 
 
@@ -49,24 +47,21 @@ def follow(found: Solution, block: Block, outer: Block, options: AdjustOptions) 
     return best if best is found else replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
 
 
-def without_strips(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
-    """The block with the rows and columns moved that lie off by themselves, or swing, where the judge finds such.
+def without_strips(
+    found: Solution, judged: Judgement, block: Block, outer: Block, options: AdjustOptions
+) -> Solution:
+    """The block with the rows and columns moved that lie off by themselves, or swing, where the judge found such.
 
     Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
     """
-    if options.loss == "linear":  # who wants least squares has no observation that may be wrong
-        return found
-    judged = judge(found.outcome, block, options.noise_floor)
     parts = [one for one in judged.findings if one.kind in FOLLOWED]
-    found = replace(found, findings=judged.findings)
     if not parts or options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
         return found
     waves, params = _waves_of(parts, len(block.views))
     tried = _with_waves(_judged(found, judged, block), block, outer, options, waves, start=params)
-    has_strips = any(one.kind in LOCAL for one in parts)
-    if is_better(found.after, tried.after, outer) or (has_strips and _is_half(found, tried, block, options)):
-        return replace(found, findings=())
-    if not has_strips:
+    if is_better(found.after, tried.after, outer):
+        return replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
+    if not any(one.kind in LOCAL for one in parts):
         return tried
     plain = follow(
         found, block, outer, options
@@ -78,7 +73,7 @@ def without_strips(found: Solution, block: Block, outer: Block, options: AdjustO
 def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
     """The block where the judge leaves it: cameras, and tracks that meet where its right observations do."""
     outcome, is_tie = found.outcome, block.point < block.num_tracks
-    inlier = np.where(is_tie, block.use & (judged.right > _HALF), outcome.inlier)
+    inlier = np.where(is_tie, block.use & (judged.right > 0.5), outcome.inlier)
     ended = outcome.minimum.state
     moved = replace(ended, params=ended.params + judged.step)
     return replace(
@@ -104,16 +99,6 @@ def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
             periods[v, n], swung[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
     params = np.hstack([moved.reshape(views, -1), swung.reshape(views, -1)])
     return Waves(0, np.zeros((views, 0)), places, periods), params
-
-
-def _is_half(found: Solution, tried: Solution, block: Block, options: AdjustOptions) -> bool:
-    """Whether strips bring back less than half of what was cut, and stretches remain in which much is.
-
-    A cloud looks like some of them, and is none.
-    """
-    cut, still = (float((block.use & ~one.outcome.inlier).sum()) for one in (found, tried))
-    left = standing_out(tried.outcome, block, options.noise_floor)
-    return still > _HALF * cut and any(one.by_share and one.share > _MUCH for one in left)
 
 
 def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:

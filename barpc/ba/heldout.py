@@ -89,20 +89,27 @@ def _scrambled(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
     return numbers ^ (numbers >> np.uint64(31))
 
 
-def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
-    """The observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
-    views = len(block.views)
+def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
+    """A problem with other observations, and where cameras of unknowns (N, q) put their points (Q, 3)."""
     index, point = np.unique(block.point, return_inverse=True)
     part = replace(
         problem,
         cameras=problem.cameras.seeing(block.xy),
-        structure=make_structure(block.view, point, views, len(index)),
+        structure=make_structure(block.view, point, len(block.views), len(index)),
         xy=block.xy,
         point_prior=None,
+        _room=[],
     )
-    observations = Observations(part, block.sigma, 0.0, np.ones(len(point), dtype=bool))
-    first, counted = block.first_points()[index], np.ones(len(point))
-    first = part.triangulate(first, part.project_points(params, first), 1.0 / block.sigma)
+    first = block.first_points()[index]
+    return part, part.triangulate(first, part.project_points(params, first), 1.0 / block.sigma)
+
+
+def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
+    """The observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
+    views, index = len(block.views), np.unique(block.point)
+    part, first = seen_in(problem, params, block)
+    observations = Observations(part, block.sigma, 0.0, np.ones(len(block.view), dtype=bool))
+    counted = np.ones(len(block.view))
     projected = part.project_points(params, first)  # near the end: from here it is linear
     points = part.triangulate(first, projected, 1.0 / block.sigma)
     for _ in range(_ROBUST_STEPS):  # of three views that do not agree two may

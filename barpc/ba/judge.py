@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from copy import copy
 from dataclasses import dataclass, field, replace
 
@@ -14,6 +14,7 @@ from barpc.ba.explanations import (
     FADE,
     FOLLOWED,
     LOCAL,
+    MOVING,
     SWING,
     WANDER,
     Explanation,
@@ -26,9 +27,11 @@ from barpc.ba.explanations import (
     sharpened,
 )
 from barpc.ba.mixture import Fit, Linear, fit, linearise, settled
+from barpc.ba.moving import Found, Ground, Motion, group_of
 from barpc.ba.periods import Swing, swings
 from barpc.ba.rounds import Outcome, revived
 from barpc.ba.scan import SURE, Interval, scan
+from barpc.ba.solve import State
 from barpc.ba.weights import Observations
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
@@ -40,6 +43,7 @@ _TRIED = 3  # intervals a round, and periods
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
+_HELD_IN = 4  # images of which a part may hold what moves
 UNKNOWNS = 400  # of all views, up to which explanations are tried
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
 
@@ -49,7 +53,7 @@ class Finding:
     """An explanation that was taken."""
 
     kind: str  # a name of `barpc.ba.explanations.EXPLANATIONS`
-    view: int
+    view: int  # -1: of none
     where: Where | None
     # (2,) displacement of what it moves, col and row [px]: a strip's with its sign, a swing's amplitude, else the root
     # mean square
@@ -62,6 +66,8 @@ class Finding:
     or_of: tuple[
         int, ...
     ] = ()  # other views that may be meant: their evidence is within `SURE` of the view's
+    moved: Found | None = field(default=None, repr=False)
+    motion: Motion | None = None  # what is said of it at the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,16 +143,17 @@ def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
     if outcome.problem.free.size > UNKNOWNS:
         return Judgement()
     first = standing_out(outcome, block, floor)
-    linear = around(outcome, block) if first or swinging(outcome, block) else None
-    if linear is None:
+    found = around(outcome, block) if first or swinging(outcome, block) else None
+    if found is None:
         return Judgement()
-    nothing = np.zeros((2, 0, len(block.view)))
-    seen = Seen(linear, block.xy, _sizes(block), fit(linear), nothing)
+    linear, state = found
+    nothing, ground = np.zeros((2, 0, len(block.view))), Ground.of(outcome.problem, state)
+    seen = Seen(linear, ground, block.xy, _sizes(block), fit(linear), nothing, np.zeros(0))
     return _Search(seen, first, floor, float(np.median(block.sigma))).run()
 
 
-def around(outcome: Outcome, block: Block) -> Linear | None:
-    """All ties of a block, linearised where the rounds ended; None where they are too many to be judged."""
+def around(outcome: Outcome, block: Block) -> tuple[Linear, State] | None:
+    """All ties of a block, linearised where the rounds ended, and there; None where they are too many to be judged."""
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks)
     if problem.free.size > UNKNOWNS or _numbers(block, use) > _NUMBERS:
@@ -155,7 +162,7 @@ def around(outcome: Outcome, block: Block) -> Linear | None:
         problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
     )
     low, high = block.alt_range
-    return linearise(problem, state, use, block.sigma, high - low)
+    return linearise(problem, state, use, block.sigma, high - low), state
 
 
 def _numbers(block: Block, use: BoolArray) -> float:
@@ -182,6 +189,7 @@ class _Search:
         self.seen, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
         self.taken: list[_Taken] = []
         self.followed = seen.base  # the last fit of what the adjustment follows
+        self.group: list[Explanation] = []  # looked for once
 
     def run(self) -> Judgement:
         """All that were taken."""
@@ -201,7 +209,7 @@ class _Search:
         if best[0].kind == WANDER and self._took_swing(tried):
             return
         if best[0].kind not in LOCAL:
-            parts, left = copy(self), _parts_of(best[0].view, tried)
+            parts, left = copy(self), _parts_of(best[0], tried)
             parts.taken = list(self.taken)
             total = 0.0
             for more in range(_PARTS, 0, -1):
@@ -211,7 +219,7 @@ class _Search:
                     break
                 total += left[0][2]
                 parts._add(left)
-                left = _parts_of(best[0].view, parts._tried())
+                left = _parts_of(best[0], parts._tried())
             if total > best[2] + SURE:
                 self.taken, self.seen, self.followed = parts.taken, parts.seen, parts.followed
                 return
@@ -244,20 +252,23 @@ class _Search:
         self.followed = made if one.kind in FOLLOWED else self.followed
         self.taken.append(_Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of))
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
-        self.seen = replace(self.seen, base=made, extra=extra)
+        sigma = np.append(self.seen.sigma, one.sigma)
+        self.seen = replace(self.seen, base=made, extra=extra, sigma=sigma)
 
     def _said(self, n: int) -> Finding:
         taken, one = self.taken[n], self.taken[n].one
         start = sum(len(row.one.sigma) for row in self.taken[:n])
         size = unknowns = self.seen.base.extra[start : start + len(one.sigma)]
-        if one.kind == SWING:
+        moved = None
+        if one.group is not None:
+            size, moved = np.zeros(2), group_of(self.seen.linear, self.seen.ground, one.group, self.seen.base)
+        elif one.kind == SWING:
             size = _amplitude(unknowns)
         elif one.kind not in LOCAL:
             rows = self.seen.linear.view == one.view
-            moved = np.einsum("cek,e->ck", one.extra[:, :, rows], unknowns)
-            size = np.sqrt((moved**2).mean(axis=1))
+            size = np.sqrt((np.einsum("cek,e->ck", one.extra[:, :, rows], unknowns) ** 2).mean(axis=1))
         said = taken.gain, taken.gap, taken.runner_up, unknowns, one.period, taken.or_of
-        return Finding(one.kind, one.view, one.where, size, *said)
+        return Finding(one.kind, one.view, one.where, size, *said, moved)
 
     def _tried(self) -> list[_Tried]:
         """Explanations of what stands out now, fitted beside those taken, with their gains; the best first."""
@@ -275,7 +286,9 @@ class _Search:
         out = scan(view, place, seen.size, wrong, off, floor)
         out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
-        made = self._sorted((one, self._fit(one)) for one in proposed(seen, out, periods[:_TRIED]))
+        made = self._sorted((one, self._fit(one)) for one in self._proposed(out, periods[:_TRIED]))
+        more = [one for row in made if row[0].group and row[2] > SURE for one in self._members(row[1], rows)]
+        made = self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
         if made and made[0][0].kind == WANDER:
             box = boxed(seen, *made[0][:2])
             made = self._sorted([*(row[:2] for row in made), (box, self._fit(box))])
@@ -290,6 +303,21 @@ class _Search:
         """Whether a swing is smaller (root mean square) than what no adjustment is asked to find."""
         size = float(np.hypot(*_amplitude(found.extra[-len(one.sigma) :]))) if one.kind == SWING else np.inf
         return bool(size < self.floor * np.sqrt(2.0))
+
+    def _proposed(self, out: list[Interval], periods: list[Swing]) -> list[Explanation]:
+        """Explanations of intervals and periods; the group is looked for once and then tried beside what was taken."""
+        known = (MOVING,) if self.group else ()
+        found = [*self.group, *proposed(self.seen, out, periods, known)]
+        self.group = [one for one in found if one.kind == MOVING]
+        return found
+
+    def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
+        """Parts of images that hold what a group does: rows of one image that lie off move on the ground, too."""
+        seen, none = self.seen, np.zeros((2, int(rows.sum())))
+        places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none)
+        best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
+        intervals = sorted(best.values(), key=lambda one: -one.gain)[:_HELD_IN]
+        return proposed(seen, intervals, [], (MOVING, WANDER))
 
     def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
         base = self.seen.base.evidence
@@ -311,9 +339,9 @@ class _Search:
         return one, found
 
     def _fit(self, one: Explanation) -> Fit:
-        sigma = np.concatenate([*(row.one.sigma for row in self.taken), one.sigma])
+        sigma = np.append(self.seen.sigma, one.sigma)
         extra = np.concatenate([self.seen.extra, one.extra], axis=1)
-        return fit(self.seen.linear, extra, sigma, self.seen.base)
+        return fit(self.seen.linear, extra, sigma, self.seen.base, one.group)
 
 
 def _amplitude(unknowns: Array) -> Array:
@@ -322,9 +350,9 @@ def _amplitude(unknowns: Array) -> Array:
     return size
 
 
-def _parts_of(view: int, tried: list[_Tried]) -> list[_Tried]:
-    """Explanations of parts of an image."""
-    return [row for row in tried if row[0].kind in LOCAL and row[0].view == view]
+def _parts_of(best: Explanation, tried: list[_Tried]) -> list[_Tried]:
+    """Explanations of parts of an image, or of any beside what is of none."""
+    return [row for row in tried if row[0].kind in LOCAL and best.view in (row[0].view, -1)]
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:
@@ -350,7 +378,7 @@ def _of_one_image(one: Explanation, other: Explanation) -> bool:
 def _part(one: Explanation, seen: Seen) -> float:
     """The part of its image that it moves: of two that explain as much it is the smaller one."""
     rows = seen.linear.view == one.view
-    return float(one.extra[:, :, rows].any(axis=(0, 1)).mean())
+    return float(one.extra[:, :, rows].any(axis=(0, 1)).sum() / max(rows.sum(), 1))
 
 
 def _differs(one: Explanation, other: Explanation) -> bool:

@@ -6,12 +6,15 @@ out, or none. Camera unknowns and what is tried beside them have normal priors; 
 of the evidence is that of all observations, of the priors, and of the room that they leave (Laplace), so that
 explanations with different unknowns compare; eps and the noise are found by expectation and maximisation, cooled from
 gross errors down (MacKay 2003, "Information Theory, Inference, and Learning Algorithms", chapters 22 and 28).
+
+Beside them tracks may belong to a group that moves on the ground while the views are taken (`Group`): every subset
+then counts twice, still and moved, and of every cell of the ground the share that moves is found with the rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -77,6 +80,16 @@ class Linear:
 
 
 @dataclass(frozen=True, eq=False)
+class Group:
+    """Tracks that may have moved while the views were taken, those of every cell of the ground with their share."""
+
+    by_move: Array  # (2, m, K) how a unit of each of its unknowns moves observations [px]
+    sigma: Array  # (m,) their prior
+    cell: IntArray  # (K,) of the ground, where an observation's track lies
+    share: Array  # (K,) probability that its track moves, before anything is known
+
+
+@dataclass(frozen=True, eq=False)
 class Fit:
     """What one explanation makes of a block."""
 
@@ -86,6 +99,9 @@ class Fit:
     noise: float  # observed over stated
     eps: Array  # (N,) part of each view's observations that is wrong
     right: Array  # (K,) probability that an observation is; 0 for those that take no part
+    move: Array = field(default_factory=lambda: np.zeros(0))  # (m,) unknowns of a group that moves
+    moving: Array = field(default_factory=lambda: np.zeros(0))  # (K,) probability that the track is of it
+    scatter: float = 0.0  # its noise, observed over stated
 
 
 def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span: float) -> Linear:
@@ -167,14 +183,43 @@ def _projectors(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, 
 
 
 def fit(
-    linear: Linear, extra: Array | None = None, sigma: Array | None = None, warm: Fit | None = None
+    linear: Linear,
+    extra: Array | None = None,
+    sigma: Array | None = None,
+    warm: Fit | None = None,
+    group: Group | None = None,
 ) -> Fit:
     """The block with cameras and, beside them, unknowns of which each moves observations by `extra` (2, e, K) [px].
 
     Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, whose unknowns may be fewer, it
-    is cooled again only from where the further ones begin.
+    is cooled again only from where the further ones begin; with a `group` that moves from the top.
     """
-    return _Mixture(linear, extra, sigma, warm).run()
+    return _Mixture(linear, extra, sigma, warm, group).run()
+
+
+def thinned(linear: Linear, most: int) -> Linear:
+    """The same with every n-th track, about so many of them."""
+    every = -(-sum(len(tracks.rows) for tracks in linear.tracks) // most)
+    if every <= 1:
+        return linear
+    few = []
+    for tracks in linear.tracks:
+        view = tracks.view[::every]
+        sets = np.flatnonzero((np.diff(view, axis=0, prepend=-1) != 0).any(axis=1))
+        parts = (tracks.project[::every], tracks.volume[::every], tracks.by_unknown[::every])
+        few.append(_Tracks(tracks.rows[::every], sets, view, tracks.subsets, *parts))
+    return replace(linear, tracks=tuple(few))
+
+
+def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
+    """Probability (K,) that the track of an observation is of a group, by a fit with it, of these tracks or others."""
+    left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
+    away = np.einsum("cmk,m->ck", group.by_move, found.move) / linear.sigma
+    moved = _Moved(left + away, group.share, found.scatter)
+    out = np.zeros(len(linear.view))
+    for tracks in linear.tracks:
+        out[tracks.rows] = _expect(linear, tracks, left, found.noise, found.eps, moved).gone[:, None]
+    return out
 
 
 def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
@@ -242,22 +287,50 @@ def first_guess(
 
 
 @dataclass(frozen=True, eq=False)
+class _Moved:
+    """Observations as they are for tracks of a group that moves."""
+
+    residual: Array  # (2, K)
+    share: Array  # (K,) of the track's cell
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
 class _Expected:
     log: Array  # (T,) log-likelihood of a track
     of_subset: Array  # (T, S) probability of each subset
     right: Array  # (T, n) of each observation, alone or with others
     square: Array  # (T, S) squared residuals of the subsets
+    moved: _Expected | None = None  # the same of tracks that move
+
+    @property
+    def sums(self) -> tuple[float, Array]:
+        """Squared residuals of subsets as often as they are right, and how often each is."""
+        return float((self.of_subset * self.square).sum()), self.of_subset.sum(axis=0)
+
+    @property
+    def gone(self) -> Array:
+        """Probability (T,) that a track of which something is right moves."""
+        assert self.moved is not None
+        still, gone = self.of_subset.sum(axis=1), self.moved.of_subset.sum(axis=1)
+        return np.asarray(gone / np.maximum(still + gone, 1e-300))
 
 
-def _expect(linear: Linear, tracks: _Tracks, residual: Array, noise: float, eps: Array) -> _Expected:
-    count, n = tracks.rows.shape
-    r = residual[:, tracks.rows].transpose(1, 2, 0).reshape(count, 1, 2 * n, 1)
-    square = (r * (tracks.project @ r))[..., 0].sum(axis=-1)
+def _expect(
+    linear: Linear, tracks: _Tracks, residual: Array, noise: float, eps: Array, moved: _Moved | None = None
+) -> _Expected:
+    n, size = tracks.rows.shape[1], len(tracks.subsets)
     area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(NEAR_LIMIT))
     right, wrong = np.log1p(-eps)[tracks.view], np.log(eps)[tracks.view]
-    subsets, members = tracks.subsets.astype(np.float64), tracks.subsets.sum(axis=1)
-    log = right @ subsets.T + wrong @ (1.0 - subsets).T + tracks.volume - square / (2.0 * noise**2)
-    log -= (n - members) * np.log(area) + 0.5 * (2 * members - 3) * np.log(2.0 * np.pi * noise**2)
+    subsets = tracks.subsets.astype(np.float64)
+    log, square = _of_subsets(tracks, residual, noise, area)
+    both = [log]
+    if moved is not None:
+        share = moved.share[tracks.rows[:, 0], None]
+        log_moved, square_moved = _of_subsets(tracks, moved.residual, moved.noise, area)
+        both = [log + np.log1p(-share), log_moved + np.log(share)]
+    chance = right @ subsets.T + wrong @ (1.0 - subsets).T
+    log = np.concatenate([one + chance for one in both], axis=1)
     odds = np.exp(right - wrong)
     alone = wrong.sum(axis=1) + np.log1p(odds.sum(axis=1)) - np.log(linear.image) - (n - 1) * np.log(area)
     top = np.maximum(log.max(axis=1), alone)
@@ -265,18 +338,43 @@ def _expect(linear: Linear, tracks: _Tracks, residual: Array, noise: float, eps:
     total = share.sum(axis=1) + of_none
     share /= total[:, None]
     single = (of_none / total / (1.0 + odds.sum(axis=1)))[:, None] * odds
-    return _Expected(top + np.log(total), share, share @ subsets + single, square)
+    all_log, still = top + np.log(total), share[:, :size]
+    if moved is None:
+        return _Expected(all_log, still, still @ subsets + single, square)
+    gone = share[:, size:]
+    right_of_all = (still + gone) @ subsets + single
+    of_moved = _Expected(all_log, gone, gone @ subsets, square_moved)
+    return _Expected(all_log, still, right_of_all, square, of_moved)
+
+
+def _of_subsets(tracks: _Tracks, residual: Array, noise: float, area: float) -> tuple[Array, Array]:
+    """Log-likelihoods (T, S) of residuals (2, K) if a subset is right, and their squares."""
+    count, n = tracks.rows.shape
+    r = residual[:, tracks.rows].transpose(1, 2, 0).reshape(count, 1, 2 * n, 1)
+    square = (r * (tracks.project @ r))[..., 0].sum(axis=-1)
+    members = tracks.subsets.sum(axis=1)
+    log = tracks.volume - square / (2.0 * noise**2)
+    log -= (n - members) * np.log(area) + 0.5 * (2 * members - 3) * np.log(2.0 * np.pi * noise**2)
+    return log, square
 
 
 class _Mixture:
-    """One fit at work: unknowns x = (cameras N q, extra e)."""
+    """One fit at work: unknowns x = (cameras N q, extra e, those of a group that moves m)."""
 
-    def __init__(self, linear: Linear, extra: Array | None, sigma: Array | None, warm: Fit | None) -> None:
-        self.linear = linear
+    def __init__(
+        self,
+        linear: Linear,
+        extra: Array | None,
+        sigma: Array | None,
+        warm: Fit | None,
+        group: Group | None = None,
+    ) -> None:
+        self.linear, self.group = linear, group
         self.extra = np.zeros((2, 0, len(linear.sigma))) if extra is None else extra / linear.sigma
         own = np.zeros(0) if sigma is None else 1.0 / sigma**2
-        self.precision = np.concatenate([linear.precision, own])
-        self.offset = np.concatenate([linear.offset, np.zeros(len(own))])
+        further = own if group is None else np.append(own, 1.0 / group.sigma**2)
+        self.precision = np.concatenate([linear.precision, further])
+        self.offset = np.concatenate([linear.offset, np.zeros(len(further))])
         self.x = np.zeros(len(self.precision))
         self.left = linear.residual
         self.noise, self.eps = _HOTTEST, np.full(linear.views, WRONG[0] / WRONG[1])
@@ -284,36 +382,49 @@ class _Mixture:
             known = warm.step.size + len(warm.extra)
             self.x[:known] = *warm.step.ravel(), *warm.extra
             self.noise, self.eps = warm.noise, warm.eps
-            if extra is not None and known < len(self.x):
+            if extra is not None and group is None and known < len(self.x):
                 old, new = np.split(extra, [len(warm.extra)], axis=1)
                 self.x[known:], far, _ = first_guess(linear, warm, old, new, own)
                 self.noise = max(self.noise, far)
+        if group is not None:
+            self.noise, self.eps = _HOTTEST, np.full(linear.views, WRONG[0] / WRONG[1])
+            self.beside = np.concatenate([self.extra, group.by_move / linear.sigma], axis=1)
+            self.moved = _Moved(linear.residual, group.share, self.noise)
 
     def run(self) -> Fit:
         """Expect and maximise until nothing changes."""
-        linear, last = self.linear, -np.inf
+        linear, last, size = self.linear, -np.inf, self.extra.shape[1]
         right, matrix, log = np.zeros(len(linear.sigma)), np.zeros((0, 0)), 0.0
+        moving = np.zeros(len(linear.sigma) if self.group is not None else 0)
         for _ in range(_ITERATIONS):
-            normal = _Normal(*linear.shape, self.extra.shape[1])
+            normal = _Normal(*linear.shape, len(self.x) - linear.precision.size)
             wrong, count = np.zeros(linear.views), np.zeros(linear.views)
-            log = squares = freedom = 0.0
+            sums, log = np.zeros((2, 2)), 0.0  # squares and freedom, of what stands still and what moves
             for tracks, found in self._expected():
                 log += float(found.log.sum())
                 right[tracks.rows] = found.right
                 wrong += np.bincount(tracks.view.ravel(), (1.0 - found.right).ravel(), linear.views)
                 count += np.bincount(tracks.view.ravel(), minlength=linear.views)
-                squares += float((found.of_subset * found.square).sum())
-                freedom += float((found.of_subset * (2 * tracks.subsets.sum(axis=1) - 3)).sum())
-                self._add(tracks, found, normal)
+                freedom = 2 * tracks.subsets.sum(axis=1) - 3
+                square, often = found.sums
+                sums[0] += square, float(often @ freedom)
+                self._add(tracks, found, self.left, self.extra, self.noise, normal)
+                if found.moved is not None:
+                    square, often = found.moved.sums
+                    sums[1] += square, float(often @ freedom)
+                    moving[tracks.rows] = found.gone[:, None]
+                    self._add(tracks, found.moved, self.moved.residual, self.beside, self.moved.noise, normal)
             matrix = normal.whole(self.precision)
             gradient = self.precision * (self.offset + self.x)
             gradient += np.concatenate([normal.pull.ravel(), normal.pull_beside])
             inverse = np.linalg.inv(matrix)
             self.x = self.x - inverse @ gradient
             known = len(self.x) - float(inverse.diagonal() @ self.precision)
-            seen = max(np.sqrt(squares / max(freedom - known, 1.0)), _LEAST_NOISE)
+            seen = max(np.sqrt(sums[0, 0] / max(sums[0, 1] - known, 1.0)), _LEAST_NOISE)
             noise = seen if self.noise <= seen else max(seen, _COOLED * self.noise)
             self.eps = np.clip((wrong + WRONG[0]) / (count + WRONG[1]), *_EPS)
+            if self.group is not None:
+                self._group(moving, right, sums[1], noise, noise <= seen)
             settled = abs(np.log(noise / self.noise)) < _STANDS[0] and abs(log - last) < _STANDS[1]
             self.noise, last = float(noise), log
             if settled:
@@ -321,22 +432,44 @@ class _Mixture:
         away = self.offset + self.x
         room = float(np.linalg.slogdet(matrix)[1] - np.log(self.precision).sum())
         evidence = log - 0.5 * float(self.precision @ away**2) - 0.5 * room
-        step, extra = np.split(self.x, [linear.shape[0] * linear.shape[1]])
-        return Fit(evidence, step.reshape(linear.shape), extra, self.noise, self.eps, right)
+        camera = linear.precision.size
+        step, extra, move = np.split(self.x, [camera, camera + size])
+        scatter = 0.0 if self.group is None else self.moved.noise
+        step = step.reshape(linear.shape)
+        return Fit(evidence, step, extra, self.noise, self.eps, right, move, moving, scatter)
+
+    def _group(self, moving: Array, right: Array, sums: Array, noise: float, cold: bool) -> None:
+        """The share of every cell that moves, once it is cold, and how much its tracks scatter."""
+        assert self.group is not None
+        share, scatter = self.group.share, noise
+        if cold:
+            rows = np.concatenate([tracks.rows[:, 0] for tracks in self.linear.tracks])
+            cell = self.group.cell
+            weights = moving[rows], np.ones(len(rows))
+            gone, all_of = (np.bincount(cell[rows], w, cell.max() + 1) for w in weights)
+            share = ((gone + 0.5) / (all_of + 1.0))[cell]
+            scatter = max(float(np.sqrt(sums[0] / max(sums[1], 1.0))), noise)
+        self.moved = _Moved(self.moved.residual, share, scatter)
 
     def _expected(self) -> Iterator[tuple[_Tracks, _Expected]]:
-        step, extra = np.split(self.x, [self.linear.precision.size])
-        self.left = self.linear.left(step.reshape(self.linear.shape)) + np.einsum(
-            "cek,e->ck", self.extra, extra
-        )
+        camera, size = self.linear.precision.size, self.extra.shape[1]
+        step, extra, move = np.split(self.x, [camera, camera + size])
+        self.left = self.linear.left(step.reshape(self.linear.shape))
+        self.left += np.einsum("cek,e->ck", self.extra, extra)
+        moved = None
+        if self.group is not None:
+            away = np.einsum("cmk,m->ck", self.beside[:, size:], move)
+            moved = self.moved = replace(self.moved, residual=self.left + away)
         for tracks in self.linear.tracks:
-            yield tracks, _expect(self.linear, tracks, self.left, self.noise, self.eps)
+            yield tracks, _expect(self.linear, tracks, self.left, self.noise, self.eps, moved)
 
-    def _add(self, tracks: _Tracks, found: _Expected, normal: _Normal) -> None:
-        """Add the normal matrix and gradient of some tracks."""
+    def _add(
+        self, tracks: _Tracks, found: _Expected, left: Array, beside: Array, noise: float, normal: _Normal
+    ) -> None:
+        """Add the normal matrix and gradient of some tracks, with the first of the unknowns beside the cameras'."""
         count, n = tracks.rows.shape
-        weight = np.einsum("ts,tsij->tij", found.of_subset, tracks.project) / self.noise**2
-        residual = self.left[:, tracks.rows].transpose(1, 2, 0).reshape(count, 2 * n, 1)
+        weight = np.einsum("ts,tsij->tij", found.of_subset, tracks.project) / noise**2
+        residual = left[:, tracks.rows].transpose(1, 2, 0).reshape(count, 2 * n, 1)
         pull, parts = weight @ residual, tracks.by_unknown
         np.add.at(normal.pull, tracks.view, np.einsum("tna,tnap->tnp", pull.reshape(count, n, 2), parts))
         turned = np.ascontiguousarray(np.swapaxes(parts, 2, 3))
@@ -348,15 +481,16 @@ class _Mixture:
                 np.add.at(normal.blocks, (first[:, i], first[:, j]), sums)
                 if i < j:
                     np.add.at(normal.blocks, (first[:, j], first[:, i]), np.swapaxes(sums, 1, 2))
-        if self.extra.shape[1]:
-            beside = self.extra[:, :, tracks.rows].transpose(2, 3, 0, 1).reshape(count, 2 * n, -1)
-            some = np.flatnonzero(beside.any(axis=(1, 2)))
-            beside = beside[some]
-            weighted = weight[some] @ beside
-            normal.beside += np.einsum("tie,tif->ef", beside, weighted, optimize=True)
-            normal.pull_beside += (beside * pull[some]).sum(axis=(0, 1))
-            cross = turned[some] @ weighted.reshape(len(some), n, 2, beside.shape[2])
-            np.add.at(normal.cross, tracks.view[some], cross)
+        size = beside.shape[1]
+        if size:
+            columns = beside[:, :, tracks.rows].transpose(2, 3, 0, 1).reshape(count, 2 * n, -1)
+            some = np.flatnonzero(columns.any(axis=(1, 2)))
+            columns = columns[some]
+            weighted = weight[some] @ columns
+            normal.beside[:size, :size] += np.einsum("tie,tif->ef", columns, weighted, optimize=True)
+            normal.pull_beside[:size] += (columns * pull[some]).sum(axis=(0, 1))
+            cross = turned[some] @ weighted.reshape(len(some), n, 2, size)
+            np.add.at(normal.cross[:, :, :size], tracks.view[some], cross)
 
 
 class _Normal:

@@ -78,6 +78,8 @@ class Adjustment:
         "drift" or "jitter" -> what was smooth before a degree was added, or splines or steps were followed, for that.
     findings : tuple of Finding
         What explains tie points beside the cameras' errors as stated, the first taken first.
+    moving : (K,)
+        Observations of ties that move together, as such were found: they took no part.
     left : tuple of Interval
         Rows and columns in which ties were cut, or are off, more than elsewhere and chance allow, at the end.
     alike : (N,)
@@ -138,6 +140,7 @@ class Adjustment:
     smooth: SmoothTest
     asked: Mapping[str, SmoothTest]
     findings: tuple[Finding, ...]
+    moving: BoolArray
     left: tuple[Interval, ...]
     alike: Array
     in_space_rms: float | None

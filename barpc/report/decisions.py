@@ -166,6 +166,8 @@ def _cut(scene: SceneEntry, views: Sequence[ViewEntry]) -> list[str]:
         most = f"the most in {worst}: {100 * share:.1f} %"
         whole = f"{lost} of {lost + kept} observations of tie points ({100 * lost / (lost + kept):.1f} %)"
         found.append(f"{whole} were cut as wrong, {most}.")
+    if moving := sum(view.num_moving for view in views):
+        found.append(f"{moving} are of tie points that move together, and took no part.")
     if scene.num_held_out:
         found.append(f"{scene.num_held_out} more took no part, so that the result is measured on them.")
     return found

@@ -94,6 +94,11 @@ class Run:
         return np.zeros(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.held_out
 
     @cached_property
+    def moving(self) -> BoolArray:
+        """The observations (K,) of tie points that move together: they took no part either."""
+        return np.zeros(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.moving
+
+    @cached_property
     def control_tests(self) -> list[ControlResidual]:
         """The residuals of control and of a reference's points in the images that could be tested."""
         if self.adjustment is None:

@@ -15,7 +15,7 @@ from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
-from barpc.report.summary.causes import explanations, left_over, strangeness
+from barpc.report.summary.causes import RIVALS, explanations, left_over, strangeness
 from barpc.tie.reference import PEAK
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
@@ -109,6 +109,12 @@ def _doubt(view: ViewEntry, run: Run) -> str:
         if run.kind == "check":
             return f"tie points disagree by {error:.2f} px: adjust the cameras"
         return f"tie points are left with {error:.2f} px: look for wrong matches and moving things"
+    moving = view.num_moving / max(view.num_moving + view.num_rejected + view.num_observations, 1)
+    if moving > MANY_REJECTED:
+        return (
+            f"{100 * moving:.0f} % of its tie points move together and took no part: check that the others are the "
+            "ground that stands still"
+        )
     if (lost := _lost(view)) > MANY_REJECTED and not _anywhere(view, run):
         return (
             f"{100 * lost:.0f} % of its tie points were rejected, neighbours in the same direction: look for clouds, "
@@ -213,7 +219,7 @@ def _block_reasons(run: Run) -> list[str]:
             "these images the others agree, with all they do not. The tie points do not tell which: check the RPCs, "
             "or add an image."
         )
-    out += _left_reasons(run)
+    out += _left_reasons(run) + _ambiguous(run.adjustment)
     for group in run.adjustment.two_groups:
         i, j = group.views
         if not (_oddity(i, run.adjustment) or _oddity(j, run.adjustment)):
@@ -254,6 +260,16 @@ def _left_reasons(run: Run) -> list[str]:
         place = f"{one.axis} {one.first:.0f}-{one.last:.0f} of {one.image}"
         worst.setdefault(one.image, f"{place[0].upper()}{place[1:]} stand out: {what}.")
     return list(worst.values())
+
+
+def _ambiguous(adjustment: Adjustment) -> list[str]:
+    """Groups that move, where something else explains tie points as well."""
+    rivals = [one.runner_up for one in adjustment.findings if one.motion is not None and one.gap < SURE]
+    return [
+        f"That tie points move together explains them no better than that {RIVALS[rival]}: look at where they are."
+        for rival in dict.fromkeys(rivals)
+        if rival
+    ]
 
 
 def _place_is_free(run: Run) -> bool:

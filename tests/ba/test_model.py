@@ -12,6 +12,7 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks, adjustment, block_prior
 from barpc.ba import solution as solved
 from barpc.ba.block import join
+from barpc.ba.judge import Judgement
 from barpc.ba.rounds import Outcome
 from barpc.ba.solution import Solution
 from barpc.ba.starting import first_state, make_problem
@@ -50,8 +51,10 @@ def choose(
     monkeypatch.setattr(adjustment, "solve_block", by_script)
     monkeypatch.setattr(adjustment, "follow", lambda found, *_: found)
     monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
+    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts, Judgement()))
     prior = given.pop("prior", None)
-    found, in_space = adjustment._choose_model(None, None, AdjustOptions(**given), None, None, prior)
+    parts: Any = SimpleNamespace(inner=None, outer=None)
+    found, in_space, _ = adjustment._choose_model(parts, AdjustOptions(**given), None, None, prior)
     return found.model, in_space, asked
 
 
@@ -447,7 +450,9 @@ def followed(
     monkeypatch.setattr(adjustment, "solve_block", solve_block)
     monkeypatch.setattr(adjustment, "follow", follow)
     monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
-    found, left = adjustment._choose_model(None, None, AdjustOptions(), None, None, prior)  # type: ignore[arg-type]
+    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts))
+    parts: Any = SimpleNamespace(inner=None, outer=None)
+    found, left, _ = adjustment._choose_model(parts, AdjustOptions(), None, None, prior)  # type: ignore[arg-type]
     return found.name, left
 
 

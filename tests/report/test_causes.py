@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from barpc.ba.apart import APART, Apart
-from barpc.ba.explanations import EXPLANATIONS, FADE, STRIP, SWING, WANDER
+from barpc.ba.explanations import EXPLANATIONS, FADE, MOVING, STRIP, SWING, WANDER
 from barpc.ba.judge import Finding
+from barpc.ba.moving import Motion
 from barpc.ba.placing import Look
 from barpc.ba.scan import Interval
 from barpc.report import verdict
@@ -82,6 +83,40 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
     assert (found.image, found.period, found.first) == ("east", 199.6, None)
     assert found.or_of == (tuple(names[v] for v in or_of) or None)
     assert found.size_px == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("side", "said"),
+    [
+        ("north-west", "35 % of the tie points, in the north-west of the block, move together"),
+        ("", "35 % of the tie points move together"),
+    ],
+)
+def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: str) -> None:
+    motion = Motion(1.14, (1, 0), 0.354, (5.0, 43.0, 5.1, 43.2), side)
+    finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, 7.0, STRIP, np.zeros(0), motion=motion)
+    (found,) = explanations(adjustment([finding]))
+    assert found.sentence == (
+        f"{said} (a cloud, water or shadows?), by 1.1 m from east to west beside what may be their height, and took no "
+        "part"
+    )
+    assert (found.image, found.share, found.moved_m, found.between) == (None, 0.354, 1.14, ("east", "west"))
+    assert found.box == (5.0, 43.0, 5.1, 43.2)
+    assert (found.axis, found.first, found.size_px, found.runner_up) == (None, None, None, STRIP)
+    assert type(found).read({**vars(found), "box": [5.0, 43.0, 5.1, 43.2]}) == found
+
+
+@pytest.mark.parametrize(("gap", "told"), [(4.9, True), (5.1, False)])
+def test_what_else_a_group_may_be_is_a_reason_where_ties_cannot_tell(gap: float, told: bool) -> None:
+    motion = Motion(1.0, (0, 1), 0.2, (5.0, 43.0, 5.1, 43.2), "")
+    finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, gap, STRIP, np.zeros(0), motion=motion)
+    said = verdict._ambiguous(adjustment([finding]))
+    assert bool(said) == told
+    if told:
+        assert said == [
+            "That tie points move together explains them no better than that rows or columns of an image lie off: look "
+            "at where they are."
+        ]
 
 
 def interval(view: int, share: float, off: float) -> Interval:

@@ -152,7 +152,9 @@ def test_images_held_by_control_points_alone_are_not_weak(block_run):
     run = block_run.run
     tracks = run.tracks.select(np.zeros(len(run.tracks), dtype=bool))
     none = np.zeros(0, dtype=bool)
-    adjustment = replace(run.adjustment, inlier=none, held_out=none, view=np.zeros(0, dtype=np.int64))
+    adjustment = replace(
+        run.adjustment, inlier=none, held_out=none, moving=none, view=np.zeros(0, dtype=np.int64)
+    )
     summary = summarize(replace(run, tracks=tracks, adjustment=adjustment))
     assert {view["status"] for view in summary["views"] if view["num_gcps"] >= 3} == {"adjusted"}
     assert {view["status"] for view in summary["views"] if view["num_gcps"] < 3} <= {"weak"}

@@ -9,7 +9,9 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.apart import APART, Apart
-from barpc.ba.explanations import FADE, STRIP, SWING, WANDER
+from barpc.ba.explanations import FADE, MOVING, STRIP, SWING, WANDER
+from barpc.ba.judge import Finding
+from barpc.ba.moving import Motion
 from barpc.ba.scan import Interval
 from barpc.report.records import Number, Record, said
 
@@ -19,6 +21,15 @@ _WORDS = {
     FADE: "rows of {image} lie {size:.2f} px off at row {origin:.0f}, which fades within {length:.0f} rows",
     WANDER: "rows of {image} wander by {size:.2f} px",
     SWING: "rows of {image} swing by {least}{size:.2f} px every {period:.0f} rows",
+    MOVING: "{share} % of the tie points{side} move together (a cloud, water or shadows?), by {metres} from {first} to "
+    "{second} beside what may be their height, and took no part",
+}
+RIVALS = {
+    STRIP: "rows or columns of an image lie off",
+    FADE: "rows of an image lie off and less and less",
+    WANDER: "rows of an image wander",
+    SWING: "rows of an image swing",
+    MOVING: "tie points move together",
 }
 
 
@@ -27,7 +38,7 @@ class ExplanationEntry(Record):
 
     name: str = said("What it is", enum=[*_WORDS, APART])
     sentence: str = said("The same in words", minLength=1)
-    image: str = said("View")
+    image: str | None = said("View; null for what is of no single one")
     gain: float = said("Logarithm of the evidence, over that without it", "nats")
     gap: float = said("The same, over the runner-up", "nats")
     runner_up: str | None = said("What explains next as much; null for nothing", default=None)
@@ -38,6 +49,14 @@ class ExplanationEntry(Record):
     period: Number = said("Rows after which a swing repeats itself", "px", default=None)
     or_of: tuple[str, ...] | None = said(
         "Views that may be meant as well: ties do not tell which", default=None
+    )
+    share: Number = said("Tie points that move together: part of all of them", default=None)
+    moved_m: Number = said(
+        "How far they move on the ground, beside what may be their height", "m", default=None
+    )
+    between: tuple[str, ...] | None = said("From the first of these views to the second", default=None)
+    box: tuple[float, ...] | None = said(
+        "Where nine in ten of them lie, each way: west, south, east, north", "deg", default=None
     )
 
 
@@ -63,6 +82,9 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
         sentence = f"the RPC of {image} is not its own: {strangeness(apart)}"
         found.append(ExplanationEntry(APART, sentence, image, apart.gain, apart.gap, other))
     for one in adjustment.findings:
+        if one.motion is not None:
+            found.append(_moving(one, one.motion, adjustment.names))
+            continue
         image, size = adjustment.names[one.view], float(np.hypot(*one.size))
         others = tuple(adjustment.names[v] for v in one.or_of)
         place: dict[str, Any] = {}
@@ -96,6 +118,23 @@ def strangeness(apart: Apart) -> str:
         f"{part} of its tie points contradict those of the other images, wherever it is moved or turned to, and these "
         "agree without it"
     )
+
+
+def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEntry:
+    between = names[motion.between[0]], names[motion.between[1]]
+    side = f", in the {motion.side} of the block," if motion.side else ""
+    share, metres = f"{100.0 * motion.share:.0f}", f"{motion.metres:.2g} m"
+    sentence = _WORDS[one.kind].format(
+        share=share, side=side, metres=metres, first=between[0], second=between[1]
+    )
+    numbers = one.gain, one.gap, one.runner_up or None
+    place: dict[str, Any] = {
+        "share": motion.share,
+        "moved_m": motion.metres,
+        "between": between,
+        "box": motion.box,
+    }
+    return ExplanationEntry(one.kind, sentence, None, *numbers, **place)
 
 
 def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:

@@ -206,6 +206,7 @@ class ViewEntry(Record):
         "Verdict on the image"
     )
     advice: str = said("What to do; empty when all is well")
+    num_moving: Count = said("Observations of tie points that move together, and took no part", default=0)
     held_out_px: Number = said(
         "RMS reprojection error of tie points that took no part in the adjustment, by their median",
         "px",
@@ -267,7 +268,8 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
     after = run.ties_after
     first = rmse_by_view(run.ties_before.residuals[keep], tracks.view[keep], num)
     last = None if after is None else rmse_by_view(after.residuals[keep], tracks.view[keep], num)
-    count, lost = (np.bincount(tracks.view[rows], minlength=num) for rows in (keep, ~(keep | run.held_out)))
+    parts = keep, ~(keep | run.held_out | run.moving), run.moving
+    count, lost, moving = (np.bincount(tracks.view[rows], minlength=num) for rows in parts)
     gcps = np.zeros(num, np.int64) if run.gcps is None else np.bincount(run.gcps.view, minlength=num)
     covered, middle = _coverage(run), _middles(run)
     incidence, azimuth = view_angles(Several(run.before, np.arange(num)), middle)
@@ -288,6 +290,7 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             azimuth_deg=float(azimuth[i]),
             num_observations=int(count[i]),
             num_rejected=int(lost[i]),
+            num_moving=int(moving[i]),
             num_gcps=int(gcps[i]),
             tie_coverage=float(covered[i]),
             rmse_before=first[i],

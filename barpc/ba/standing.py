@@ -1,0 +1,126 @@
+"""A block in parts: what is solved, what is kept out to measure it, and groups of ties that moved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barpc.ba.block import MIN_OBSERVATIONS, Block
+from barpc.ba.heldout import is_better, measure
+from barpc.ba.judge import Finding, Judgement, judge
+from barpc.ba.moving import Found, Motion, members
+from barpc.ba.solution import Solution
+from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
+from barpc.options import AdjustOptions
+from barpc.scene import BoolArray, IntArray, connected_groups
+
+_GROUPS = 2  # that move, at most
+_MOST = 0.05, 0.95  # quantiles between which the place of a group is said to lie
+_NAMES = ("west", "east"), ("south", "north")
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The observations (K,) of a block, each in one part."""
+
+    block: Block
+    kept_out: BoolArray  # (K,)
+    group: IntArray  # (K,) number of the group that moved from 1 on, 0: of none
+
+    @property
+    def inner(self) -> Block:
+        """What is solved."""
+        return self.block.without(self.kept_out | (self.group > 0))
+
+    @property
+    def outer(self) -> Block:
+        """What measures it."""
+        return self.block.without(~self.kept_out | (self.group > 0))
+
+    @property
+    def apart(self) -> Block:
+        """What moved."""
+        return self.block.without(self.group == 0)
+
+    def without_view(self, view: int) -> Parts:
+        """Without all observations of one view."""
+        of_it = self.block.view == view
+        return Parts(self.block.without(of_it), self.kept_out[~of_it], self.group[~of_it])
+
+    def less(self, found: Solution, one: Found) -> Parts:
+        """Without one group more."""
+        number, group = self.group.max(initial=0) + 1, self.group.copy()
+        still = group == 0
+        group[still & ~self.kept_out] = number * one.member
+        outer = members(found.problem, found.final.params, one, self.outer)
+        group[still & self.kept_out] = number * outer
+        return replace(self, group=group)
+
+    def is_tied(self) -> bool:
+        """Whether every view keeps enough observations, and all hang together as they did."""
+        block, inner = self.block, self.inner
+        kept, had = (np.bincount(b.view[b.use], minlength=len(b.views)) for b in (inner, block))
+        enough = bool((kept[had > 0] >= MIN_OBSERVATIONS).all())
+        return enough and _groups(inner) == _groups(block)
+
+    def motion(self, number: int, one: Found, points: Array) -> Motion:
+        """What is said of a group, of the points (P, 3) [m] of all tracks."""
+        placed = self.block.point[self.block.point < self.block.num_tracks]
+        placed = placed[np.isfinite(points[placed, 0])]
+        every, of_group = np.unique(placed), np.unique(self.block.point[self.group == number])
+        of_group = np.intersect1d(every, of_group)
+        ground, all_of = ground_from_ecef(points[of_group]), ground_from_ecef(points[every])
+        center = float(all_of[0, 0])
+        place, whole = (np.column_stack([wrap_longitude(g[:, 0], center), g[:, 1]]) for g in (ground, all_of))
+        low, high = np.quantile(place, _MOST, axis=0)
+        middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
+        sides = [
+            names[0] if high[axis] < middle[axis] else names[1] if low[axis] > middle[axis] else ""
+            for axis, names in enumerate(_NAMES)
+        ]
+        west, east = (float(wrap_longitude(lon)) for lon in (low[0], high[0]))
+        box = west, float(low[1]), east, float(high[1])
+        share = len(of_group) / max(len(every), 1)
+        return Motion(one.metres, one.between, share, box, "-".join(side for side in sides[::-1] if side))
+
+
+def _groups(block: Block) -> int:
+    """Into how many groups views fall."""
+    rows = np.flatnonzero(block.use)
+    rows = rows[np.lexsort((block.view[rows], block.point[rows]))]
+    same = np.flatnonzero(np.diff(block.point[rows]) == 0)
+    pairs = np.unique(np.column_stack([block.view[rows[same]], block.view[rows[same + 1]]]), axis=0)
+    return len(connected_groups(len(block.views), [(int(i), int(j)) for i, j in pairs]))
+
+
+def without_moving(
+    found: Solution, parts: Parts, options: AdjustOptions, solve: Callable[[Parts], Solution]
+) -> tuple[Solution, Parts, Judgement]:
+    """The block solved again without groups of ties that move, and what explains the rest.
+
+    `Solution.findings` has both.
+
+    Refused where tracks that took no part, and do not move, are met worse, or the views do not hang together any more.
+    """
+    if options.loss == "linear":  # who wants least squares has no observation that may be wrong
+        return found, parts, Judgement()
+    groups: list[Finding] = []
+    while True:
+        judged = judge(found.outcome, parts.inner, options.noise_floor)
+        findings = judged.findings
+        one = findings[-1] if findings else None
+        if one is None or one.moved is None:
+            break
+        findings = findings[:-1]
+        less = parts.less(found, one.moved)
+        if len(groups) == _GROUPS or not less.is_tied():
+            break
+        tried = solve(less)
+        if is_better(measure(found.problem, found.final.params, less.outer), tried.after, less.outer):
+            break
+        found, parts = tried, less
+        groups.append(one)
+    judged = replace(judged, findings=findings)
+    return replace(found, findings=(*groups, *findings)), parts, judged

@@ -1,0 +1,204 @@
+"""Ties that move together on the ground: named with their place, motion and share, and the scene stands as without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba.block import Block as Joined
+from barpc.ba.block import join
+from barpc.ba.explanations import MOVING, STRIP
+from barpc.ba.mixture import Group, fit, linearise, thinned
+from barpc.ba.moving import CELLS, Ground, group_of
+from barpc.ba.problem import Problem
+from barpc.ba.solve import State
+from barpc.ba.standing import Parts
+from barpc.ba.starting import first_state, make_problem
+from barpc.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
+from barpc.scene import BoolArray, Tracks
+from barpc.sensor.corrected import Corrected
+from barpc.simulate import Block, simulate_block
+from tests.lanes import rest_slow
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
+GSD = 0.5
+
+
+def shifted(ground: Array, east_north: Array) -> Array:
+    """Ground points (n, 3) moved by metres (n, 2)."""
+    out = ground.copy()
+    out[:, :2] += east_north / metres_per_unit(ground)[:, :2]
+    return out
+
+
+def across(block: Block) -> Array:
+    """The direction (2,) on the ground, east and north, that no height looks like in the first and last view."""
+    middle = block.truth.ground.mean(axis=0)[None]
+    leans = []
+    for view in (block.views[0], block.views[-1]):
+        at = view.sensor.project(middle)[0]
+        by = [view.sensor.project(shifted(middle, 10.0 * axis[None]))[0] - at for axis in np.eye(2)]
+        by_up = view.sensor.project(middle + [0.0, 0.0, 10.0])[0] - at
+        leans.append(np.linalg.solve(np.column_stack(by), by_up))
+    along = leans[1] - leans[0]
+    return np.array([-along[1], along[0]]) / np.hypot(*along)
+
+
+def corner(block: Block, part: float) -> BoolArray:
+    """Which ground points (P,) lie in the north-west: about so many of them."""
+    place = block.truth.ground[:, 1] - block.truth.ground[:, 0]
+    chosen: BoolArray = place > np.quantile(place, 1.0 - part)
+    return chosen
+
+
+def drifting(
+    views: int, tracks: int, part: float, metres: float, seed: int = 0, outliers: float = 0.0
+) -> tuple[Block, Tracks, BoolArray]:
+    """A block whose corner moves by `metres` from the first to the last view; which ties (K,) are there."""
+    block = simulate_block(
+        views, tracks, seed=seed, attitude=10e-6, position=2.0, per_site=views, outliers=outliers
+    )
+    ties, moves = block.tracks, corner(block, part)[block.tracks.point]
+    xy, direction = ties.xy.copy(), across(block)
+    for v, (view, correction) in enumerate(zip(block.views, block.truth.corrections, strict=True)):
+        rows = np.flatnonzero(moves & (ties.view == v))
+        camera, ground = Corrected(view.sensor, correction), block.truth.ground[ties.point[rows]]
+        away = np.tile(metres * v / (views - 1) * direction, (len(rows), 1))
+        xy[rows] += camera.project(shifted(ground, away)) - camera.project(ground)
+    return block, replace(ties, xy=xy), moves
+
+
+def started(views: Block, tracks: Tracks) -> tuple[Joined, Problem, State]:
+    """A block at its delivered cameras."""
+    block = join(views.views, tracks, None, AdjustOptions())
+    problem = make_problem(block, AdjustOptions(), None, None)
+    return block, problem, first_state(problem, block, AdjustOptions(), None)[0]
+
+
+def test_a_metre_on_the_ground_moves_images_as_cameras_say() -> None:
+    made = simulate_block(3, 60, seed=2)
+    block, problem, state = started(made, made.tracks)
+    ground = Ground.of(problem, state)
+    rows = np.flatnonzero(block.view == 1)
+    at = ground_from_ecef(state.points[block.point[rows]])
+    for axis in (0, 1):
+        away = np.tile(np.eye(2)[axis], (len(rows), 1))
+        moved = made.views[1].sensor.project(shifted(at, away)) - made.views[1].sensor.project(at)
+        np.testing.assert_allclose(ground.by_ground[:, axis, rows].T, moved, rtol=0.01, atol=5e-3)
+    by_move = ground.by_moves(block.view, 3)
+    assert not by_move[:, :, block.view == 0].any()
+    np.testing.assert_allclose(by_move[:, :2, rows], ground.by_ground[:, :2, rows] * ground.pixel)
+    assert not by_move[:, 2:, rows].any()
+    assert ground.cells(CELLS).min() == 0
+    assert ground.cells(CELLS).max() == CELLS**2 - 1
+
+
+def test_a_group_is_told_from_what_stands_still() -> None:
+    """The mixture alone, begun where some of it is known."""
+    made, tracks, moves = drifting(3, 300, 0.3, 3.0 * GSD)
+    block, problem, state = started(made, tracks)
+    linear = linearise(problem, state, block.use, block.sigma, 800.0)
+    ground, moves = Ground.of(problem, state), moves[block.order]
+    by_move = ground.by_moves(block.view, 3)
+    start = np.where(corner(made, 0.15)[block.point], 0.95, 0.3)
+    group = Group(by_move, np.full(4, 30.0), ground.cells(CELLS), start)
+    base, found = fit(linear), fit(linear, group=group)
+    assert found.evidence > base.evidence + 200.0
+    one = group_of(linear, ground, group, found)
+    assert (one.member == moves).mean() > 0.98
+    assert one.metres == pytest.approx(3.0 * GSD, rel=0.1)
+    assert one.between == (0, 2)
+    assert found.noise == pytest.approx(1.0, abs=0.1)
+    few = thinned(linear, 100)
+    assert 80 <= sum(len(part.rows) for part in few.tracks) <= 110
+    assert fit(few, group=group).noise == pytest.approx(found.noise, rel=0.15)
+
+
+def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:
+    made, tracks, moves = drifting(3, 300, 0.1, 1.0)
+    block = join(made.views, tracks, None, AdjustOptions())
+    none, points = np.zeros(len(block.view), dtype=bool), ecef_from_ground(made.truth.ground)
+    found: Any = SimpleNamespace(metres=1.0, between=(0, 2))
+    parts = Parts(block, none, moves[block.order].astype(np.int64))
+    said = parts.motion(1, found, points)
+    assert said.side == "north-west"
+    inside = made.truth.ground[corner(made, 0.1)]
+    assert said.share == pytest.approx(0.1, abs=0.01)
+    low, high = inside[:, :2].min(axis=0), inside[:, :2].max(axis=0)
+    assert low[0] <= said.box[0] < said.box[2] <= high[0]
+    assert low[1] <= said.box[1] < said.box[3] <= high[1]
+    everywhere = replace(parts, group=(block.point % 5 == 0).astype(np.int64)).motion(1, found, points)
+    assert everywhere.side == ""
+    assert everywhere.share == pytest.approx(0.2, abs=0.01)
+    assert parts.is_tied()
+    assert [len(part.view) for part in (parts.inner, parts.apart)] == [int((~moves).sum()), int(moves.sum())]
+    lost = replace(parts, group=(block.view == 1).astype(np.int64))
+    assert not lost.is_tied()
+    alone = replace(parts, group=np.isin(block.point, block.point[block.view == 0]) & (block.view > 0))
+    assert not alone.is_tied()
+
+
+CASES = [(3, 0.35, 2.0, 0, 0.02), (2, 0.2, 2.0, 1, 0.02), (4, 0.45, 1.5, 2, 0.05), (3, 0.25, 6.0, 3, 0.1)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_a_cloud_is_named_and_the_scene_is_as_without_it(case: tuple[int, float, float, int, float]) -> None:
+    views, part, metres, seed, outliers = case
+    block, tracks, moves = drifting(views, 900, part, metres, seed, outliers=outliers)
+    found, without = (adjust_tracks(block.views, ties) for ties in (tracks, tracks.select(~moves)))
+    (one,) = [f for f in found.findings if f.kind == MOVING]
+    assert one.motion is not None
+    assert one.motion.share == pytest.approx(part, abs=0.03)
+    assert one.motion.metres == pytest.approx(metres, rel=0.15)
+    assert one.motion.between == (0, views - 1)
+    assert (found.moving == moves).mean() > 0.97
+    assert not (found.moving & (found.inlier | found.held_out)).any()
+    inside = block.truth.ground[corner(block, part)]
+    west, south, east, north = one.motion.box
+    assert np.quantile(inside[:, 0], 0.02) < west < np.quantile(inside[:, 0], 0.1)
+    assert np.quantile(inside[:, 1], 0.9) < north < np.quantile(inside[:, 1], 0.98)
+    assert west < east
+    assert south < north
+    assert np.abs(found.scene_shift - without.scene_shift).max() < 0.3 * without.gauge.sigma.max()
+    assert block.held_out_rms(list(found.sensors)) < block.held_out_rms(list(without.sensors)) + 0.02
+    assert np.isfinite(found.points[np.unique(tracks.point[found.moving])]).all()
+    assert np.isfinite(found.residuals[found.moving]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_vehicles_are_no_group(seed: int) -> None:
+    """One in twenty moves, each its own way."""
+    block = simulate_block(2 + seed % 3, 900, seed=50 + seed, attitude=10e-6, position=2.0)
+    rng, ties = np.random.default_rng(seed), block.tracks
+    drives = rng.uniform(size=ties.num_points) < 0.05
+    speed = (drives * rng.uniform(2.0, 20.0, ties.num_points))[:, None] * rng.choice(
+        [-1, 1], (ties.num_points, 2)
+    )
+    xy = ties.xy + speed[ties.point] * ties.view[:, None]
+    found = adjust_tracks(block.views, replace(ties, xy=xy))
+    assert not found.findings
+    assert not found.moving.any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", rest_slow([1, 0]))
+def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
+    block = simulate_block(3, 1200, seed=7, attitude=10e-6, position=2.0)
+    ties, size = block.tracks, block.views[1].size[axis]
+    inside = (ties.view == 1) & (ties.xy[:, axis] < 0.35 * size)
+    found = adjust_tracks(block.views, replace(ties, xy=ties.xy + inside[:, None] * [1.0, 1.5]))
+    assert [one.kind for one in found.findings] == [STRIP]
+    assert not found.moving.any()
+
+
+@pytest.mark.slow
+def test_least_squares_that_were_asked_for_have_no_group() -> None:
+    block, tracks, _ = drifting(3, 600, 0.3, 2.0)
+    assert not adjust_tracks(block.views, tracks, AdjustOptions(loss="linear")).moving.any()
