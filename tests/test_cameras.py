@@ -15,7 +15,7 @@ from barpc import cameras
 from barpc.cameras import OPENERS, Camera, Opener, open_camera
 from barpc.cli import main
 from barpc.cli.main import cli
-from barpc.errors import InputError
+from barpc.errors import ImageError, InputError
 from barpc.geodesy import (
     Array,
     ecef_from_ground,
@@ -23,11 +23,13 @@ from barpc.geodesy import (
     enu_basis,
     ground_from_ecef,
 )
+from barpc.remote import Remote
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import altitude_range
 from tests.rpcio.conftest import make_rpc, write_image
 from tests.sensor.conftest import MODELS
+from tests.sensor.linescan_files import Flight, isd
 from tests.sensor.terrasar_files import Terrasar
 
 SAMPLES = sorted((Path(__file__).parents[1] / "data_samples").glob("*.tif"))
@@ -186,6 +188,24 @@ def test_the_camera_of_an_image_may_lie_anywhere(tmp_path):
     assert camera.model == make_rpc()
     assert camera.size == (60, 40)
     assert camera.path == tmp_path / "elsewhere" / "other.RPB"
+
+
+@pytest.mark.parametrize(
+    ("kind", "choices"),
+    [("sentinel-1", {}), ("terrasar-x", {}), ("sicd", {}), ("physical", {"model": "physical"})],
+)
+def test_cameras_that_are_read_from_disk_only_say_so_of_a_url(kind, choices):
+    with pytest.raises(ImageError, match=r"^s3://bucket/product: .* read from disk only$"):
+        OPENERS[kind].open(Remote("s3://bucket/product"), **choices)
+
+
+def test_a_physical_model_is_found_beside_its_image_or_read_from_its_own_file(tmp_path):
+    flight = Flight(size=(60, 40), swing=0.0)
+    (tmp_path / "scene.XML").write_text(isd(flight)[0])
+    image = write_image(tmp_path / "scene.tif", shape=(1, 40, 60))
+    for given in (image, tmp_path / "scene.XML"):
+        camera = open_camera(given, model="physical")
+        assert (camera.path, camera.size) == (tmp_path / "scene.XML", (60, 40))
 
 
 def test_a_file_whose_name_looks_like_choices_is_a_file(tmp_path):

@@ -136,6 +136,15 @@ def test_an_observation_is_of_a_point_that_is_there(point, taken):
             ground_points(point=point)
 
 
+def test_a_position_in_an_image_that_is_none_spoils_no_other_point():
+    """Whoever reads control names the point and leaves it out: the others must get so far."""
+    place = [[5.0, 43.0, 100.0], [5.1, 43.1, 200.0]]
+    points = GroundPoints(
+        ("a", "b"), place, np.ones((2, 3)), [0, 1], [0, 0], [[np.nan, 3.0], [4.0, 5.0]], [1, 1]
+    )
+    assert points.select(np.isfinite(points.xy).all(axis=1)).xy.tolist() == [[4.0, 5.0]]
+
+
 def test_selected_ground_points_keep_their_own_observations():
     kept = ground_points().select(np.array([True, False, True]))
     assert kept.names == ("a", "c")

@@ -70,6 +70,12 @@ def test_the_key_depends_on_everything_that_goes_in():
         key_of(object())
 
 
+def test_in_a_key_a_path_counts_by_its_name_and_a_set_by_its_members_in_any_order():
+    assert key_of(Path("a/b.tif")) == key_of(str(Path("a/b.tif"))) != key_of(Path("a/c.tif"))
+    for members in ({"left", "right", "nadir"}, frozenset(("nadir", "right", "left"))):
+        assert key_of(members) == key_of(["left", "nadir", "right"])
+
+
 def test_the_fingerprint_is_of_the_content(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
     a.write_bytes(b"one")

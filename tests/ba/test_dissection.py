@@ -115,6 +115,27 @@ def test_two_cliques_are_parted_between_them_whatever_their_sizes() -> None:
     assert 60 < sizes[-2] <= 80
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_of_all_cuts_of_an_order_the_best_parts_most_for_the_views_that_touch_it(seed) -> None:
+    """Counted view by view, those before a cut and those behind it: the fewer ones are taken out of their side."""
+    n, rng = 24, np.random.default_rng(seed)
+    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    tied = rng.random((n, n)) < np.where(apart < 4, 0.4, 0.01)
+    tied[:, int(rng.integers(n))] |= rng.random(n) < 0.5  # a view that many are tied to
+    tied |= tied.T | np.eye(n, dtype=bool)
+    order = rng.permutation(n)
+    graph = sp.csr_array(tied[np.ix_(np.argsort(order), np.argsort(order))].astype(np.int8))
+    costs = []
+    for cut in range(1, n):
+        across = tied[:cut, cut:]
+        before, behind = int(across.any(axis=1).sum()), int(across.any(axis=0).sum())
+        near, far = (cut - before, n - cut) if before < behind else (cut, n - cut - behind)
+        costs.append((min(before, behind) + 1) / (near * far) if near * far else np.inf)
+    _, cut, cost = dissection._best_cut(graph, order)
+    assert cost == pytest.approx(min(costs))
+    assert costs[cut - 1] == pytest.approx(min(costs))
+
+
 def _layered(levels: int) -> sp.csr_array:
     """A row may be reached along 2^levels ways, none of which ends at a free column (scipy issue 26147)."""
     tied = [(2 * d + k, 2 * d + k) for d in range(levels) for k in range(2)]

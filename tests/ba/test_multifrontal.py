@@ -84,6 +84,15 @@ def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(
         np.testing.assert_allclose(found.pairs, blocks[i, :, j, :], atol=1e-13)
 
 
+def test_the_block_of_a_pair_is_found_where_it_is_and_nowhere_else() -> None:
+    pairs = np.array([[0, 1], [0, 4], [1, 2], [1, 3], [3, 4]])
+    matrix = _matrix(pairs, 5, 2)
+    found = {(i, j): matrix.pair(i, j) for j in range(5) for i in range(j)}
+    assert {pair: at for pair, at in found.items() if at is not None} == {
+        (int(i), int(j)): at for at, (i, j) in enumerate(pairs)
+    }
+
+
 def test_a_matrix_that_is_not_positive_definite_is_said() -> None:
     pairs, place = _sites(6, 6)
     matrix = _matrix(pairs, len(place), 2)

@@ -13,6 +13,8 @@ from barpc.ba.linear import Factor
 from barpc.ba.multifrontal import Blocks
 from barpc.ba.normal import (
     TRIANGLE,
+    Common,
+    Reduced,
     _assemble,
     cholesky3,
     point_products,
@@ -87,6 +89,27 @@ def test_a_ray_alone_leaves_its_own_direction_unknown() -> None:
 
 
 # --- sizes --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("in_common", [False, True])
+@pytest.mark.parametrize("as_array", [False, True])
+def test_the_blocks_of_views_are_those_on_the_diagonal_however_the_matrix_is_kept(
+    as_array: bool, in_common: bool
+) -> None:
+    rng, (n, q) = np.random.default_rng(3), (4, 2)
+    pairs = np.array([[0, 2], [1, 2], [2, 3]])
+    matrix: Any = Blocks(rng.normal(size=(n, q, q)), rng.normal(size=(3, q, q)), pairs)
+    by_camera, expected = rng.normal(size=(3, n * q)), matrix.plain()
+    if in_common and not as_array:  # an array has lost it already
+        expected = expected - by_camera.T @ by_camera
+    none: Any = np.zeros(0)
+    common = Common(none, none, none, by_camera, none) if in_common else None
+    structure: Any = SimpleNamespace(num_views=n)
+    kept = matrix.plain() if as_array else matrix
+    reduced = Reduced(structure, kept, none, 0.0, 0.0, none, none, np.zeros((1, 3, q)), common)
+    np.testing.assert_allclose(
+        reduced.of_views(), [expected[k : k + q, k : k + q] for k in range(0, n * q, q)], atol=1e-14
+    )
 
 
 @pytest.mark.parametrize(("views", "plain"), [(100, True), (101, False)])

@@ -15,7 +15,15 @@ from rasterio.errors import NotGeoreferencedWarning
 from barpc.errors import ImageError, OutputError, RpcFormatError
 from barpc.handoff import CONSUMERS
 from barpc.raster import open_raster
-from barpc.rpcio import read_rpc, read_rpc_source, write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.rpcio import (
+    images,
+    read_rpc,
+    read_rpc_source,
+    write_crop,
+    write_rpc_copy,
+    write_rpc_nitf,
+    write_rpc_vrt,
+)
 from barpc.rpcio.tiff import read_tag, survives
 from tests.rpcio.conftest import grid, make_rpc, write_image
 
@@ -235,6 +243,27 @@ def test_a_raster_that_is_no_tiff_is_converted_and_leaves_nothing_beside(rpc, tm
     assert read_rpc(tmp_path / "copy.tif") == rpc
     np.testing.assert_array_equal(pixels(tmp_path / "copy.tif"), pixels(image))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["copy.tif", "in.png"]
+
+
+@pytest.mark.parametrize("write", [write_rpc_copy, write_rpc_nitf])
+def test_a_converted_copy_whose_pixels_are_not_the_image_s_is_an_error_and_leaves_nothing(
+    write, tmp_path, monkeypatch
+):
+    """As on a disk that is full when GDAL closes the file, of which it says nothing."""
+    real = images.raster_copy
+
+    def losing(dataset, target, **options):
+        real(dataset, target, **options)
+        with rasterio.open(target, "r+") as out:
+            out.write(np.zeros((1, 1), out.dtypes[0]), 1, window=rasterio.windows.Window(7, 5, 1, 1))
+
+    monkeypatch.setattr(images, "raster_copy", losing)
+    image = write_image(tmp_path / "a.png", shape=(1, 30, 30), driver="PNG", dtype="uint8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with pytest.raises(OutputError, match="other pixels than were written"):
+            write(make_rpc(), image, tmp_path / "out" / "copy.any")
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_the_tag_of_a_tiff_that_is_cut_off_is_an_error_in_one_line(rpc, image, tmp_path):

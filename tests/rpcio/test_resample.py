@@ -176,6 +176,13 @@ def test_an_image_ends_half_a_pixel_beyond_its_last_centre(tmp_path, shift, lost
     assert known.sum() == (SIZE[0] - lost) * (SIZE[1] - lost)
 
 
+@pytest.mark.parametrize("shift", [(-500.0, 0.0), (0.0, -500.0), (500.0, 500.0)])
+def test_of_an_image_that_is_moved_all_out_of_its_frame_nothing_is_known(tmp_path, shift):
+    image = raster(tmp_path / "a.tif", np.full((1, 40, 60), 7, np.uint8), nodata=0)
+    write_resampled(make_rpc(), grid(lambda c, r: shift[0], lambda c, r: shift[1]), image, tmp_path / "b.tif")
+    assert not pixels(tmp_path / "b.tif").any()
+
+
 def test_a_mask_and_an_alpha_band_go_along(tmp_path):
     data = seen(200.0, "uint8")
     mask = np.full(SIZE[::-1], 255, np.uint8)

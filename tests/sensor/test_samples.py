@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from barpc.errors import InputError, RpcFormatError
 from barpc.geodesy import ecef_from_ground, enu_basis
 from barpc.sensor.linescan import read_linescan
-from barpc.sensor.linescan.samples import Detector, Samples, build, unit
+from barpc.sensor.linescan.samples import Detector, Samples, _check_times, build, unit
 from tests.sensor.linescan_files import SIZE, Flight, Truth, dimap, isd, stamp
 
 FLIGHT = Flight(swing=0.0)
@@ -130,6 +131,18 @@ def test_a_gap_outside_of_the_image_does_not_matter(times: list[float]) -> None:
     assert first < 0 < last
     with pytest.raises(RpcFormatError, match=r"no positions from .*, within the image"):
         build(shifted, late)
+
+
+@pytest.mark.parametrize(
+    ("span", "ok"), [((0.5, 4.0), True), ((0.5, 4.25), False), ((20.0, 22.5), True), ((19.75, 22.5), False)]
+)
+def test_a_gap_may_begin_where_the_image_ends_and_end_where_it_begins(
+    span: tuple[float, float], ok: bool
+) -> None:
+    """The samples on either side of it are enough then."""
+    times = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 20.0, 21.0, 22.0, 23.0])
+    with nullcontext() if ok else pytest.raises(RpcFormatError, match=r"no positions from 4.00 to 20.00 s"):
+        _check_times(times, span, "positions", "a.xml")
 
 
 @pytest.mark.parametrize("what", ["positions", "attitudes"])

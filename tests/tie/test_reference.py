@@ -18,7 +18,7 @@ from barpc.pipeline.views import load_views
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
-from barpc.tie.reference import PEAK, _affine, peak, register
+from barpc.tie.reference import PEAK, _affine, _Work, peak, register
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
@@ -276,7 +276,41 @@ def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(pla
     assert mixed.control.points.sigma[0] == pytest.approx([0.1 * mixed.step, 0.1 * mixed.step, 10.0])
 
 
+@pytest.mark.parametrize(("metres", "sigma"), [(0.5, 0.5), (1.6, 0.5), (4.0, 1.0), (10.0, 2.5)])
+def test_a_reference_is_good_to_a_quarter_of_its_pixel_and_to_half_a_metre_at_best(
+    metres, sigma, tmp_path, monkeypatch
+):
+    path, degrees = tmp_path / "ref.tif", metres / 111_000.0
+    corner = rasterio.Affine(degrees, 0, -25 * degrees, 0, -degrees, 25 * degrees)
+    profile = {"width": 50, "height": 50, "count": 1, "dtype": "uint8", "crs": "EPSG:4326"}
+    with rasterio.open(path, "w", "GTiff", transform=corner, **profile) as file:
+        file.write(np.ones((50, 50), np.uint8), 1)
+    monkeypatch.setattr(_Work, "vote", lambda self: [(0.0, np.zeros(2))])  # it shows nothing
+    view = View("a", "", (SIDE, SIDE), camera(0.0), (0.0, 200.0))
+    assert register([view], [str(path)], flat).sigma == pytest.approx(sigma, rel=0.02)
+    assert register([view], [str(path)], flat, sigma=7.0).sigma == 7.0
+
+
 # --- pieces -------------------------------------------------------------------------------------------------
+
+
+def test_in_the_north_points_are_looked_for_where_the_vote_says_that_they_are_seen():
+    """At 60 degrees, where a degree of longitude is half as long: those within the image that is 100 m off."""
+    sensor = camera(0.0)
+    scale = sensor.ground_scale * [2.0, 1.0, 1.0]
+    sensor = replace(sensor, ground_offset=np.array([10.0, 60.0, 100.0]), ground_scale=scale)
+    view = View("north", "", (SIDE, SIDE), sensor, (0.0, 200.0))
+    metres = metres_per_unit(np.array([10.0, 60.0, 0.0]))[:2]
+    local = np.stack(np.meshgrid(*[np.arange(-300.0, 301.0, 20.0)] * 2), axis=-1).reshape(-1, 2)
+    work = _Work((view,), [], flat, 1, step=2.0, pixel=2.0, executor=None, progress=None)
+    tiles = work._tiles(
+        view, np.array([100.0, 0.0]), [10.0, 60.0] + local / metres, np.full(len(local), LEVEL), 8
+    )
+    found = np.isin(np.arange(len(local)), np.concatenate([tile.points for tile in tiles]))
+    edge = scale[:2] * metres - 16.0  # half a template from the border
+    away = (np.abs(local + [100.0, 0.0]) - edge).max(axis=1)
+    assert found[away < -5.0].all()
+    assert not found[away > 5.0].any()
 
 
 def test_the_peak_of_all_votes_is_told_in_robust_standard_deviations_from_the_middle():

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from barpc.errors import TiePointError
 from barpc.scene import View
-from barpc.tie import Matches, PairReport, TieOptions, common_tracks, find_tracks, matching, select_pairs
+from barpc.tie import (
+    Matches,
+    PairReport,
+    TieOptions,
+    common_tracks,
+    find_tracks,
+    matching,
+    select_pairs,
+    structure,
+)
 from barpc.tie.epipolar import Frame, robust_affine
 from barpc.tie.features import join
 from barpc.tie.matcher import NO_MATCHES, Prediction
@@ -268,6 +279,21 @@ def test_the_cameras_error_is_looked_for_in_pictures_as_coarse_as_the_search_is_
     assert pitch == step * int((3000 * 3000 / 200) ** 0.5 / step)
 
 
+@pytest.mark.parametrize(("half", "step"), [(20.0, 2), (200.0, 4)])
+def test_how_long_bands_are_is_measured_in_the_middles_of_the_windows(half, step) -> None:
+    """Half of the length; a window that B does not see says nothing."""
+
+    def where(at: np.ndarray) -> Frame:
+        length = np.where(at[:, 0] < 2000.0, half, np.nan)
+        nothing = np.zeros(len(at))
+        return Frame(np.array([1.0, 0.0]), nothing, nothing, nothing, -0.5 * length, 1.5 * length, np.eye(2))
+
+    view: View = SimpleNamespace(path="", size=(4000, 2000))  # type: ignore[assignment]
+    for windows, found in (([(0, 0, 2000, 2000), (3000, 0, 900, 900)], step), ([(3000, 0, 900, 900)], 2)):
+        search = _Search(view, view, 1, Prediction(where, 3.0, lambda windows=windows: windows))
+        assert search._step == found
+
+
 @pytest.mark.parametrize(("side", "step"), [(480, 8), (479, 4), (240, 4), (239, 2), (100, 2), (20, 2)])
 def test_a_picture_has_sixty_pixels_a_side_where_it_can(side, step) -> None:
     assert level(10.0, 1000, side, probes=1500, band=120.0)[0] == step
@@ -297,6 +323,57 @@ def test_a_segment_is_looked_at_as_far_as_it_lies_in_the_image(start, axis, most
     where = Frame(np.array(axis), np.array([along]), np.array([across]), np.zeros(1), -half, half, np.eye(2))
     found = search._part_in_b(where, np.zeros(1), np.array([0]), 10.0)
     assert found == pytest.approx(expected)
+
+
+@pytest.fixture(scope="module")
+def textured(tmp_path_factory) -> tuple[structure.Files, np.ndarray]:
+    """Files of an image and of the same moved by as much as is said: x, y [px]."""
+    folder, moved = tmp_path_factory.mktemp("textured"), np.array([20, -10])
+    grey = 2000 + 400 * ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(300, 300)), 1.5)
+    files = []
+    for name, pixels in (("a", grey), ("b", np.roll(grey, moved[::-1], axis=(0, 1)))):
+        path = write_image(folder / f"{name}.tif", pixels.astype(np.uint16))
+        files.append((str(path), (300, 300)))
+    return files, moved
+
+
+@pytest.mark.parametrize(
+    ("aside", "beyond", "seen"), [(0.0, 0.0, True), (24.0, 0.0, False), (0.0, 30.0, False)]
+)
+def test_a_place_beyond_the_band_and_its_sides_is_not_found_however_alike(
+    textured, monkeypatch, aside, beyond, seen
+) -> None:
+    """It goes diagonally, 25 px either way, and 12 px to its sides are looked at; chance finds others there."""
+    files, moved = textured
+    at = np.array([[140.0, 150.0], [150.0, 160.0], [160.0, 140.0]])
+    axis = np.array([0.6, 0.8])
+    along, across = (at + moved) @ axis + beyond, (at + moved) @ [-0.8, 0.6] + aside
+    half = np.full(3, 25.0)
+    where = Frame(axis, along, across, np.zeros(3), -half, half, np.eye(2))
+    monkeypatch.setattr(structure, "linear_map", lambda *_: np.eye(2))
+    search = _Search.__new__(_Search)
+    search._views, search._files, search._band = (), files, 1  # type: ignore[assignment]
+    search._points, search._step = at, 1
+    search._prediction = Prediction(lambda _: where, 2.0, list)
+    found, xy, _ = search._tile(where, np.arange(3))
+    off = where.errors(at + moved)[0]
+    assert (np.abs(off) <= [25.0, 12.0]).all() == seen
+    true = np.abs(xy - found - moved).max(axis=1, initial=0.0) < 0.1
+    assert true.sum() == (3 if seen else 0)
+
+
+def test_patches_that_lie_together_share_a_picture(textured, monkeypatch) -> None:
+    """Of 256 px a side, at either resolution: each is read and brought onto A's pixels once."""
+    files, moved = textured
+    made, real = [], structure._seen
+    monkeypatch.setattr(structure, "_seen", lambda *given: made.append(given) or real(*given))
+    axis = np.arange(80.0, 241.0, 40.0)
+    at = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    turn = np.broadcast_to(np.eye(2), (len(at), 2, 2))
+    xy, ok, _ = register_places(files, 1, at, at + moved, turn)
+    assert ok.all()
+    np.testing.assert_allclose(xy, at + moved, atol=0.05)
+    assert len(made) == 4  # of both images, whole pixels and halves
 
 
 def plain_tile(reach: tuple[int, int] = (4, 3), half: int = 5) -> Tile:
