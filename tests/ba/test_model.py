@@ -450,7 +450,7 @@ def followed(
     monkeypatch.setattr(adjustment, "solve_block", solve_block)
     monkeypatch.setattr(adjustment, "follow", follow)
     monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
-    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts))
+    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts, Judgement()))
     parts: Any = SimpleNamespace(inner=None, outer=None)
     found, left, _ = adjustment._choose_model(parts, AdjustOptions(), None, None, prior)  # type: ignore[arg-type]
     return found.name, left
