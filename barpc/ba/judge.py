@@ -43,6 +43,7 @@ _TRIED = 3  # intervals a round, and periods
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
+_WORTH = 0.1 * SURE  # nats: less decides nothing
 _HELD_IN = 4  # images of which a part may hold what moves
 UNKNOWNS = 400  # of all views, up to which explanations are tried
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
@@ -234,7 +235,8 @@ class _Search:
         parts = copy(self)
         parts.taken = list(self.taken)
         parts._add([first, *(row for row in tried if row is not first and row[0] is not best[0])])
-        beside = max((row[2] for row in parts._tried() if row[0].kind == WANDER), default=0.0)
+        wanders = [row[0] for row in tried if row[0].kind == WANDER]
+        beside = parts._sorted((one, parts._fit(one)) for one in wanders)[0][2]
         if not first[2] + beside > best[2] + SURE:
             return False
         self.taken, self.seen, self.followed = parts.taken, parts.seen, parts.followed
@@ -293,9 +295,13 @@ class _Search:
             box = boxed(seen, *made[0][:2])
             made = self._sorted([*(row[:2] for row in made), (box, self._fit(box))])
         local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:_LOCAL]]
+        # where something is sure already, what is not waits for the next round
+        blunt = SURE if made and made[0][2] > SURE else -np.inf
         sharp = [
-            self._sharpened(one, found) if one in local or one.kind == SWING else (one, found)
-            for one, found, _ in made
+            self._sharpened(one, found)
+            if gain > blunt and (one in local or one.kind == SWING)
+            else (one, found)
+            for one, found, gain in made
         ]
         return self._sorted(row for row in sharp if not self._is_nothing(*row))
 
@@ -333,9 +339,11 @@ class _Search:
             better, made = max(
                 ((self._fit(shape), shape) for shape in again), key=lambda row: row[0].evidence
             )
-            if not better.evidence > found.evidence:
+            more = better.evidence - found.evidence
+            if more > 0.0:
+                one, found = made, better
+            if more < _WORTH:
                 break
-            one, found = made, better
         return one, found
 
     def _fit(self, one: Explanation) -> Fit:

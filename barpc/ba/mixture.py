@@ -471,9 +471,10 @@ class _Mixture:
         weight = np.einsum("ts,tsij->tij", found.of_subset, tracks.project) / noise**2
         residual = left[:, tracks.rows].transpose(1, 2, 0).reshape(count, 2 * n, 1)
         pull, parts = weight @ residual, tracks.by_unknown
-        np.add.at(normal.pull, tracks.view, np.einsum("tna,tnap->tnp", pull.reshape(count, n, 2), parts))
-        turned = np.ascontiguousarray(np.swapaxes(parts, 2, 3))
         first = tracks.view[tracks.sets]
+        pulls = np.einsum("tna,tnap->tnp", pull.reshape(count, n, 2), parts)
+        np.add.at(normal.pull, first, np.add.reduceat(pulls, tracks.sets, axis=0))
+        turned = np.ascontiguousarray(np.swapaxes(parts, 2, 3))
         for j in range(n):
             of_all = weight[:, :, 2 * j : 2 * j + 2] @ parts[:, j]
             for i in range(j + 1):
@@ -490,7 +491,11 @@ class _Mixture:
             normal.beside[:size, :size] += np.einsum("tie,tif->ef", columns, weighted, optimize=True)
             normal.pull_beside[:size] += (columns * pull[some]).sum(axis=(0, 1))
             cross = turned[some] @ weighted.reshape(len(some), n, 2, size)
-            np.add.at(normal.cross[:, :, :size], tracks.view[some], cross)
+            of_set = np.searchsorted(tracks.sets, some, side="right") - 1
+            begin = np.flatnonzero(np.diff(of_set, prepend=-1))
+            if len(some):
+                sums = np.add.reduceat(cross, begin, axis=0)
+                np.add.at(normal.cross[:, :, :size], first[of_set[begin]], sums)
 
 
 class _Normal:

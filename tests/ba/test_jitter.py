@@ -51,7 +51,9 @@ def shaken(made, view, wave):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seeds", "tracks"), [((1,), 1500), (SEEDS, 3000)])
+@pytest.mark.parametrize(
+    ("seeds", "tracks"), [((1,), 1500), pytest.param(SEEDS, 3000, marks=pytest.mark.nightly)]
+)
 def test_jitter_is_followed_to_the_noise_and_heights_are_not_bent(seeds, tracks):
     name, many = "jitter 0.5 at 1 Hz", {"tracks": tracks}
     assert medians(name, lambda j: j.across, seeds, jitter="off", **many) > 0.4

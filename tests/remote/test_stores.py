@@ -105,7 +105,7 @@ class Blind(Executor):
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         data = pickle.dumps((fn, args, kwargs))
         assert not [place for place in self._places if place in data], args
-        self.sent[args[0].__name__] += 1
+        self.sent[(args[0] if callable(args[0]) else fn).__name__] += 1  # tasks of a batch; files to hash
         return self._pool.submit(fn, *args, **kwargs)
 
 
