@@ -81,9 +81,13 @@ def test_a_spline_that_is_subtracted_makes_it_worse():
 
 
 @pytest.mark.slow
-def test_fast_jitter_gets_denser_knots():
+def test_fast_jitter_of_one_frequency_is_a_swing():
+    """Of all views the differences are seen: which of them swing is not."""
     found, after = solved("jitter 0.1 at 5 Hz", 1)
-    assert found.splines[0].spacing <= 1000.0
+    assert {one.kind for one in found.findings} == {"swing"}
+    periods = [one.period for one in found.findings]
+    assert max(periods) < 1.01 * min(periods)
+    assert 0.005 < after.shape < 0.05
     assert 0.005 < after.across < 0.05 < 0.15 < solved("jitter 0.1 at 5 Hz", 1, jitter="off")[1].across
 
 
@@ -172,9 +176,10 @@ def test_knots_are_no_denser_than_the_observations_hold():
     count = np.bincount(scene("jitter 0.5 at 1 Hz", 0, tracks=250).tracks.view).max()
     for found in (few, given):
         assert all(
-            spline is None or 7 <= len(spline.coeffs) <= max(count / 30, 7) for spline in found.splines
-        )
-    assert given.splines[0] is not None
+            spline is None or len(spline.coeffs) == 0 or 7 <= len(spline.coeffs) <= max(count / 30, 7)
+            for spline in found.splines
+        )  # a swing needs none
+    assert len(given.splines[0].coeffs) >= 7
 
 
 @pytest.mark.slow
@@ -210,7 +215,7 @@ def test_the_covariance_counts_the_splines():
     q = found.params.shape[1]
     part = found.cameras.unknowns.in_waves
     sigma = np.sqrt(np.diag(found.covariance.view(2)))[part]
-    assert q - part.start == 20
+    assert q - part.start == found.cameras.unknowns.waves.size >= 20
     assert sigma.min() > 0.001
     assert sigma.max() < 1.5
 
