@@ -43,6 +43,7 @@ _TRIED = 3  # intervals a round, and periods
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
+_SEEN = 2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
 _WORTH = 0.1 * SURE  # nats: less decides nothing
 _HELD_IN = 4  # images of which a part may hold what moves
 UNKNOWNS = 400  # of all views, up to which explanations are tried
@@ -306,9 +307,14 @@ class _Search:
         return self._sorted(row for row in sharp if not self._is_nothing(*row))
 
     def _is_nothing(self, one: Explanation, found: Fit) -> bool:
-        """Whether a swing is smaller (root mean square) than what no adjustment is asked to find."""
-        size = float(np.hypot(*_amplitude(found.extra[-len(one.sigma) :]))) if one.kind == SWING else np.inf
-        return bool(size < self.floor * np.sqrt(2.0))
+        """Whether a swing or a group's motion is smaller than what an adjustment is asked to find."""
+        size = np.inf
+        if one.kind == SWING:
+            size = float(np.hypot(*_amplitude(found.extra[-len(one.sigma) :])))
+        elif one.group is not None and (found.moving > 0.5).any():
+            away = np.einsum("cmk,m->ck", one.group.by_move[:, :, found.moving > 0.5], found.move)
+            size = float(np.sqrt((away**2).sum(axis=0).mean()))
+        return bool(size < self.floor * _SEEN)
 
     def _proposed(self, out: list[Interval], periods: list[Swing]) -> list[Explanation]:
         """Explanations of intervals and periods; the group is looked for once and then tried beside what was taken."""
