@@ -47,9 +47,7 @@ class Kind:
     words: str  # what a message calls it
     most: int | None  # larger files are refused [bytes]; None for images, which are never read whole
     error: type[BarpcError] = InputError
-    between: bytes = (
-        b""  # what stands between the numbers of a text: as many are refused as would be larger in memory
-    )
+    between: bytes = b""  # what stands between the numbers of a text, which are counted
 
     def check(self, path: Path | str, size: int) -> None:
         """Raise if a file of `size` bytes is too large."""

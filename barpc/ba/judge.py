@@ -43,7 +43,9 @@ _TRIED = 3  # intervals a round, and periods
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
-_SEEN = 2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
+_SEEN = (
+    2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
+)
 _WORTH = 0.1 * SURE  # nats: less decides nothing
 _HELD_IN = 4  # images of which a part may hold what moves
 UNKNOWNS = 400  # of all views, up to which explanations are tried

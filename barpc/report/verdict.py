@@ -128,8 +128,8 @@ def _lost(view: ViewEntry) -> float:
 
 
 def _anywhere(view: ViewEntry, run: Run) -> bool:
-    """Whether the tie points of a view that were rejected lie anywhere, as wrong matches do."""
-    return run.adjustment is not None and bool(run.adjustment.alike[run.number[view.name]] <= SURE)
+    """Whether the tie points of a view that were rejected lie off in any direction, as wrong matches do."""
+    return run.adjustment is not None and bool(-np.inf < run.adjustment.alike[run.number[view.name]] <= SURE)
 
 
 def _oddity(i: int, adjustment: Adjustment) -> str:
@@ -365,8 +365,8 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     lines += _jitter_lines(views) + _radar_lines(views)
     if many := [view.name for view in views if _lost(view) > MANY_REJECTED and _anywhere(view, run)]:
         lines.append(
-            f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, all over and in "
-            "any direction: wrong matches."
+            f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, neighbours in "
+            "any direction, as wrong matches are."
         )
     lines += [
         f"{one.sentence[0].upper()}{one.sentence[1:]}."
