@@ -75,11 +75,15 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What makes a view's RPC as good as stated: nothing, or an offset, other heights, its axes swapped."""
+    """What makes a view's RPC as good as stated: it is, or nothing, or an offset, other heights, its axes swapped.
+
+    Where it is, and more than half of its tie points contradict the others', these may be wrong as well as it.
+    """
 
     offset: Array | None = None  # (2,) col, row [px] by which it puts points too far
     height: float | None = None  # [m] by which its heights are too high, where that explains as much
     swapped: bool = False
+    as_stated: bool = False
 
 
 def known_points(found: Solution, block: Block) -> BoolArray:
@@ -187,6 +191,8 @@ def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
     constants = problem.cameras.unknowns.constants
     metres = float(np.sqrt((problem.camera_prior.sigma[view, :constants:3] ** 2).sum()))
     stated = metres * float(np.nanmedian(np.linalg.norm(projected.by_point, axis=1)))
+    if not placed.meets and _half(off) < _STATED * stated:
+        return Look(as_stated=True)
     swapped = projected.image[::-1] - xy
     if _half(swapped) < _STATED * stated < _half(off):
         return Look(swapped=True)
@@ -195,7 +201,7 @@ def look(found: Solution, block: Block, placed: Placed, view: int) -> Look:
         return Look()
     height = float(np.nanmedian((by_height * off).sum(axis=0) / (by_height**2).sum(axis=0)))
     explains = _half(off - height * by_height) < stated and abs(height) < _SURFACES
-    return Look(offset, height if explains else None)
+    return Look(offset=offset, height=height if explains else None)
 
 
 def _half(off: Array) -> float:

@@ -59,10 +59,10 @@ def _failure(view: ViewEntry, run: Run) -> str:
     if run.adjustment is not None and view.name in run.adjustment.left_out:
         return "not tied to the other images: its camera was left as it was"
     if (apart := _apart(view, run)) is not None and apart.placed is None:
-        return (
-            f"its RPC is not its own: {strangeness(apart)}. They were adjusted without it, and its camera was left as "
-            "it was: check that the RPC belongs to this image"
-        )
+        left = "They were adjusted without it, and its camera was left as it was: check "
+        if apart.look.as_stated:
+            return f"{strangeness(apart)}. {left}clouds, water and change, and that the RPC belongs to this image"
+        return f"its RPC is not its own: {strangeness(apart)}. {left}that the RPC belongs to this image"
     beyond = _follows_more(view) or getattr(run.options, "grids", False)  # grids hold what the RPC does not
     if view.fit is not None and not beyond and not all(_known(v) <= tolerance for v in view.fit.max_px):
         return f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range"

@@ -152,10 +152,18 @@ def apart_of(look: Look, **given: Any) -> Apart:
         ),
         (Look(), 0.987, "more than 98 % of its tie points contradict"),
         (Look(), 1.0, "all of its tie points contradict"),
+        (Look(as_stated=True), 0.61, "more than 61 % of its tie points contradict"),
     ],
 )  # fmt: skip
 def test_a_strange_rpc_is_said_with_what_it_looks_like(look, share, said) -> None:
     assert strangeness(replace(apart_of(look), contradicted=share)).startswith(said)
+
+
+def test_of_a_view_that_lies_where_it_is_stated_to_the_rpc_is_not_blamed_alone() -> None:
+    clouds = apart_of(Look(as_stated=True))
+    assert strangeness(clouds).endswith("as delivered it meets them to what is stated of it")
+    (one,) = explanations(adjustment(apart=clouds))
+    assert one.sentence.startswith("many tie points of east are wrong, or its RPC is not its own: ")
 
 
 def test_a_strange_rpc_is_an_explanation_where_it_is_clear() -> None:

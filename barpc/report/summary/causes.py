@@ -79,7 +79,8 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
     if (apart := adjustment.apart) is not None and apart.clear and np.isfinite(apart.gain):
         other = None if apart.runner_up is None else f"{APART}: {adjustment.names[apart.runner_up]}"
         image = adjustment.names[apart.view]
-        sentence = f"the RPC of {image} is not its own: {strangeness(apart)}"
+        what = "many tie points of {} are wrong, or its RPC is" if apart.look.as_stated else "the RPC of {} is"
+        sentence = f"{what.format(image)} not its own: {strangeness(apart)}"
         found.append(ExplanationEntry(APART, sentence, image, apart.gain, apart.gap, other))
     for one in adjustment.findings:
         if one.motion is not None:
@@ -114,9 +115,10 @@ def strangeness(apart: Apart) -> str:
         height = "" if look.height is None else f", or with its heights moved by {-look.height:+.0f} m,"
         return f"moved by {col:+.1f} columns and {row:+.1f} rows{height} {met}"
     part = "all" if apart.contradicted == 1.0 else f"more than {int(100 * apart.contradicted)} %"
+    where = "; as delivered it meets them to what is stated of it" if look.as_stated else ""
     return (
         f"{part} of its tie points contradict those of the other images, wherever it is moved or turned to, and these "
-        "agree without it"
+        f"agree without it{where}"
     )
 
 
