@@ -366,6 +366,11 @@ class AdjustOptions(Options):
         """The model to start with."""
         return GEOMETRIC if self.model == AUTO else self.model
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether rotations stand still and no waves are asked for: what these leave is to be seen, not bent."""
+        return self.jitter == AUTO and self.drift == 0
+
 
 @dataclass(frozen=True, repr=False)
 class FitOptions(Options):

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from barpc.ba import moving
-from barpc.ba.mixture import Fit, Group, Linear, first_guess, log_likelihoods
+from barpc.ba.linearised import Linear
+from barpc.ba.mixture import Fit, Group, first_guess, log_likelihoods
 from barpc.ba.periods import Swing
 from barpc.ba.periods import price as price_of_period
 from barpc.ba.scan import BINS, Interval, price
@@ -57,6 +58,7 @@ class Seen:
     """Observations as explanations see them."""
 
     linear: Linear
+    few: Linear  # of it some tracks, to choose with
     ground: moving.Ground
     place: Array  # (2, K) [px]
     size: Array  # (2, N) of the images [px]
@@ -87,7 +89,7 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
             ends = _open_ended(start, stop, size)
             for length in (stop - start) * _LENGTHS if stop > start else ():
                 one = _local(FADE, seen, interval.view, (1, *ends, origin, sign / float(length)), _STRIP)
-                cost = first_guess(seen.linear, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
+                cost = first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
                 tried.append((cost - _untouched(seen, one), one))
         found += [min(tried, key=lambda row: row[0])[1]] if tried else []
     return found
@@ -96,7 +98,7 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
 def _untouched(seen: Seen, one: Explanation) -> float:
     """The cost of the same tracks without it: others may be touched by another."""
     nothing = np.full(2, 1e18)
-    return first_guess(seen.linear, seen.base, seen.extra, one.extra, nothing)[2]
+    return first_guess(seen.few, seen.base, seen.extra, one.extra, nothing)[2]
 
 
 def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Explanation:

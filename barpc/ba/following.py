@@ -55,7 +55,7 @@ def without_strips(
     Refused where it makes tracks worse that took no part, or no better than what follows an image as a whole.
     """
     parts = [one for one in judged.findings if one.kind in FOLLOWED]
-    if not parts or options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
+    if not parts or options.jitter == OFF or options.is_plain:
         return found
     waves, params = _waves_of(parts, len(block.views))
     tried = _with_waves(_judged(found, judged, block), block, outer, options, waves, start=params)
@@ -126,8 +126,7 @@ def _given_edges(block: Block, options: AdjustOptions) -> Array:
 def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
     """Numbers of splines to try, the fewest first, as many as the observations of a view hold."""
     rows = max(view.size[1] for view in block.views)
-    # who has rotations stand still wants what they leave to be seen, not to be bent away
-    if options.jitter == OFF or (options.jitter == AUTO and options.drift == 0):
+    if options.jitter == OFF or options.is_plain:
         return [0] if options.detectors else []
     most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // _PER_SPLINE
     if options.spacing:

@@ -26,7 +26,8 @@ from barpc.ba.explanations import (
     proposed,
     sharpened,
 )
-from barpc.ba.mixture import Fit, Linear, fit, linearise, settled
+from barpc.ba.linearised import Linear, linearise, numbers
+from barpc.ba.mixture import Fit, fit, settled
 from barpc.ba.moving import Found, Ground, Motion, group_of
 from barpc.ba.periods import Swing, swings
 from barpc.ba.rounds import Outcome, revived
@@ -43,6 +44,7 @@ _TRIED = 3  # intervals a round, and periods
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
+_FEW = 600  # tracks with which explanations are chosen that are worth more
 _SEEN = (
     2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
 )
@@ -152,7 +154,9 @@ def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
         return Judgement()
     linear, state = found
     nothing, ground = np.zeros((2, 0, len(block.view))), Ground.of(outcome.problem, state)
-    seen = Seen(linear, ground, block.xy, _sizes(block), fit(linear), nothing, np.zeros(0))
+    seen = Seen(
+        linear, linear.thinned(_FEW), ground, block.xy, _sizes(block), fit(linear), nothing, np.zeros(0)
+    )
     return _Search(seen, first, floor, float(np.median(block.sigma))).run()
 
 
@@ -160,18 +164,13 @@ def around(outcome: Outcome, block: Block) -> tuple[Linear, State] | None:
     """All ties of a block, linearised where the rounds ended, and there; None where they are too many to be judged."""
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks)
-    if problem.free.size > UNKNOWNS or _numbers(block, use) > _NUMBERS:
+    if problem.free.size > UNKNOWNS or numbers(np.bincount(block.point[use])) > _NUMBERS:
         return None
     state, _ = revived(
         problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
     )
     low, high = block.alt_range
     return linearise(problem, state, use, block.sigma, high - low), state
-
-
-def _numbers(block: Block, use: BoolArray) -> float:
-    count = np.bincount(block.point[use]).astype(np.float64)
-    return float((np.where(count <= 4, 2.0**count, count + 1.0) * 4.0 * count**2).sum())
 
 
 _Tried = tuple[Explanation, Fit, float]
@@ -291,7 +290,8 @@ class _Search:
         out = scan(view, place, seen.size, wrong, off, floor)
         out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
-        made = self._sorted((one, self._fit(one)) for one in self._proposed(out, periods[:_TRIED]))
+        offered = self._worth_more(self._proposed(out, periods[:_TRIED]))
+        made = self._sorted((one, self._fit(one)) for one in offered)
         more = [one for row in made if row[0].group and row[2] > SURE for one in self._members(row[1], rows)]
         made = self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
         if made and made[0][0].kind == WANDER:
@@ -299,7 +299,7 @@ class _Search:
             made = self._sorted([*(row[:2] for row in made), (box, self._fit(box))])
         local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:_LOCAL]]
         # where something is sure already, what is not waits for the next round
-        blunt = SURE if made and made[0][2] > SURE else -np.inf
+        blunt = max(SURE, made[0][2] / _PARTS) if made and made[0][2] > SURE else -np.inf
         sharp = [
             self._sharpened(one, found)
             if gain > blunt and (one in local or one.kind == SWING)
@@ -307,6 +307,16 @@ class _Search:
             for one, found, gain in made
         ]
         return self._sorted(row for row in sharp if not self._is_nothing(*row))
+
+    def _worth_more(self, offered: list[Explanation]) -> list[Explanation]:
+        """Those of which few tracks show that they may gain most, alone or as the largest of some parts."""
+        few = self.seen.few
+        if few is self.seen.linear or len(offered) < 3:
+            return offered
+        base = fit(few, self.seen.extra, self.seen.sigma, self.seen.base)
+        gains = [self._fit(one, few, base).evidence - base.evidence - one.price for one in offered]
+        least = max(gains) / _PARTS if max(gains) > SURE else -np.inf
+        return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
 
     def _is_nothing(self, one: Explanation, found: Fit) -> bool:
         """Whether a swing or a group's motion is smaller than what an adjustment is asked to find."""
@@ -354,10 +364,10 @@ class _Search:
                 break
         return one, found
 
-    def _fit(self, one: Explanation) -> Fit:
-        sigma = np.append(self.seen.sigma, one.sigma)
-        extra = np.concatenate([self.seen.extra, one.extra], axis=1)
-        return fit(self.seen.linear, extra, sigma, self.seen.base, one.group)
+    def _fit(self, one: Explanation, linear: Linear | None = None, base: Fit | None = None) -> Fit:
+        seen, sigma = self.seen, np.append(self.seen.sigma, one.sigma)
+        extra = np.concatenate([seen.extra, one.extra], axis=1)
+        return fit(linear or seen.linear, extra, sigma, base or seen.base, one.group)
 
 
 def _amplitude(unknowns: Array) -> Array:

@@ -13,70 +13,29 @@ then counts twice, still and moved, and of every cell of the ground the share th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
-from barpc.ba.problem import Problem
-from barpc.ba.solve import State
+from barpc.ba.linearised import Linear, Tracks
 from barpc.geodesy import Array
-from barpc.scene import BoolArray, IntArray
+from barpc.scene import IntArray
 
 _HOTTEST = 200.0  # times the noise stated, where it is cooled from: 20 px of 0.1
 _COOLED = 0.6  # from one iteration to the next, at most
 _LEAST_NOISE = 0.2  # of what is stated
 _ITERATIONS = 60
 _BEGINNINGS = 6  # reweightings of a first guess
-_STANDS = 1e-3, 0.05  # change of the noise (logarithm) and of the log-likelihood at the end
+_STANDS = 2e-3, 0.3  # change of the noise (logarithm) and of the log-likelihood at the end
 WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
 _EPS = 1e-3, 0.98
-_MOST_SUBSETS = (
-    4  # views of a track up to which every subset may be right; of more, all of them or all but one
-)
+_CHANGED = 0.1  # of what an unknown rests on: its curvature is summed anew
 NEAR_LIMIT = (
     4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
 )
-
-
-@dataclass(frozen=True, eq=False)
-class _Tracks:
-    """Tracks of n views each."""
-
-    rows: IntArray  # (T, n) their observations, sorted by what views they are of
-    sets: IntArray  # where tracks of other views begin
-    view: IntArray  # (T, n)
-    subsets: BoolArray  # (S, n) which may be right together
-    project: Array  # (T, S, 2n, 2n) takes away what the ground point follows; zero outside the subset
-    volume: Array  # (T, S) log of what the integral over the ground point leaves
-    by_unknown: Array  # (T, n, 2, q)
-
-
-@dataclass(frozen=True, eq=False)
-class Linear:
-    """Tie points linearised at a state, in units of their stated standard deviations, and the cameras' priors."""
-
-    view: IntArray  # (K,)
-    residual: Array  # (2, K)
-    by_unknown: Array  # (2, q, K)
-    sigma: Array  # (K,) [px]
-    tracks: tuple[_Tracks, ...]
-    shape: tuple[int, int]  # N views, q unknowns
-    precision: Array  # (N q,) of the priors
-    offset: Array  # (N q,) unknowns at the state, less the priors' means
-    area: float  # in which a wrong match may lie
-    image: float  # of an image
-
-    @property
-    def views(self) -> int:
-        """N."""
-        return self.shape[0]
-
-    def left(self, step: Array) -> Array:
-        """Residuals (2, K) after a step (N, q) of the cameras."""
-        left: Array = self.residual + np.einsum("cqk,kq->ck", self.by_unknown, step[self.view])
-        return left
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,84 +63,6 @@ class Fit:
     scatter: float = 0.0  # its noise, observed over stated
 
 
-def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span: float) -> Linear:
-    """Tie points in use (K,) of a problem at a state where they may all be seen; heights span so much [m]."""
-    structure = problem.structure
-    projected = problem.linearise(state.params, state.points)
-    residual = (projected.image - problem.xy) / sigma
-    by_point, by_unknown = projected.by_point / sigma, projected.by_unknown / sigma
-    finite = np.isfinite(residual).all(axis=0) & np.isfinite(by_point).all(axis=(0, 1))
-    order = structure.by_point[(use & finite)[structure.by_point]]
-    point = structure.point[order]
-    start = np.flatnonzero(np.diff(point, prepend=-1))
-    count = np.diff(np.append(start, len(point)))
-    half, held = problem.cameras.unknowns.half, problem.point_terms(state.points)[0]
-    image = float(np.median(4.0 * half[0] * half[1]) / np.median(sigma) ** 2)
-    pixels = float(np.median(np.linalg.norm(by_point[:, :, order], axis=1)))  # a metre
-    volume = image / pixels**2 * max(span, 1.0)
-    tracks, bases = [], [np.zeros(0)]
-    for n in np.unique(count[count >= 2]).tolist():
-        rows = order[start[count == n][:, None] + np.arange(n)]
-        rows = rows[np.lexsort(structure.view[rows].T)]
-        changes = (np.diff(structure.view[rows], axis=0, prepend=-1) != 0).any(axis=1)
-        ground = by_point[:, :, rows].transpose(2, 3, 0, 1).reshape(len(rows), 2 * n, 3)
-        subsets = _subsets(n)
-        project, room = _projectors(ground, subsets, _matrices(held[:, structure.point[rows[:, 0]]]))
-        of_cameras = np.ascontiguousarray(by_unknown[:, :, rows].transpose(2, 3, 0, 1))
-        seen = np.flatnonzero(changes), structure.view[rows]
-        tracks.append(_Tracks(rows, *seen, subsets, project, room - np.log(volume), of_cameras))
-        ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
-        bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
-    far = (
-        max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
-    )
-    parallax = float(np.median(np.concatenate(bases))) * volume / image if len(order) else 0.0
-    prior = problem.camera_prior
-    return Linear(
-        structure.view,
-        residual,
-        by_unknown,
-        sigma,
-        tuple(tracks),
-        (structure.num_views, by_unknown.shape[1]),
-        (1.0 / prior.sigma**2).ravel(),
-        (state.params - prior.mean).ravel(),
-        2.0 * far * max(2.0 * far, parallax),
-        image,
-    )
-
-
-def _subsets(n: int) -> BoolArray:
-    """Which views of n may be right together (S, n): all, then fewer."""
-    sizes = range(n, 1, -1) if n <= _MOST_SUBSETS else range(n, n - 2, -1)
-    chosen = [subset for size in sizes for subset in combinations(range(n), size)]
-    out = np.zeros((len(chosen), n), dtype=bool)
-    for row, subset in zip(out, chosen, strict=True):
-        row[list(subset)] = True
-    return out
-
-
-def _matrices(triangle: Array) -> Array:
-    """Symmetric matrices (T, 3, 3) of their upper triangles (6, T)."""
-    a, b, c, d, e, f = triangle
-    return np.stack([np.stack(row, -1) for row in ((a, b, c), (b, d, e), (c, e, f))], -2)
-
-
-def _projectors(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, Array]:
-    """I - J (J' J + held)^-1 J' of each subset's rows (T, S, 2n, 2n), and -1/2 log det of the matrix (T, S)."""
-    size = ground.shape[1]
-    project = np.empty((len(ground), len(subsets), size, size))
-    room = np.empty((len(ground), len(subsets)))
-    for k, subset in enumerate(subsets):
-        mask = np.repeat(subset, 2).astype(np.float64)
-        part = ground * mask[:, None]
-        matrix = np.swapaxes(part, 1, 2) @ part + held
-        matrix += 1e-12 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        project[:, k] = np.diag(mask) - part @ np.linalg.solve(matrix, np.swapaxes(part, 1, 2))
-        room[:, k] = -0.5 * np.linalg.slogdet(matrix)[1]
-    return project, room
-
-
 def fit(
     linear: Linear,
     extra: Array | None = None,
@@ -195,20 +76,6 @@ def fit(
     is cooled again only from where the further ones begin; with a `group` that moves from the top.
     """
     return _Mixture(linear, extra, sigma, warm, group).run()
-
-
-def thinned(linear: Linear, most: int) -> Linear:
-    """The same with every n-th track, about so many of them."""
-    every = -(-sum(len(tracks.rows) for tracks in linear.tracks) // most)
-    if every <= 1:
-        return linear
-    few = []
-    for tracks in linear.tracks:
-        view = tracks.view[::every]
-        sets = np.flatnonzero((np.diff(view, axis=0, prepend=-1) != 0).any(axis=1))
-        parts = (tracks.project[::every], tracks.volume[::every], tracks.by_unknown[::every])
-        few.append(_Tracks(tracks.rows[::every], sets, view, tracks.subsets, *parts))
-    return replace(linear, tracks=tuple(few))
 
 
 def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
@@ -231,19 +98,18 @@ def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
     return out
 
 
-def settled(linear: Linear, residual: Array, found: Fit) -> Array:
+def settled(linear: Linear, residual: Array, fitted: Fit) -> Array:
     """Residuals (2, K) of the right observations once the ground points have moved to where these are smallest.
 
     In standard deviations that they would have then; 0 of the wrong ones.
     """
     out = np.zeros_like(residual)
     for tracks in linear.tracks:
-        weight = _expect(linear, tracks, residual, found.noise, found.eps)
+        found = _expect(linear, tracks, residual, fitted.noise, fitted.eps)
         count, n = tracks.rows.shape
-        project = np.einsum("ts,tsij->tij", weight.of_subset, tracks.project)
-        r = residual[:, tracks.rows].transpose(1, 2, 0).reshape(count, 2 * n, 1)
-        free = np.trace(project, axis1=1, axis2=2)[:, None, None] / (2 * n)
-        off = (project @ r) / np.sqrt(np.maximum(free, 0.1)) / found.noise
+        spread = (tracks.follow**2).sum(axis=2).reshape(count, -1, 3).sum(axis=2)
+        free = (found.of_subset * (2.0 * tracks.subsets.sum(axis=1) - spread)).sum(axis=1) / (2 * n)
+        off = found.pull(tracks) / np.sqrt(np.maximum(free, 0.1))[:, None] / fitted.noise
         out[:, tracks.rows] = off.reshape(count, n, 2).transpose(2, 0, 1)
     return out
 
@@ -258,19 +124,15 @@ def first_guess(
     """
     left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
     prior = np.diag(precision[len(precision) - new.shape[1] :])
-    parts = []
+    parts, beside = [], new / linear.sigma
+    touched = np.asarray(beside.any(axis=(0, 1)))
     for tracks in linear.tracks:
-        count, n = tracks.rows.shape
-        beside = (
-            (new[:, :, tracks.rows] / linear.sigma[tracks.rows])
-            .transpose(2, 3, 0, 1)
-            .reshape(count, 2 * n, -1)
-        )
-        some = np.flatnonzero(beside.any(axis=(1, 2)))
-        off = tracks.project[some, 0] @ left[:, tracks.rows[some]].transpose(1, 2, 0).reshape(
-            len(some), 2 * n, 1
-        )
-        parts.append((off, tracks.project[some, 0] @ beside[some]))
+        some = np.flatnonzero(touched[tracks.rows].any(axis=1))
+        rows, size = tracks.rows[some], 2 * tracks.rows.shape[1]
+        columns = beside[:, :, rows].transpose(2, 3, 0, 1).reshape(len(some), size, new.shape[1])
+        off = left[:, rows].transpose(1, 2, 0).reshape(len(some), size, 1)
+        follow = tracks.follow[some, :3]
+        parts.append(tuple(one - np.swapaxes(follow, 1, 2) @ (follow @ one) for one in (off, columns)))
     moved, far = np.zeros(new.shape[1]), [np.zeros(0)]
     for _ in range(_BEGINNINGS):
         matrix, gradient, far = prior.copy(), prior @ moved, []
@@ -301,6 +163,8 @@ class _Expected:
     of_subset: Array  # (T, S) probability of each subset
     right: Array  # (T, n) of each observation, alone or with others
     square: Array  # (T, S) squared residuals of the subsets
+    values: Array  # (T, 2n) residuals
+    followed: Array  # (T, S, 3) what ground points follow of them
     moved: _Expected | None = None  # the same of tracks that move
 
     @property
@@ -315,19 +179,25 @@ class _Expected:
         still, gone = self.of_subset.sum(axis=1), self.moved.of_subset.sum(axis=1)
         return np.asarray(gone / np.maximum(still + gone, 1e-300))
 
+    def pull(self, tracks: Tracks) -> Array:
+        """Residuals (T, 2n), less what ground points follow, as far as they are right."""
+        return tracks.weighed(self.values, self.followed, self.of_subset)
+
 
 def _expect(
-    linear: Linear, tracks: _Tracks, residual: Array, noise: float, eps: Array, moved: _Moved | None = None
+    linear: Linear, tracks: Tracks, residual: Array, noise: float, eps: Array, moved: _Moved | None = None
 ) -> _Expected:
     n, size = tracks.rows.shape[1], len(tracks.subsets)
     area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(NEAR_LIMIT))
     right, wrong = np.log1p(-eps)[tracks.view], np.log(eps)[tracks.view]
     subsets = tracks.subsets.astype(np.float64)
-    log, square = _of_subsets(tracks, residual, noise, area)
+    log, square, values, followed = _of_subsets(tracks, residual, noise, area)
     both = [log]
     if moved is not None:
         share = moved.share[tracks.rows[:, 0], None]
-        log_moved, square_moved = _of_subsets(tracks, moved.residual, moved.noise, area)
+        log_moved, square_moved, values_moved, followed_moved = _of_subsets(
+            tracks, moved.residual, moved.noise, area
+        )
         both = [log + np.log1p(-share), log_moved + np.log(share)]
     chance = right @ subsets.T + wrong @ (1.0 - subsets).T
     log = np.concatenate([one + chance for one in both], axis=1)
@@ -340,26 +210,55 @@ def _expect(
     single = (of_none / total / (1.0 + odds.sum(axis=1)))[:, None] * odds
     all_log, still = top + np.log(total), share[:, :size]
     if moved is None:
-        return _Expected(all_log, still, still @ subsets + single, square)
+        return _Expected(all_log, still, still @ subsets + single, square, values, followed)
     gone = share[:, size:]
     right_of_all = (still + gone) @ subsets + single
-    of_moved = _Expected(all_log, gone, gone @ subsets, square_moved)
-    return _Expected(all_log, still, right_of_all, square, of_moved)
+    of_moved = _Expected(all_log, gone, gone @ subsets, square_moved, values_moved, followed_moved)
+    return _Expected(all_log, still, right_of_all, square, values, followed, of_moved)
 
 
-def _of_subsets(tracks: _Tracks, residual: Array, noise: float, area: float) -> tuple[Array, Array]:
-    """Log-likelihoods (T, S) of residuals (2, K) if a subset is right, and their squares."""
-    count, n = tracks.rows.shape
-    r = residual[:, tracks.rows].transpose(1, 2, 0).reshape(count, 1, 2 * n, 1)
-    square = (r * (tracks.project @ r))[..., 0].sum(axis=-1)
+def _of_subsets(
+    tracks: Tracks, residual: Array, noise: float, area: float
+) -> tuple[Array, Array, Array, Array]:
+    """Log-likelihoods (T, S) of residuals (2, K) if a subset is right, their squares, and what they are made of."""
+    n = tracks.rows.shape[1]
+    values = tracks.of(residual)
+    followed = tracks.followed(values)
+    of_each = (values**2).reshape(len(values), n, 2).sum(axis=2)
+    square = np.maximum(of_each @ tracks.subsets.T - (followed**2).sum(axis=2), 0.0)
     members = tracks.subsets.sum(axis=1)
     log = tracks.volume - square / (2.0 * noise**2)
     log -= (n - members) * np.log(area) + 0.5 * (2 * members - 3) * np.log(2.0 * np.pi * noise**2)
-    return log, square
+    return log, square, values, followed
+
+
+@dataclass(frozen=True, eq=False)
+class _Kind:
+    """What a mixture expects of what stands still, or of what moves."""
+
+    weight: tuple[Array, ...]  # of tracks their subsets' probabilities (T, S)
+    right: Array  # (K,) probability of every observation, not by itself
+    pull: Array  # (2, K) residuals less what ground points follow, as far as they are right
+    squares: float
+    freedom: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a mixture expects of all tracks with its unknowns as they are."""
+
+    log: float
+    right: Array  # (K,)
+    moving: Array  # (K,)
+    kinds: tuple[_Kind, ...]
 
 
 class _Mixture:
-    """One fit at work: unknowns x = (cameras N q, extra e, those of a group that moves m)."""
+    """One fit at work: unknowns x = (cameras N q, extra e, those of a group that moves m).
+
+    Each step is Newton's for the weights expected now, but for the curvature, which is summed anew only where weights
+    have changed: at the end it is that of the weights there.
+    """
 
     def __init__(
         self,
@@ -376,7 +275,6 @@ class _Mixture:
         self.precision = np.concatenate([linear.precision, further])
         self.offset = np.concatenate([linear.offset, np.zeros(len(further))])
         self.x = np.zeros(len(self.precision))
-        self.left = linear.residual
         self.noise, self.eps = _HOTTEST, np.full(linear.views, WRONG[0] / WRONG[1])
         if warm is not None:
             known = warm.step.size + len(warm.extra)
@@ -386,130 +284,164 @@ class _Mixture:
                 old, new = np.split(extra, [len(warm.extra)], axis=1)
                 self.x[known:], far, _ = first_guess(linear, warm, old, new, own)
                 self.noise = max(self.noise, far)
+        self.beside = [self.extra]  # of what stands still, and of what moves
         if group is not None:
             self.noise, self.eps = _HOTTEST, np.full(linear.views, WRONG[0] / WRONG[1])
-            self.beside = np.concatenate([self.extra, group.by_move / linear.sigma], axis=1)
+            self.beside.append(np.concatenate([self.extra, group.by_move / linear.sigma], axis=1))
             self.moved = _Moved(linear.residual, group.share, self.noise)
+        self.squared = [(beside**2).sum(axis=0) for beside in self.beside]
+        self.part = np.flatnonzero(linear.taking_part)
+        self.count = np.bincount(linear.view[self.part], minlength=linear.views)
+        self.touched = np.asarray(self.beside[-1].any(axis=(0, 1)))
+        self.curvature: list[Array] = []
+        self.summed: list[Array] = []
 
     def run(self) -> Fit:
         """Expect and maximise until nothing changes."""
-        linear, last, size = self.linear, -np.inf, self.extra.shape[1]
-        right, matrix, log = np.zeros(len(linear.sigma)), np.zeros((0, 0)), 0.0
-        moving = np.zeros(len(linear.sigma) if self.group is not None else 0)
-        for _ in range(_ITERATIONS):
-            normal = _Normal(*linear.shape, len(self.x) - linear.precision.size)
-            wrong, count = np.zeros(linear.views), np.zeros(linear.views)
-            sums, log = np.zeros((2, 2)), 0.0  # squares and freedom, of what stands still and what moves
-            for tracks, found in self._expected():
-                log += float(found.log.sum())
-                right[tracks.rows] = found.right
-                wrong += np.bincount(tracks.view.ravel(), (1.0 - found.right).ravel(), linear.views)
-                count += np.bincount(tracks.view.ravel(), minlength=linear.views)
-                freedom = 2 * tracks.subsets.sum(axis=1) - 3
-                square, often = found.sums
-                sums[0] += square, float(often @ freedom)
-                self._add(tracks, found, self.left, self.extra, self.noise, normal)
-                if found.moved is not None:
-                    square, often = found.moved.sums
-                    sums[1] += square, float(often @ freedom)
-                    moving[tracks.rows] = found.gone[:, None]
-                    self._add(tracks, found.moved, self.moved.residual, self.beside, self.moved.noise, normal)
-            matrix = normal.whole(self.precision)
-            gradient = self.precision * (self.offset + self.x)
-            gradient += np.concatenate([normal.pull.ravel(), normal.pull_beside])
-            inverse = np.linalg.inv(matrix)
-            self.x = self.x - inverse @ gradient
-            known = len(self.x) - float(inverse.diagonal() @ self.precision)
-            seen = max(np.sqrt(sums[0, 0] / max(sums[0, 1] - known, 1.0)), _LEAST_NOISE)
-            noise = seen if self.noise <= seen else max(seen, _COOLED * self.noise)
-            self.eps = np.clip((wrong + WRONG[0]) / (count + WRONG[1]), *_EPS)
-            if self.group is not None:
-                self._group(moving, right, sums[1], noise, noise <= seen)
-            settled = abs(np.log(noise / self.noise)) < _STANDS[0] and abs(log - last) < _STANDS[1]
-            self.noise, last = float(noise), log
-            if settled:
+        linear, last, known, ends = self.linear, -np.inf, 0.0, False
+        for left in range(_ITERATIONS, 0, -1):
+            seen = self._expected()
+            is_new = self._has_changed(seen) or ends or left == 1
+            if is_new:
+                kinds = zip(seen.kinds, self.beside, strict=True)
+                self.curvature = [self._curvature(kind.weight, beside) for kind, beside in kinds]
+            matrix = self._matrix()
+            factor = cho_factor(matrix, lower=True, check_finite=False)
+            if is_new:
+                inverse = cho_solve(factor, np.eye(len(matrix)), check_finite=False)
+                known = len(matrix) - float(inverse.diagonal() @ self.precision)
+            self.x = self.x - cho_solve(factor, self._gradient(seen), check_finite=False)
+            settled = self._noise(seen, known) and abs(seen.log - last) < _STANDS[1]
+            last = seen.log
+            if settled and is_new:
                 break
+            ends = settled
         away = self.offset + self.x
-        room = float(np.linalg.slogdet(matrix)[1] - np.log(self.precision).sum())
-        evidence = log - 0.5 * float(self.precision @ away**2) - 0.5 * room
-        camera = linear.precision.size
-        step, extra, move = np.split(self.x, [camera, camera + size])
+        room = 2.0 * float(np.log(factor[0].diagonal()).sum()) - float(np.log(self.precision).sum())
+        evidence = seen.log - 0.5 * float(self.precision @ away**2) - 0.5 * room
+        sizes = linear.precision.size, linear.precision.size + self.extra.shape[1]
+        step, extra, move = np.split(self.x, sizes)
         scatter = 0.0 if self.group is None else self.moved.noise
         step = step.reshape(linear.shape)
-        return Fit(evidence, step, extra, self.noise, self.eps, right, move, moving, scatter)
+        return Fit(evidence, step, extra, self.noise, self.eps, seen.right, move, seen.moving, scatter)
 
-    def _group(self, moving: Array, right: Array, sums: Array, noise: float, cold: bool) -> None:
+    def _noise(self, seen: _Seen, known: float) -> bool:
+        """The noise, and what is wrong, as they are seen; whether the noise stands."""
+        still = seen.kinds[0]
+        found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), _LEAST_NOISE)
+        cold = self.noise <= found
+        noise = found if cold else max(found, _COOLED * self.noise)
+        wrong = np.bincount(
+            self.linear.view[self.part], 1.0 - seen.right[self.part], minlength=self.linear.views
+        )
+        self.eps = np.clip((wrong + WRONG[0]) / (self.count + WRONG[1]), *_EPS)
+        if self.group is not None:
+            self._group(seen, noise, noise <= found)
+        stands = abs(np.log(noise / self.noise)) < _STANDS[0]
+        self.noise = noise
+        return bool(stands)
+
+    def _group(self, seen: _Seen, noise: float, cold: bool) -> None:
         """The share of every cell that moves, once it is cold, and how much its tracks scatter."""
         assert self.group is not None
         share, scatter = self.group.share, noise
         if cold:
             rows = np.concatenate([tracks.rows[:, 0] for tracks in self.linear.tracks])
-            cell = self.group.cell
-            weights = moving[rows], np.ones(len(rows))
+            cell, moved = self.group.cell, seen.kinds[1]
+            weights = seen.moving[rows], np.ones(len(rows))
             gone, all_of = (np.bincount(cell[rows], w, cell.max() + 1) for w in weights)
             share = ((gone + 0.5) / (all_of + 1.0))[cell]
-            scatter = max(float(np.sqrt(sums[0] / max(sums[1], 1.0))), noise)
+            scatter = max(float(np.sqrt(moved.squares / max(moved.freedom, 1.0))), noise)
         self.moved = _Moved(self.moved.residual, share, scatter)
 
-    def _expected(self) -> Iterator[tuple[_Tracks, _Expected]]:
-        camera, size = self.linear.precision.size, self.extra.shape[1]
-        step, extra, move = np.split(self.x, [camera, camera + size])
-        self.left = self.linear.left(step.reshape(self.linear.shape))
-        self.left += np.einsum("cek,e->ck", self.extra, extra)
-        moved = None
+    def _expected(self) -> _Seen:
+        linear, size = self.linear, self.extra.shape[1]
+        step, extra, move = np.split(self.x, [linear.precision.size, linear.precision.size + size])
+        left = linear.left(step.reshape(linear.shape)) + np.einsum("cek,e->ck", self.extra, extra)
+        moved, log = None, 0.0
         if self.group is not None:
-            away = np.einsum("cmk,m->ck", self.beside[:, size:], move)
-            moved = self.moved = replace(self.moved, residual=self.left + away)
-        for tracks in self.linear.tracks:
-            yield tracks, _expect(self.linear, tracks, self.left, self.noise, self.eps, moved)
+            away = np.einsum("cmk,m->ck", self.beside[1][:, size:], move)
+            moved = self.moved = replace(self.moved, residual=left + away)
+        right, moving = np.zeros((2, len(linear.view)))
+        found = [_expect(linear, tracks, left, self.noise, self.eps, moved) for tracks in linear.tracks]
+        for tracks, one in zip(linear.tracks, found, strict=True):
+            log += float(one.log.sum())
+            right[tracks.rows] = one.right
+            if moved is not None:
+                moving[tracks.rows] = one.gone[:, None]
+        kinds = [found] if moved is None else [found, [one.moved for one in found if one.moved is not None]]
+        return _Seen(log, right, moving if moved is not None else moving[:0], tuple(map(self._kind, kinds)))
 
-    def _add(
-        self, tracks: _Tracks, found: _Expected, left: Array, beside: Array, noise: float, normal: _Normal
-    ) -> None:
-        """Add the normal matrix and gradient of some tracks, with the first of the unknowns beside the cameras'."""
-        count, n = tracks.rows.shape
-        weight = np.einsum("ts,tsij->tij", found.of_subset, tracks.project) / noise**2
-        residual = left[:, tracks.rows].transpose(1, 2, 0).reshape(count, 2 * n, 1)
-        pull, parts = weight @ residual, tracks.by_unknown
-        first = tracks.view[tracks.sets]
-        pulls = np.einsum("tna,tnap->tnp", pull.reshape(count, n, 2), parts)
-        np.add.at(normal.pull, first, np.add.reduceat(pulls, tracks.sets, axis=0))
-        turned = np.ascontiguousarray(np.swapaxes(parts, 2, 3))
-        for j in range(n):
-            of_all = weight[:, :, 2 * j : 2 * j + 2] @ parts[:, j]
-            for i in range(j + 1):
-                sums = np.add.reduceat(turned[:, i] @ of_all[:, 2 * i : 2 * i + 2], tracks.sets, axis=0)
-                np.add.at(normal.blocks, (first[:, i], first[:, j]), sums)
-                if i < j:
-                    np.add.at(normal.blocks, (first[:, j], first[:, i]), np.swapaxes(sums, 1, 2))
-        size = beside.shape[1]
-        if size:
-            columns = beside[:, :, tracks.rows].transpose(2, 3, 0, 1).reshape(count, 2 * n, -1)
-            some = np.flatnonzero(columns.any(axis=(1, 2)))
-            columns = columns[some]
-            weighted = weight[some] @ columns
-            normal.beside[:size, :size] += np.einsum("tie,tif->ef", columns, weighted, optimize=True)
-            normal.pull_beside[:size] += (columns * pull[some]).sum(axis=(0, 1))
-            cross = turned[some] @ weighted.reshape(len(some), n, 2, size)
-            of_set = np.searchsorted(tracks.sets, some, side="right") - 1
-            begin = np.flatnonzero(np.diff(of_set, prepend=-1))
-            if len(some):
-                sums = np.add.reduceat(cross, begin, axis=0)
-                np.add.at(normal.cross[:, :, :size], first[of_set[begin]], sums)
+    def _kind(self, found: Sequence[_Expected]) -> _Kind:
+        squares, freedom = 0.0, 0.0
+        right, pull = np.zeros(len(self.linear.view)), np.zeros((2, len(self.linear.view)))
+        for tracks, one in zip(self.linear.tracks, found, strict=True):
+            count, n = tracks.rows.shape
+            square, often = one.sums
+            squares += square
+            freedom += float(often @ (2 * tracks.subsets.sum(axis=1) - 3))
+            right[tracks.rows] = one.of_subset @ tracks.subsets.astype(np.float64)
+            pull[:, tracks.rows] = one.pull(tracks).reshape(count, n, 2).transpose(2, 0, 1)
+        return _Kind(tuple(one.of_subset for one in found), right, pull, squares, freedom)
 
+    @property
+    def _noises(self) -> list[float]:
+        return [self.noise] if self.group is None else [self.noise, self.moved.noise]
 
-class _Normal:
-    """Sums of a normal matrix, view by view."""
+    def _has_changed(self, seen: _Seen) -> bool:
+        """Whether what views and unknowns rest on is another part of the observations than the curvature's."""
+        sums, further = [], self.precision[self.linear.precision.size :]
+        for kind, squared, noise in zip(seen.kinds, self.squared, self._noises, strict=True):
+            of_views = np.bincount(self.linear.view, kind.right, minlength=self.linear.views)
+            sums += [of_views + 1.0, squared @ kind.right + further[: len(squared)] * noise**2]
+        new = np.log(np.concatenate(sums))
+        if len(self.summed) and bool((np.abs(new - self.summed) < _CHANGED).all()):
+            return False
+        self.summed = new
+        return True
 
-    def __init__(self, views: int, q: int, extra: int) -> None:
-        self.blocks, self.pull = np.zeros((views, views, q, q)), np.zeros((views, q))
-        self.cross, self.beside = np.zeros((views, q, extra)), np.zeros((extra, extra))
-        self.pull_beside = np.zeros(extra)
-
-    def whole(self, precision: Array) -> Array:
-        """The matrix, with the precisions of the priors."""
-        size = self.pull.size
-        cross = self.cross.reshape(size, -1)
-        out = np.block([[np.swapaxes(self.blocks, 1, 2).reshape(size, size), cross], [cross.T, self.beside]])
-        out[np.diag_indices(len(out))] += precision
+    def _matrix(self) -> Array:
+        """The normal matrix, with the precisions of the priors."""
+        out = np.diag(self.precision)
+        for matrix, noise in zip(self.curvature, self._noises, strict=True):
+            out[: len(matrix), : len(matrix)] += matrix / noise**2
         return out
+
+    def _gradient(self, seen: _Seen) -> Array:
+        linear, out = self.linear, self.precision * (self.offset + self.x)
+        camera, pulls = linear.precision.size, np.zeros_like(linear.residual)
+        for kind, beside, noise in zip(seen.kinds, self.beside, self._noises, strict=True):
+            pull = kind.pull / noise**2
+            pulls += pull
+            out[camera : camera + beside.shape[1]] += np.einsum("cek,ck->e", beside, pull)
+        of_each = np.einsum("cqk,ck->qk", linear.by_unknown, pulls)
+        of_views = [np.bincount(linear.view, one, minlength=linear.views) for one in of_each]
+        out[:camera] += np.stack(of_views, axis=1).ravel()
+        return out
+
+    def _curvature(self, weights: Sequence[Array], beside: Array) -> Array:
+        """Second derivatives of half the squares by the cameras' unknowns and those beside them."""
+        (views, q), size = self.linear.shape, beside.shape[1]
+        blocks, of_beside = np.zeros((views, q, views, q)), np.zeros((size, size))
+        across = np.zeros((views, q, size))
+        for tracks, of_subset in zip(self.linear.tracks, weights, strict=True):
+            count, n = tracks.rows.shape
+            weight, touched = tracks.weight(of_subset), np.asarray(self.touched[tracks.rows].any(axis=1))
+            for begin, end in pairwise([*tracks.sets.tolist(), count]):
+                parts, seen = tracks.by_unknown[begin:end], tracks.view[begin]
+                rows = np.ascontiguousarray(parts.transpose(1, 0, 2, 3)).reshape(n, -1, q)
+                for j in range(n):
+                    of_one = (weight[begin:end, :, 2 * j : 2 * j + 2] @ parts[:, j]).reshape(-1, n, 2, q)
+                    of_rows = of_one.transpose(1, 0, 2, 3).reshape(n, -1, q)
+                    blocks[seen, :, seen[j]] += np.swapaxes(rows, 1, 2) @ of_rows
+                some = np.flatnonzero(touched[begin:end])
+                if len(some) and size:
+                    columns = beside[:, :, tracks.rows[begin + some]].transpose(2, 3, 0, 1)
+                    columns = columns.reshape(len(some), 2 * n, size)
+                    weighted = weight[begin + some] @ columns
+                    of_beside += columns.reshape(-1, size).T @ weighted.reshape(-1, size)
+                    turned = weighted.reshape(-1, n, 2, size).transpose(1, 0, 2, 3).reshape(n, -1, size)
+                    of_some = parts[some].transpose(1, 3, 0, 2).reshape(n, q, -1)
+                    across[seen] += of_some @ turned
+        cameras, cross = blocks.reshape(views * q, -1), across.reshape(views * q, size)
+        return np.block([[cameras, cross], [cross.T, of_beside]])

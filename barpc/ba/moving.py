@@ -16,7 +16,8 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.heldout import seen_in
-from barpc.ba.mixture import Fit, Group, Linear, fit, linearise, moving, thinned
+from barpc.ba.linearised import Linear, linearise
+from barpc.ba.mixture import Fit, Group, fit, moving
 from barpc.ba.problem import Problem
 from barpc.ba.solve import State
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
@@ -99,7 +100,7 @@ class Found:
 
 def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Array) -> Group | None:
     """The group that moves, where it is to be begun with; beside what else was found, with its unknowns' prior."""
-    few = thinned(linear, _FEW)
+    few = linear.thinned(_FEW)
     by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(CELLS)
     group = Group(by_move, np.full(by_move.shape[1], _SIGMA), cell, np.full(len(cell), 0.5))
     rows = np.zeros(len(cell), dtype=bool)

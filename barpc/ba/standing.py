@@ -11,7 +11,7 @@ from barpc.ba.block import MIN_OBSERVATIONS, Block
 from barpc.ba.heldout import is_better, measure
 from barpc.ba.judge import Finding, Judgement, judge
 from barpc.ba.moving import Found, Motion, members
-from barpc.ba.solution import Solution
+from barpc.ba.solution import MUCH_NOISE, Solution
 from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, connected_groups
@@ -104,7 +104,10 @@ def without_moving(
 
     Refused where tracks that took no part, and do not move, are met worse, or the views do not hang together any more.
     """
-    if options.loss == "linear":  # who wants least squares has no observation that may be wrong
+    # who wants least squares has no observation that may be wrong; a model too small bends all images
+    noise = MUCH_NOISE * found.outcome.noise * float(np.median(parts.inner.sigma))
+    too_small = options.is_plain and bool(found.outcome.smooth.found(noise).all())
+    if options.loss == "linear" or too_small:
         return found, parts, Judgement()
     groups: list[Finding] = []
     while True:

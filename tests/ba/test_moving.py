@@ -13,7 +13,8 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.block import Block as Joined
 from barpc.ba.block import join
 from barpc.ba.explanations import MOVING, STRIP
-from barpc.ba.mixture import Group, fit, linearise, thinned
+from barpc.ba.linearised import linearise
+from barpc.ba.mixture import Group, fit
 from barpc.ba.moving import CELLS, Ground, group_of
 from barpc.ba.problem import Problem
 from barpc.ba.solve import State
@@ -114,7 +115,7 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     assert one.metres == pytest.approx(3.0 * GSD, rel=0.1)
     assert one.between == (0, 2)
     assert found.noise == pytest.approx(1.0, abs=0.1)
-    few = thinned(linear, 100)
+    few = linear.thinned(100)
     assert 80 <= sum(len(part.rows) for part in few.tracks) <= 110
     assert fit(few, group=group).noise == pytest.approx(found.noise, rel=0.15)
 

@@ -79,7 +79,9 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
     if (apart := adjustment.apart) is not None and apart.clear and np.isfinite(apart.gain):
         other = None if apart.runner_up is None else f"{APART}: {adjustment.names[apart.runner_up]}"
         image = adjustment.names[apart.view]
-        what = "many tie points of {} are wrong, or its RPC is" if apart.look.as_stated else "the RPC of {} is"
+        what = (
+            "many tie points of {} are wrong, or its RPC is" if apart.look.as_stated else "the RPC of {} is"
+        )
         sentence = f"{what.format(image)} not its own: {strangeness(apart)}"
         found.append(ExplanationEntry(APART, sentence, image, apart.gain, apart.gap, other))
     for one in adjustment.findings:
