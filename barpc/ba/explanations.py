@@ -13,9 +13,10 @@ from barpc.ba.mixture import Fit, Group, first_guess, log_likelihoods
 from barpc.ba.periods import Swing
 from barpc.ba.periods import price as price_of_period
 from barpc.ba.scan import BINS, Interval, price
+from barpc.ba.waves import Waves
 from barpc.geodesy import Array
 from barpc.scene import IntArray
-from barpc.sensor.splined import bsplines, profile
+from barpc.sensor.splined import profile
 from barpc.sensor.splined import swing as waves_of
 
 STRIP = "strip"
@@ -25,11 +26,11 @@ SWING = "swing"
 MOVING = "moving"
 LOCAL = STRIP, FADE
 """Those of a part of an image."""
-FOLLOWED = *LOCAL, SWING
+FOLLOWED = *LOCAL, SWING, WANDER
 """Those that the adjustment follows; others may be beside them."""
 _LENGTHS = 2.0 ** np.arange(-4.0, 1.0)  # of an interval: over what it may fade
 _A_BIN = 5  # places of a bin at which a curve is looked at
-_SPLINES = 14  # over the rows of an image
+SPLINES = 14  # over the rows of an image
 _WANDER = 0.5  # px
 _STRIP = 1.0  # px, before it is known; then its own size, for which a scale of x 30 is paid
 SCALE = float(np.log(2.0 * np.log(30.0)))
@@ -127,7 +128,7 @@ def faster(one: Explanation, found: Fit) -> Explanation:
 
 
 def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explanation:
-    """A strip whose ends are where ties say, or a swing, whose prior is as wide as it is large.
+    """A strip whose ends are where ties say, or what all rows do, whose prior is as wide as it is large.
 
     `found` is a fit with it, its own unknowns the last; `others` (2, K) is what those before it move [px].
     """
@@ -179,11 +180,12 @@ def _largest_part(gain: Array) -> tuple[int, int]:
 
 
 def wander(seen: Seen, interval: Interval) -> list[Explanation]:
-    """Rows of an image that wander: splines."""
+    """Rows of an image that wander: splines, apart from what a drift follows."""
     view = interval.view
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
-    return [_on_both(seen, WANDER, view, rows, bsplines(u, _SPLINES), _WANDER)]
+    one = _on_both(seen, WANDER, view, rows, Waves(SPLINES).splines(u), _WANDER)
+    return [replace(one, price=one.price + SCALE)]
 
 
 def swing(seen: Seen, found: Swing) -> Explanation:
@@ -195,20 +197,26 @@ def swing(seen: Seen, found: Swing) -> Explanation:
     return replace(one, price=costs, period=found.period)
 
 
-def boxed(seen: Seen, one: Explanation, found: Fit) -> Explanation:
-    """The strip that a view's wandering rows look most like, apart from what a drift follows."""
-    u = (np.arange(BINS * _A_BIN) + 0.5) / (BINS * _A_BIN) * 2.0 - 1.0
-    curve = found.extra[-2 * _SPLINES :].reshape(2, _SPLINES) @ bsplines(u, _SPLINES)
-    drift = np.linalg.qr(np.vander(u, 3))[0]
-    ends = np.stack(np.triu_indices(BINS + 1, 1)) * _A_BIN
-    place = np.arange(len(u))[:, None]
-    boxes = ((place >= ends[0]) & (place < ends[1])).astype(np.float64)
-    boxes -= drift @ (drift.T @ boxes)
-    curve = curve - (curve @ drift) @ drift.T
-    alike = ((curve @ boxes) ** 2).sum(axis=0) / np.maximum((boxes**2).sum(axis=0), 0.1)
-    start, stop = (ends[:, int(alike.argmax())] / len(u) * seen.size[1, one.view]).tolist()
-    reach = _open_ended(start, stop, float(seen.size[1, one.view]))
-    return _local(STRIP, seen, one.view, (1, *reach, 0.0, 0.0), _STRIP)
+def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
+    """The strip and what fades that a view's wandering rows look most like, apart from what a drift follows."""
+    size, view = float(seen.size[1, one.view]), one.view
+    rows = (np.arange(BINS * _A_BIN) + 0.5) / (BINS * _A_BIN) * size
+    curve = found.extra[-len(one.sigma) :].reshape(2, -1) @ Waves(SPLINES).splines(2.0 * rows / size - 1.0)
+    drift = np.linalg.qr(np.vander(rows / size - 0.5, 3))[0]
+    ends = np.stack(np.triu_indices(BINS + 1, 1)) / BINS * size
+    nothing = np.zeros(ends.shape[1])
+    origin, length, sign = (
+        grid.ravel() for grid in np.meshgrid(np.arange(BINS) / BINS * size, _LENGTHS * size, (-1.0, 1.0))
+    )
+    start, stop = np.where(sign > 0.0, origin, -size), np.where(sign > 0.0, 2.0 * size, origin)
+    told = []
+    for kind, shapes in ((STRIP, (*ends, nothing, nothing)), (FADE, (start, stop, origin, sign / length))):
+        parts = profile(rows[:, None], *shapes)
+        parts -= drift @ (drift.T @ parts)
+        explained = ((curve @ parts) ** 2).sum(axis=0) / np.maximum((parts**2).sum(axis=0), 0.1)
+        first, last, *rest = (float(shape[int(explained.argmax())]) for shape in shapes)
+        told.append(_local(kind, seen, view, (1, *_open_ended(first, last, size), rest[0], rest[1]), _STRIP))
+    return told
 
 
 def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sigma: float) -> Explanation:

@@ -8,7 +8,7 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
-from barpc.ba.explanations import FOLLOWED, LOCAL, SWING
+from barpc.ba.explanations import FOLLOWED, LOCAL, SPLINES, SWING, WANDER
 from barpc.ba.heldout import is_better
 from barpc.ba.judge import Finding, Judgement, standing_out
 from barpc.ba.rounds import Rounds, revived
@@ -84,8 +84,8 @@ def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:
 def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
     """The unknowns in the image that explanations are, and what these found (N, size)."""
     own = [
-        [[one for one in parts if one.view == v and (one.kind == SWING) == swings] for v in range(views)]
-        for swings in (False, True)
+        [[one for one in parts if one.view == v and one.kind in kinds] for v in range(views)]
+        for kinds in (LOCAL, (SWING,))
     ]
     most = [max(map(len, of_kind)) for of_kind in own]
     places, periods = np.full((views, most[0], 5), np.inf), np.full((views, most[1]), np.inf)
@@ -97,8 +97,12 @@ def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
         for n, one in enumerate(of_swings):
             assert one.period is not None
             periods[v, n], swung[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
-    params = np.hstack([moved.reshape(views, -1), swung.reshape(views, -1)])
-    return Waves(0, np.zeros((views, 0)), places, periods), params
+    wandering = [one for one in parts if one.kind == WANDER]
+    waves = Waves(SPLINES if wandering else 0, np.zeros((views, 0)), places, periods)
+    splines = np.zeros((views, 2 * waves.parts[0]))
+    for one in wandering:
+        splines[one.view] = one.unknowns
+    return waves, np.hstack([splines, moved.reshape(views, -1), swung.reshape(views, -1)])
 
 
 def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:

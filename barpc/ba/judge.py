@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator
-from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,8 +19,8 @@ from barpc.ba.explanations import (
     Explanation,
     Seen,
     Where,
+    alike,
     bent,
-    boxed,
     faster,
     proposed,
     sharpened,
@@ -41,6 +40,7 @@ _LOG = logging.getLogger(__name__)
 
 _MOST = 6  # explanations of one block
 _TRIED = 3  # intervals a round, and periods
+_STATES = 3  # ways to explain a block that are gone on with
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
@@ -184,95 +184,91 @@ class _Taken:
     runner_up: str
     or_of: tuple[int, ...]
 
+    @property
+    def what(self) -> tuple[str, int]:
+        """Its kind and view."""
+        return self.one.kind, self.one.view
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """A search with some explanations taken."""
+
+    seen: Seen
+    followed: Fit  # the last of what the adjustment follows
+    taken: tuple[_Taken, ...] = ()
+    ended: bool = False  # nothing may be taken beside what was
+
+    @property
+    def gain(self) -> float:
+        """Of all that were taken, together."""
+        return sum(row.gain for row in self.taken)
+
+    def may_pass(self, best: _State) -> bool:
+        """Whether some more, each of which gains less than the last, may explain more than another that ended."""
+        left = _PARTS + len(best.taken) - 1 - len(self.taken)
+        return self.gain + left * self.taken[-1].gain > best.gain
+
+    def added(self, tried: list[_Tried]) -> _State:
+        """With the first of those that were tried; the others are what it was chosen from."""
+        first = tried[0]
+        same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
+        one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
+        others = [row for row in tried if row[0] is not one and _differs(row[0], one)]
+        other = max(((row[0].kind, row[2]) for row in others), default=("", 0.0), key=lambda row: row[1])
+        close = [row[0] for row in others if row[2] > gain - SURE]
+        or_of = tuple(sorted({row.view for row in close if one.kind == row.kind == SWING}))
+        _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
+        taken = (*self.taken, _Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of))
+        extra = np.concatenate([self.seen.extra, one.extra], axis=1)
+        sigma = np.append(self.seen.sigma, one.sigma)
+        seen = replace(self.seen, base=made, extra=extra, sigma=sigma)
+        follows = one.kind in FOLLOWED
+        return _State(seen, made if follows else self.followed, taken, not follows or len(taken) == _MOST)
+
 
 class _Search:
-    """Taking one explanation after the other."""
+    """Taking one explanation after the other, of the best and of its rival."""
 
     def __init__(self, seen: Seen, first: list[Interval], floor: float, sigma: float) -> None:
-        self.seen, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
-        self.taken: list[_Taken] = []
-        self.followed = seen.base  # the last fit of what the adjustment follows
+        self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
+        self.seen, self.taken = seen, ()
         self.group: list[Explanation] = []  # looked for once
 
     def run(self) -> Judgement:
         """All that were taken."""
-        tried = self._tried()
-        while tried and tried[0][2] > SURE and len(self.taken) < _MOST:
-            self._take(tried)
-            if self.taken[-1].one.kind not in FOLLOWED:  # what is smooth is followed by other means
-                break
-            tried = self._tried()
-        followed = sum(row.one.kind in FOLLOWED for row in self.taken)
-        base = self.seen.base if followed == len(self.taken) else self.followed
-        return Judgement(tuple(self._said(n) for n in range(len(self.taken))), base.step, base.right)
+        states, ended = [_State(self.start, self.start.base)], False
+        while not ended:
+            states, ended = self._grown(states)
+        best, margin = states[0], states[0].gain - (states[1].gain if len(states) > 1 else 0.0)
+        self.seen = best.seen
+        # what was not the best by itself is beside the others: by what these gain together
+        taken = [row if row.gap > 0.0 else replace(row, gap=margin) for row in best.taken]
+        followed = sum(row.one.kind in FOLLOWED for row in taken)
+        base = best.seen.base if followed == len(taken) else best.followed
+        found = tuple(_said(taken, n, best.seen) for n in range(len(taken)))
+        return Judgement(found, base.step, base.right)
 
-    def _take(self, tried: list[_Tried]) -> None:
-        """The best, or several parts of its image where these explain more together than it does alone."""
-        best = tried[0]
-        if best[0].kind == WANDER and self._took_swing(tried):
-            return
-        if best[0].kind not in LOCAL:
-            parts, left = copy(self), _parts_of(best[0], tried)
-            parts.taken = list(self.taken)
-            total = 0.0
-            for more in range(_PARTS, 0, -1):
-                if (
-                    not left or not left[0][2] > SURE or total + more * left[0][2] < best[2]
-                ):  # each gains less
-                    break
-                total += left[0][2]
-                parts._add(left)
-                left = _parts_of(best[0], parts._tried())
-            if total > best[2] + SURE:
-                self.taken, self.seen, self.followed = parts.taken, parts.seen, parts.followed
-                return
-        self._add(tried)
-
-    def _took_swing(self, tried: list[_Tried]) -> bool:
-        """Whether what wanders explains more with a swing beside it, which is then taken first."""
-        best = tried[0]
-        first = next((row for row in tried if row[0].kind == SWING and row[2] > SURE), None)
-        if first is None:
-            return False
-        parts = copy(self)
-        parts.taken = list(self.taken)
-        parts._add([first, *(row for row in tried if row is not first and row[0] is not best[0])])
-        wanders = [row[0] for row in tried if row[0].kind == WANDER]
-        beside = parts._sorted((one, parts._fit(one)) for one in wanders)[0][2]
-        if not first[2] + beside > best[2] + SURE:
-            return False
-        self.taken, self.seen, self.followed = parts.taken, parts.seen, parts.followed
-        return True
-
-    def _add(self, tried: list[_Tried]) -> None:
-        best = tried[0]
-        same = [row for row in tried if row[2] > best[2] - SURE and _of_one_image(row[0], best[0])]
-        one, made, gain = min(same, key=lambda row: _part(row[0], self.seen))  # of two that are as good
-        others = [row for row in tried if row[0] is not one and _differs(row[0], one)]
-        other = next(((row[0].kind, row[2]) for row in others), ("", 0.0))
-        close = [row[0] for row in others if row[2] > gain - SURE]
-        or_of = tuple(sorted({row.view for row in close if one.kind == row.kind == SWING}))
-        _LOG.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.kind, one.view, one.where, gain, *other)
-        self.followed = made if one.kind in FOLLOWED else self.followed
-        self.taken.append(_Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of))
-        extra = np.concatenate([self.seen.extra, one.extra], axis=1)
-        sigma = np.append(self.seen.sigma, one.sigma)
-        self.seen = replace(self.seen, base=made, extra=extra, sigma=sigma)
-
-    def _said(self, n: int) -> Finding:
-        taken, one = self.taken[n], self.taken[n].one
-        start = sum(len(row.one.sigma) for row in self.taken[:n])
-        size = unknowns = self.seen.base.extra[start : start + len(one.sigma)]
-        moved = None
-        if one.group is not None:
-            size, moved = np.zeros(2), group_of(self.seen.linear, self.seen.ground, one.group, self.seen.base)
-        elif one.kind == SWING:
-            size = _amplitude(unknowns)
-        elif one.kind not in LOCAL:
-            rows = self.seen.linear.view == one.view
-            size = np.sqrt((np.einsum("cek,e->ck", one.extra[:, :, rows], unknowns) ** 2).mean(axis=1))
-        said = taken.gain, taken.gap, taken.runner_up, unknowns, one.period, taken.or_of
-        return Finding(one.kind, one.view, one.where, size, *said, moved)
+    def _grown(self, states: list[_State]) -> tuple[list[_State], bool]:
+        """The best with one more explanation, and whether they are the last."""
+        best, grown = states[0], list[_State]()
+        for state in states:
+            if state.ended or (best.ended and not state.may_pass(best)):
+                grown.append(state)
+                continue
+            self.seen, self.taken = state.seen, state.taken
+            tried = [row for row in self._tried() if row[2] > SURE]
+            if not tried and state is best:  # it explains all
+                return states, True
+            for n in [0, *_rival(tried)] if tried else []:
+                grown.append(state.added([tried[n], *tried[:n], *tried[n + 1 :]]))
+            grown += [] if tried else [replace(state, ended=True)]
+        kept: list[_State] = []
+        for state in sorted(grown, key=lambda state: -state.gain):
+            if not any({row.what for row in state.taken} == {row.what for row in one.taken} for one in kept):
+                kept.append(state)
+        kept = kept[:_STATES]
+        return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
 
     def _tried(self) -> list[_Tried]:
         """Explanations of what stands out now, fitted beside those taken, with their gains; the best first."""
@@ -295,14 +291,14 @@ class _Search:
         more = [one for row in made if row[0].group and row[2] > SURE for one in self._members(row[1], rows)]
         made = self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
         if made and made[0][0].kind == WANDER:
-            box = boxed(seen, *made[0][:2])
-            made = self._sorted([*(row[:2] for row in made), (box, self._fit(box))])
+            more = [(one, self._fit(one)) for one in alike(seen, *made[0][:2])]
+            made = self._sorted([*(row[:2] for row in made), *more])
         local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:_LOCAL]]
         # where something is sure already, what is not waits for the next round
         blunt = max(SURE, made[0][2] / _PARTS) if made and made[0][2] > SURE else -np.inf
         sharp = [
             self._sharpened(one, found)
-            if gain > blunt and (one in local or one.kind == SWING)
+            if gain > blunt and (one in local or one.kind in (SWING, WANDER))
             else (one, found)
             for one, found, gain in made
         ]
@@ -376,9 +372,28 @@ def _amplitude(unknowns: Array) -> Array:
     return size
 
 
-def _parts_of(best: Explanation, tried: list[_Tried]) -> list[_Tried]:
-    """Explanations of parts of an image, or of any beside what is of none."""
-    return [row for row in tried if row[0].kind in LOCAL and best.view in (row[0].view, -1)]
+def _said(rows: list[_Taken], n: int, seen: Seen) -> Finding:
+    taken, one = rows[n], rows[n].one
+    start = sum(len(row.one.sigma) for row in rows[:n])
+    size = unknowns = seen.base.extra[start : start + len(one.sigma)]
+    moved = None
+    if one.group is not None:
+        size, moved = np.zeros(2), group_of(seen.linear, seen.ground, one.group, seen.base)
+    elif one.kind == SWING:
+        size = _amplitude(unknowns)
+    elif one.kind not in LOCAL:
+        of_view = seen.linear.view == one.view
+        size = np.sqrt((np.einsum("cek,e->ck", one.extra[:, :, of_view], unknowns) ** 2).mean(axis=1))
+    said = taken.gain, taken.gap, taken.runner_up, unknowns, one.period, taken.or_of
+    return Finding(one.kind, one.view, one.where, size, *said, moved)
+
+
+def _rival(tried: list[_Tried]) -> list[int]:
+    """The best that is another than the first and can be gone on with, where it may be its better with some beside."""
+    for n, row in enumerate(tried):
+        if row[0].kind in FOLLOWED and _differs(row[0], tried[0][0]):
+            return [n] if row[2] > tried[0][2] / _PARTS else []
+    return []
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:

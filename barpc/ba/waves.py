@@ -48,6 +48,11 @@ class Waves:
         vectors: Array = free @ la.eigh(rough.T @ rough)[1]
         return vectors * np.where(vectors[-1] < 0, -1.0, 1.0)
 
+    def splines(self, row: Array) -> Array:
+        """What one unit of the splines' unknowns of one coordinate adds (m, n) at rows (n,) normalised."""
+        found: Array = self._of_splines.T @ bsplines(row, self.count)
+        return found
+
     @cached_property
     def _of_steps(self) -> Array:
         """(C + 1, s) the same of detectors, against a shift and, of three and more, a scale."""
@@ -108,7 +113,7 @@ class Waves:
 
         Their rows (n,) normalised are given, too.
         """
-        found = [self._of_splines.T @ bsplines(row, self.count)] if self.count else []
+        found = [self.splines(row)] if self.count else []
         if self.edges.shape[1]:
             steps = self._of_steps.T[:, (seen[0][:, None] >= self.edges[index]).sum(axis=1)]
             found.append(steps * np.isfinite(self.edges[index, 0]))
