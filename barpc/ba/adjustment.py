@@ -283,7 +283,7 @@ def _adjustment(
         asked=found.asked,
         findings=tuple(_said(found.findings, parts, points)),
         moving=parts.block.in_order(parts.group > 0)[ties],
-        left=tuple(left_over(outcome, block, options.noise_floor)),
+        left=(*left_over(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
         alike=_alike(block, outcome, is_tie),
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),

@@ -232,7 +232,7 @@ class _Search:
 
     def __init__(self, seen: Seen, first: list[Interval], floor: float, sigma: float) -> None:
         self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
-        self.seen, self.taken = seen, ()
+        self.seen, self.taken = seen, tuple[_Taken, ...]()
         self.group: list[Explanation] = []  # looked for once
 
     def run(self) -> Judgement:
@@ -273,9 +273,7 @@ class _Search:
     def _tried(self) -> list[_Tried]:
         """Explanations of what stands out now, fitted beside those taken, with their gains; the best first."""
         seen, linear = self.seen, self.seen.linear
-        rows = np.zeros(len(linear.view), dtype=bool)
-        for tracks in linear.tracks:
-            rows[tracks.rows] = True
+        rows = linear.taking_part
         left = (
             linear.left(seen.base.step) + np.einsum("cek,e->ck", seen.extra, seen.base.extra) / linear.sigma
         )
@@ -287,12 +285,11 @@ class _Search:
         out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
         out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
         offered = self._worth_more(self._proposed(out, periods[:_TRIED]))
-        made = self._sorted((one, self._fit(one)) for one in offered)
-        more = [one for row in made if row[0].group and row[2] > SURE for one in self._members(row[1], rows)]
-        made = self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
+        made = self._with([], offered)
+        sure = [row for row in made if row[0].group and row[2] > SURE]
+        made = self._with(made, [one for row in sure for one in self._members(row[1], rows)])
         if made and made[0][0].kind == WANDER:
-            more = [(one, self._fit(one)) for one in alike(seen, *made[0][:2])]
-            made = self._sorted([*(row[:2] for row in made), *more])
+            made = self._with(made, alike(seen, *made[0][:2]))
         local = [one for kind in LOCAL for one in [row[0] for row in made if row[0].kind == kind][:_LOCAL]]
         # where something is sure already, what is not waits for the next round
         blunt = max(SURE, made[0][2] / _PARTS) if made and made[0][2] > SURE else -np.inf
@@ -338,6 +335,10 @@ class _Search:
         best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
         intervals = sorted(best.values(), key=lambda one: -one.gain)[:_HELD_IN]
         return proposed(seen, intervals, [], (MOVING, WANDER))
+
+    def _with(self, made: list[_Tried], more: list[Explanation]) -> list[_Tried]:
+        """What was tried and more, the best first."""
+        return self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
 
     def _sorted(self, made: Iterable[tuple[Explanation, Fit]]) -> list[_Tried]:
         base = self.seen.base.evidence

@@ -16,6 +16,7 @@ from barpc.scene import IntArray
 
 BINS = 40  # stretches of an image's rows or columns
 SURE = 5.0  # nats: an explanation that gains less is none
+_LINE = 0.05  # of the larger extent of residuals: a smaller one is none
 CLIPPED = 8.0
 """Standard deviations: one residual tells no more."""
 
@@ -33,6 +34,7 @@ class Interval:
     off: float  # what the others have in common, in the units of the residuals
     by_share: bool  # whether the share stands out, or what they have in common
     apart: float = 0.0  # half of those that are wrong are farther off than this, where it was measured
+    moves: bool = False  # the share is of a group that moves
 
 
 def price(views: int) -> float:
@@ -93,8 +95,11 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
         rows = np.flatnonzero(view == v)
         if len(rows) < 2:
             continue
+        axes, size = np.linalg.svd(residual[:, rows], full_matrices=False)[:2]
+        # of two views all lie along one line: what is left across it is no direction
+        along = axes.T[size > _LINE * size[0]] @ residual[:, rows]
         for axis in (0, 1):
-            signs = residual[:, rows[np.argsort(place[axis, rows], kind="stable")]] > 0.0
+            signs = along[:, np.argsort(place[axis, rows], kind="stable")] > 0.0
             alike, count = (signs[:, 1:] == signs[:, :-1]).sum(axis=1), float(len(rows) - 1)
             share = np.maximum(alike / count, 0.5)
             found = count * (np.log(2.0) - entr(share) - entr(1.0 - share))

@@ -11,6 +11,7 @@ from barpc.ba.block import MIN_OBSERVATIONS, Block
 from barpc.ba.heldout import is_better, measure
 from barpc.ba.judge import Finding, Judgement, judge
 from barpc.ba.moving import Found, Motion, members
+from barpc.ba.scan import SURE, Interval, scan
 from barpc.ba.solution import MUCH_NOISE, Solution
 from barpc.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.options import AdjustOptions
@@ -64,6 +65,17 @@ class Parts:
         kept, had = (np.bincount(b.view[b.use], minlength=len(b.views)) for b in (inner, block))
         enough = bool((kept[had > 0] >= MIN_OBSERVATIONS).all())
         return enough and _groups(inner) == _groups(block)
+
+    def mostly_moving(self, inlier: BoolArray) -> list[Interval]:
+        """Rows of images of which more ties move than stand, of those kept (K,) of `inner`: they may be what is off."""
+        block, gone = self.block, self.group > 0
+        rows = gone.copy()
+        rows[~self.kept_out & ~gone] = inlier & (self.inner.point < block.num_tracks)
+        size = np.array([view.size for view in block.views], dtype=np.float64).T
+        none = np.zeros((2, int(rows.sum())))
+        found = scan(block.view[rows], block.xy[:, rows], size, gone[rows].astype(np.float64), none)
+        sure = [one for one in found if one.by_share and one.axis == 1 and one.gain > SURE]
+        return [replace(one, moves=True) for one in sure if one.share > 0.5]
 
     def motion(self, number: int, one: Found, points: Array) -> Motion:
         """What is said of a group, of the points (P, 3) [m] of all tracks."""

@@ -247,7 +247,16 @@ def _left_reasons(run: Run) -> list[str]:
     """Rows and columns in which tie points were cut, or are off, more than elsewhere; each image's worst."""
     assert run.adjustment is not None
     worst: dict[str, str] = {}
-    for one in left_over(run.adjustment):
+    found = left_over(run.adjustment)
+    moving = [f"rows {one.first:.0f}-{one.last:.0f} of {one.image}" for one in found if one.moving]
+    if moving:
+        worst[""] = (
+            f"Most tie points of {listed(moving, 3)} are of what moves: it may as well be these rows that lie off, "
+            "and no camera follows them."
+        )
+    for one in found:
+        if one.moving:
+            continue
         if one.rejected > MANY_REJECTED:
             what = (
                 f"{100 * one.rejected:.0f} % of their tie points contradict the others, half of these by more than "

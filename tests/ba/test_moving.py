@@ -144,6 +144,21 @@ def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:
     assert not alone.is_tied()
 
 
+def test_rows_of_which_more_ties_move_than_stand_are_told() -> None:
+    made, tracks, _ = drifting(3, 1500, 0.1, 1.0)
+    block = join(made.views, tracks, None, AdjustOptions())
+    kept_out = (block.point % 10 == 0) & (block.point < block.num_tracks)
+    rows = made.views[1].size[1]
+    of_rows = block.xy[1] < 0.05 * rows
+    within = np.isin(block.point, block.point[of_rows & (block.view == 1)])
+    west = np.isin(block.point, block.point[(block.xy[0] < 0.3 * made.views[1].size[0]) & (block.view == 1)])
+    for gone, views in ((within, {0, 1, 2}), (west, set()), (within & west, set())):
+        parts = Parts(block, kept_out, gone.astype(np.int64))
+        found = parts.mostly_moving(np.ones(len(parts.inner.view), dtype=bool))
+        assert {one.view for one in found} == views
+        assert all(one.moves and one.start == 0.0 and one.stop < 0.2 * rows for one in found)
+
+
 CASES = [(3, 0.35, 2.0, 0, 0.02), (2, 0.2, 2.0, 1, 0.02), (4, 0.45, 1.5, 2, 0.05), (3, 0.25, 6.0, 3, 0.1)]
 
 

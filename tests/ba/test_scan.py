@@ -94,6 +94,10 @@ def test_wrong_matches_lie_in_any_direction() -> None:
             assert (neighbours_alike(view, place, off, 2) <= SURE).all()
             along = np.outer((0.6, -0.8), off[0])  # of two views they lie along one line
             assert (neighbours_alike(view, place, along, 2) <= SURE).all()
+            biased = np.stack(
+                [off[0], 0.1 + 0.002 * off[1]]
+            )  # a trace of the other direction, all the same way
+            assert (neighbours_alike(view, place, biased, 2) <= SURE).all()
             bent = off[:, view == 0] - 15.0 * np.sign(off[:, view == 0])
             assert np.isneginf(neighbours_alike(view[view == 0], place[:, view == 0], bent, 2)[1])
 

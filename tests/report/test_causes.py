@@ -137,6 +137,15 @@ def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     assert verdict._left_reasons(quiet) == []
 
 
+def test_rows_of_which_most_ties_move_may_be_what_is_off() -> None:
+    left = [replace(interval(view, 0.8, 0.0), moves=True) for view in (0, 1, 0, 1)]
+    (said,) = verdict._left_reasons(SimpleNamespace(adjustment=adjustment(left=left)))
+    assert said == (
+        "Most tie points of rows 100-399 of west, rows 100-399 of east, rows 100-399 of west and 1 more are of what "
+        "moves: it may as well be these rows that lie off, and no camera follows them."
+    )
+
+
 def apart_of(look: Look, **given: Any) -> Apart:
     return Apart((1,), 420.0, 17.0, 0, 0.987, look, None, **given)
 

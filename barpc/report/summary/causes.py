@@ -71,6 +71,7 @@ class LeftEntry(Record):
     off_px: float = said("What the others have in common", "px")
     apart_px: float = said("Half of those that were cut contradict the others by more than this", "px")
     gain: float = said("Logarithm of the likelihood, over that of a whole image alike", "nats")
+    moving: bool = said("Whether the share is not of what was cut, but of a group that moves", default=False)
 
 
 def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
@@ -148,4 +149,6 @@ def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
 
 def _left(one: Interval, names: Sequence[str]) -> LeftEntry:
     ends = one.start, one.stop - 1.0
-    return LeftEntry(names[one.view], AXES[one.axis], *ends, one.share, one.off, one.apart, one.gain)
+    return LeftEntry(
+        names[one.view], AXES[one.axis], *ends, one.share, one.off, one.apart, one.gain, one.moves
+    )
