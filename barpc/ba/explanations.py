@@ -13,7 +13,7 @@ from barpc.ba.mixture import Fit, Group, first_guess, log_likelihoods
 from barpc.ba.periods import Swing
 from barpc.ba.periods import price as price_of_period
 from barpc.ba.scan import BINS, Interval, price
-from barpc.ba.waves import Waves
+from barpc.ba.waves import DRIFTS, FEWEST, PER_SPLINE, Waves
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import profile
@@ -30,7 +30,7 @@ FOLLOWED = *LOCAL, SWING, WANDER
 """Those that the adjustment follows; others may be beside them."""
 _LENGTHS = 2.0 ** np.arange(-4.0, 1.0)  # of an interval: over what it may fade
 _A_BIN = 5  # places of a bin at which a curve is looked at
-SPLINES = 14  # over the rows of an image
+_SPLINES = 14  # over the rows of an image, where it holds so many
 _WANDER = 0.5  # px
 _STRIP = 1.0  # px, before it is known; then its own size, for which a scale of x 30 is paid
 SCALE = float(np.log(2.0 * np.log(30.0)))
@@ -184,8 +184,14 @@ def wander(seen: Seen, interval: Interval) -> list[Explanation]:
     view = interval.view
     rows = np.flatnonzero(seen.linear.view == view)
     u = 2.0 * seen.place[1, rows] / seen.size[1, view] - 1.0
-    one = _on_both(seen, WANDER, view, rows, Waves(SPLINES).splines(u), _WANDER)
+    each = int(np.median(np.bincount(seen.linear.view[seen.linear.taking_part]))) // PER_SPLINE
+    one = _on_both(seen, WANDER, view, rows, Waves(min(max(each, FEWEST), _SPLINES)).splines(u), _WANDER)
     return [replace(one, price=one.price + SCALE)]
+
+
+def spline_count(unknowns: Array) -> int:
+    """How many B-splines over the rows there are to the unknowns (e,) of both coordinates that are left of them."""
+    return len(unknowns) // 2 + DRIFTS
 
 
 def swing(seen: Seen, found: Swing) -> Explanation:
@@ -201,7 +207,8 @@ def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
     """The strip and what fades that a view's wandering rows look most like, apart from what a drift follows."""
     size, view = float(seen.size[1, one.view]), one.view
     rows = (np.arange(BINS * _A_BIN) + 0.5) / (BINS * _A_BIN) * size
-    curve = found.extra[-len(one.sigma) :].reshape(2, -1) @ Waves(SPLINES).splines(2.0 * rows / size - 1.0)
+    unknowns = found.extra[-len(one.sigma) :]
+    curve = unknowns.reshape(2, -1) @ Waves(spline_count(unknowns)).splines(2.0 * rows / size - 1.0)
     drift = np.linalg.qr(np.vander(rows / size - 0.5, 3))[0]
     ends = np.stack(np.triu_indices(BINS + 1, 1)) / BINS * size
     nothing = np.zeros(ends.shape[1])

@@ -8,19 +8,17 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
-from barpc.ba.explanations import FOLLOWED, LOCAL, SPLINES, SWING, WANDER
+from barpc.ba.explanations import FOLLOWED, LOCAL, SWING, WANDER, spline_count
 from barpc.ba.heldout import is_better
 from barpc.ba.judge import Finding, Judgement, standing_out
 from barpc.ba.rounds import Rounds, revived
 from barpc.ba.solution import Solution, finished
 from barpc.ba.starting import make_problem
-from barpc.ba.waves import Waves
+from barpc.ba.waves import FEWEST, PER_SPLINE, Waves
 from barpc.geodesy import Array
 from barpc.options import AUTO, OFF, AdjustOptions
 
 _SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
-_PER_SPLINE = 30  # observations of a view
-_FEWEST = 7  # splines
 _LOOKS = 2  # for detectors
 _MISSES = 2  # one after the other
 _MOST_SPLINES = 4000  # of all views: what a block of 300 takes is 2.6 times as long
@@ -98,7 +96,8 @@ def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
             assert one.period is not None
             periods[v, n], swung[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
     wandering = [one for one in parts if one.kind == WANDER]
-    waves = Waves(SPLINES if wandering else 0, np.zeros((views, 0)), places, periods)
+    count = spline_count(wandering[0].unknowns) if wandering else 0
+    waves = Waves(count, np.zeros((views, 0)), places, periods)
     splines = np.zeros((views, 2 * waves.parts[0]))
     for one in wandering:
         splines[one.view] = one.unknowns
@@ -132,12 +131,12 @@ def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> lis
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF or options.is_plain:
         return [0] if options.detectors else []
-    most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // _PER_SPLINE
+    most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // PER_SPLINE
     if options.spacing:
-        return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), _FEWEST)]
+        return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), FEWEST)]
     most = min(most, _MOST_SPLINES // len(block.views))
     wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
-    dense = np.unique(np.clip(wanted, _FEWEST, most)).tolist() if has_waves and most >= _FEWEST else []
+    dense = np.unique(np.clip(wanted, FEWEST, most)).tolist() if has_waves and most >= FEWEST else []
     return dense or [0] * bool(options.detectors)
 
 

@@ -44,7 +44,7 @@ _STATES = 3  # ways to explain a block that are gone on with
 _PARTS = 3  # of images that may explain together what something else does alone
 _LOCAL = 2  # of each kind of part of an image whose ends are looked for, a round
 _SHARPENED = 6  # times
-_FEW = 600  # tracks with which explanations are chosen that are worth more
+_FEW = 2000  # observations with which explanations are chosen that are worth more
 _SEEN = (
     2.5  # floors: swings and motions that are taken; sound crops show swings of 1.8, where ties share errors
 )

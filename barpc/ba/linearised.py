@@ -89,8 +89,8 @@ class Linear:
         return left
 
     def thinned(self, most: int) -> Linear:
-        """The same with every n-th track, about so many of them."""
-        every = -(-sum(len(tracks.rows) for tracks in self.tracks) // most)
+        """The same with every n-th track, of about so many observations."""
+        every = -(-sum(tracks.rows.size for tracks in self.tracks) // most)
         if every <= 1:
             return self
         few = []

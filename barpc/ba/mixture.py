@@ -431,9 +431,12 @@ class _Mixture:
                 parts, seen = tracks.by_unknown[begin:end], tracks.view[begin]
                 rows = np.ascontiguousarray(parts.transpose(1, 0, 2, 3)).reshape(n, -1, q)
                 for j in range(n):
-                    of_one = (weight[begin:end, :, 2 * j : 2 * j + 2] @ parts[:, j]).reshape(-1, n, 2, q)
-                    of_rows = of_one.transpose(1, 0, 2, 3).reshape(n, -1, q)
-                    blocks[seen, :, seen[j]] += np.swapaxes(rows, 1, 2) @ of_rows
+                    block = weight[begin:end, : 2 * j + 2, 2 * j : 2 * j + 2]
+                    of_one = (block @ parts[:, j]).reshape(-1, j + 1, 2, q)
+                    of_rows = of_one.transpose(1, 0, 2, 3).reshape(j + 1, -1, q)
+                    sums = np.swapaxes(rows[: j + 1], 1, 2) @ of_rows
+                    blocks[seen[: j + 1], :, seen[j]] += sums
+                    blocks[seen[j], :, seen[:j]] += np.swapaxes(sums[:j], 1, 2)
                 some = np.flatnonzero(touched[begin:end])
                 if len(some) and size:
                     columns = beside[:, :, tracks.rows[begin + some]].transpose(2, 3, 0, 1)

@@ -26,7 +26,7 @@ from barpc.scene import BoolArray, IntArray
 CELLS = 6  # a side of the ground: the group's share is free in each
 _STARTS = 4  # a side of the ground, of which each moves in turn
 _LIKELY = 0.95  # that a track moves where the group is looked for, and that it stands far from there
-_FEW = 500  # tracks that are looked at from every start
+_FEW = 1500  # observations that are looked at from every start
 _SIGMA = 30.0  # px on the ground: a displacement from view to view, before it is known
 
 

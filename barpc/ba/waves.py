@@ -20,8 +20,12 @@ from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import RowSpline, bsplines, profile, swing
 
+PER_SPLINE = 30  # observations of a view
+FEWEST = 7  # splines
 FIRST_SIGMA = 0.3  # px: a prior's standard deviation before anything is known
 _DEGREE = 2  # of the polynomials of the row that are the drift's
+DRIFTS = _DEGREE + 1
+"""How many polynomials these are: splines are apart from them."""
 _SAMPLES = 40  # a spline, to integrate over
 
 
