@@ -59,7 +59,8 @@ def without_strips(
     tried = _with_waves(_judged(found, judged, block), block, outer, options, waves, start=params)
     if is_better(found.after, tried.after, outer):
         return replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
-    if not any(one.kind in LOCAL for one in parts):
+    # rows that wander have competed with these already, detectors that all images have in common have not
+    if not any(one.where is not None and one.where[0] == 0 for one in parts):
         return tried
     plain = follow(
         found, block, outer, options
