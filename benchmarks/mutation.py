@@ -33,16 +33,13 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-import cv2  # noqa: F401 - imported once, before the tests are forked: each would take seconds to do so
-import pyproj  # noqa: F401
 import pytest
-import rasterio  # noqa: F401
-import shapely  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[1]
 TOML = Path(__file__).with_suffix(".toml")
 TOP = "top"
 LONGEST = 1200.0  # seconds of a part's tests without a mutant
+LOADED = ["cv2", "pyproj", "pytest", "rasterio", "shapely"]  # once: every run would take seconds to do so
 SKIPPED = (".git", "__pycache__", ".venv", "site", "dist", ".*_cache")  # of a tree that is copied
 
 COMPARISONS = {
@@ -264,9 +261,15 @@ class Tree:
             target.write_text(before)
 
     def failing(self, tests: list[str], limit: float) -> tuple[bool, str, float]:
-        """Run tests in a forked process, file by file as given, up to the first that fails."""
+        """Run tests in a process of their own, file by file as given, up to the first that fails.
+
+        It is forked from one that has done nothing yet: numba ends what is forked from a process with its threads.
+        """
         start, log = time.monotonic(), self.root / "log.txt"
-        child = multiprocessing.get_context("fork").Process(target=self._run, args=(log, tests))
+        log.write_text("")
+        clean = multiprocessing.get_context("forkserver")
+        clean.set_forkserver_preload(LOADED)
+        child = clean.Process(target=self._run, args=(log, tests))
         child.start()
         child.join(limit)
         if child.is_alive():
@@ -274,7 +277,9 @@ class Tree:
             child.join()
             return True, "too slow", limit
         named = [line for line in log.read_text().splitlines() if line.startswith(("FAILED", "ERROR"))]
-        return child.exitcode != 0, named[0][:160] if named else "", time.monotonic() - start
+        code = child.exitcode
+        told = named[0][:160] if named else f"no test is named: exit code {code}" if code else ""
+        return code != 0, told, time.monotonic() - start
 
     def _run(self, log: Path, tests: list[str]) -> None:
         """The forked process: pytest on the tree's own modules, none of which is imported yet."""

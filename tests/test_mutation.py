@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import random
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,14 +16,10 @@ SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks/mutation.py"
 
 
 @pytest.fixture(scope="module")
-def mutation() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("mutation", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["mutation"] = module
-    spec.loader.exec_module(module)
-    return module
+def mutation() -> Iterator[ModuleType]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.path", [*sys.path, str(SCRIPT.parent)])  # processes of its own find it by its name
+        yield importlib.import_module(SCRIPT.stem)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +94,6 @@ def small(mutation, tmp_path, monkeypatch) -> ModuleType:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_what_tests_see_is_caught_and_what_they_do_not_see_survives(small, tmp_path, capfd) -> None:
     rows = list(small.run(small.mutants(["ba"]), 2))
     fates = {str(row["diff"]).splitlines()[-1].strip("+ "): row["fate"] for row in rows}
@@ -112,7 +108,6 @@ def test_what_tests_see_is_caught_and_what_they_do_not_see_survives(small, tmp_p
     capfd.readouterr()
 
 
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_tests_that_fail_without_a_mutant_are_refused(small, tmp_path, capfd) -> None:
     """Else every mutant would count as caught."""
     (tmp_path / "benchmarks/data.py").unlink()
@@ -121,6 +116,28 @@ def test_tests_that_fail_without_a_mutant_are_refused(small, tmp_path, capfd) ->
     ):
         list(small.run(small.mutants(["ba"]), 1))
     capfd.readouterr()
+
+
+@pytest.mark.slow
+def test_tests_that_are_ended_are_told_from_tests_that_fail(small, tmp_path) -> None:
+    """As numba ends a process that was forked from one with its threads: none of the tests has said a word."""
+    (tmp_path / "tests/ba/test_sums.py").write_text(
+        "import os, signal\n\ndef test_ended():\n    os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    tree = small.Tree(tmp_path.with_name("copy"))
+    failed, told, _ = tree.failing(["tests/ba/test_sums.py"], 60.0)
+    assert failed
+    assert told == "no test is named: exit code -15"
+
+
+@pytest.mark.slow
+def test_what_runs_the_tests_was_not_forked_from_a_process_with_threads(small, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("sys.used_before", True, raising=False)
+    (tmp_path / "tests/ba/test_sums.py").write_text(
+        "import sys\n\ndef test_fresh():\n    assert not hasattr(sys, 'used_before')\n"
+    )
+    tree = small.Tree(tmp_path.with_name("copy"))
+    assert tree.failing(["tests/ba/test_sums.py"], 60.0)[:2] == (False, "")
 
 
 @pytest.mark.nightly

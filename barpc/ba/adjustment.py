@@ -19,7 +19,7 @@ from barpc.ba.gauge import GaugeReport, gauge_report
 from barpc.ba.ground import Terrain
 from barpc.ba.heldout import enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior
-from barpc.ba.judge import Finding, left_over
+from barpc.ba.judge import Finding, left_over, standing_out
 from barpc.ba.placing import place
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Outcome
@@ -191,27 +191,40 @@ def _choose_model(
     def solve(parts: Parts) -> Solution:
         return solve_block(parts.inner, parts.outer, options, dem, centers, prior)
 
-    found, in_space = solve(parts) if first is None else first, None
-    block, outer = parts.inner, parts.outer
-    if prior is None and found.problem.cameras.unknowns.geometric:
-        found, parts, judged = without_moving(found, parts, options, solve)
-        block, outer = parts.inner, parts.outer
-        found = without_strips(found, judged, block, outer, options)
+    found = solve(parts) if first is None else first
     given = options.model != AUTO or options.drift is not None or prior is not None
-    skew, chosen = found.is_skew, found
-    trend = skew or found.has_trend or found.has_waves
+    before, in_image = found, None if given else _in_image(found, parts, options, dem)
+    judges = prior is None and found.problem.cameras.unknowns.geometric
+    if judges and (in_image is None or not _is_calm(in_image, parts.inner, options.noise_floor)):
+        found, parts, judged = without_moving(found, parts, options, solve)
+        found = without_strips(found, judged, parts.inner, parts.outer, options)
+    block, outer = parts.inner, parts.outer
+    trend = found.is_skew or found.has_trend or found.has_waves
     if trend and not given and _bent_by_control(found, block, outer, options, dem, centers):
         return found, None, parts
-    if (skew or found.has_trend) and not given:
-        in_image = solve_block(block, outer, replace(options, model="affine"), dem, None, None)
-        better = in_image.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error
-        if better and in_image.after.whole_rms < found.after.whole_rms - _WORTH:
-            chosen, in_space = in_image, found.after.whole_rms
-    if prior is None and found.problem.cameras.unknowns.geometric:
+    if found is not before:
+        in_image = None if given else _in_image(found, parts, options, dem)
+    chosen, in_space = (found, None) if in_image is None else (in_image, found.after.whole_rms)
+    if judges:
         followed = follow(found, block, outer, options)
         if chosen is found or followed.after.error < _MUCH_BETTER * chosen.after.error:
             return followed, None, parts
     return chosen, in_space, parts
+
+
+def _in_image(found: Solution, parts: Parts, options: AdjustOptions, dem: Terrain | None) -> Solution | None:
+    """The block solved by an affine in the image, where something is left for it and that is much better."""
+    skew = found.is_skew
+    if not (skew or found.has_trend):
+        return None
+    tried = solve_block(parts.inner, parts.outer, replace(options, model="affine"), dem, None, None)
+    better = tried.after.error < (_CLEARLY_BETTER if skew else _MUCH_BETTER) * found.after.error
+    return tried if better and tried.after.whole_rms < found.after.whole_rms - _WORTH else None
+
+
+def _is_calm(found: Solution, block: Block, floor: float) -> bool:
+    """Whether nothing is left of which a part of an image, or what moves, might be the cause."""
+    return not (found.has_trend or found.has_waves or standing_out(found.outcome, block, floor))
 
 
 def _bent_by_control(

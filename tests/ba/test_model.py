@@ -20,6 +20,7 @@ from barpc.ba.structure import make_structure
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks
+from barpc.sensor.corrected import ImageAffine, ImageCorrected
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of, solve
@@ -46,9 +47,10 @@ def choose(
             after = SimpleNamespace(error=error, whole_rms=rms)
         in_space = SimpleNamespace(cameras=SimpleNamespace(unknowns=SimpleNamespace(geometric=True)))
         said = {"is_skew": skew, "has_trend": trend, "has_waves": False, "tested": None}
-        return SimpleNamespace(**said, after=after, model=options.model, problem=in_space)
+        return SimpleNamespace(**said, after=after, model=options.model, problem=in_space, outcome=None)
 
     monkeypatch.setattr(adjustment, "solve_block", by_script)
+    monkeypatch.setattr(adjustment, "standing_out", lambda *_: [])
     monkeypatch.setattr(adjustment, "follow", lambda found, *_: found)
     monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
     monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts, Judgement()))
@@ -91,6 +93,60 @@ def test_an_affine_is_taken_where_it_is_clearly_better(monkeypatch, skew, trend,
 )
 def test_a_model_that_is_asked_for_is_the_only_one(monkeypatch, given) -> None:
     assert choose(monkeypatch, True, True, 0.1, 0.1, **given)[1:] == (None, [given.get("model", "auto")])
+
+
+@pytest.mark.parametrize(
+    ("left", "out", "judged"),
+    [("", [], False), ("", ["an interval"], True), ("has_trend", [], True), ("has_waves", [], True)],
+)
+def test_what_an_affine_explains_wholly_no_parts_of_images_are_asked_to(
+    monkeypatch, left, out, judged
+) -> None:
+    """Strips and ties that move can be laid like steps along what grows evenly over an image."""
+    asked: list[str] = []
+
+    def solve_block(block: Any, outer: Any, options: AdjustOptions, *_: Any) -> Any:
+        affine = options.model == "affine"
+        says = dict.fromkeys(("is_skew", "has_trend", "has_waves"), not affine)
+        if affine and left:
+            says[left] = True
+        rms = 0.1 if affine else 1.0
+        in_space = SimpleNamespace(cameras=SimpleNamespace(unknowns=SimpleNamespace(geometric=not affine)))
+        return SimpleNamespace(
+            **says, after=SimpleNamespace(error=rms, whole_rms=rms), problem=in_space, outcome=None, tested=None,
+            model=options.model,
+        )  # fmt: skip
+
+    def without_moving(found: Any, parts: Any, *_: Any) -> Any:
+        asked.append("moving")
+        return found, parts, Judgement()
+
+    def without_strips(found: Any, *_: Any) -> Any:
+        asked.append("strips")
+        return found
+
+    monkeypatch.setattr(adjustment, "solve_block", solve_block)
+    monkeypatch.setattr(adjustment, "standing_out", lambda *_: out)
+    monkeypatch.setattr(adjustment, "follow", lambda found, *_: found)
+    monkeypatch.setattr(adjustment, "without_strips", without_strips)
+    monkeypatch.setattr(adjustment, "without_moving", without_moving)
+    parts: Any = SimpleNamespace(inner=None, outer=None)
+    found, in_space, _ = adjustment._choose_model(parts, AdjustOptions(), None, None, None)
+    assert (found.model, in_space) == ("affine", 1.0)
+    assert asked == (["moving", "strips"] if judged else [])
+
+
+@pytest.mark.slow
+def test_an_image_that_was_turned_a_little_is_met_in_the_image_with_all_its_ties() -> None:
+    made = simulate_block(3, 400, seed=11)
+    view = made.views[1]
+    slope = np.array([[0.0, -3e-3], [3e-3, 0.0]])
+    turned = ImageCorrected(view.sensor, ImageAffine(-slope @ (np.array(view.size) / 2.0), slope))
+    views = [made.views[0], replace(view, sensor=turned), made.views[2]]
+    found = adjust_tracks(views, made.tracks, AdjustOptions(learn_priors=False))
+    assert found.cameras.unknowns.model == "affine"
+    assert found.findings == ()
+    assert (found.inlier | found.held_out).mean() > 0.97
 
 
 def outcome_of(rms: float, noise: float = 1.0, drift: tuple[float, ...] = ()) -> Any:

@@ -17,6 +17,11 @@ def ties(seed: int, wrong: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.nda
     return view, place, (rng.uniform(size=len(view)) < wrong).astype(float), rng.normal(size=(2, len(view)))
 
 
+def test_the_price_is_that_of_one_of_all_runs_of_bins_of_both_axes_of_all_views() -> None:
+    runs = [(first, last) for first in range(BINS) for last in range(first, BINS)]
+    assert np.exp(price(3)) == pytest.approx(len(runs) * 2 * 3)
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_stretch_with_more_wrong_ties_is_found_where_it_is(axis: int) -> None:
     view, place, wrong, off = ties(1)

@@ -107,6 +107,8 @@ def test_an_image_that_was_turned_or_resampled_is_met_all_the_same(shared_data, 
     in_image = found.cameras.unknowns.model == "affine"
     assert in_image == (found.in_space_rms is not None)
     assert in_image == (name != "as delivered")
+    assert found.findings == ()  # nothing but the image as a whole
+    assert not found.moving.any()
     if name == "as delivered":
         assert np.abs(found.scene_shift).max() < 0.1
 

@@ -220,6 +220,9 @@ def test_a_table_may_state_sigmas_and_call_its_ground_x_and_y(tmp_path) -> None:
     path.write_text("5.4 43.2 100 10 20\n1 2 3 4\n")
     with pytest.raises(InputError, match="line 2: expected 5 columns"):
         read_correspondences(path)
+    path.write_text("lon lat alt col row\n# 5.4 43.2 100 10 20\n")
+    with pytest.raises(InputError, match=r"a\.txt: no points in it$"):
+        read_correspondences(path)
 
 
 def test_arrays_of_an_npz_have_one_length(tmp_path) -> None:

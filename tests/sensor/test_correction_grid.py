@@ -134,6 +134,7 @@ def test_a_camera_that_sees_no_ground_in_a_part_of_the_image_gets_no_grid(camera
     [
         ([0.0], [0.0, 1.0], np.zeros((2, 1, 2))),
         ([1.0, 0.0], [0.0, 1.0], np.zeros((2, 2, 2))),
+        ([0.0, 1.0], [0.0, 2.0, 2.0], np.zeros((3, 2, 2))),
         ([0.0, 1.0], [0.0, 1.0], np.zeros((2, 3, 2))),
         ([0.0, 1.0], [0.0, 1.0], np.full((2, 2, 2), np.nan)),
     ],

@@ -176,7 +176,14 @@ def given_matches(count: int) -> Matches:
 
 @pytest.mark.parametrize(
     ("count", "kept", "unlike"),
-    [(60, 0.47, True), (60, 0.51, False), (1000, 0.09, True), (1000, 0.11, False), (1000, 0.0, True)],
+    [
+        (60, 0.47, True),
+        (60, 0.51, False),
+        (1000, 0.09, True),
+        (1000, 0.11, False),
+        (1000, 0.0, True),
+        (1, 0.0, True),
+    ],
 )
 def test_grey_values_do_not_compare_where_under_half_of_a_hundred_register_and_too_few_are_left(
     monkeypatch, count, kept, unlike

@@ -70,6 +70,15 @@ def test_a_hot_pixel_does_not_drown_the_others(tmp_path) -> None:
     assert np.corrcoef(patch[:29].ravel(), data[:29].ravel())[0, 1] > 1 - 1e-9
 
 
+def test_the_scale_of_a_window_is_that_of_all_its_pixels() -> None:
+    """Of every other column, as of a detector with two gains, too."""
+    data = np.tile([1.0, 1.0, 1.0, 1000.0], (50, 20)) * RNG.uniform(0.9, 1.1, (50, 80))
+    for pixels in (data, data[:, ::-1]):
+        patch = levelled(pixels, np.ones(pixels.shape, bool))
+        assert 0.95 * 1000.0 < patch.max() < 1.05 * 1000.0
+        assert -50.0 < patch.min() < 0.0
+
+
 def test_complex_pixels_are_refused_with_advice(tmp_path) -> None:
     path = write_image(tmp_path / "slc.tif", np.ones((64, 64), np.complex64))
     with pytest.raises(ImageError, match=r"slc\.tif: band 1 is complex; give its amplitude"):
