@@ -26,7 +26,7 @@ SWING = "swing"
 MOVING = "moving"
 LOCAL = STRIP, FADE
 """Those of a part of an image."""
-FOLLOWED = *LOCAL, SWING, WANDER
+FOLLOWED = *LOCAL, SWING
 """Those that the adjustment follows; others may be beside them."""
 _LENGTHS = 2.0 ** np.arange(-4.0, 1.0)  # of an interval: over what it may fade
 _A_BIN = 5  # places of a bin at which a curve is looked at
@@ -189,11 +189,6 @@ def wander(seen: Seen, interval: Interval) -> list[Explanation]:
     return [replace(one, price=one.price + SCALE)]
 
 
-def spline_count(unknowns: Array) -> int:
-    """How many B-splines over the rows there are to the unknowns (e,) of both coordinates that are left of them."""
-    return len(unknowns) // 2 + DRIFTS
-
-
 def swing(seen: Seen, found: Swing) -> Explanation:
     """All rows of an image that swing with one period."""
     rows = np.flatnonzero(seen.linear.view == found.view)
@@ -208,7 +203,7 @@ def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
     size, view = float(seen.size[1, one.view]), one.view
     rows = (np.arange(BINS * _A_BIN) + 0.5) / (BINS * _A_BIN) * size
     unknowns = found.extra[-len(one.sigma) :]
-    curve = unknowns.reshape(2, -1) @ Waves(spline_count(unknowns)).splines(2.0 * rows / size - 1.0)
+    curve = unknowns.reshape(2, -1) @ Waves(len(unknowns) // 2 + DRIFTS).splines(2.0 * rows / size - 1.0)
     drift = np.linalg.qr(np.vander(rows / size - 0.5, 3))[0]
     ends = np.stack(np.triu_indices(BINS + 1, 1)) / BINS * size
     nothing = np.zeros(ends.shape[1])

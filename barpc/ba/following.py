@@ -8,7 +8,7 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
-from barpc.ba.explanations import FOLLOWED, LOCAL, SWING, WANDER, spline_count
+from barpc.ba.explanations import FOLLOWED, LOCAL, SWING
 from barpc.ba.heldout import is_better
 from barpc.ba.judge import Finding, Judgement, standing_out
 from barpc.ba.rounds import Rounds, revived
@@ -96,13 +96,8 @@ def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
         for n, one in enumerate(of_swings):
             assert one.period is not None
             periods[v, n], swung[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
-    wandering = [one for one in parts if one.kind == WANDER]
-    count = spline_count(wandering[0].unknowns) if wandering else 0
-    waves = Waves(count, np.zeros((views, 0)), places, periods)
-    splines = np.zeros((views, 2 * waves.parts[0]))
-    for one in wandering:
-        splines[one.view] = one.unknowns
-    return waves, np.hstack([splines, moved.reshape(views, -1), swung.reshape(views, -1)])
+    params = np.hstack([moved.reshape(views, -1), swung.reshape(views, -1)])
+    return Waves(0, np.zeros((views, 0)), places, periods), params
 
 
 def _with_edges(found: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
