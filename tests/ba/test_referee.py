@@ -170,7 +170,7 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
     [
         ("no drift", "good", ""),
         ("drift 3", "good", ""),
-        ("jitter 0.5 at 1 Hz", "look", "jitter"),
+        ("jitter 0.5 at 1 Hz", "look", "Jitter along the rows is followed by splines"),
         ("jitter 0.1 at 5 Hz", "look", "px every 27"),
         ("clouds 60 %", "bad", "check clouds, water and change"),
         ("RPC 200 px wrong", "look", "farther off than stated"),
