@@ -210,3 +210,13 @@ def test_exact_points_meet_in_the_strip_and_beside_it() -> None:
     met = triangulate(found.sensors, tracks.view[rows], index, tracks.xy[rows])
     assert np.isfinite(met.points).all()
     assert np.nanmax(found.held_out_rms) < 0.16
+
+
+def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any) -> None:
+        raise np.linalg.LinAlgError("7-th leading minor")
+
+    monkeypatch.setattr("barpc.ba.judge.fit", fails)
+    found = adjusted(*flawed(3, 400, MIDDLE))
+    assert not found.findings
+    assert {one.view for one in found.left} == {1}  # and what stands out is still said
