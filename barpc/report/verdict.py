@@ -214,8 +214,9 @@ def _block_reasons(run: Run) -> list[str]:
         )
     names = run.adjustment.names
     if (apart := run.adjustment.apart) is not None and not apart.clear:
+        what = "RPC, or most tie points of one image," if apart.look.as_stated else "RPC"
         out.append(
-            f"One RPC among those of {listed([names[v] for v in apart.views])} is not its own: without any one of "
+            f"One {what} among those of {listed([names[v] for v in apart.views])} is not its own: without any one of "
             "these images the others agree, with all they do not. The tie points do not tell which: check the RPCs, "
             "or add an image."
         )
@@ -373,9 +374,12 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         lines.append(f"Rotations change along the rows ({drift}; {sizes}).")
     lines += _jitter_lines(views) + _radar_lines(views)
     if many := [view.name for view in views if _lost(view) > MANY_REJECTED and _anywhere(view, run)]:
+        # what is wrong in one image takes the tie points of the others with it
+        alike = [view.name for view in views if _lost(view) > MANY_REJECTED and view.name not in many]
+        why = f"but those of {listed(alike)} in the same" if alike else "as wrong matches are"
         lines.append(
             f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, neighbours in "
-            "any direction, as wrong matches are."
+            f"any direction, {why}."
         )
     lines += [
         f"{one.sentence[0].upper()}{one.sentence[1:]}."

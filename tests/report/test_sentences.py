@@ -95,8 +95,12 @@ def test_an_image_is_judged_at_its_limits(fields, status):
 def test_wrong_matches_that_lie_anywhere_are_told_and_need_no_look():
     run = run_of(adjusted(alike=np.array([5.0, 5.1, -1.0])))
     lines = said(run, [a_view(name, num_observations=60, num_rejected=40) for name in NAMES])
-    told = "More than 30 % of the tie points of A, C were rejected, neighbours in any direction, as wrong matches are."
-    assert told in lines
+    told = "More than 30 % of the tie points of A, C were rejected, neighbours in any direction, "
+    assert told + "but those of B in the same." in lines
+    calm = run_of(adjusted(alike=np.array([5.0, -np.inf, -1.0])))
+    few = {"A": 40, "B": 2, "C": 40}
+    lines = said(calm, [a_view(name, num_observations=60, num_rejected=few[name]) for name in NAMES])
+    assert told + "as wrong matches are." in lines
     lost = {"num_observations": 60, "num_rejected": 40}
     assert [view_status(a_view(name, **lost), run)["status"] for name in NAMES] == [
         "adjusted",
