@@ -349,7 +349,7 @@ tests/remote and tests/reliability."""
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ELSEWHERE)) for name in ROWS]
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in ELSEWHERE)) for name in ROWS]
 )
 def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene: Path) -> None:
     before = {path.name: path.read_bytes() for path in scene.iterdir() if path.is_file()}

@@ -103,7 +103,7 @@ def test_its_points_can_be_read_as_gcps(held, place):
 
 @pytest.mark.slow
 def test_a_stated_sigma_is_the_scene_s(options, tmp_path):
-    run = adjust(IMAGES, tmp_path / "run", replace(options, reference_sigma=2.0))
+    run = adjust(IMAGES, tmp_path / "run", replace(options, reference_sigma=2.0, stop_after="adjustment"))
     assert run.summary["scene"]["sigma_enu_m"][:2] == pytest.approx([2.0, 2.0], rel=0.1)
 
 
