@@ -241,6 +241,7 @@ def test_a_later_run_goes_on_from_splines(tmp_path, name, tracks):
     assert [len(spline.edges) for spline in again.splines] == [len(spline.edges) for spline in found.splines]
 
 
+@pytest.mark.slow
 def test_the_best_single_rpc_is_fitted_to_the_camera_with_jitter():
     found, _ = solved("jitter 0.5 at 1 Hz", 1, tracks=1500)
     view, camera = scene("jitter 0.5 at 1 Hz", 1, tracks=1500).views[2], found.sensors[2]
