@@ -22,7 +22,7 @@ TABLE = cases()
 SEEDS = (0, 1, 2)
 EDGES = tuple(np.arange(1, 8) * 2500.0)
 FEW_STEPS = ("steps 0.1 px", 1000)  # steps and splines are found in both
-FOUND = rest_slow([FEW_STEPS, ("all", 3000)], mark=pytest.mark.nightly)
+FOUND = [FEW_STEPS, pytest.param("all", 3000, marks=pytest.mark.nightly)]
 
 
 @cache
