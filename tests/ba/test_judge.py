@@ -198,7 +198,9 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"jitter": "off"}, {"drift": 0}], ids=str)
+@pytest.mark.parametrize(
+    "options", rest_slow([{"jitter": "off"}, {"drift": 0}], mark=pytest.mark.nightly), ids=str
+)
 def test_who_asked_for_no_such_unknowns_is_told_and_gets_none(options: dict[str, Any]) -> None:
     block, tracks = flawed(3, 1500, MIDDLE)
     found = adjusted(block, tracks, **options)
