@@ -195,6 +195,13 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
     found = adjusted(block, replace(block.tracks, xy=xy))
     assert found.findings[0].kind == WANDER
     assert not any(one.kind in LOCAL for one in found.findings)
+    at = np.linspace(0.0, rows - 1.0, 300)
+    size = [
+        s.correction.at(np.column_stack([at, at]))[:, 0].std() if isinstance(s, Splined) else 0.0
+        for s in found.sensors
+    ]
+    assert 0.4 < size[1] < 0.65  # 0.6, of which a drift takes some
+    assert max(size[0], size[2]) < 0.4 * size[1]
 
 
 @pytest.mark.slow
