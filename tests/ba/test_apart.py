@@ -64,8 +64,11 @@ def met(found: Adjustment, block: Block, view: int) -> float:
 
 @pytest.mark.parametrize(
     ("change", "look"),
-    [(swapped, "axes"), (shifted, "offset"), (raised, "height")],
-    ids=["axes swapped", "another tile", "another datum"],
+    [
+        pytest.param(swapped, "axes", id="axes swapped"),
+        pytest.param(shifted, "offset", id="another tile"),
+        pytest.param(raised, "height", id="another datum", marks=pytest.mark.slow),
+    ],
 )
 def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(
     monkeypatch, change: Change, look: str

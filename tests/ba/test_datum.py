@@ -58,6 +58,7 @@ def test_a_terrain_holds_heights_and_no_more_than_its_common_error_lets_it():
     assert (solved(dem=level).datum["heights"] == 0.0).all()
 
 
+@pytest.mark.slow
 def test_views_that_are_fixed_hold_it():
     names = [view.name for view in BLOCK.views]
     found = solved(fixed=(names[0], names[1]))
