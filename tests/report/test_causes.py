@@ -125,7 +125,7 @@ def interval(view: int, share: float, off: float) -> Interval:
 
 def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     left = [interval(0, 0.8, 0.0), interval(0, 0.4, 0.0), interval(1, 0.02, 0.09)]
-    run: Any = SimpleNamespace(adjustment=adjustment(left=left))
+    run: Any = SimpleNamespace(adjustment=adjustment(left=left), met_worse=[])
     first, second = verdict._left_reasons(run)
     assert first == (
         "Rows 100-399 of west stand out: 80 % of their tie points contradict the others, half of these by more than "
@@ -133,13 +133,13 @@ def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     )
     assert second == "Rows 100-399 of east stand out: their tie points are left with 0.09 px in common."
     assert [one.last for one in left_over(run.adjustment)] == [399.0] * 3
-    quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]))
+    quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]), met_worse=[])
     assert verdict._left_reasons(quiet) == []
 
 
 def test_rows_of_which_most_ties_move_may_be_what_is_off() -> None:
     left = [replace(interval(view, 0.8, 0.0), moves=True) for view in (0, 1, 0, 1)]
-    (said,) = verdict._left_reasons(SimpleNamespace(adjustment=adjustment(left=left)))
+    (said,) = verdict._left_reasons(SimpleNamespace(adjustment=adjustment(left=left), met_worse=[]))
     assert said == (
         "Most tie points of rows 100-399 of west, rows 100-399 of east, rows 100-399 of west and 1 more are of what "
         "moves: it may as well be these rows that lie off, and no camera follows them."

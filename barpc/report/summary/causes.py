@@ -12,8 +12,10 @@ from barpc.ba.apart import APART, Apart
 from barpc.ba.explanations import FADE, MOVING, STRIP, SWING, WANDER
 from barpc.ba.judge import Finding
 from barpc.ba.moving import Motion
+from barpc.ba.places import Place
 from barpc.ba.scan import Interval
 from barpc.report.records import Number, Record, said
+from barpc.report.summary.words import Count
 
 AXES = "columns", "rows"
 _WORDS = {
@@ -72,6 +74,19 @@ class LeftEntry(Record):
     apart_px: float = said("Half of those that were cut contradict the others by more than this", "px")
     gain: float = said("Logarithm of the likelihood, over that of a whole image alike", "nats")
     moving: bool = said("Whether the share is not of what was cut, but of a group that moves", default=False)
+
+
+class HeldOutEntry(Record):
+    """Rows, columns or a cell of an image in which tie points that took no part are met worse than in the rest of it."""
+
+    image: str = said("View")
+    sentence: str = said("The same in words", minLength=1)
+    columns: tuple[float, float] | None = said("From, to; null for all", "px")
+    rows: tuple[float, float] | None = said("From, to; null for all", "px")
+    count: Count = said("Observations there that were looked at")
+    far: float = said("Share of them that lies far off in one direction")
+    off_px: float = said("Half of the far ones are off by more than this; else what the near ones share", "px")
+    chance: float = said("Probability of as much anywhere where all places are alike, at most")
 
 
 def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
@@ -145,6 +160,37 @@ def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEn
 def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
     """Where something stands out at the end, the most first."""
     return tuple(_left(one, adjustment.names) for one in adjustment.left)
+
+
+def held_out_places(places: Sequence[Place], names: Sequence[str]) -> tuple[HeldOutEntry, ...]:
+    """Where tie points that took no part are met worse, the surest first."""
+    return tuple(
+        HeldOutEntry(
+            names[one.view],
+            held_out_place(one, names),
+            one.columns,
+            one.rows,
+            one.count,
+            one.far,
+            one.off,
+            one.chance,
+        )
+        for one in places
+    )
+
+
+def held_out_place(one: Place, names: Sequence[str]) -> str:
+    """The same of one, in words."""
+    ends = [
+        f"{axis} {side[0]:.0f}-{side[1] - 1.0:.0f}"
+        for axis, side in (("rows", one.rows), ("columns", one.columns))
+        if side is not None
+    ]
+    what = f"lie {one.off:.2f} px off in common"
+    if one.far:
+        what = f"contradict the cameras, {100 * one.far:.0f} % in one direction, half of these by more than {one.off:.2f} px"
+    place = ", ".join(ends)
+    return f"{place[0].upper()}{place[1:]} of {names[one.view]}: tie points there that took no part {what}"
 
 
 def _left(one: Interval, names: Sequence[str]) -> LeftEntry:

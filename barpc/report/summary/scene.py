@@ -11,7 +11,15 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.ba.gauge import MOTIONS, Mode
 from barpc.report.records import Column, Number, Record, said
-from barpc.report.summary.causes import ExplanationEntry, LeftEntry, explanations, left_over
+from barpc.report.run import Run
+from barpc.report.summary.causes import (
+    ExplanationEntry,
+    HeldOutEntry,
+    LeftEntry,
+    explanations,
+    held_out_places,
+    left_over,
+)
 from barpc.report.summary.words import Count, Vector, metres, percent_of
 
 _LEVEL = 1e-4  # probability of the F test below which something is called smooth
@@ -134,13 +142,19 @@ class SceneEntry(Record):
         "What explains tie points beside the cameras' errors as stated, the first taken first", default=()
     )
     left: tuple[LeftEntry, ...] = said("Rows and columns that stand out at the end", default=())
+    held_out_places: tuple[HeldOutEntry, ...] = said(
+        "Where tie points that took no part are met worse than in the rest of an image", default=()
+    )
 
 
 _DEM = attrgetter("held", "known", "total", "offset", "spread")
 
 
-def measure_scene(adjustment: Adjustment) -> SceneEntry:
-    """The block as a whole."""
+def measure_scene(run: Run) -> SceneEntry | None:
+    """The block as a whole; None for a check."""
+    adjustment = run.adjustment
+    if adjustment is None:
+        return None
     gauge, prior, terrain = adjustment.gauge, adjustment.prior, adjustment.terrain
     datum = [
         DatumEntry(
@@ -174,6 +188,7 @@ def measure_scene(adjustment: Adjustment) -> SceneEntry:
         solver=adjustment.status,
         explanations=explanations(adjustment),
         left=left_over(adjustment),
+        held_out_places=held_out_places(run.met_worse, adjustment.names),
     )
 
 
