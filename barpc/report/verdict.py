@@ -203,12 +203,14 @@ def _block_reasons(run: Run) -> list[str]:
             "what is known of the scene's place with them."
         )
     if (in_space := run.adjustment.in_space_rms) is not None:
-        tilts = _lengths(run.adjustment.gauge.motion_sigma[3:5])
+        tilts, bends = (
+            _lengths(run.adjustment.gauge.motion_sigma[part]) for part in (slice(3, 5), slice(7, 10))
+        )
         out.append(
             f"Rotations and translations leave {in_space:.3f} px of tie points that took no part; an affine in each "
             f"image leaves {median(run.adjustment.held_out_rms):.3f} px and was taken: images that were turned, "
             "resampled or cropped otherwise than their RPCs say, or RPCs of other images. Its tilts are known to "
-            f"{tilts} (east, north) only."
+            f"{tilts} (east, north) only, its twist and bending to {bends} (twist, east, north)."
         )
     names = run.adjustment.names
     if (apart := run.adjustment.apart) is not None and not apart.clear:

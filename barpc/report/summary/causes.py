@@ -77,7 +77,7 @@ class LeftEntry(Record):
 
 
 class HeldOutEntry(Record):
-    """Rows, columns or a cell of an image in which tie points that took no part are met worse than in the rest of it."""
+    """Rows, columns or a cell of an image in which tie points that took no part are met worse than elsewhere in it."""
 
     image: str = said("View")
     sentence: str = said("The same in words", minLength=1)
@@ -85,7 +85,9 @@ class HeldOutEntry(Record):
     rows: tuple[float, float] | None = said("From, to; null for all", "px")
     count: Count = said("Observations there that were looked at")
     far: float = said("Share of them that lies far off in one direction")
-    off_px: float = said("Half of the far ones are off by more than this; else what the near ones share", "px")
+    off_px: float = said(
+        "Half of the far ones are off by more than this; else what the near ones share", "px"
+    )
     chance: float = said("Probability of as much anywhere where all places are alike, at most")
 
 
@@ -188,7 +190,8 @@ def held_out_place(one: Place, names: Sequence[str]) -> str:
     ]
     what = f"lie {one.off:.2f} px off in common"
     if one.far:
-        what = f"contradict the cameras, {100 * one.far:.0f} % in one direction, half of these by more than {one.off:.2f} px"
+        share, size = f"{100 * one.far:.0f} %", f"{one.off:.2f} px"
+        what = f"contradict the cameras, {share} in one direction, half of these by more than {size}"
     place = ", ".join(ends)
     return f"{place[0].upper()}{place[1:]} of {names[one.view]}: tie points there that took no part {what}"
 

@@ -31,6 +31,9 @@ _MODE_WORDS = {
     "tilt north": "the scene may be tilted: {0} up or down at its northern and southern edges",
     "turn": "the scene may be turned about the vertical: {0} at its edge",
     "scale": "the scene may be too large or too small: {0} at its edge",
+    "twist": "heights may be twisted: by {0} from one corner of the scene to the next",
+    "bend east": "heights may be bent: by {0} from the middle of the scene to its eastern and western edges",
+    "bend north": "heights may be bent: by {0} from the middle of the scene to its northern and southern edges",
 }
 
 _DATUM_HEADS = {
@@ -50,7 +53,10 @@ class ModeEntry(Record):
     sigma_m: Number = said("Posterior standard deviation", "m")
     meaning: str = said("Its largest motion", enum=list(_MODE_WORDS))
     motion_m: tuple[Number, ...] = said(
-        "East, north, up; tilts, turn, scale at the edge", "m", minItems=7, maxItems=7
+        "East, north, up; tilts, turn, scale at the edge; twist and bending, from the lowest to the highest place",
+        "m",
+        minItems=7,
+        maxItems=len(MOTIONS),
     )
     words: str = said("The same in words", minLength=1)
 
@@ -64,7 +70,11 @@ class DatumEntry(Record):
 
     part: str = said("Motion of the scene", enum=list(_MODE_WORDS))
     sigma_m: Number = said(
-        "Posterior standard deviation; at the edge for tilts, turn and scale", "m", "known to", ".2f"
+        "Posterior standard deviation; at the edge for tilts, turn and scale, from the lowest to the highest place for "
+        "twist and bending",
+        "m",
+        "known to",
+        ".2f",
     )
     cameras: Number = said("Accuracies of the cameras as delivered")
     earlier_run: Number = said("The earlier run")
