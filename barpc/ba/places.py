@@ -2,10 +2,10 @@
 
 Rows, columns and cells of each image, halved again and again, are tested against the rest of their image. That no
 place is worse than another is the one assumption, so that neither how much ties scatter nor how many are wrong
-matters. Two tests, each bounded over all places (Bonferroni): of how many lie far off in the same direction, which
-wrong matches do not (exact, hypergeometric), and of what the near ones have in common (chi-square). Neighbours share
-errors: of a small part of an image one observation is taken, and what is shared and no larger than any adjustment
-is asked to be is let be.
+matters. Two tests, each bounded over all places (Bonferroni): of how many lie far off by the same, which wrong matches
+do not (exact, hypergeometric), and of what the near ones have in common (Hotelling). Neighbours share errors: of a
+small part of an image one observation is taken, and what is shared and no larger than any adjustment is asked to be is
+let be.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2, hypergeom
+from scipy.stats import f, hypergeom
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
@@ -21,6 +21,10 @@ from barpc.scene import BoolArray, IntArray
 CHANCE = 1e-3  # that any place of a block is named where all are alike
 _FINEST = 32  # parts of rows or columns, and a side of the parts of which one observation is taken
 _CELLS = 8  # a side of the finest cells
+_PARTS, _TELLING = (
+    4,
+    12.0,
+)  # a side of the parts that may scatter by themselves, and observations that tell of one
 _FEWEST = 20  # observations of an image that tell nothing by themselves
 _LINE = 0.5  # of the larger spread: a smaller one is that of epipolar lines, which turn over an image
 
@@ -33,7 +37,7 @@ class Place:
     columns: tuple[float, float] | None  # from, to [px]; None: all
     rows: tuple[float, float] | None
     count: int  # observations of it that were looked at
-    far: float  # their share that lies far off in one direction
+    far: float  # their share that lies far off by the same
     off: float  # what the far ones are off by, half of them, else what the near ones have in common [px]
     chance: float  # of as much anywhere where all places are alike, at most
 
@@ -65,7 +69,7 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
     """
     whole = [_thinned(unused.part(unused.view == v), size[:, v]) for v in range(size.shape[1])]
     whole = [one for one in whole if len(one.view) >= _FEWEST]
-    tests = 3.0 * len(whole) * _PLACES.shape[1]  # of each place the near ones, and each of two axes
+    tests = 2.0 * len(whole) * _PLACES.shape[1]  # of each place the far ones and the near ones
     found = [_worst(one, size[:, one.view[0]], limit, least, share) for one in whole]
     sure = [replace(one, chance=one.chance * tests) for one in found if one and one.chance * tests < CHANCE]
     return sorted(sure, key=lambda one: one.chance)
@@ -105,44 +109,67 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
         return None
     axes, spread = _axes(standard[:, near])
     along = axes.T @ standard
-    far = [along[axis] * sign > limit for axis in range(2) for sign in (1.0, -1.0)]
-    wrong = np.array([inside @ off.astype(np.float64) for off in far])
-    chances = np.ones((len(far) + 1, len(count)))
-    for chance, off, bad in zip(chances, far, wrong, strict=False):
-        many = np.flatnonzero(bad > share * count)
-        sure = hypergeom.sf(bad[many] - 1.0, len(near), int(off.sum()), count[many])
-        chance[many] = 2.0 * sure  # of either direction
-    here = (inside & near).sum(axis=1)
-    mean = (inside & near) @ along.T / np.maximum(here, 1)[:, None]
+    chances, together = np.ones((2, len(count))), np.zeros((len(count), len(near)), dtype=bool)
+    for place in np.flatnonzero((inside & ~near).sum(axis=1) > share * count):
+        # wrong matches lie anywhere, what is moved as a whole lies together: how many do so here, and elsewhere
+        of_place = inside[place] & ~near
+        center = np.median(standard[:, of_place], axis=1, keepdims=True)
+        alike = ~near & (np.hypot(*(standard - center)) <= limit)
+        together[place] = alike & inside[place]
+        found = int(together[place].sum())
+        if found > share * count[place]:  # one of them is where the others are looked for
+            sure = hypergeom.sf(found - 2, len(near) - 1, int(alike.sum()) - 1, count[place] - 1)
+            chances[0, place] = min(1.0, float(sure) * int(of_place.sum()))
+    of_near = (inside & near).astype(np.float64)
+    here = of_near.sum(axis=1)
+    mean = of_near @ along.T / np.maximum(here, 1.0)[:, None]
     common = np.hypot(*mean.T) * float(np.median(one.deviation))
-    rest = mean - along[:, near].mean(axis=1)
-    left = 1.0 / np.maximum(here, 1) - 1.0 / near.sum()
-    told = (here > 1) & (left > 0.0) & (common > least)
+    along = along - along[:, near].mean(axis=1, keepdims=True)
+    rest = of_near @ along.T / np.maximum(here, 1.0)[:, None]
+    told = (here > 1) & (here < near.sum()) & (common > least)
     known = spread > _LINE * spread.max()
-    squared = (rest[told][:, known] ** 2 / spread[known] ** 2).sum(axis=1) / left[told]
-    chances[-1, told] = chi2.sf(squared, int(known.sum()))
+    variance = _variances(along * near, of_near, rest, _cells(near, col, row))
+    squared = (rest[told][:, known] ** 2 / variance[told][:, known]).sum(axis=1)
+    free, others = int(known.sum()), max(float(near.sum() - known.sum() - 1), 1.0)
+    chances[1, told] = f.sf(squared / free, free, others)  # Hotelling's T^2, the variance one of so many
     if not (chances < CHANCE).any():
         return None
     test, place = (int(index) for index in np.unravel_index(int(chances.argmin()), chances.shape))
-    is_far = test < len(far)
-    off_px = float(common[place])
-    if is_far:
-        off_px = float(np.median(np.hypot(*one.residual[:, inside[place] & far[test]])))
-    return Place(
-        int(one.view[0]),
-        _ends(size[0], *_PLACES[:2, place]),
-        _ends(size[1], *_PLACES[2:, place]),
-        int(count[place]),
-        float(wrong[test, place] / max(count[place], 1)) if is_far else 0.0,
-        off_px,
-        float(chances[test, place]),
-    )
+    off, far = float(common[place]), 0.0
+    if test == 0:
+        off = float(np.median(np.hypot(*one.residual[:, together[place]])))
+        far = float(together[place].sum() / count[place])
+    ends = _ends(size[0], *_PLACES[:2, place]), _ends(size[1], *_PLACES[2:, place])
+    return Place(int(one.view[0]), *ends, int(count[place]), far, off, float(chances[test, place]))
 
 
 def _axes(standard: Array) -> tuple[Array, Array]:
     """Along which residuals (2, K) scatter most and least, as columns, and how much; of two views along one line."""
     axes, size, _ = np.linalg.svd(standard - standard.mean(axis=1, keepdims=True), full_matrices=False)
     return axes, np.asarray(size / np.sqrt(standard.shape[1]))
+
+
+def _cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
+    """In which part of the image each near observation lies (K, C), 1 or 0."""
+    parts = int(np.clip(np.sqrt(near.sum() / _TELLING), 1, _PARTS))
+    cell = row * parts // _FINEST * parts + col * parts // _FINEST
+    return (cell[:, None] == np.arange(parts**2)) * near[:, None].astype(np.float64)
+
+
+def _variances(along: Array, of_near: Array, mean: Array, cells: Array) -> Array:
+    """Variance (P, 2) of the mean of each place about zero, once its own is taken off it.
+
+    By how much observations scatter in each part of the image, where that is more than in the whole.
+    """
+    count, in_place = cells.sum(axis=0), of_near @ cells
+    here = np.maximum(of_near.sum(axis=1), 1.0)
+    found = []
+    for values, own in zip(along, mean.T[:, :, None], strict=True):
+        left = values**2 @ cells - 2.0 * own * (of_near @ (cells * values[:, None])) + own**2 * in_place
+        whole = left.sum(axis=1, keepdims=True) / max(count.sum() - 2.0, 1.0)
+        variance = np.maximum(left / np.maximum(count - 1.0, 1.0), whole)
+        found.append((in_place * variance).sum(axis=1) / here**2 * (1.0 - here / count.sum()))
+    return np.stack(found, axis=1)
 
 
 def _ends(size: float, parts: int, k: int) -> tuple[float, float] | None:

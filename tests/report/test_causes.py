@@ -16,7 +16,7 @@ from barpc.ba.moving import Motion
 from barpc.ba.placing import Look
 from barpc.ba.scan import Interval
 from barpc.report import verdict
-from barpc.report.summary.causes import _WORDS, explanations, left_over, strangeness
+from barpc.report.summary.causes import _WORDS, _place, explanations, left_over, strangeness
 
 NAMES = "west", "east"
 
@@ -88,8 +88,11 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
 @pytest.mark.parametrize(
     ("side", "said"),
     [
-        ("north-west", "35 % of the tie points, in the north-west of the block, move together"),
-        ("", "35 % of the tie points move together"),
+        (
+            "north-west",
+            "35 % of the tie points, in the north-west of the block (5.000-5.100 E, 43.000-43.200 N), move together",
+        ),
+        ("", "35 % of the tie points, at 5.000-5.100 E, 43.000-43.200 N, move together"),
     ],
 )
 def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: str) -> None:
@@ -104,6 +107,20 @@ def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: st
     assert found.box == (5.0, 43.0, 5.1, 43.2)
     assert (found.axis, found.first, found.size_px, found.runner_up) == (None, None, None, STRIP)
     assert type(found).read({**vars(found), "box": [5.0, 43.0, 5.1, 43.2]}) == found
+
+
+@pytest.mark.parametrize(
+    ("box", "said"),
+    [
+        ((-5.2, -43.2, -5.1, -43.0), "5.100-5.200 W, 43.000-43.200 S"),
+        ((179.9, 0.5, -179.9, 0.7), "179.900 E to 179.900 W, 0.500-0.700 N"),  # over the 180th meridian
+        ((-0.2, -0.1, 0.1, 0.1), "0.200 W to 0.100 E, 0.100 S to 0.100 N"),
+        ((5.0, 43.0, 5.0002, 43.0001), "5.000000-5.000200 E, 43.000000-43.000100 N"),  # some metres
+        ((5.0, 43.0, 5.0, 43.0), "5.000000-5.000000 E, 43.000000-43.000000 N"),
+    ],
+)
+def test_longitudes_and_latitudes_are_said_with_their_side_and_as_many_digits_as_tell(box, said) -> None:
+    assert _place(Motion(1.0, (0, 1), 0.2, box, "")) == f"at {said}"
 
 
 @pytest.mark.parametrize(("gap", "told"), [(4.9, True), (5.1, False)])

@@ -84,10 +84,8 @@ class HeldOutEntry(Record):
     columns: tuple[float, float] | None = said("From, to; null for all", "px")
     rows: tuple[float, float] | None = said("From, to; null for all", "px")
     count: Count = said("Observations there that were looked at")
-    far: float = said("Share of them that lies far off in one direction")
-    off_px: float = said(
-        "Half of the far ones are off by more than this; else what the near ones share", "px"
-    )
+    far: float = said("Share of them that lies far off by the same")
+    off_px: float = said("What the far ones are off by, by their median; else what the near ones share", "px")
     chance: float = said("Probability of as much anywhere where all places are alike, at most")
 
 
@@ -144,7 +142,7 @@ def strangeness(apart: Apart) -> str:
 
 def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEntry:
     between = names[motion.between[0]], names[motion.between[1]]
-    side = f", in the {motion.side} of the block," if motion.side else ""
+    side = f", {_place(motion)},"
     share, metres = f"{100.0 * motion.share:.0f}", f"{motion.metres:.2g} m"
     sentence = _WORDS[one.kind].format(
         share=share, side=side, metres=metres, first=between[0], second=between[1]
@@ -157,6 +155,24 @@ def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEn
         "box": motion.box,
     }
     return ExplanationEntry(one.kind, sentence, None, *numbers, **place)
+
+
+def _place(motion: Motion) -> str:
+    """Where most of a group lies: a side of the block where it is on one, and longitudes and latitudes."""
+    west, south, east, north = motion.box
+    # as many digits as tell the ends apart by a hundredth: of a scene of any size
+    size = max(min((east - west) % 360.0, north - south), 1e-6)
+    digits = int(np.clip(np.round(2.0 - np.log10(size)), 1, 6))
+    box = f"{_degrees(west, east, 'WE', digits)}, {_degrees(south, north, 'SN', digits)}"
+    return f"in the {motion.side} of the block ({box})" if motion.side else f"at {box}"
+
+
+def _degrees(low: float, high: float, sides: str, digits: int) -> str:
+    if low < 0.0 <= high or high < low:  # over the equator, Greenwich or the 180th meridian
+        ends = (f"{abs(end):.{digits}f} {sides[end >= 0.0]}" for end in (low, high))
+        return " to ".join(ends)
+    ends = (f"{abs(end):.{digits}f}" for end in ((low, high) if low >= 0.0 else (high, low)))
+    return f"{'-'.join(ends)} {sides[low >= 0.0]}"
 
 
 def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
@@ -191,7 +207,7 @@ def held_out_place(one: Place, names: Sequence[str]) -> str:
     what = f"lie {one.off:.2f} px off in common"
     if one.far:
         share, size = f"{100 * one.far:.0f} %", f"{one.off:.2f} px"
-        what = f"contradict the cameras, {share} in one direction, half of these by more than {size}"
+        what = f"contradict the cameras, {share} by the same {size}"
     place = ", ".join(ends)
     return f"{place[0].upper()}{place[1:]} of {names[one.view]}: tie points there that took no part {what}"
 

@@ -20,6 +20,7 @@ from barpc.report.summary.causes import (
     held_out_places,
     left_over,
 )
+from barpc.report.summary.moving import MovingEntry, moving_cells
 from barpc.report.summary.words import Count, Vector, metres, percent_of
 
 _LEVEL = 1e-4  # probability of the F test below which something is called smooth
@@ -151,6 +152,9 @@ class SceneEntry(Record):
     explanations: tuple[ExplanationEntry, ...] = said(
         "What explains tie points beside the cameras' errors as stated, the first taken first", default=()
     )
+    moving: tuple[MovingEntry, ...] = said(
+        "Where tie points move together: cells of the ground, as many each way, that hold any", default=()
+    )
     left: tuple[LeftEntry, ...] = said("Rows and columns that stand out at the end", default=())
     held_out_places: tuple[HeldOutEntry, ...] = said(
         "Where tie points that took no part are met worse than in the rest of an image", default=()
@@ -197,6 +201,7 @@ def measure_scene(run: Run) -> SceneEntry | None:
         gcp_residuals_enu_m=adjustment.gcp_residuals.tolist(),
         solver=adjustment.status,
         explanations=explanations(adjustment),
+        moving=moving_cells(run),
         left=left_over(adjustment),
         held_out_places=held_out_places(run.met_worse, adjustment.names),
     )
