@@ -134,13 +134,13 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
     chances[1, told] = f.sf(squared / free, free, others)  # Hotelling's T^2, the variance one of so many
     if not (chances < CHANCE).any():
         return None
-    test, place = (int(index) for index in np.unravel_index(int(chances.argmin()), chances.shape))
-    off, far = float(common[place]), 0.0
+    test, worst = divmod(int(chances.argmin()), len(count))
+    off, far = float(common[worst]), 0.0
     if test == 0:
-        off = float(np.median(np.hypot(*one.residual[:, together[place]])))
-        far = float(together[place].sum() / count[place])
-    ends = _ends(size[0], *_PLACES[:2, place]), _ends(size[1], *_PLACES[2:, place])
-    return Place(int(one.view[0]), *ends, int(count[place]), far, off, float(chances[test, place]))
+        off = float(np.median(np.hypot(*one.residual[:, together[worst]])))
+        far = float(together[worst].sum() / count[worst])
+    ends = _ends(size[0], *_PLACES[:2, worst]), _ends(size[1], *_PLACES[2:, worst])
+    return Place(int(one.view[0]), *ends, int(count[worst]), far, off, float(chances[test, worst]))
 
 
 def _axes(standard: Array) -> tuple[Array, Array]:
@@ -153,7 +153,7 @@ def _cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
     """In which part of the image each near observation lies (K, C), 1 or 0."""
     parts = int(np.clip(np.sqrt(near.sum() / _TELLING), 1, _PARTS))
     cell = row * parts // _FINEST * parts + col * parts // _FINEST
-    return (cell[:, None] == np.arange(parts**2)) * near[:, None].astype(np.float64)
+    return np.asarray((cell[:, None] == np.arange(parts**2)) * near[:, None].astype(np.float64))
 
 
 def _variances(along: Array, of_near: Array, mean: Array, cells: Array) -> Array:

@@ -269,8 +269,8 @@ def _left_reasons(run: Run) -> list[str]:
             continue
         place = f"{one.axis} {one.first:.0f}-{one.last:.0f} of {one.image}"
         worst.setdefault(one.image, f"{place[0].upper()}{place[1:]} stand out: {what}.")
-    for place in run.met_worse:  # what was solved with may agree with what it bent
-        worst.setdefault(names[place.view], f"{held_out_place(place, names)}.")
+    for unmet in run.met_worse:  # what was solved with may agree with what it bent
+        worst.setdefault(names[unmet.view], f"{held_out_place(unmet, names)}.")
     return list(worst.values())
 
 

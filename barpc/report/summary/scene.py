@@ -156,8 +156,9 @@ class SceneEntry(Record):
         "Where tie points move together: cells of the ground, as many each way, that hold any", default=()
     )
     left: tuple[LeftEntry, ...] = said("Rows and columns that stand out at the end", default=())
-    held_out_places: tuple[HeldOutEntry, ...] = said(
-        "Where tie points that took no part are met worse than in the rest of an image", default=()
+    held_out_places: tuple[HeldOutEntry, ...] | None = said(
+        "Where tie points that took no part are met worse than in the rest of an image; null: not tested",
+        default=None,
     )
 
 
