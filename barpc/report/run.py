@@ -105,9 +105,8 @@ class Run:
     def met_worse(self) -> list[Place]:
         """Rows, columns and cells of images in which tie points that took no part are met worse than elsewhere."""
         found, tracks = self.adjustment, self.tracks
-        if (
-            found is None or found.options.loss == "linear"
-        ):  # who asks for that has no tie point that may be wrong
+        # who asks for plain least squares has no tie point that may be wrong
+        if found is None or not found.held_out.any() or found.options.loss == "linear":
             return []
         stated = np.array([found.options.view_weights.get(name, 1.0) for name in found.names])
         known = np.isfinite(found.held_out_noise)
