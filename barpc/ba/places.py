@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f, hypergeom
+from scipy.special import fdtrc, gammaln
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
@@ -86,6 +86,16 @@ def _places() -> IntArray:
 _PLACES = _places()
 
 
+def _held() -> BoolArray:
+    """(P, C) which places hold which of the smallest parts of an image."""
+    columns, k, rows, n = _PLACES[:, :, None]
+    row, col = np.divmod(np.arange(_FINEST**2), _FINEST)
+    return np.asarray((col * columns // _FINEST == k) & (row * rows // _FINEST == n))
+
+
+_HELD = _held()
+
+
 def _part(unused: Unused, size: Array) -> IntArray:
     """(2, K) of so many columns and rows of an image, which."""
     return np.clip(unused.xy / size[:, None] * _FINEST, 0, _FINEST - 1).astype(np.int64)
@@ -99,9 +109,8 @@ def _thinned(unused: Unused, size: Array) -> Unused:
 
 def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -> Place | None:
     """The place of one image of which chance leaves least, not yet times the places; None where none stands out."""
-    columns, k, rows, n = _PLACES[:, :, None]
     col, row = _part(one, size)
-    inside = (col * columns // _FINEST == k) & (row * rows // _FINEST == n)  # (P, K)
+    inside = _HELD[:, row * _FINEST + col]
     count = inside.sum(axis=1)
     standard = one.residual / one.deviation
     near = np.hypot(*standard) <= limit
@@ -110,7 +119,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
     axes, spread = _axes(standard[:, near])
     along = axes.T @ standard
     chances, together = np.ones((2, len(count))), np.zeros((len(count), len(near)), dtype=bool)
-    for place in np.flatnonzero((inside & ~near).sum(axis=1) > share * count):
+    for place in np.flatnonzero((inside[:, ~near]).sum(axis=1) > np.maximum(share * count, 1)):
         # wrong matches lie anywhere, what is moved as a whole lies together: how many do so here, and elsewhere
         of_place = inside[place] & ~near
         center = np.median(standard[:, of_place], axis=1, keepdims=True)
@@ -118,8 +127,8 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
         together[place] = alike & inside[place]
         found = int(together[place].sum())
         if found > share * count[place]:  # one of them is where the others are looked for
-            sure = hypergeom.sf(found - 2, len(near) - 1, int(alike.sum()) - 1, count[place] - 1)
-            chances[0, place] = min(1.0, float(sure) * int(of_place.sum()))
+            sure = _at_least(found - 1, int(count[place]) - 1, int(alike.sum()) - 1, len(near) - 1)
+            chances[0, place] = min(1.0, sure * int(of_place.sum()))
     of_near = (inside & near).astype(np.float64)
     here = of_near.sum(axis=1)
     mean = of_near @ along.T / np.maximum(here, 1.0)[:, None]
@@ -131,7 +140,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
     variance = _variances(along * near, of_near, rest, _cells(near, col, row))
     squared = (rest[told][:, known] ** 2 / variance[told][:, known]).sum(axis=1)
     free, others = int(known.sum()), max(float(near.sum() - known.sum() - 1), 1.0)
-    chances[1, told] = f.sf(squared / free, free, others)  # Hotelling's T^2, the variance one of so many
+    chances[1, told] = fdtrc(free, others, squared / free)  # Hotelling's T^2, the variance one of so many
     if not (chances < CHANCE).any():
         return None
     test, worst = divmod(int(chances.argmin()), len(count))
@@ -143,10 +152,21 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
     return Place(int(one.view[0]), *ends, int(count[worst]), far, off, float(chances[test, worst]))
 
 
+def _at_least(found: int, count: int, alike: int, whole: int) -> float:
+    """Probability that of so many that are alike in a whole at least the found are among a count (hypergeometric)."""
+    k = np.arange(found, min(count, alike) + 1)
+
+    def ways(n: int, m: IntArray | int) -> Array:
+        return np.asarray(gammaln(n + 1.0) - gammaln(m + 1.0) - gammaln(n - m + 1.0))
+
+    return float(np.exp(ways(alike, k) + ways(whole - alike, count - k) - ways(whole, count)).sum())
+
+
 def _axes(standard: Array) -> tuple[Array, Array]:
     """Along which residuals (2, K) scatter most and least, as columns, and how much; of two views along one line."""
-    axes, size, _ = np.linalg.svd(standard - standard.mean(axis=1, keepdims=True), full_matrices=False)
-    return axes, np.asarray(size / np.sqrt(standard.shape[1]))
+    off = standard - standard.mean(axis=1, keepdims=True)
+    variance, axes = np.linalg.eigh(off @ off.T / standard.shape[1])
+    return axes[:, ::-1], np.sqrt(np.maximum(variance[::-1], 0.0))
 
 
 def _cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
