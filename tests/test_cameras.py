@@ -27,12 +27,11 @@ from barpc.remote import Remote
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import altitude_range
+from tests.pipeline.known import part
 from tests.rpcio.conftest import make_rpc, write_image
 from tests.sensor.conftest import MODELS
 from tests.sensor.linescan_files import Flight, isd
 from tests.sensor.terrasar_files import Terrasar
-
-SAMPLES = sorted((Path(__file__).parents[1] / "data_samples").glob("*.tif"))
 
 
 def run(*args: object) -> int:
@@ -261,14 +260,15 @@ class Own:
 def test_views_with_one_s_own_model_are_adjusted_as_files_are(tmp_path):
     from barpc.pipeline import load_views
 
-    views = load_views(SAMPLES[:2]).views
+    images = part(tmp_path).images[:2]
+    views = load_views(images).views
     views = [replace(v, sensor=replace(v.sensor, err_bias=None)) for v in views]  # what only an RPC can state
     own = [replace(v, sensor=Own(v.sensor)) for v in views]
     files = barpc.adjust(views, tmp_path / "files")
     mine = barpc.adjust(own, tmp_path / "mine")
-    assert [view.path for view in mine.views] == [str(path) for path in SAMPLES[:2]]
+    assert [view.path for view in mine.views] == [str(path) for path in images]
     for view, expected in zip(mine.views, files.views, strict=True):
-        points = expected.sensor.localize([[0.0, 0.0], [300.0, 900.0]], np.array([200.0, 250.0]))
+        points = expected.sensor.localize([[0.0, 0.0], [90.0, 270.0]], np.array([200.0, 250.0]))
         np.testing.assert_allclose(view.sensor.project(points), expected.sensor.project(points), atol=1e-4)
     assert mine.summary["views"][0]["rpc_source"]["format"] == "given"
     assert barpc.check(mine.views).passed

@@ -64,8 +64,11 @@ def met(found: Adjustment, block: Block, view: int) -> float:
 
 @pytest.mark.parametrize(
     ("change", "look"),
-    [(swapped, "axes"), (shifted, "offset"), (raised, "height")],
-    ids=["axes swapped", "another tile", "another datum"],
+    [
+        pytest.param(swapped, "axes", id="axes swapped"),
+        pytest.param(shifted, "offset", id="another tile"),
+        pytest.param(raised, "height", id="another datum", marks=pytest.mark.slow),
+    ],
 )
 def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(
     monkeypatch, change: Change, look: str
@@ -197,7 +200,15 @@ def beside(world: World, odd: int) -> tuple[Adjustment, float, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 4, 5, 10], ids=["date of 3", "axes of 3", "tile of 4", "date of 5"])
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(4, id="axes of 3"),
+        pytest.param(5, id="tile of 4"),
+        pytest.param(10, id="date of 5"),
+        pytest.param(0, id="date of 3", marks=pytest.mark.nightly),
+    ],
+)
 def test_a_foreign_rpc_leaves_the_others_as_without_it(seed: int) -> None:
     world = make("foreign", seed)
     (odd,) = world.plan.deliver
@@ -216,7 +227,11 @@ def test_a_foreign_rpc_leaves_the_others_as_without_it(seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("family", "seed"), [("cloud", 1), ("local", 4), ("clean", 9), ("wander", 3), ("priors", 0)]
+    ("family", "seed"),
+    [
+        *(("cloud", 1), ("clean", 9), ("wander", 3), ("priors", 0)),
+        pytest.param("local", 4, marks=pytest.mark.nightly),
+    ],
 )
 def test_what_is_wrong_otherwise_is_no_foreign_rpc(family: str, seed: int) -> None:
     world = make(family, seed)

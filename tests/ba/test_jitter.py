@@ -16,10 +16,13 @@ from barpc.fit import fit_rpc
 from barpc.sensor.splined import Splined
 from benchmarks.referee import cases, judge, make, solve
 from tests.ba.test_referee import hills
+from tests.lanes import rest_slow
 
 TABLE = cases()
 SEEDS = (0, 1, 2)
 EDGES = tuple(np.arange(1, 8) * 2500.0)
+FEW_STEPS = ("steps 0.1 px", 1000)  # steps and splines are found in both
+FOUND = [FEW_STEPS, pytest.param("all", 3000, marks=pytest.mark.nightly)]
 
 
 @cache
@@ -104,7 +107,7 @@ def test_all_errors_together_with_detectors_found_and_given():
         assert medians("all", lambda j: j.shape, seeds, **options) < min(delivered, off)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_robust_rounds_would_let_go_is_followed():
     found, after = solved("all", 14)
     off, without = solved("all", 14, jitter="off")
@@ -115,15 +118,16 @@ def test_what_robust_rounds_would_let_go_is_followed():
 
 
 @pytest.mark.slow
-def test_the_drift_is_not_taken_wider_than_it_is_seen_where_jitter_is_followed():
-    found, after = solved("all", 18)  # flown: 2.1 m, of degree 2 1.0 m
+@pytest.mark.parametrize("seed", rest_slow([3, 18], mark=pytest.mark.nightly))
+def test_the_drift_is_not_taken_wider_than_it_is_seen_where_jitter_is_followed(seed):
+    found, after = solved("all", seed)  # flown: 2.1 m, of degree 2 1.0 m
     assert 1.5 < found.prior.drift_sigma[0] < 4.0
     assert 0.4 < found.prior.drift_sigma[1] < 2.0
-    assert 0.5 < after.shape < 4.0  # 6.1 with a drift that may be 5.5 m
+    assert 0.5 < after.shape < 4.0  # seed 18: 6.1 with a drift that may be 5.5 m
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [3, 7])
+@pytest.mark.parametrize("seed", rest_slow([3, 7], mark=pytest.mark.nightly))
 def test_detectors_of_one_focal_plane_are_found_where_single_views_do_not_show_them(seed):
     found, after = solved("all", seed)
     (edges,) = {tuple(spline.edges) for spline in found.splines}
@@ -133,12 +137,14 @@ def test_detectors_of_one_focal_plane_are_found_where_single_views_do_not_show_t
 
 
 @pytest.mark.slow
-def test_detectors_are_found_where_they_begin():
-    found, after = solved("steps 0.1 px", 1)
+@pytest.mark.parametrize("tracks", rest_slow([1000, 3000], mark=pytest.mark.nightly))
+def test_detectors_are_found_where_they_begin(tracks):
+    found, after = solved("steps 0.1 px", 1, tracks=tracks)
     for spline in found.splines:
         assert 5 <= len(spline.edges) <= 7
         assert np.abs(spline.edges[:, None] - EDGES).min(axis=1).max() < 120.0
-    assert after.across < 0.05 < 0.1 < solved("steps 0.1 px", 1, jitter="off")[1].across
+    off = solved("steps 0.1 px", 1, jitter="off", tracks=tracks)[1]
+    assert after.across < 0.05 < 0.1 < off.across
 
 
 @pytest.mark.parametrize(
@@ -182,7 +188,7 @@ def test_knots_are_no_denser_than_the_observations_hold():
     assert len(given.splines[0].coeffs) >= 7
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # before: what wanders in test_judge
 def test_one_view_of_three_with_jitter_is_the_one_that_is_corrected():
     def wave(row):
         angle = 2 * np.pi * row / 11000 + 0.7
@@ -203,8 +209,10 @@ def test_one_view_of_three_with_jitter_is_the_one_that_is_corrected():
 
 
 @pytest.mark.slow
-def test_the_same_tracks_give_the_same_bytes():
-    first, again = solved("all", 1)[0], solve(scene("all", 1))[1]
+@pytest.mark.parametrize(("name", "tracks"), FOUND)
+def test_the_same_tracks_give_the_same_bytes(name, tracks):
+    first, again = solved(name, 1, tracks=tracks)[0], solve(scene(name, 1, tracks=tracks))[1]
+    assert all(len(spline.coeffs) for spline in first.splines)
     np.testing.assert_array_equal(first.params, again.params)
     assert first.splines == again.splines
 
@@ -221,9 +229,10 @@ def test_the_covariance_counts_the_splines():
 
 
 @pytest.mark.slow
-def test_a_later_run_goes_on_from_splines(tmp_path):
-    made = scene("all", 1)
-    found, after = solved("all", 1)
+@pytest.mark.parametrize(("name", "tracks"), FOUND)
+def test_a_later_run_goes_on_from_splines(tmp_path, name, tracks):
+    made = scene(name, 1, tracks=tracks)
+    found, after = solved(name, 1, tracks=tracks)
     block_prior(found).save(tmp_path / "prior.npz")
     prior = BlockPrior.load(tmp_path / "prior.npz")
     few = made.tracks.select(made.tracks.point % 10 == 0)
@@ -232,6 +241,7 @@ def test_a_later_run_goes_on_from_splines(tmp_path):
     assert [len(spline.edges) for spline in again.splines] == [len(spline.edges) for spline in found.splines]
 
 
+@pytest.mark.slow
 def test_the_best_single_rpc_is_fitted_to_the_camera_with_jitter():
     found, _ = solved("jitter 0.5 at 1 Hz", 1, tracks=1500)
     view, camera = scene("jitter 0.5 at 1 Hz", 1, tracks=1500).views[2], found.sensors[2]

@@ -261,8 +261,15 @@ def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(monkeypa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [24, 110])
-@pytest.mark.parametrize("options", [{"dem_for_all": True}, {}], ids=["terrain", "alone"])
+@pytest.mark.parametrize(
+    ("options", "n"),
+    [
+        pytest.param({"dem_for_all": True}, 110, id="terrain-110"),
+        pytest.param({}, 24, id="alone-24"),
+        pytest.param({"dem_for_all": True}, 24, id="terrain-24", marks=pytest.mark.nightly),
+        pytest.param({}, 110, id="alone-110", marks=pytest.mark.nightly),
+    ],
+)
 def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, options, n) -> None:
     """Rounds, variances and covariance: nothing else may change. Heights held by a terrain are wrong together."""
     made = simulate_block(n, 20 * n, seed=4, num_checks=0)

@@ -73,7 +73,7 @@ def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, sha
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seeds", [SEEDS[:1], SEEDS])
+@pytest.mark.parametrize("seeds", rest_slow([SEEDS[:1], SEEDS], mark=pytest.mark.nightly))
 def test_without_a_drift_in_the_model_the_same_scene_is_not_met(seeds):
     assert median(verdicts("drift 1", seeds, drift=0), lambda v: v.after.across) > 0.15
 
@@ -170,7 +170,12 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
     [
         ("no drift", "good", ""),
         ("drift 3", "good", ""),
-        ("jitter 0.5 at 1 Hz", "look", "Jitter along the rows is followed by splines"),
+        pytest.param(
+            "jitter 0.5 at 1 Hz",
+            "look",
+            "Jitter along the rows is followed by splines",
+            marks=pytest.mark.nightly,
+        ),
         ("jitter 0.1 at 5 Hz", "look", "px every 27"),
         ("clouds 60 %", "bad", "check clouds, water and change"),
         ("RPC 200 px wrong", "look", "farther off than stated"),

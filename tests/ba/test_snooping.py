@@ -23,8 +23,10 @@ from barpc.simulate import Block, simulate_block
 from benchmarks.referee import cases, judge, make
 from tests.ba.conftest import INDEPENDENT, centers_of
 from tests.ba.test_referee import hills
+from tests.lanes import rest_slow
 
 SEEDS = (1, 2)
+ONE = rest_slow(SEEDS, mark=pytest.mark.nightly)
 
 
 @cache
@@ -69,7 +71,7 @@ def test_a_control_point_that_contradicts_is_said_to() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", ONE)
 @pytest.mark.parametrize(
     ("count", "wrong"), [(5, {1: 3.0}), (5, {2: 30.0}), (10, {1: 30.0, 4: 30.0, 7: 30.0}), (3, {0: 30.0})]
 )
@@ -90,7 +92,7 @@ def test_what_is_wrong_is_found_named_and_left_out(count, wrong, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1, 7))
+@pytest.mark.parametrize("seed", rest_slow(range(1, 7), keep=2, mark=pytest.mark.nightly))
 def test_points_that_hold_are_all_used(seed):
     scene = scene_of(8, seed)
     tested = adjust_tracks(scene.views, scene.tracks, None, scene.gcps).control
@@ -146,7 +148,7 @@ def said(scene, gcps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", rest_slow([1, 4], mark=pytest.mark.nightly))
 def test_two_points_that_contradict_each_other_are_never_good(seed):
     scene = scene_of(2, seed)
     gcps = scene.gcps
@@ -164,7 +166,7 @@ def test_two_points_that_contradict_each_other_are_never_good(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", ONE)
 @pytest.mark.parametrize(("times", "good"), [(1.0, True), (3.5, False)])
 def test_errors_that_are_no_ones_alone_show_in_all_together(seed, times, good):
     scene = scene_of(6, seed)
@@ -187,7 +189,7 @@ def test_a_point_that_nothing_checks_is_said_to_be():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", ONE)
 def test_points_in_one_image_are_tested_across_its_line_of_sight(seed):
     scene = scene_of(6, seed)
     gcps, keep = scene.gcps, scene.gcps.view == 1

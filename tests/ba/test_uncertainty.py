@@ -94,7 +94,8 @@ def test_some_trials_agree_with_the_prediction(tracks, count):
     ("views", "tracks", "count", "near"),
     [
         (3, 60, 10, 0.35),
-        *(pytest.param(*row, 0.1, marks=pytest.mark.slow) for row in ((3, 200, 150), (10, 300, 40))),
+        pytest.param(10, 300, 40, 0.1, marks=pytest.mark.slow),
+        pytest.param(3, 200, 150, 0.1, marks=pytest.mark.nightly),
     ],
 )
 def test_with_every_default_on_errors_are_as_large_as_predicted(views, tracks, count, near):

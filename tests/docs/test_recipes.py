@@ -24,7 +24,13 @@ GATE = "# ends with exit code 3"
 """Said behind a command whose verdict asks for a look."""
 
 RUN = [page for page in PAGES if blocks(page, "bash", "python")]
-LONG = ("absolute", "dates", "drift")  # more than ten seconds each
+LATE = (
+    "absolute",
+    "dates",
+    "drift",
+    "json",
+    "matches",
+)  # five seconds or more each, and more of the same kind
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +85,7 @@ def test_the_first_pages_run_on_parts_of_the_images(small, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=pytest.mark.nightly if page.stem in LONG else ()) for page in RUN],
+    [pytest.param(page, marks=pytest.mark.nightly if page.stem in LATE else ()) for page in RUN],
     ids=lambda page: str(page.relative_to(DOCS)),
 )
 def test_the_commands_of_a_page_run_as_they_stand(page, folder, codes, monkeypatch):

@@ -139,7 +139,7 @@ def test_the_last_worker_is_said_within_ten_seconds_and_then_once_a_minute() -> 
     assert cluster.REMIND == 60
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore")
 def test_workers_close_and_come_during_a_run_and_the_bytes_are_the_same(
     distributed: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch

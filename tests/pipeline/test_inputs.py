@@ -18,9 +18,10 @@ from barpc.rpcio import read_rpc
 from barpc.rpcio.tiff import put_tag
 from barpc.scene import Tracks
 
-from .known import SAMPLES, errors_at_check_points
+from .known import WHOLE_AT_NIGHT, errors_at_check_points
 
 
+@WHOLE_AT_NIGHT
 def test_tie_points_from_a_file_give_the_same_answer(known, matched, tmp_path):
     result, out = matched
     runs = []
@@ -33,6 +34,7 @@ def test_tie_points_from_a_file_give_the_same_answer(known, matched, tmp_path):
     np.testing.assert_array_equal(*runs)
 
 
+@WHOLE_AT_NIGHT
 def test_asp_text_matches_hold_the_same_tie_points(matched):
     result, out = matched
     assert sorted(path.name for path in (out / "asp").iterdir()) == [
@@ -50,6 +52,7 @@ def test_asp_text_matches_hold_the_same_tie_points(matched):
     assert theirs <= ours
 
 
+@WHOLE_AT_NIGHT
 def test_control_points_put_the_scene_in_its_place(known, matched, tmp_path):
     options = RunOptions(
         matches_only=True, matches=str(matched[1] / "matches.npz"), gcp=(str(known.gcps),), pictures=False
@@ -90,6 +93,7 @@ def test_control_points_of_other_images_are_refused_before_any_work(corner, tmp_
 
 
 @pytest.mark.slow  # before a commit: a list that leaves an image alone, and the option
+@WHOLE_AT_NIGHT
 def test_a_stray_image_is_named_and_left_out_when_asked(known, tmp_path):
     stray = tmp_path / "img_01.tif"
     elsewhere(known.images[0], stray)
@@ -114,15 +118,16 @@ def elsewhere(source: Path, target: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_real_stray_image_is_left_out(shared_data, tmp_path):
+def test_a_real_stray_image_is_left_out(corner, shared_data, tmp_path):
     stray = shared_data / "optical/phr_triplet_north/img_01.tif"
-    result = adjust([*SAMPLES, stray], tmp_path / "out", RunOptions(keep_going=True))
+    result = adjust([*corner.images, stray], tmp_path / "out", RunOptions(keep_going=True))
     assert [view.name for view in result.views] == ["view_00", "view_01", "view_02"]
     assert not result.passed
     assert result.summary["left_out"][0]["path"] == str(stray)
 
 
 @pytest.mark.slow  # before a commit: the option
+@WHOLE_AT_NIGHT
 def test_a_later_run_goes_on_from_an_earlier_block(known, matched, tmp_path):
     given = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), pictures=False)
     two = tmp_path / "two.csv"
@@ -157,6 +162,7 @@ def test_what_the_earlier_block_knew_does_not_count_twice():
 
 
 @pytest.mark.slow
+@WHOLE_AT_NIGHT
 def test_a_second_pass_matches_with_the_adjusted_cameras(known, tmp_path):
     images = known.images if known.whole else known.images[:2]
     result = adjust(images, tmp_path / "out", RunOptions(num_passes=2, pictures=False))
@@ -201,6 +207,7 @@ def test_paths_with_spaces_and_accents_and_equal_stems(corner, tmp_path):
         assert read_rpc(Path(tmp_path / "out à moi" / f"{name}.vrt")) is not None
 
 
+@WHOLE_AT_NIGHT
 def test_check_points_are_measured_and_not_used(known, matched, tmp_path):
     given = RunOptions(
         matches_only=True, matches=str(matched[1] / "matches.npz"), pictures=False, stop_after="adjustment"

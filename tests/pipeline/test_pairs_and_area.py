@@ -20,7 +20,7 @@ from barpc.sensor.geometry import triangulate
 from barpc.tie import read_area
 from tests.reliability.conftest import barpc
 
-from .known import SAMPLES
+from .known import SAMPLES, WHOLE_AT_NIGHT
 
 IMAGES = [str(path) for path in SAMPLES]
 
@@ -140,6 +140,7 @@ def area_file(path: Path, views: tuple[View, ...]) -> Path:
     return path
 
 
+@WHOLE_AT_NIGHT
 def test_only_the_listed_pairs_are_matched_and_only_in_the_area(known, tmp_path) -> None:
     views = load_views(known.images).views
     pairs = tmp_path / "pairs.txt"
@@ -168,6 +169,7 @@ def test_a_missing_file_ends_the_run_with_one_line(tmp_path, flag, word) -> None
     assert word in line
 
 
+@WHOLE_AT_NIGHT
 def test_an_image_that_the_list_leaves_alone_can_be_left_out(known, tmp_path) -> None:
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("view_00 view_01\n")

@@ -101,9 +101,9 @@ def test_its_points_can_be_read_as_gcps(held, place):
     assert np.median(np.linalg.norm(image - points.xy, axis=1)) < 8.0  # px, of 2 m pixels and single heights
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # before: the option's row, and tests/ba/test_reference
 def test_a_stated_sigma_is_the_scene_s(options, tmp_path):
-    run = adjust(IMAGES, tmp_path / "run", replace(options, reference_sigma=2.0))
+    run = adjust(IMAGES, tmp_path / "run", replace(options, reference_sigma=2.0, stop_after="adjustment"))
     assert run.summary["scene"]["sigma_enu_m"][:2] == pytest.approx([2.0, 2.0], rel=0.1)
 
 

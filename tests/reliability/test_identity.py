@@ -80,8 +80,8 @@ def test_a_vrt_whose_image_was_replaced_is_another_input(images, tmp_path) -> No
 @pytest.mark.parametrize(
     ("change", "stage"),
     [
-        pytest.param(change, stage, marks=() if (change, stage) in FAST else pytest.mark.slow)
-        for change in (in_place, moved_in)
+        pytest.param(change, stage, marks=() if (change, stage) in FAST else mark)
+        for change, mark in ((in_place, pytest.mark.slow), (moved_in, pytest.mark.nightly))
         for stage in ("cameras", "hash", "read", "detect", "match", "fit")
     ],
 )

@@ -296,7 +296,7 @@ def test_debug_shows_the_traceback_of_a_bug(crops, out, monkeypatch):
 
 @pytest.mark.parametrize(
     ("whole", "share"),
-    [(False, 0.7), pytest.param(True, 0.95, marks=pytest.mark.slow)],
+    [(False, 0.7), pytest.param(True, 0.95, marks=pytest.mark.nightly)],
     ids=["part", "whole"],
 )
 def test_stages_are_told_with_seconds_and_memory(crops, tmp_path, caplog, whole, share):

@@ -61,16 +61,13 @@ def ways(scene: Path) -> dict[str, RunOptions]:
     }
 
 
-SELDOM = (
-    "given matches",
-    "two passes",
-    "matches to be verified",
-    "a list of pairs",
-    "an area",
-    "an earlier run",
-    "a bad file",
-    "the defaults",
-)
+SELDOM = {
+    **dict.fromkeys(
+        ("two passes", "a list of pairs", "an area", "an earlier run", "a bad file"), pytest.mark.slow
+    ),
+    # in all orders below, or as with control points
+    **dict.fromkeys(("the defaults", "given matches", "matches to be verified"), pytest.mark.nightly),
+}
 
 
 def images_of(scene: Path, way: str) -> list[Path]:
@@ -78,7 +75,7 @@ def images_of(scene: Path, way: str) -> list[Path]:
 
 
 @pytest.mark.parametrize(
-    "way", [pytest.param(way, marks=pytest.mark.slow) if way in SELDOM else way for way in ways(Path())]
+    "way", [pytest.param(way, marks=SELDOM[way]) if way in SELDOM else way for way in ways(Path())]
 )
 def test_the_order_of_the_images_changes_no_byte(scene, tmp_path, way):
     orders = list(permutations(images_of(scene, way)))

@@ -16,6 +16,7 @@ from barpc.report.tables import read_tables
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed, Timing
+from tests.lanes import rest_slow
 from tests.sensor.s1_product import Product
 
 MODELS = ("rotation+translation", "rotation", "translation")
@@ -67,7 +68,7 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", rest_slow(MODELS, mark=pytest.mark.nightly))
 def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, model):
     run = block_run.run
     adjustment = adjust_tracks(run.views, run.tracks, AdjustOptions(model=model, drift=0))

@@ -23,6 +23,9 @@ from tests.scenes import ImageOptions, Scene
 SIDES = [300, pytest.param(600, marks=pytest.mark.slow)]
 """Rows and columns of a rendered scene: a quarter of the ground before a commit, all of it in the slower lanes."""
 
+SIDES_AT_NIGHT = [300, pytest.param(600, marks=pytest.mark.nightly)]
+"""The same of tests with bounds that do not depend on the side."""
+
 
 def write_image(path: Path, data: np.ndarray, **profile: object) -> Path:
     """Write (H, W) or (bands, H, W) as a GeoTIFF without georeference."""

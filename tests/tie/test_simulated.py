@@ -17,7 +17,7 @@ from barpc.sensor.corrected import Corrected
 from barpc.tie import TieOptions, common_tracks, find_tracks
 from tests.lanes import rest_slow
 
-from .conftest import SIDES, write_image
+from .conftest import SIDES, SIDES_AT_NIGHT, write_image
 
 
 def rms(scene, tracks: Tracks, i: int, j: int) -> np.ndarray:
@@ -67,8 +67,9 @@ def test_tie_points_hold_under_other_light_and_half_the_sky_in_clouds(render, co
 
 
 @pytest.mark.slow
-def test_the_corrected_cameras_of_a_second_pass_find_the_same_ground(render) -> None:
-    scene = render(views=3)
+@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
+def test_the_corrected_cameras_of_a_second_pass_find_the_same_ground(render, side: int) -> None:
+    scene = render(views=3, size=(side, side))
     exact = [
         replace(v, sensor=Corrected(v.sensor, s.correction))
         for v, s in zip(scene.views, scene.scene.shots, strict=True)
@@ -96,7 +97,7 @@ def _unpickled(task: bytes):
     ("workers", "number", "side"),
     [
         (Pickled, 2, 300),
-        pytest.param(ThreadPoolExecutor, 3, 600, marks=pytest.mark.slow),
+        pytest.param(ThreadPoolExecutor, 3, 600, marks=pytest.mark.nightly),
         pytest.param(ProcessPoolExecutor, 3, 600, marks=pytest.mark.slow),
     ],
 )
@@ -136,7 +137,7 @@ def test_tie_points_hold_where_both_images_saturate(render, tmp_path) -> None:
     assert (np.abs(errors).max(axis=1) > 1.0).mean() <= 0.02
 
 
-@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
 @pytest.mark.parametrize(
     "change",
     rest_slow(
@@ -158,7 +159,7 @@ def test_any_real_pixel_type_works(render, tmp_path, change, side: int) -> None:
     assert find_tracks(views).tracks.num_points > 400 * (side / 600) ** 2
 
 
-@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("side", SIDES_AT_NIGHT)
 @pytest.mark.parametrize(
     "change",
     rest_slow(
@@ -195,7 +196,7 @@ def test_a_linear_change_of_the_grey_values_moves_no_tie_point(render, tmp_path,
         pytest.param(
             lambda d: np.random.default_rng(0).integers(1, 4000, d.shape).astype(np.uint16),
             "no common offset",
-            marks=pytest.mark.slow,
+            marks=pytest.mark.nightly,
         ),
         pytest.param(lambda d: np.rot90(d, 2).copy(), "no common offset", marks=pytest.mark.slow),
     ],

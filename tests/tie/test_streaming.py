@@ -57,7 +57,12 @@ def left(xy: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(
-    ("most", "zoom"), rest_slow(pytest.param(*row) for row in ((300, 4), (4000, 1), (900, 2), (150, 4)))
+    ("most", "zoom"),
+    [
+        (300, 4),
+        *(pytest.param(*row, marks=pytest.mark.slow) for row in ((900, 2), (150, 4))),
+        pytest.param(4000, 1, marks=pytest.mark.nightly),
+    ],
 )
 def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_hold(
     pair, monkeypatch, most: int, zoom: int
@@ -261,19 +266,20 @@ def stored(view: View, folder: Path, layout: dict[str, Any]) -> View:
 
 @pytest.mark.parametrize(
     ("layout", "zoom", "surveyed", "found"),
-    rest_slow(
-        [
-            pytest.param({"tiled": True, "blockxsize": 64, "blockysize": 64}, 2, 0.8, 1.6),
-            pytest.param({"tiled": True, "blockxsize": 64, "blockysize": 64}, 1, 0.8, 1.6),
-            pytest.param({"blockysize": 8, "compress": "deflate"}, 1, 0.75, 1.15),
-            pytest.param(
-                {"driver": "JP2OpenJPEG", "BLOCKXSIZE": 256, "BLOCKYSIZE": 256, "RESOLUTIONS": 4},
-                1,
-                0.07,
-                1.0,
-            ),
-        ]
-    ),
+    [
+        ({"tiled": True, "blockxsize": 64, "blockysize": 64}, 2, 0.8, 1.6),
+        pytest.param(
+            {"tiled": True, "blockxsize": 64, "blockysize": 64}, 1, 0.8, 1.6, marks=pytest.mark.nightly
+        ),
+        pytest.param({"blockysize": 8, "compress": "deflate"}, 1, 0.75, 1.15, marks=pytest.mark.nightly),
+        pytest.param(
+            {"driver": "JP2OpenJPEG", "BLOCKXSIZE": 256, "BLOCKYSIZE": 256, "RESOLUTIONS": 4},
+            1,
+            0.07,
+            1.0,
+            marks=pytest.mark.slow,
+        ),
+    ],
 )
 def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zoom, surveyed, found) -> None:
     """But for those in the margins; of JPEG 2000 the survey looks at every fourth pixel."""
