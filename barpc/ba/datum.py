@@ -34,12 +34,12 @@ def datum_shares(
     num_tracks: int,
     num_known: int,
 ) -> Mapping[str, Array]:
-    """Share (7,) of each source in what is known of the scene's motions; NaN for one that no free camera tells of.
+    """Share (10,) of each source in what is known of the scene's motions; NaN for one that no free camera tells of.
 
     Parameters
     ----------
     covariance : Covariance, at the solution
-    by_unknown : (7, N q), motions by the unknowns of the cameras
+    by_unknown : (10, N q), motions by the unknowns of the cameras
     problem, state, weight : as solved last, and 1 / sigma of every observation (K,)
     num_tracks, num_known : int, points from the first on are GCPs, from the second on a reference's
     """

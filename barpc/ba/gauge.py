@@ -1,7 +1,7 @@
-"""What the observations cannot tell: the scene's shift, tilt and turn, and the weakest modes.
+"""What the observations cannot tell: the scene's shift, tilt, turn and bending, and the weakest modes.
 
 A change of the camera unknowns moves the points by dX = -V^-1 W^T dp. The mean of that move and its
-best-fitting tilts, turn and scale are linear in dp: seven numbers with a covariance.
+best-fitting tilts, turn, scale, twist and bending are linear in dp: ten numbers with a covariance.
 """
 
 from __future__ import annotations
@@ -16,8 +16,21 @@ from barpc.ba.normal import solve_lower
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 
-MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale")
-"""The scene's motions [m]: shift; then rise to the east and north, turn and scale, at the scene's edge."""
+MOTIONS = (
+    "east",
+    "north",
+    "up",
+    "tilt east",
+    "tilt north",
+    "turn",
+    "scale",
+    "twist",
+    "bend east",
+    "bend north",
+)
+"""The scene's motions [m]: shift; then rise to the east and north, turn and scale, at the scene's edge; what heights do
+that go with the product of east and north and with the square of each, beside a plane, from the lowest to the highest
+place of the scene. A rotation that changes with the row does the last: rows follow each other along the flight."""
 
 _SAMPLE = 5000  # points that stand for the scene's shape
 
@@ -27,7 +40,7 @@ class Mode:
     """A way in which the scene may move as a whole, independent of the other modes."""
 
     sigma: float  # posterior standard deviation [m]
-    motion: Array  # (7,) the move of one standard deviation in terms of `MOTIONS` [m]
+    motion: Array  # (10,) the move of one standard deviation in terms of `MOTIONS` [m]
     meaning: str  # its largest motion
 
 
@@ -38,11 +51,11 @@ class GaugeReport:
     # (3,) mean move of the points from their place under the delivered cameras, east, north, up [m]
     shift: Array
     sigma: Array  # (3,) posterior standard deviation of the scene's place, east, north, up [m]
-    motion_sigma: Array  # (7,) the same for all `MOTIONS` [m]
+    motion_sigma: Array  # (10,) the same for all `MOTIONS` [m]
     modes: tuple[Mode, ...]  # the weakest first
     # RMS distance of the points from their middle [m]: where tilts, turn and scale are measured
     radius: float
-    by_unknown: Array = field(repr=False)  # (7, N q) the motions by the unknowns of the cameras
+    by_unknown: Array = field(repr=False)  # (10, N q) the motions by the unknowns of the cameras
     # (3,) how far off the delivered cameras let the scene be, east, north, up [m]; NaN where that is not known
     delivered_sigma: Array = field(default_factory=lambda: np.full(3, np.nan))
 
@@ -75,14 +88,14 @@ def gauge_report(
 def _motion_by_unknowns(
     covariance: Covariance, local: Array, enu: Array, use: BoolArray, share: float
 ) -> tuple[Array, Array]:
-    """The scene's motions by the camera unknowns (7, N q), and their covariance (7, 7) where the cameras are known,
+    """The scene's motions by the camera unknowns (10, N q), and their covariance (10, 10) where the cameras are known,
     of points that are a `share` of those that count.
     """
     reduced = covariance.reduced
     structure = reduced.structure
     count, q = len(MOTIONS), covariance.num_unknowns
     index = np.flatnonzero(use)
-    pick = _motion_of_points(local) @ enu  # (7, n, 3) by ECEF moves
+    pick = _motion_of_points(local) @ enu  # (10, n, 3) by ECEF moves
     lower = reduced.lower[:, index]
     whitened = np.zeros((len(use), 3, count))  # L^-1 of each motion's weights: dX = -L^-T Y dp
     whitened[index] = solve_lower(lower, pick.transpose(2, 0, 1)).transpose(2, 0, 1)
@@ -103,14 +116,25 @@ def _motion_by_unknowns(
 
 
 def _motion_of_points(local: Array) -> Array:
-    """(7, n, 3): least-squares motions by the moves (east, north, up) of points at `local` (n, 3) radii."""
+    """(10, n, 3): least-squares motions by the moves (east, north, up) of points at `local` (n, 3) radii."""
     n = len(local)
     e, o, one, zero = local[:, 0], local[:, 1], np.ones(n), np.zeros(n)
     shifts = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
     motions = np.array([*shifts, [zero, zero, e], [zero, zero, o], [-o, e, zero], [e, o, zero]])
+    bends = np.zeros((3, 3, n))
+    bends[:, 2] = _bends(e, o)
+    motions = np.concatenate([motions, bends])
     flat = np.swapaxes(motions, 1, 2).reshape(len(MOTIONS), -1)
     gram = flat @ flat.T + 1e-9 * n * np.eye(len(MOTIONS))
     return np.linalg.solve(gram, flat).reshape(len(MOTIONS), n, 3)
+
+
+def _bends(east: Array, north: Array) -> Array:
+    """Heights (3, n) of a twist and of bending to the east and north without the plane in them, each a metre in all."""
+    plane = np.stack([np.ones_like(east), east, north])
+    curved = np.stack([east * north, east**2, north**2])
+    curved -= np.linalg.lstsq(plane.T, curved.T, rcond=None)[0].T @ plane
+    return np.asarray(curved / np.maximum(np.ptp(curved, axis=1, keepdims=True), 1e-6))
 
 
 def _modes(motion_covariance: Array) -> tuple[Mode, ...]:

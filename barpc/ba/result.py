@@ -69,7 +69,7 @@ class Adjustment:
     gauge : GaugeReport
         Shift of the scene, what it is known to, the weakest modes.
     datum : mapping
-        Source (`barpc.ba.datum.SOURCES`) -> its share (7,) in what is known of the scene's `MOTIONS`.
+        Source (`barpc.ba.datum.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
     prior : PriorTest
         How the corrections compare with the priors given, and what the priors became.
     smooth : SmoothTest

@@ -87,7 +87,7 @@ class Parts:
         center = float(all_of[0, 0])
         place, whole = (np.column_stack([wrap_longitude(g[:, 0], center), g[:, 1]]) for g in (ground, all_of))
         low, high = np.quantile(place, _MOST, axis=0)
-        middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
+        middle = np.quantile(whole, _MOST, axis=0).mean(axis=0)  # a wrong match may lie anywhere
         sides = [
             names[0] if high[axis] < middle[axis] else names[1] if low[axis] > middle[axis] else ""
             for axis, names in enumerate(_NAMES)

@@ -6,6 +6,9 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from barpc.ba.apart import APART
+from barpc.ba.judge import UNKNOWNS
+from barpc.ba.scan import SURE
 from barpc.report.records import Table, table
 from barpc.report.summary import (
     AskedEntry,
@@ -17,9 +20,11 @@ from barpc.report.summary import (
     listed,
     metres,
 )
+from barpc.report.summary.causes import RIVALS, ExplanationEntry
 
 SHARED = 0.03  # px: what neighbours share and is less is not followed
 _NAMED = 5  # of many points
+_LEFT = 3  # places
 
 
 def decisions(summary: Summary) -> list[str]:
@@ -28,6 +33,7 @@ def decisions(summary: Summary) -> list[str]:
     if (scene := summary.scene) is not None:
         found += [
             *_model(scene, summary),
+            *_explained(scene, summary),
             *_drift(scene, summary),
             *_jitter(scene, summary),
             *_priors(scene, summary),
@@ -88,6 +94,47 @@ def _model(scene: SceneEntry, summary: Summary) -> list[str]:
     return [f"Rotations and translations leave {left}{affine}."]
 
 
+def _explained(scene: SceneEntry, summary: Summary) -> list[str]:
+    """What explains the tie points beside the cameras' errors as stated, what was refused, and what is left."""
+    found = [_won(one) for one in scene.explanations]
+    tested = scene.held_out_places is not None  # not by earlier releases
+    if not found and tested:
+        found = [
+            "Nothing stood out that the cameras' errors as stated do not explain: nothing else was tried."
+        ]
+        if sum(len(view.correction.unknowns) for view in summary.views if view.correction) > UNKNOWNS:
+            found = [
+                f"Nothing else was tried: in blocks of more than {UNKNOWNS} unknowns explanations do not compete."
+            ]
+        elif scene.left:
+            found = [f"None of what was tried explains what is left ({', '.join(RIVALS.values())}): refused."]
+    if scene.left:
+        rows = [
+            f"{one.axis} {one.first:.0f}-{one.last:.0f} of {one.image} ({one.gain:.0f} nats; "
+            f"{100 * one.rejected:.0f} % {'move' if one.moving else 'cut'}, {one.off_px:.2f} px in common)"
+            for one in scene.left
+        ]
+        found.append(f"Still standing out: {listed(rows, _LEFT)}.")
+    if scene.held_out_places:
+        found += [f"{one.sentence} (p < {one.chance:.0e})." for one in scene.held_out_places[:_LEFT]]
+    elif tested and scene.num_held_out:
+        found.append(
+            "Tie points that took no part are met alike over rows, columns and cells of every image."
+        )
+    return found
+
+
+def _won(one: ExplanationEntry) -> str:
+    """An explanation that was taken, and by how much over what."""
+    words = f"{one.sentence[0].upper()}{one.sentence[1:]}: {one.gain:.0f} nats more likely than without"
+    if one.runner_up is None:
+        return f"{words}; nothing else gained anything."
+    rival = RIVALS.get(one.runner_up, f"the RPC of {one.runner_up.removeprefix(f'{APART}: ')} is not its own")
+    if one.gap < SURE:
+        return f"{words}, and no surer than what was refused, that {rival} ({one.gap:.0f} nats more)."
+    return f"{words}, {one.gap:.0f} more than the best of what was refused, that {rival}."
+
+
 def _drift(scene: SceneEntry, summary: Summary) -> list[str]:
     degree, sigmas = scene.drift_degree, scene.drift_sigma_m
     if _option(summary, "adjust", "drift") is not None:
@@ -127,6 +174,10 @@ def _jitter(scene: SceneEntry, summary: Summary) -> list[str]:
         return ["Jitter was not looked for, as asked."]
     if _option(summary, "adjust", "drift") == 0 and _option(summary, "adjust", "jitter") == "auto":
         return ["Jitter was not looked for, as one rotation an image was asked for."]
+    if any(
+        one.axis or one.period for one in scene.explanations
+    ):  # rows, columns and swings are followed, said above
+        return []
     return [_calm(summary.views)] if any(view.shared_px is not None for view in summary.views) else []
 
 
@@ -166,8 +217,6 @@ def _cut(scene: SceneEntry, views: Sequence[ViewEntry]) -> list[str]:
         most = f"the most in {worst}: {100 * share:.1f} %"
         whole = f"{lost} of {lost + kept} observations of tie points ({100 * lost / (lost + kept):.1f} %)"
         found.append(f"{whole} were cut as wrong, {most}.")
-    if moving := sum(view.num_moving for view in views):
-        found.append(f"{moving} are of tie points that move together, and took no part.")
     if scene.num_held_out:
         found.append(f"{scene.num_held_out} more took no part, so that the result is measured on them.")
     return found

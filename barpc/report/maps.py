@@ -25,6 +25,7 @@ from barpc.report.charts import (
     tag,
     titled,
 )
+from barpc.report.shading import moving_ground
 from barpc.report.summary import (
     CELLS,
     CheckPointEntry,
@@ -113,6 +114,7 @@ def ground_map(files: RunFiles) -> str:
     points = plane(files.points[:: max(1, -(-len(files.points) // MAX_DOTS)), :2])
     parts = [
         *grid,
+        *moving_ground(plane, summary),
         tag("path", d="".join(f"M{x:.1f} {y:.1f}h0" for x, y in points.tolist()) or "M0 0", class_="point"),
     ]
     outlines = list(zip(range(len(summary.views)), summary.views, files.outlines, strict=True))

@@ -157,6 +157,10 @@ def _map(files: RunFiles) -> Section | None:
         )
         if files.summary.gcps or files.summary.check_points:
             caption += " Triangles are GCPs, those on their tip check points."
+        if files.summary.scene is not None and files.summary.scene.moving:
+            caption += (
+                " Shaded: where tie points move together, stronger with more of them; dashed: where most are."
+            )
         shown.append((ground_map(files), caption))
     if shown and len(views) > charts.MAX_DRAWN:
         more = f"At most {charts.MAX_DRAWN} of {len(views)} outlines are drawn, evenly taken, and no matrix"

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment
+from barpc.ba.places import Place, Unused, met_worse
 from barpc.cameras import Camera
 from barpc.fit import RpcFit
 from barpc.geodesy import Array, ground_from_ecef
@@ -23,6 +24,8 @@ MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
 WHOLE, MOST, LEAST = 0.05, 0.9, 20
 """A whole shift [px], the share of a pair's matches that must have it, and how many there must be."""
+SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
+MANY_REJECTED = 0.3  # A view that lost a larger share of its observations, not at random, is called doubtful
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +100,27 @@ class Run:
     def moving(self) -> BoolArray:
         """The observations (K,) of tie points that move together: they took no part either."""
         return np.zeros(len(self.tracks), dtype=bool) if self.adjustment is None else self.adjustment.moving
+
+    @cached_property
+    def met_worse(self) -> list[Place]:
+        """Rows, columns and cells of images in which tie points that took no part are met worse than elsewhere."""
+        found, tracks = self.adjustment, self.tracks
+        # who asks for plain least squares has no tie point that may be wrong
+        if found is None or not found.held_out.any() or found.options.loss == "linear":
+            return []
+        stated = np.array([found.options.view_weights.get(name, 1.0) for name in found.names])
+        known = np.isfinite(found.held_out_noise)
+        if found.apart is not None and found.apart.clear:
+            known[found.apart.view] = False
+        noise = np.where(known, found.held_out_noise / stated, np.nan)
+        rows = found.held_out & known[tracks.view] & np.isfinite(found.residuals).all(axis=1)
+        seen = np.bincount(tracks.point[found.held_out], minlength=tracks.num_points)[tracks.point[rows]]
+        # of a track's coordinates three go into its point
+        free = np.maximum(2.0 * seen - 3.0, 1.0) / np.maximum(seen, 1)
+        deviation = noise[tracks.view[rows]] * tracks.sigma[rows] * np.sqrt(free)
+        unused = Unused(tracks.view[rows], tracks.xy[rows].T, found.residuals[rows].T, deviation)
+        size = np.array([view.size for view in self.views], dtype=np.float64).T
+        return met_worse(unused, size, found.options.robust_threshold, SMOOTH_LEFT, MANY_REJECTED)
 
     @cached_property
     def control_tests(self) -> list[ControlResidual]:

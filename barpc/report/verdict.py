@@ -13,18 +13,16 @@ from barpc.ba.apart import APART, Apart
 from barpc.ba.scan import SURE
 from barpc.geodesy import Array
 from barpc.report.records import plain
-from barpc.report.run import Run
+from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
-from barpc.report.summary.causes import RIVALS, explanations, left_over, strangeness
+from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_over, strangeness
 from barpc.tie.reference import PEAK
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
 FEW_OBSERVATIONS = 30  # A view with fewer is called weakly tied, unless control points hold it
 ENOUGH_GCPS = 3  # Control points that hold a view without any tie point
-MANY_REJECTED = 0.3  # A view that lost a larger share of its observations, not at random, is called doubtful
 
 WORST_LEFT = 0.15  # px: an image with more anywhere is called doubtful
-SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
 NOISE_LIMIT = 2.5  # Tie points that scatter by more than so many times what the matcher states need a look
 _MOST_NAMED = 5  # images in a sentence
@@ -205,12 +203,14 @@ def _block_reasons(run: Run) -> list[str]:
             "what is known of the scene's place with them."
         )
     if (in_space := run.adjustment.in_space_rms) is not None:
-        tilts = _lengths(run.adjustment.gauge.motion_sigma[3:5])
+        tilts, bends = (
+            _lengths(run.adjustment.gauge.motion_sigma[part]) for part in (slice(3, 5), slice(7, 10))
+        )
         out.append(
             f"Rotations and translations leave {in_space:.3f} px of tie points that took no part; an affine in each "
             f"image leaves {median(run.adjustment.held_out_rms):.3f} px and was taken: images that were turned, "
             "resampled or cropped otherwise than their RPCs say, or RPCs of other images. Its tilts are known to "
-            f"{tilts} (east, north) only."
+            f"{tilts} (east, north) only, its twist and bending to {bends} (twist, east, north)."
         )
     names = run.adjustment.names
     if (apart := run.adjustment.apart) is not None and not apart.clear:
@@ -245,10 +245,10 @@ def _block_reasons(run: Run) -> list[str]:
 
 
 def _left_reasons(run: Run) -> list[str]:
-    """Rows and columns in which tie points were cut, or are off, more than elsewhere; each image's worst."""
+    """Where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst."""
     assert run.adjustment is not None
     worst: dict[str, str] = {}
-    found = left_over(run.adjustment)
+    found, names = left_over(run.adjustment), run.adjustment.names
     moving = [f"rows {one.first:.0f}-{one.last:.0f} of {one.image}" for one in found if one.moving]
     if moving:
         worst[""] = (
@@ -269,6 +269,8 @@ def _left_reasons(run: Run) -> list[str]:
             continue
         place = f"{one.axis} {one.first:.0f}-{one.last:.0f} of {one.image}"
         worst.setdefault(one.image, f"{place[0].upper()}{place[1:]} stand out: {what}.")
+    for unmet in run.met_worse:  # what was solved with may agree with what it bent
+        worst.setdefault(names[unmet.view], f"{held_out_place(unmet, names)}.")
     return list(worst.values())
 
 

@@ -81,7 +81,7 @@ def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
     found = solved(gcps)
     summary = summarize(Run("adjust", BLOCK.views, (), BLOCK.tracks, adjustment=found, gcps=gcps))
     assert [entry.part for entry in summary.scene.datum] == [
-        "east", "north", "up", "tilt east", "tilt north", "turn", "scale"
+        "east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north"
     ]  # fmt: skip
     for m, entry in enumerate(summary.scene.datum):
         assert entry.sigma_m == pytest.approx(found.gauge.motion_sigma[m])

@@ -238,21 +238,35 @@ def test_a_camera_is_as_accurate_as_it_states_for_attitude_and_position() -> Non
 
 
 def test_motions_of_points_are_those_of_least_squares() -> None:
-    """Of a scene that was moved, tilted, turned and grown by known amounts."""
-    local = np.random.default_rng(0).uniform(-1, 1, (20, 2))
-    east, north = local.T
-    amount = np.arange(1.0, 8.0)
+    """Of a scene that was moved, tilted, turned, grown, twisted and bent by known amounts."""
+    east, north = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-2, 2, 9)))
+    local = np.column_stack([east, north])
+    amount = np.arange(1.0, 11.0)
+    # from one corner to the next, from the middle to the edges
+    bent = amount[7] * east * north / 4 + amount[8] * east**2 + amount[9] * north**2 / 4
     moves = np.stack(
         [
             amount[0] - amount[5] * north + amount[6] * east,
             amount[1] + amount[5] * east + amount[6] * north,
-            amount[2] + amount[3] * east + amount[4] * north,
+            amount[2] + amount[3] * east + amount[4] * north + bent - bent.mean(),
         ],
         axis=1,
     )
-    found = np.einsum("mnx,nx->m", _motion_of_points(np.column_stack([local, np.zeros(20)])), moves)
+    found = np.einsum("mnx,nx->m", _motion_of_points(np.column_stack([local, np.zeros(45)])), moves)
     np.testing.assert_allclose(found, amount, rtol=1e-6)
-    assert MOTIONS == ("east", "north", "up", "tilt east", "tilt north", "turn", "scale")
+    assert MOTIONS[:7] == ("east", "north", "up", "tilt east", "tilt north", "turn", "scale")
+    assert MOTIONS[7:] == ("twist", "bend east", "bend north")
+
+
+def test_heights_of_a_narrow_scene_are_not_said_to_bend_where_it_is_not() -> None:
+    """What bends is counted over the scene, not up to a distance that it does not have."""
+    east, north = np.random.default_rng(1).uniform(-1, 1, (2, 400)) * [[0.01], [1.0]]
+    up = np.random.default_rng(2).normal(0, 1.0, 400)
+    moves = np.column_stack([np.zeros((400, 2)), up])
+    found = np.einsum("mnx,nx->m", _motion_of_points(np.column_stack([east, north, up])), moves)
+    assert np.abs(found[7:]).max() < 1.0
+    line = _motion_of_points(np.column_stack([np.zeros(400), north, up]))
+    assert np.isfinite(line).all()
 
 
 def test_heights_without_a_terrain_may_be_wrong_together_by_a_quarter_of_their_spread() -> None:

@@ -16,7 +16,7 @@ from barpc.ba.moving import Motion
 from barpc.ba.placing import Look
 from barpc.ba.scan import Interval
 from barpc.report import verdict
-from barpc.report.summary.causes import _WORDS, explanations, left_over, strangeness
+from barpc.report.summary.causes import _WORDS, _place, explanations, left_over, strangeness
 
 NAMES = "west", "east"
 
@@ -88,8 +88,11 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
 @pytest.mark.parametrize(
     ("side", "said"),
     [
-        ("north-west", "35 % of the tie points, in the north-west of the block, move together"),
-        ("", "35 % of the tie points move together"),
+        (
+            "north-west",
+            "35 % of the tie points, in the north-west of the block (5.000-5.100 E, 43.000-43.200 N), move together",
+        ),
+        ("", "35 % of the tie points, at 5.000-5.100 E, 43.000-43.200 N, move together"),
     ],
 )
 def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: str) -> None:
@@ -104,6 +107,20 @@ def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: st
     assert found.box == (5.0, 43.0, 5.1, 43.2)
     assert (found.axis, found.first, found.size_px, found.runner_up) == (None, None, None, STRIP)
     assert type(found).read({**vars(found), "box": [5.0, 43.0, 5.1, 43.2]}) == found
+
+
+@pytest.mark.parametrize(
+    ("box", "said"),
+    [
+        ((-5.2, -43.2, -5.1, -43.0), "5.100-5.200 W, 43.000-43.200 S"),
+        ((179.9, 0.5, -179.9, 0.7), "179.900 E to 179.900 W, 0.500-0.700 N"),  # over the 180th meridian
+        ((-0.2, -0.1, 0.1, 0.1), "0.200 W to 0.100 E, 0.100 S to 0.100 N"),
+        ((5.0, 43.0, 5.0002, 43.0001), "5.000000-5.000200 E, 43.000000-43.000100 N"),  # some metres
+        ((5.0, 43.0, 5.0, 43.0), "5.000000-5.000000 E, 43.000000-43.000000 N"),
+    ],
+)
+def test_longitudes_and_latitudes_are_said_with_their_side_and_as_many_digits_as_tell(box, said) -> None:
+    assert _place(Motion(1.0, (0, 1), 0.2, box, "")) == f"at {said}"
 
 
 @pytest.mark.parametrize(("gap", "told"), [(4.9, True), (5.1, False)])
@@ -125,7 +142,7 @@ def interval(view: int, share: float, off: float) -> Interval:
 
 def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     left = [interval(0, 0.8, 0.0), interval(0, 0.4, 0.0), interval(1, 0.02, 0.09)]
-    run: Any = SimpleNamespace(adjustment=adjustment(left=left))
+    run: Any = SimpleNamespace(adjustment=adjustment(left=left), met_worse=[])
     first, second = verdict._left_reasons(run)
     assert first == (
         "Rows 100-399 of west stand out: 80 % of their tie points contradict the others, half of these by more than "
@@ -133,13 +150,13 @@ def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     )
     assert second == "Rows 100-399 of east stand out: their tie points are left with 0.09 px in common."
     assert [one.last for one in left_over(run.adjustment)] == [399.0] * 3
-    quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]))
+    quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]), met_worse=[])
     assert verdict._left_reasons(quiet) == []
 
 
 def test_rows_of_which_most_ties_move_may_be_what_is_off() -> None:
     left = [replace(interval(view, 0.8, 0.0), moves=True) for view in (0, 1, 0, 1)]
-    (said,) = verdict._left_reasons(SimpleNamespace(adjustment=adjustment(left=left)))
+    (said,) = verdict._left_reasons(SimpleNamespace(adjustment=adjustment(left=left), met_worse=[]))
     assert said == (
         "Most tie points of rows 100-399 of west, rows 100-399 of east, rows 100-399 of west and 1 more are of what "
         "moves: it may as well be these rows that lie off, and no camera follows them."

@@ -10,6 +10,7 @@ import pytest
 from barpc.options import AUTO
 from barpc.report.decisions import control_sentence, decisions, second_attempts
 from barpc.report.summary import AskedEntry, ControlTestEntry, PairEntry, Summary
+from barpc.report.summary.causes import ExplanationEntry, HeldOutEntry, LeftEntry
 
 
 def said(summary: Summary, **scene: Any) -> str:
@@ -190,7 +191,13 @@ def test_the_test_of_control_says_who_exceeds_and_what_chance_does(record):
 def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
     assert decisions(check_run.record) == ["Tie points were taken as given: nothing was matched."]
     bare = replace(
-        record.scene, drift_asked=None, jitter_asked=None, prior_ratio=None, model="", num_held_out=0
+        record.scene,
+        drift_asked=None,
+        jitter_asked=None,
+        prior_ratio=None,
+        model="",
+        num_held_out=0,
+        held_out_places=None,
     )
     older = with_views(record, *[{"shared_px": None, "smooth_p": None, "num_rejected": 0}] * 9)
     found = decisions(replace(older, scene=bare, options=None, control_test=None, gcps=(), pairs=()))
@@ -252,3 +259,56 @@ def test_an_affine_in_the_image_is_said_without_what_is_not_known(record):
     text = said(views, in_space_px=0.4)
     assert "leave 0.400 px of tie points that took no part." in text
     assert "affine" not in text
+
+
+STRIP = ExplanationEntry(
+    "strip", "rows 5-9 of B lie 1.00 px off the rest of it", "B", 120.4, 33.0, "wander", "rows", 5.0, 9.0, 1.0
+)
+
+
+def test_what_won_is_said_with_its_gain_and_what_was_refused(record):
+    text = said(record, explanations=(STRIP,))
+    assert (
+        "Rows 5-9 of B lie 1.00 px off the rest of it: 120 nats more likely than without, 33 more than the best of "
+        "what was refused, that rows of an image wander." in text
+    )
+    assert "Nothing stood out" not in text
+    assert "No jitter is followed" not in text  # the rows that lie off are
+    close = said(record, explanations=(replace(STRIP, gap=4.9),))
+    assert "and no surer than what was refused, that rows of an image wander (5 nats more)." in close
+    assert "no surer" not in said(record, explanations=(replace(STRIP, gap=5.1),))
+    alone = said(record, explanations=(replace(STRIP, runner_up=None),))
+    assert "than without; nothing else gained anything." in alone
+    apart = said(record, explanations=(replace(STRIP, name="apart", runner_up="apart: C"),))
+    assert "of what was refused, that apart: C." not in apart
+    assert "of what was refused, that the RPC of C is not its own." in apart
+
+
+def test_where_nothing_won_it_is_said_why(record):
+    assert "Nothing stood out that the cameras' errors as stated do not explain" in said(record)
+    left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
+    text = said(record, left=(left,))
+    assert "None of what was tried explains what is left (rows or columns of an image lie off, " in text
+    assert "Still standing out: columns 10-99 of B (17 nats; 42 % cut, 0.03 px in common)." in text
+    assert "Nothing stood out" not in text
+    assert "42 % move, " in said(record, left=(replace(left, moving=True),))
+    many = with_views(record, *[{"unknowns": (0.0,) * 50}] * 9)
+    assert "in blocks of more than 400 unknowns explanations do not compete" in said(many, left=(left,))
+    won = said(record, left=(left,), explanations=(STRIP,))
+    assert "Still standing out" in won
+    assert "None of what was tried" not in won
+
+
+def test_what_took_no_part_is_said_to_agree_or_where_it_does_not(record):
+    agrees = "Tie points that took no part are met alike over rows, columns and cells of every image."
+    assert agrees in said(record)
+    assert agrees not in said(record, num_held_out=0)
+    one = HeldOutEntry(
+        "B", "Rows 0-99 of B: tie points there lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7
+    )
+    text = said(record, held_out_places=(one,) * 4)
+    assert text.count("Rows 0-99 of B: tie points there lie off (p < 3e-07).") == 3
+    assert agrees not in text
+    older = said(record, held_out_places=None)  # of an earlier release
+    assert agrees not in older
+    assert "Nothing stood out" not in older

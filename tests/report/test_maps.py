@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from itertools import chain
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ import pytest
 from barpc.report import charts, maps
 from barpc.report.maps import Plane, cells_of, ground_map, place_map, residual_panels
 from barpc.report.summary import CheckPointEntry, EllipseEntry
+from barpc.report.summary.causes import ExplanationEntry
+from barpc.report.summary.moving import MovingEntry
 from barpc.report.tables import Pictures
 
 from .made import (
@@ -165,6 +168,48 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
     assert (drawn.titles("gcps"), drawn.titles("check_points")) == (["P"], ["Q"])
     assert drawn.described == "3 outlines, 3 pairs, 1 GCPs, 1 check points."
     assert drawn.root.get("class") is None
+
+
+def test_what_moves_is_shaded_by_its_share_and_outlined_and_says_so():
+    views, outlines, pairs = scene()
+    cells = (
+        MovingEntry((9.995, -0.005, 10.0, 0.0), 20, 0.25),
+        MovingEntry((10.0, -0.005, 10.005, 0.0), 4, 1.0),
+    )
+    box = (9.996, -0.004, 10.004, -0.001)
+    groups = (
+        ExplanationEntry("moving", "a <group> & more", None, 50.0, 40.0, box=box),
+        ExplanationEntry("strip", "rows lie off", "A", 9.0, 9.0),
+    )
+    found = SimpleNamespace(moving=cells, explanations=groups)
+    drawn = Drawing(ground_map(files_of(a_summary(views, pairs, scene=found), outlines)))
+    at = maps._plane_of(np.concatenate([*chain(*outlines)]))
+    shown = drawn.rects("moves")
+    for (x, y, width, height), cell in zip(shown, cells, strict=True):
+        west, south, east, north = cell.box
+        corners_of = at(np.array([(west, north), (east, south)]))
+        assert np.array([(x, y), (x + width, y + height)]) == pytest.approx(corners_of, abs=0.02)
+    opacity = [float(e.get("fill-opacity")) for e in drawn.all("rect", "moves")]
+    assert opacity[0] == pytest.approx(0.25 * opacity[1], abs=0.006)
+    assert drawn.titles("moves") == [
+        "25 % of 20 tie points move together",
+        "100 % of 4 tie points move together",
+    ]
+    assert drawn.titles("group") == ["a <group> & more"]
+    (outline,) = drawn.rects("group")
+    assert outline[:2] == pytest.approx(at(np.array([box[0], box[3]])), abs=0.006)
+    still = Drawing(ground_map(files_of(a_summary(views, pairs), outlines)))
+    assert not still.all("rect", "moves")
+
+
+def test_what_moves_over_the_180th_meridian_is_drawn_there():
+    outlines = [a_square(180.0, 0.0)]
+    cell = MovingEntry((179.998, 0.0, -179.998, 0.002), 5, 0.5)
+    found = SimpleNamespace(moving=(cell,), explanations=())
+    drawn = Drawing(ground_map(files_of(a_summary([a_view()], scene=found), outlines)))
+    ((x, _, width, height),) = drawn.rects("moves")
+    assert x + width / 2 == pytest.approx(210.0, abs=0.5)
+    assert 1.5 * height < width < 2.5 * height
 
 
 def test_a_point_outside_of_all_images_is_on_the_map_too():

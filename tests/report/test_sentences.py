@@ -35,7 +35,7 @@ def adjusted(**fields: Any) -> Any:
         "options": SimpleNamespace(drift=None, fixed=(), dem_for_all=False, min_convergence=1.0, dem_sigma=2.0),
         "gauge": SimpleNamespace(shift=np.array([1.0, -2.0, 3.0]), sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  delivered_sigma=np.array([1.0, 2.0, 0.5]) * 10,
-                                 motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0])),
+                                 motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0, 0.8, 9.0, 0.1])),
         "apart": None, "cameras": SimpleNamespace(unknowns=SimpleNamespace(drift=1)),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
@@ -45,7 +45,8 @@ def run_of(adjustment: Any = None, kind: str = "adjust", **fields: Any) -> Any:
     usual = {
         "kind": kind, "adjustment": adjustment or adjusted(), "options": SimpleNamespace(), "reference": None,
         "copies": {}, "number": {name: k for k, name in enumerate(NAMES)}, "gcps": None, "check_points": None,
-        "left_out": (), "after": None, "tracks": [0] * 9, "views": tuple(SimpleNamespace(name=name) for name in NAMES),
+        "left_out": (), "after": None, "tracks": [0] * 9, "met_worse": (),
+        "views": tuple(SimpleNamespace(name=name) for name in NAMES),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
 
@@ -293,7 +294,10 @@ def test_an_affine_in_the_image_says_what_it_was_better_than():
         "Rotations and translations leave 0.950 px of tie points that took no part; an affine in each"
     )
     assert "leaves 0.200 px and was taken" in line
-    assert line.endswith("Its tilts are known to 40.0 cm, 5.0 m (east, north) only.")
+    assert line.endswith(
+        "Its tilts are known to 40.0 cm, 5.0 m (east, north) only, its twist and bending to 80.0 cm, 9.0 m, 10.0 cm "
+        "(twist, east, north)."
+    )
 
 
 def test_two_groups_are_not_said_again_of_an_odd_image():
@@ -309,7 +313,7 @@ def test_two_groups_are_not_said_again_of_an_odd_image():
 
 def moved(by: float, **fields: Any) -> Any:
     shift, sigma = np.array([0.0, -by, 0.1]), np.array([0.0, 2.0, 1.0])
-    gauge = {"shift": shift, "sigma": sigma * 0.1, "delivered_sigma": sigma, "motion_sigma": np.ones(7)}
+    gauge = {"shift": shift, "sigma": sigma * 0.1, "delivered_sigma": sigma, "motion_sigma": np.ones(10)}
     return adjusted(gauge=SimpleNamespace(**gauge), **fields)
 
 

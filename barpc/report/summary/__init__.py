@@ -236,7 +236,7 @@ def measure(run: Run) -> Summary:
             by_length={str(n): int(count) for n, count in enumerate(lengths) if n and count},
         ),
         tables=TablesEntry(usable, written, complete=written == usable),
-        scene=None if run.adjustment is None else measure_scene(run.adjustment),
+        scene=measure_scene(run),
         gcps=measure_gcps(run),
         control_test=measure_control(run),
         check_points=measure_check_points(run),

@@ -12,8 +12,10 @@ from barpc.ba.apart import APART, Apart
 from barpc.ba.explanations import FADE, MOVING, STRIP, SWING, WANDER
 from barpc.ba.judge import Finding
 from barpc.ba.moving import Motion
+from barpc.ba.places import Place
 from barpc.ba.scan import Interval
 from barpc.report.records import Number, Record, said
+from barpc.report.summary.words import Count
 
 AXES = "columns", "rows"
 _WORDS = {
@@ -74,6 +76,19 @@ class LeftEntry(Record):
     moving: bool = said("Whether the share is not of what was cut, but of a group that moves", default=False)
 
 
+class HeldOutEntry(Record):
+    """Rows, columns or a cell of an image in which tie points that took no part are met worse than elsewhere in it."""
+
+    image: str = said("View")
+    sentence: str = said("The same in words", minLength=1)
+    columns: tuple[float, float] | None = said("From, to; null for all", "px")
+    rows: tuple[float, float] | None = said("From, to; null for all", "px")
+    count: Count = said("Observations there that were looked at")
+    far: float = said("Share of them that lies far off by the same")
+    off_px: float = said("What the far ones are off by, by their median; else what the near ones share", "px")
+    chance: float = said("Probability of as much anywhere where all places are alike, at most")
+
+
 def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
     """What was taken, the first first."""
     found = []
@@ -127,7 +142,7 @@ def strangeness(apart: Apart) -> str:
 
 def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEntry:
     between = names[motion.between[0]], names[motion.between[1]]
-    side = f", in the {motion.side} of the block," if motion.side else ""
+    side = f", {_place(motion)},"
     share, metres = f"{100.0 * motion.share:.0f}", f"{motion.metres:.2g} m"
     sentence = _WORDS[one.kind].format(
         share=share, side=side, metres=metres, first=between[0], second=between[1]
@@ -142,9 +157,59 @@ def _moving(one: Finding, motion: Motion, names: Sequence[str]) -> ExplanationEn
     return ExplanationEntry(one.kind, sentence, None, *numbers, **place)
 
 
+def _place(motion: Motion) -> str:
+    """Where most of a group lies: a side of the block where it is on one, and longitudes and latitudes."""
+    west, south, east, north = motion.box
+    # as many digits as tell the ends apart by a hundredth: of a scene of any size
+    size = max(min((east - west) % 360.0, north - south), 1e-6)
+    digits = int(np.clip(np.round(2.0 - np.log10(size)), 1, 6))
+    box = f"{_degrees(west, east, 'WE', digits)}, {_degrees(south, north, 'SN', digits)}"
+    return f"in the {motion.side} of the block ({box})" if motion.side else f"at {box}"
+
+
+def _degrees(low: float, high: float, sides: str, digits: int) -> str:
+    if low < 0.0 <= high or high < low:  # over the equator, Greenwich or the 180th meridian
+        ends = (f"{abs(end):.{digits}f} {sides[end >= 0.0]}" for end in (low, high))
+        return " to ".join(ends)
+    ends = (f"{abs(end):.{digits}f}" for end in ((low, high) if low >= 0.0 else (high, low)))
+    return f"{'-'.join(ends)} {sides[low >= 0.0]}"
+
+
 def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
     """Where something stands out at the end, the most first."""
     return tuple(_left(one, adjustment.names) for one in adjustment.left)
+
+
+def held_out_places(places: Sequence[Place], names: Sequence[str]) -> tuple[HeldOutEntry, ...]:
+    """Where tie points that took no part are met worse, the surest first."""
+    return tuple(
+        HeldOutEntry(
+            names[one.view],
+            held_out_place(one, names),
+            one.columns,
+            one.rows,
+            one.count,
+            one.far,
+            one.off,
+            one.chance,
+        )
+        for one in places
+    )
+
+
+def held_out_place(one: Place, names: Sequence[str]) -> str:
+    """The same of one, in words."""
+    ends = [
+        f"{axis} {side[0]:.0f}-{side[1] - 1.0:.0f}"
+        for axis, side in (("rows", one.rows), ("columns", one.columns))
+        if side is not None
+    ]
+    what = f"lie {one.off:.2f} px off in common"
+    if one.far:
+        share, size = f"{100 * one.far:.0f} %", f"{one.off:.2f} px"
+        what = f"contradict the cameras, {share} by the same {size}"
+    place = ", ".join(ends)
+    return f"{place[0].upper()}{place[1:]} of {names[one.view]}: tie points there that took no part {what}"
 
 
 def _left(one: Interval, names: Sequence[str]) -> LeftEntry:

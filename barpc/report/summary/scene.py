@@ -11,7 +11,16 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.ba.gauge import MOTIONS, Mode
 from barpc.report.records import Column, Number, Record, said
-from barpc.report.summary.causes import ExplanationEntry, LeftEntry, explanations, left_over
+from barpc.report.run import Run
+from barpc.report.summary.causes import (
+    ExplanationEntry,
+    HeldOutEntry,
+    LeftEntry,
+    explanations,
+    held_out_places,
+    left_over,
+)
+from barpc.report.summary.moving import MovingEntry, moving_cells
 from barpc.report.summary.words import Count, Vector, metres, percent_of
 
 _LEVEL = 1e-4  # probability of the F test below which something is called smooth
@@ -23,6 +32,9 @@ _MODE_WORDS = {
     "tilt north": "the scene may be tilted: {0} up or down at its northern and southern edges",
     "turn": "the scene may be turned about the vertical: {0} at its edge",
     "scale": "the scene may be too large or too small: {0} at its edge",
+    "twist": "heights may be twisted: by {0} from one corner of the scene to the next",
+    "bend east": "heights may be bent: by {0} from the middle of the scene to its eastern and western edges",
+    "bend north": "heights may be bent: by {0} from the middle of the scene to its northern and southern edges",
 }
 
 _DATUM_HEADS = {
@@ -42,7 +54,10 @@ class ModeEntry(Record):
     sigma_m: Number = said("Posterior standard deviation", "m")
     meaning: str = said("Its largest motion", enum=list(_MODE_WORDS))
     motion_m: tuple[Number, ...] = said(
-        "East, north, up; tilts, turn, scale at the edge", "m", minItems=7, maxItems=7
+        "East, north, up; tilts, turn, scale at the edge; twist and bending, from the lowest to the highest place",
+        "m",
+        minItems=7,
+        maxItems=len(MOTIONS),
     )
     words: str = said("The same in words", minLength=1)
 
@@ -56,7 +71,11 @@ class DatumEntry(Record):
 
     part: str = said("Motion of the scene", enum=list(_MODE_WORDS))
     sigma_m: Number = said(
-        "Posterior standard deviation; at the edge for tilts, turn and scale", "m", "known to", ".2f"
+        "Posterior standard deviation; at the edge for tilts, turn and scale, from the lowest to the highest place for "
+        "twist and bending",
+        "m",
+        "known to",
+        ".2f",
     )
     cameras: Number = said("Accuracies of the cameras as delivered")
     earlier_run: Number = said("The earlier run")
@@ -133,14 +152,24 @@ class SceneEntry(Record):
     explanations: tuple[ExplanationEntry, ...] = said(
         "What explains tie points beside the cameras' errors as stated, the first taken first", default=()
     )
+    moving: tuple[MovingEntry, ...] = said(
+        "Where tie points move together: cells of the ground, as many each way, that hold any", default=()
+    )
     left: tuple[LeftEntry, ...] = said("Rows and columns that stand out at the end", default=())
+    held_out_places: tuple[HeldOutEntry, ...] | None = said(
+        "Where tie points that took no part are met worse than in the rest of an image; null: not tested",
+        default=None,
+    )
 
 
 _DEM = attrgetter("held", "known", "total", "offset", "spread")
 
 
-def measure_scene(adjustment: Adjustment) -> SceneEntry:
-    """The block as a whole."""
+def measure_scene(run: Run) -> SceneEntry | None:
+    """The block as a whole; None for a check."""
+    adjustment = run.adjustment
+    if adjustment is None:
+        return None
     gauge, prior, terrain = adjustment.gauge, adjustment.prior, adjustment.terrain
     datum = [
         DatumEntry(
@@ -173,7 +202,9 @@ def measure_scene(adjustment: Adjustment) -> SceneEntry:
         gcp_residuals_enu_m=adjustment.gcp_residuals.tolist(),
         solver=adjustment.status,
         explanations=explanations(adjustment),
+        moving=moving_cells(run),
         left=left_over(adjustment),
+        held_out_places=held_out_places(run.met_worse, adjustment.names),
     )
 
 
