@@ -71,6 +71,8 @@ def scan(
             gain[:, 0, BINS] = 0.0  # all of an image is no interval
             for v in range(views):
                 i, j = np.unravel_index(int(gain[v].argmax()), gain[v].shape)
+                if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
+                    i, j = (0, i) if j == BINS else (j, BINS)  # means tell of two parts: the smaller one lies off
                 step = size[axis, v] / BINS
                 share = float(bad[v, i, j] / max(count[v, i, j], 1.0))
                 at = float(i * step), float(j * step)

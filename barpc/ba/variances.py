@@ -31,7 +31,6 @@ _STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside 
 _LEVEL = 0.05  # a sum of squares less probable than this is too large
 _SURE = 5.0  # of two explanations whose evidences differ by less (a factor of 150) none is ruled out
 _LIKELIER = 2.3  # but one odd view is named where it is ten times as likely as that all are worse than stated
-_GROSS = 16.0  # times the variance stated: a view whose corrections are smaller is not called odd
 _FREE = 100.0  # times its prior: a view whose camera may be anywhere
 _SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
@@ -245,12 +244,11 @@ class Variances:
         if self.cautious:
             factor = max(factor, _possible(total.sum(), freedom.sum()))
         odd = np.zeros(n, dtype=bool)
-        with np.errstate(all="ignore"):
-            gross = bool((total > _GROSS * freedom)[freedom > _LEAST].any())
-        if around.small and n > 2 and gross:
+        if around.small and n > 2:
             common = np.full(n, np.sqrt(factor))
             scale, alone, evidence = self._odd(around, wide)
             together = around.under(self._prior(common, wide))[0]
+            evidence -= float(np.log(n))  # of the choice among the views
             if evidence >= together + _LIKELIER:
                 return scale, alone
             both_may_be = evidence >= together - _SURE  # the priors cover both

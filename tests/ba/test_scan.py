@@ -39,9 +39,21 @@ def test_a_stretch_that_is_off_is_found_by_what_it_shares(direction: tuple[float
     inside = (view == 0) & (place[1] < 0.25 * SIZE[1, 0])
     found = scan(view, place, SIZE, wrong, off + inside * np.array(direction)[:, None])[0]
     assert (found.view, found.axis, found.by_share) == (0, 1, False)
-    # of two parts that lie apart either may be named
-    assert 0.25 * SIZE[1, 0] in (pytest.approx(found.start), pytest.approx(found.stop))
-    assert found.off == pytest.approx(1.0, abs=0.15) or found.start > 0
+    # of two parts that lie apart either may be meant: the smaller one is named
+    assert (found.start, found.stop) == pytest.approx((0.0, 0.25 * SIZE[1, 0]))
+    assert found.off == pytest.approx(1.0, abs=0.15)
+
+
+def test_of_two_parts_the_smaller_one_lies_off_at_either_end() -> None:
+    """What all share is taken up by the camera: the larger part seems to lie where it should."""
+    view, place, wrong, off = ties(2, wrong=0.0)
+    for first, inside in ((0.0, place[1] < 0.1 * SIZE[1, 0]), (0.9, place[1] > 0.9 * SIZE[1, 0])):
+        inside &= view == 0
+        moved = off + np.where(view == 0, inside - inside[view == 0].mean(), 0.0) * 2.0
+        found = scan(view, place, SIZE, wrong, moved)[0]
+        ends = np.array([first, first + 0.1]) * SIZE[1, 0]
+        assert (found.view, found.axis, found.start, found.stop) == pytest.approx((0, 1, *ends))
+        assert found.off == pytest.approx(1.8 * np.sqrt(2.0), abs=0.2)  # along both
 
 
 def test_chance_and_outliers_that_lie_anywhere_stand_out_nowhere() -> None:
