@@ -164,6 +164,11 @@ class Heights:
     dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
     reference: Reference | None = None  # whose heights are the DEM's
 
+    def loose(self, sigma: float) -> Heights:
+        """The same where the places of GCPs are known to `sigma` [m] only."""
+        first = self.control[0]
+        return replace(self, control=(replace(first, rows=enu_basis(ground_from_ecef(first.mean)) / sigma), *self.control[1:]))
+
     def hold(self, problem: Problem, points: Array) -> Problem:
         """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
         return replace(problem, point_prior=_join([*self.control, self._held(points)]))

@@ -1,0 +1,264 @@
+"""Which control points agree with each other, found before any of them moves a camera.
+
+The block is solved by its tie points alone; control points are seen in it, and their places hold nothing. What the
+block says of a point minus its given place is d = U a + n: the block's free motions (a, standard normal; a shift of
+any size is one of them) and what is the point's own, n, whitened to unit variance: the stated accuracy of its place and
+that of its rays. A set S of points agrees as well as its evidence says, the density of d with the motions integrated
+out; the points outside are wrong by anything, alike at all sizes. All accuracies of n may be s times too good, and
+the cameras' motions l times larger than their covariance: the data choose among a few (MacKay 1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from barpc.ba.block import Block
+from barpc.ba.covariance import Covariance
+from barpc.ba.heldout import enu_offsets
+from barpc.ba.normal import solve_transposed
+from barpc.geodesy import Array, enu_basis
+from barpc.scene import BoolArray
+
+LOOSE = 1e4  # m: a place so uncertain holds nothing, and keeps a point that one ray shows from running away
+_SHIFT = 1e3  # m: of the scene, farther than any delivered camera is off
+_SEEN = 0.01  # of a point's own variance: motions that are smaller cannot be told from it
+_EVERY = 12  # points of which every set is looked at
+_TRIALS = 300  # sets of three drawn of more: 1e-6 to miss three right ones where 35 % are
+_TRIPLE = 3  # points that tell shift, tilts, turn and scale
+_KEPT = 64  # of the sets looked at, those that are looked at again with every scale
+_NEAR = 16.0  # squared deviation of a point that goes with a set: that of `snooping.CRITICAL`
+_SCALES = (1.0, 1.5, 2.2, 3.3, 5.0, 7.0, 10.0)
+_MOTIONS = (1.0, 3.0)
+_WRONG = 2.9  # nats that it costs to call a point wrong: one in twenty is
+_ANYWHERE = 4.8  # nats: the density at one sigma of an error between one and 10,000, alike in its logarithm
+_CLEAR = 3.0  # nats by which a set must beat any other that contradicts it: one in twenty
+_AS_MANY = 10.0  # nats, where that other has as many points: how well points happen to fit is no vote
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Which control points hold a block.
+
+    Parameters
+    ----------
+    used : (G,)
+        Points that agree with each other, and more than half of what may be said against them does not.
+    sets : tuple of (G,)
+        Two sets that contradict each other and weigh the same: none is used. Empty where one is.
+    scale : float
+        By how much the stated accuracies of the points used are too good; 1: they are not.
+    """
+
+    used: BoolArray
+    sets: tuple[BoolArray, ...] = ()
+    scale: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """What a block says of points minus where they are said to be, in units of what is each point's own.
+
+    Parameters
+    ----------
+    own : (G, 3)
+    motions : (G, 3, r)
+        By the free motions of the block, of one standard deviation; the last three are shifts of any size.
+    closure, freedom : (G,)
+        Squared residuals of the point's rays where they meet, and how many there are more than a place has numbers.
+    """
+
+    own: Array
+    motions: Array
+    closure: Array
+    freedom: Array
+
+    def select(self, keep: BoolArray) -> Offsets:
+        """Those of some of the points."""
+        return Offsets(self.own[keep], self.motions[keep], self.closure[keep], self.freedom[keep])
+
+    def moving(self, times: float) -> Offsets:
+        """The same with motions of the cameras so many times as large."""
+        factor = np.full(self.motions.shape[2], times)
+        factor[-3:] = 1.0
+        return Offsets(self.own, self.motions * factor, self.closure, self.freedom)
+
+
+def offsets_of(
+    covariance: Covariance, block: Block, points: Array, residual: Array, weight: Array
+) -> Offsets:
+    """The offsets of the control points of a block at a solution in which their places hold nothing.
+
+    Parameters
+    ----------
+    covariance : Covariance, of the solution
+    block : Block
+    points : (P, 3), adjusted, ECEF [m]
+    residual, weight : (2, K) and (K,), projected - observed [px] and 1 / sigma as solved last
+    """
+    gcps, first, structure = block.gcps, block.num_tracks, covariance.reduced.structure
+    count, q = len(gcps.names), covariance.num_unknowns
+    index = np.arange(first, first + count)
+    enu = enu_basis(gcps.lonlatalt)
+    rays = solve_transposed(covariance.reduced.lower[:, index], np.eye(3)[..., None]).transpose(2, 0, 1)
+    bounds = structure.point_bounds
+    rows = [structure.by_point[bounds[p] : bounds[p + 1]] for p in index]
+    views = np.unique(structure.view[np.concatenate(rows)])
+    of_cameras = np.zeros((count, 3, len(views) * q))
+    for g, mine in enumerate(rows):
+        for k in mine:
+            at = int(np.searchsorted(views, structure.view[k])) * q
+            of_cameras[g, :, at : at + q] -= enu[g] @ rays[g] @ covariance.reduced.cross[k]
+    turned = enu @ rays
+    own = turned @ np.swapaxes(turned, 1, 2) + gcps.sigma[:, :, None] ** 2 * np.eye(3)
+    whitening = np.linalg.inv(np.linalg.cholesky(own))
+    flat = (whitening @ of_cameras).reshape(3 * count, -1)
+    size, modes = np.linalg.eigh(flat @ covariance.joint(views) @ flat.T)
+    modes = (modes * np.sqrt(np.maximum(size, 0.0)))[:, size > _SEEN].reshape(count, 3, -1)
+    motions = np.concatenate([modes, _SHIFT * whitening @ enu], axis=2)
+    offset = enu_offsets(points[index], gcps.lonlatalt)
+    squared = ((residual * weight) ** 2).sum(axis=0)
+    mine = (weight > 0) & (block.point >= first) & (block.point < block.num_known)
+    at = block.point[mine] - first
+    seen = np.bincount(at, minlength=count)
+    closure = np.bincount(at, squared[mine], minlength=count)
+    return Offsets((whitening @ offset[..., None])[..., 0], motions, closure, np.maximum(2.0 * seen - 3.0, 0))
+
+
+def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
+    """The points that hold a block, of those that are `told` (G,) of at all; the others go with them.
+
+    Every set of up to twelve points is looked at; of more, those that agree with three drawn at random.
+    """
+    given = np.flatnonzero(told)
+    if len(given) < 2:
+        return Agreement(np.ones(len(told), dtype=bool))
+    found = _Search(offsets.select(told))
+    best, score, scale = found.best()
+    others = found.against(best, score)
+
+    def whole(mask: BoolArray) -> BoolArray:
+        out = np.zeros(len(told), dtype=bool)
+        out[given[mask]] = True
+        return out
+
+    if others is not None:
+        return Agreement(np.zeros(len(told), dtype=bool), (whole(best), whole(others)))
+    return Agreement(whole(best), scale=scale)
+
+
+class _Search:
+    """The sets of points that are looked at, and their evidence."""
+
+    def __init__(self, offsets: Offsets) -> None:
+        self.offsets, self.count = offsets, len(offsets.own)
+        if self.count <= _EVERY:
+            numbers = np.arange(1, 2**self.count)
+            self.masks = ((numbers[:, None] >> np.arange(self.count)) & 1).astype(bool)
+        else:
+            self.masks = np.unique(np.array(list(self._drawn(np.ones(self.count, dtype=bool)))), axis=0)
+        self.score, self.scale = self._scored(self.masks)
+        if self.count > _EVERY:
+            self._refine(int(self.score.argmax()))
+            rest = ~self.masks[self.score.argmax()]
+            if rest.sum() >= _TRIPLE:
+                self._add(np.unique(np.array(list(self._drawn(rest))) & rest, axis=0))
+
+    def best(self) -> tuple[BoolArray, float, float]:
+        """The set with the largest evidence, that, and the scale of its accuracies."""
+        n = int(self.score.argmax())
+        return self.masks[n], float(self.score[n]), float(self.scale[n])
+
+    def against(self, best: BoolArray, score: float) -> BoolArray | None:
+        """The set that contradicts the best and weighs as much; the rest where the best is none; None where it wins."""
+        size, common = self.masks.sum(axis=1), (self.masks & best).sum(axis=1)
+        other = (size > common) & (2 * common <= best.sum())
+        least = np.where(size >= best.sum(), _AS_MANY, _CLEAR)
+        rival = np.where(other & (self.score > score - least), self.score, -np.inf)
+        if np.isfinite(rival).any():
+            return np.asarray(self.masks[rival.argmax()])
+        return None if 2 * best.sum() >= self.count else ~best
+
+    def _drawn(self, among: BoolArray) -> Iterator[BoolArray]:
+        """Sets that agree with three points drawn from some; the same whenever they are drawn."""
+        rng, places = np.random.default_rng(0), np.flatnonzero(among)
+        yield among.copy()
+        for trial in range(_TRIALS):
+            mask = np.zeros(self.count, dtype=bool)
+            mask[rng.choice(places, _TRIPLE, replace=False)] = True
+            scale = (1.0, 3.0)[trial % 2]
+            for _ in range(2):
+                squared = _evidence(self.offsets, mask[None], scale)[1][0]
+                mask = (squared < _NEAR) & among | (mask & (squared < _NEAR))
+            if mask.any():
+                yield mask
+
+    def _refine(self, n: int) -> None:
+        """Put single points in and out of a set as long as that is better."""
+        mask, score = self.masks[n], self.score[n]
+        for _ in range(self.count):
+            tried = mask[None] ^ np.eye(self.count, dtype=bool)
+            scores, scales = self._scored(tried)
+            k = int(scores.argmax())
+            if scores[k] <= score:
+                break
+            mask, score = tried[k], scores[k]
+            self._append(tried[k : k + 1], scores[k : k + 1], scales[k : k + 1])
+
+    def _add(self, masks: BoolArray) -> None:
+        self._append(masks, *self._scored(masks))
+
+    def _append(self, masks: BoolArray, score: Array, scale: Array) -> None:
+        self.masks = np.concatenate([self.masks, masks])
+        self.score = np.concatenate([self.score, score])
+        self.scale = np.concatenate([self.scale, scale])
+
+    def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
+        """Evidence (B,) of sets (B, G), and the scale of the accuracies that it has it with."""
+        score, scale = np.full(len(masks), -np.inf), np.ones(len(masks))
+        first = ((1.0, 1.0), (3.3, 1.0))
+        done = set(first)
+        for times, motions in first:
+            self._better(masks, np.arange(len(masks)), times, motions, score, scale)
+        kept = np.sort(np.argsort(-score, kind="stable")[:_KEPT])
+        for times, motions in product(_SCALES, _MOTIONS):
+            if (times, motions) not in done:
+                self._better(masks, kept, times, motions, score, scale)
+        return score, scale
+
+    def _better(
+        self, masks: BoolArray, rows: Array, times: float, motions: float, score: Array, scale: Array
+    ) -> None:
+        offsets = self.offsets if motions == 1.0 else self.offsets.moving(motions)
+        found = _evidence(offsets, masks[rows], times)[0] - np.log(times) - 2.0 * np.log(motions)
+        better = found > score[rows]
+        score[rows[better]], scale[rows[better]] = found[better], times
+
+
+def _evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array]:
+    """Logarithmic evidence (B,) of sets (B, G), and squared deviation (B, G) of every point from what a set says."""
+    own, motions, variance = offsets.own, offsets.motions, scale**2
+    chosen = masks.astype(np.float64)
+    count, r = motions.shape[0], motions.shape[2]
+    gram = np.einsum("gir,gis->grs", motions, motions).reshape(count, -1) / variance
+    matrix = np.eye(r) + (chosen @ gram).reshape(-1, r, r)
+    vector = chosen @ (np.einsum("gir,gi->gr", motions, own) / variance)
+    inverse = np.linalg.inv(matrix)
+    mean = np.einsum("brs,bs->br", inverse, vector)
+    volume = np.linalg.slogdet(matrix)[1]
+    squares = chosen @ ((own**2).sum(axis=1) / variance) - (vector * mean).sum(axis=1)
+    inside = chosen @ (1.5 * np.log(2.0 * np.pi * variance) + 0.5 * offsets.freedom * np.log(variance))
+    inside = -0.5 * (squares + volume) - inside - chosen @ (0.5 * offsets.closure / variance)
+    left = own[None] - np.einsum("gir,br->bgi", motions, mean)
+    spread = np.einsum("gir,brs,gjs->bgij", motions, inverse, motions, optimize=True)
+    spread = spread + variance * np.eye(3)
+    squared = np.einsum("bgi,bgi->bg", left, np.linalg.solve(spread, left[..., None])[..., 0])
+    anywhere = 1.5 * np.log(np.maximum(squared, 1.0)) + _ANYWHERE + 0.5 * np.linalg.slogdet(spread)[1]
+    rays = np.minimum(
+        0.5 * offsets.closure / variance,
+        0.5 * offsets.freedom * np.log(np.maximum(offsets.closure / variance, 1.0)) + _ANYWHERE,
+    ) + 0.5 * offsets.freedom * np.log(variance)
+    return inside - ((1.0 - chosen) * (anywhere + rays + _WRONG)).sum(axis=1), squared
