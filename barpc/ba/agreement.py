@@ -56,11 +56,14 @@ class Agreement:
         Two sets that contradict each other and weigh the same: none is used. Empty where one is.
     scale : float
         By how much the stated accuracies of the points used are too good; 1: they are not.
+    alike : bool
+        Whether the points that are not used, two or more, agree with each other: in another datum, perhaps.
     """
 
     used: BoolArray
     sets: tuple[BoolArray, ...] = ()
     scale: float = 1.0
+    alike: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,29 +75,23 @@ class Offsets:
     own : (G, 3)
     motions : (G, 3, r)
         By the free motions of the block, of one standard deviation; the last three are shifts of any size.
-    closure, freedom : (G,)
-        Squared residuals of the point's rays where they meet, and how many there are more than a place has numbers.
     """
 
     own: Array
     motions: Array
-    closure: Array
-    freedom: Array
 
     def select(self, keep: BoolArray) -> Offsets:
         """Those of some of the points."""
-        return Offsets(self.own[keep], self.motions[keep], self.closure[keep], self.freedom[keep])
+        return Offsets(self.own[keep], self.motions[keep])
 
     def moving(self, times: float) -> Offsets:
         """The same with motions of the cameras so many times as large."""
         factor = np.full(self.motions.shape[2], times)
         factor[-3:] = 1.0
-        return Offsets(self.own, self.motions * factor, self.closure, self.freedom)
+        return Offsets(self.own, self.motions * factor)
 
 
-def offsets_of(
-    covariance: Covariance, block: Block, points: Array, residual: Array, weight: Array
-) -> Offsets:
+def offsets_of(covariance: Covariance, block: Block, points: Array) -> Offsets:
     """The offsets of the control points of a block at a solution in which their places hold nothing.
 
     Parameters
@@ -102,7 +99,6 @@ def offsets_of(
     covariance : Covariance, of the solution
     block : Block
     points : (P, 3), adjusted, ECEF [m]
-    residual, weight : (2, K) and (K,), projected - observed [px] and 1 / sigma as solved last
     """
     gcps, first, structure = block.gcps, block.num_tracks, covariance.reduced.structure
     count, q = len(gcps.names), covariance.num_unknowns
@@ -125,12 +121,7 @@ def offsets_of(
     modes = (modes * np.sqrt(np.maximum(size, 0.0)))[:, size > _SEEN].reshape(count, 3, -1)
     motions = np.concatenate([modes, _SHIFT * whitening @ enu], axis=2)
     offset = enu_offsets(points[index], gcps.lonlatalt)
-    squared = ((residual * weight) ** 2).sum(axis=0)
-    mine = (weight > 0) & (block.point >= first) & (block.point < block.num_known)
-    at = block.point[mine] - first
-    seen = np.bincount(at, minlength=count)
-    closure = np.bincount(at, squared[mine], minlength=count)
-    return Offsets((whitening @ offset[..., None])[..., 0], motions, closure, np.maximum(2.0 * seen - 3.0, 0))
+    return Offsets((whitening @ offset[..., None])[..., 0], motions)
 
 
 def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
@@ -153,8 +144,10 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
         return out
 
     if others is not None:
-        return Agreement(np.zeros(len(told), dtype=bool), (whole(best), whole(others)))
-    return Agreement(whole(best), scale=scale)
+        one, other = sorted((whole(best), whole(others)), key=lambda mask: int(mask.argmax()))
+        return Agreement(np.zeros(len(told), dtype=bool), (one, other))
+    alike = int(np.count_nonzero(~best)) > 1 and _fits_as_stated(found.offsets.select(~best))
+    return Agreement(whole(best), scale=scale, alike=alike)
 
 
 def _fits_as_stated(offsets: Offsets) -> bool:
@@ -266,13 +259,10 @@ def _evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, 
     mean = np.einsum("brs,bs->br", inverse, vector)
     volume = np.linalg.slogdet(matrix)[1]
     squares = chosen @ ((own**2).sum(axis=1) / variance) - (vector * mean).sum(axis=1)
-    numbers = 1.5 * np.log(2.0 * np.pi * variance) + 0.5 * offsets.closure
-    inside = -0.5 * (squares + volume) - chosen @ numbers
+    inside = -0.5 * (squares + volume) - 1.5 * np.log(2.0 * np.pi * variance) * chosen.sum(axis=1)
     left = own[None] - np.einsum("gir,br->bgi", motions, mean)
     spread = np.einsum("gir,brs,gjs->bgij", motions, inverse, motions, optimize=True)
     spread = spread + variance * np.eye(3)
     squared = np.einsum("bgi,bgi->bg", left, np.linalg.solve(spread, left[..., None])[..., 0])
     anywhere = 1.5 * np.log(np.maximum(squared, 1.0)) + _ANYWHERE + 0.5 * np.linalg.slogdet(spread)[1]
-    rays = 0.5 * offsets.freedom * np.log(np.maximum(offsets.closure, 1.0)) + _ANYWHERE
-    rays = np.minimum(rays, 0.5 * offsets.closure)
-    return inside - ((1.0 - chosen) * (anywhere + rays + _WRONG)).sum(axis=1), squared, squares
+    return inside - ((1.0 - chosen) * (anywhere + _WRONG)).sum(axis=1), squared, squares

@@ -54,8 +54,8 @@ class ControlTest:
         Root mean square residual of the points used over what is expected; NaN where too little is told.
     fits : bool
         Whether that may be chance.
-    sets : tuple of (G,)
-        Two sets that contradict each other and weigh the same, of which none is used; empty where one is.
+    agreed : Agreement or None
+        How the points used were found.
     """
 
     used: BoolArray
@@ -64,7 +64,7 @@ class ControlTest:
     redundancy: Array
     scatter: float = np.nan
     fits: bool = True
-    sets: tuple[BoolArray, ...] = ()
+    agreed: Agreement | None = None
 
     @property
     def checked(self) -> bool:
@@ -73,13 +73,19 @@ class ControlTest:
 
     @property
     def agrees(self) -> bool:
-        """Whether the points used contradict nothing, each and all together."""
-        return self.fits and not any(self.status(g) == "contradicts" for g in range(len(self.used)))
+        """Whether the points used contradict nothing, each and all together, and one set of them outweighs others."""
+        status = [self.status(g) for g in range(len(self.used))]
+        return self.fits and not {"contradicts", "undecided"} & set(status)
+
+    @property
+    def sets(self) -> tuple[BoolArray, ...]:
+        """Two sets of points (G,) that contradict each other and weigh the same; none is used. Empty where one is."""
+        return () if self.agreed is None else self.agreed.sets
 
     def status(self, point: int) -> str:
         """What became of a point, in a word."""
         if not self.used[point]:
-            return "rejected"
+            return "undecided" if any(points[point] for points in self.sets) else "rejected"
         return "contradicts" if self.w[point] > CRITICAL else "used"
 
 
@@ -124,7 +130,7 @@ def control_test(
         w[g] = (np.abs(offset[g] / sigmas[g]) / spread).max()
     scatter, fits = _together(offset / sigmas, redundancy, used)
     fits &= agreed.scale == 1.0
-    return ControlTest(used, residual, w, redundancy, scatter * agreed.scale, fits, agreed.sets)
+    return ControlTest(used, residual, w, redundancy, scatter * agreed.scale, fits, agreed)
 
 
 def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[float, bool]:

@@ -14,7 +14,7 @@ from barpc.ba.ground import Heights, Terrain
 from barpc.ba.heldout import HeldOut, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import Finding
-from barpc.ba.priors import DRIFT_SIGMA, PointPrior
+from barpc.ba.priors import DRIFT_SIGMA
 from barpc.ba.problem import Problem
 from barpc.ba.rounds import Outcome, Rounds, revived
 from barpc.ba.smooth import SmoothTest
@@ -113,13 +113,13 @@ def solve_block(
     observations of `outer`.
     """
     problem = make_problem(block, options, centers, prior)
-    state, heights = first_state(problem, block, options, dem)
-    control, heights = heights.control, heights.loose(LOOSE) if block.gcps.names else heights
+    state, given = first_state(problem, block, options, dem)
+    heights = given.loose(LOOSE) if block.gcps.names else given
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, options, heights, block.use)
     before, agreed = rounds.residual, None
     if block.gcps.names and not (block.point < block.num_tracks).any():  # control is all that holds the cameras
-        agreed, heights = _with_control(block, control, heights, rounds.run(once=True))
+        agreed, heights = _with_control(block, given, rounds.run(once=True))
         rounds = Rounds(problem, block, state, options, heights, block.use)
     outcome = rounds.run()
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
@@ -137,27 +137,24 @@ def solve_block(
         asked = {"drift": outcome.smooth}
         problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
     if block.gcps.names and agreed is None:
-        agreed, heights = _with_control(block, control, heights, outcome)
+        agreed, heights = _with_control(block, given, outcome)
         outcome = Rounds(problem, block, outcome.minimum.state, options, heights, block.use, outcome).run()
     first = Solution(problem, state, before, heights, outcome, start, start, None, asked, agreed=agreed)
     return finished(first, problem, block, outer, options, outcome)
 
 
-def _with_control(
-    block: Block, control: tuple[PointPrior, ...], heights: Heights, outcome: Outcome
-) -> tuple[Agreement, Heights]:
-    """The control points that agree with each other where the places of all hold nothing, and what holds them."""
+def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agreement, Heights]:
+    """The control points that agree with each other at an outcome that none of them holds, and what holds them."""
     count, first = len(block.gcps.names), block.num_tracks
     mine = (block.point >= first) & (block.point < block.num_known)
     lost = np.isin(np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first)  # by hundreds of sigmas
     told = np.isin(np.arange(count), block.point[mine & outcome.inlier] - first) & ~lost
     covariance = outcome.minimum.covariance(outcome.problem.free)
-    at_end = outcome.minimum.state.points, outcome.residual, outcome.weight
-    found = agreement(offsets_of(covariance, block, *at_end), told)
+    found = agreement(offsets_of(covariance, block, outcome.minimum.state.points), told)
     found = replace(found, used=found.used & ~lost)
-    kept = control[0].select(found.used[control[0].index - first])
+    kept = heights.control[0].select(found.used[heights.control[0].index - first])
     kept = replace(kept, rows=kept.rows / found.scale)
-    return found, replace(heights, control=(kept, *control[1:]))
+    return found, replace(heights, control=(kept, *heights.control[1:]), has_control=bool(found.used.any()))
 
 
 def finished(

@@ -11,6 +11,7 @@ import numpy as np
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import APART, Apart
 from barpc.ba.scan import SURE
+from barpc.ba.snooping import ControlTest
 from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import Run
@@ -340,20 +341,38 @@ def _control_reasons(run: Run) -> list[str]:
     if run.gcps is not None and tested is not None:
         for status, words in _CONTROL_WORDS.items():
             names = [
-                f"{name} ({metres(float(np.linalg.norm(tested.residual[g])))}, w = {tested.w[g]:.1f})"
+                f"{name} ({_enu(tested.residual[g])}, w = {tested.w[g]:.1f})"
                 if np.isfinite(tested.w[g])
                 else f"{name} (too few images show it to tell by how much)"
                 for g, name in enumerate(run.gcps.names)
                 if tested.status(g) == status
             ]
             if names:
-                out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.")
+                alike = status == "rejected" and tested.agreed is not None and tested.agreed.alike
+                datum = " They agree with each other: is their datum, or their height, another one?" * alike
+                out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.{datum}")
+        out += _undecided(run.gcps.names, tested)
         if not tested.fits and not any(tested.status(g) == "contradicts" for g in range(len(tested.used))):
             out.append(
                 f"{_count(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
                 "accuracies are too good, or more than one is wrong."
             )
     return out + [f"{line}." for p in (run.gcps, run.check_points) if p is not None for line in p.left_out]
+
+
+def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
+    """Sets of GCPs that contradict each other and weigh the same."""
+    if not tested.sets:
+        return []
+    one, other = (listed([names[g] for g in np.flatnonzero(points)], _MOST_NAMED) for points in tested.sets)
+    middle = [tested.residual[points & np.isfinite(tested.w)] for points in tested.sets]
+    apart = ""
+    if all(len(residual) for residual in middle):
+        apart = f" ({_enu(middle[0].mean(axis=0) - middle[1].mean(axis=0))} between them)"
+    return [
+        f"GCPs contradict each other, and no set of them outweighs the others: {one} against {other}{apart}. None of "
+        "them was used: check coordinates, axes, datum and image positions, or add a point."
+    ]
 
 
 def _count(number: int, what: str) -> str:
@@ -397,7 +416,17 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         is_seen = np.bincount(run.gcps.point, minlength=len(run.gcps.names)) > 0
         tested = run.adjustment.control
         held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
-        lines.append(f"With {_count(held, 'GCP')} {known}{'' if held else ' only'}.")
+        if tested is None or tested.agrees:
+            lines.append(f"With {_count(held, 'GCP')} {known}{'' if held else ' only'}.")
+        elif not held:
+            lines.append(f"Without ground control that agrees {known} only.")
+        elif tested.agreed is not None and tested.agreed.scale > 1.0:
+            as_good = f"{tested.agreed.scale:.0f} times less accurate than stated"
+            lines.append(f"With {_count(held, 'GCP')}, taken for {as_good}, {known}.")
+        else:
+            lines.append(
+                f"{_count(held, 'GCP')} that hold the scene do not agree: what is known of its place they do not tell."
+            )
         if held and tested is not None and tested.agrees and not tested.checked:
             lines.append(f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show.")
         alone = np.unique(run.gcps.view)
