@@ -133,7 +133,7 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
     if len(given) < 2:
         return Agreement(np.ones(len(told), dtype=bool))
     if _fits_as_stated(offsets.select(told)):
-        return Agreement(told.copy())
+        return Agreement(np.ones(len(told), dtype=bool))
     found = _Search(offsets.select(told))
     best, score, scale = found.best()
     others = found.against(best, score)
@@ -147,7 +147,7 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
         one, other = sorted((whole(best), whole(others)), key=lambda mask: int(mask.argmax()))
         return Agreement(np.zeros(len(told), dtype=bool), (one, other))
     alike = int(np.count_nonzero(~best)) > 1 and _fits_as_stated(found.offsets.select(~best))
-    return Agreement(whole(best), scale=scale, alike=alike)
+    return Agreement(whole(best) | ~told, scale=scale, alike=alike)
 
 
 def _fits_as_stated(offsets: Offsets) -> bool:
