@@ -28,7 +28,7 @@ LOOSE = 1e4  # m: a place so uncertain holds nothing, and keeps a point that one
 _SHIFT = 1e3  # m: of the scene, farther than any delivered camera is off
 _SEEN = 0.01  # of a point's own variance: motions that are smaller cannot be told from it
 _EVERY = 12  # points of which every set is looked at
-_TRIALS = 300  # sets of three drawn of more: 1e-6 to miss three right ones where 35 % are
+_TRIALS = 100  # sets of three drawn of more: 2e-6 to miss three right ones where half are
 _TRIPLE = 3  # points that tell shift, tilts, turn and scale
 _USUAL = 0.05  # of chance: sets are looked at where all points together are farther off
 _KEPT = 64  # of the sets looked at, those that are looked at again with every scale
@@ -184,11 +184,14 @@ class _Search:
     def against(self, best: BoolArray, score: float) -> BoolArray | None:
         """The set that contradicts the best and weighs as much; the rest where the best is none; None where it wins."""
         size, common = self.masks.sum(axis=1), (self.masks & best).sum(axis=1)
-        other = (size > common) & (2 * common <= best.sum())
-        least = np.where(size >= best.sum(), _AS_MANY, _CLEAR)
-        rival = np.where(other & (self.score > score - least), self.score, -np.inf)
-        if np.isfinite(rival).any():
-            return np.asarray(self.masks[rival.argmax()])
+        other = np.flatnonzero((size > common) & (2 * common <= best.sum()))
+        other = other[np.argsort(-self.score[other], kind="stable")[:_KEPT]]
+        if len(other):
+            masks, found = self.masks[other], self._scored(self.masks[other])[0]
+            least = np.where(size[other] >= best.sum(), _AS_MANY, _CLEAR)
+            rival = np.where(found > score - least, found, -np.inf)
+            if np.isfinite(rival).any():
+                return np.asarray(masks[rival.argmax()])
         return None if 2 * best.sum() >= self.count else ~best
 
     def _drawn(self, among: BoolArray) -> Iterator[BoolArray]:

@@ -85,7 +85,7 @@ class ControlTest:
     def status(self, point: int) -> str:
         """What became of a point, in a word."""
         if not self.used[point]:
-            return "undecided" if any(points[point] for points in self.sets) else "rejected"
+            return "undecided" if self.sets else "rejected"
         return "contradicts" if self.w[point] > CRITICAL else "used"
 
 
