@@ -583,7 +583,11 @@ def fly(plan: Plan, family: str = "", seed: int = 0) -> World:
             rpc = plan.deliver[v](rpc, camera.orbit, alt)
         views.append(View(NAMES[v], f"{NAMES[v]}.tif", plan.size, rpc, alt))
     assert worst < 0.01, f"{family} {seed}: an RPC misses its camera by {worst:.3g} px"
-    gcps = None if plan.control is None else _points(plan, cameras, scatter(20 * len(plan.control.wrong), False)[0])
+    gcps = (
+        None
+        if plan.control is None
+        else _points(plan, cameras, scatter(20 * len(plan.control.wrong), False)[0])
+    )
     return World(family, seed, plan, tuple(cameras), tuple(views), tracks, bad, check, ground, worst, gcps)
 
 

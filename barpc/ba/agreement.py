@@ -22,7 +22,7 @@ from barpc.ba.covariance import Covariance
 from barpc.ba.heldout import enu_offsets
 from barpc.ba.normal import solve_transposed
 from barpc.geodesy import Array, enu_basis
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, IntArray
 
 LOOSE = 1e4  # m: a place so uncertain holds nothing, and keeps a point that one ray shows from running away
 _SHIFT = 1e3  # m: of the scene, farther than any delivered camera is off
@@ -35,7 +35,9 @@ _KEPT = 64  # of the sets looked at, those that are looked at again with every s
 _NEAR = 16.0  # squared deviation of a point that goes with a set: that of `snooping.CRITICAL`
 _SCALES = (1.0, 3.0, 2.0, 5.0)  # every set with the first two; more than five times is wrong, not optimistic
 _MOTIONS = (1.0, 3.0)
-_OPTIMISTIC = 3.0  # nats for each factor of e in the accuracies. Measured, 60 draws each: with 2, 3, 4 one of five
+_OPTIMISTIC = (
+    3.0  # nats for each factor of e in the accuracies. Measured, 60 draws each: with 2, 3, 4 one of five
+)
 # points 3 m off is found in 55, 57, 60; six with sigmas 3 x too small stay together in 60, 59, 56
 _FLOPPY = 2.0  # nats, the same for the motions
 _WRONG = 2.9  # nats that it costs to call a point wrong: one in twenty is
@@ -239,7 +241,7 @@ class _Search:
         return score, scale
 
     def _better(
-        self, masks: BoolArray, rows: Array, times: float, motions: float, score: Array, scale: Array
+        self, masks: BoolArray, rows: IntArray, times: float, motions: float, score: Array, scale: Array
     ) -> None:
         offsets = self.offsets if motions == 1.0 else self.offsets.moving(motions)
         found = _evidence(offsets, masks[rows], times)[0]

@@ -118,7 +118,9 @@ def solve_block(
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, options, heights, block.use)
     before, agreed = rounds.residual, None
-    if block.gcps.names and not (block.point < block.num_tracks).any():  # control is all that holds the cameras
+    if (
+        block.gcps.names and not (block.point < block.num_tracks).any()
+    ):  # control is all that holds the cameras
         agreed, heights = _with_control(block, given, rounds.run(once=True))
         rounds = Rounds(problem, block, state, options, heights, block.use)
     outcome = rounds.run()
@@ -147,7 +149,9 @@ def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agr
     """The control points that agree with each other at an outcome that none of them holds, and what holds them."""
     count, first = len(block.gcps.names), block.num_tracks
     mine = (block.point >= first) & (block.point < block.num_known)
-    lost = np.isin(np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first)  # by hundreds of sigmas
+    lost = np.isin(
+        np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first
+    )  # by hundreds of sigmas
     told = np.isin(np.arange(count), block.point[mine & outcome.inlier] - first) & ~lost
     covariance = outcome.minimum.covariance(outcome.problem.free)
     found = agreement(offsets_of(covariance, block, outcome.minimum.state.points), told)

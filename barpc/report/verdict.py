@@ -17,6 +17,7 @@ from barpc.report.records import plain
 from barpc.report.run import Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
 from barpc.report.summary.causes import RIVALS, explanations, left_over, strangeness
+from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
@@ -364,7 +365,9 @@ def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
     """Sets of GCPs that contradict each other and weigh the same."""
     if not tested.sets:
         return []
-    one, other = (listed([names[g] for g in np.flatnonzero(points)], _MOST_NAMED) for points in tested.sets)
+    one, other = (
+        listed([names[g] for g in np.flatnonzero(points).tolist()], _MOST_NAMED) for points in tested.sets
+    )
     middle = [tested.residual[points & np.isfinite(tested.w)] for points in tested.sets]
     apart = ""
     if all(len(residual) for residual in middle):
@@ -413,27 +416,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         held_by = "Without ground control" if run.reference is None or run.reference.control is None else "So"
         lines.append(f"{held_by} {known}{' only' if held_by != 'So' else ''}.")
     else:
-        is_seen = np.bincount(run.gcps.point, minlength=len(run.gcps.names)) > 0
-        tested = run.adjustment.control
-        held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
-        if tested is None or tested.agrees:
-            lines.append(f"With {_count(held, 'GCP')} {known}{'' if held else ' only'}.")
-        elif not held:
-            lines.append(f"Without ground control that agrees {known} only.")
-        elif tested.agreed is not None and tested.agreed.scale > 1.0:
-            as_good = f"{tested.agreed.scale:.0f} times less accurate than stated"
-            lines.append(f"With {_count(held, 'GCP')}, taken for {as_good}, {known}.")
-        else:
-            lines.append(
-                f"{_count(held, 'GCP')} that hold the scene do not agree: what is known of its place they do not tell."
-            )
-        if held and tested is not None and tested.agrees and not tested.checked:
-            lines.append(f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show.")
-        alone = np.unique(run.gcps.view)
-        if held and len(alone) == 1 and len(views) > 1:
-            lines.append(
-                f"They are seen in {views[alone[0]].name} alone, which says nothing along its lines of sight."
-            )
+        lines += _held_lines(run, run.gcps, known)
     lines += _dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()
@@ -441,6 +424,33 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         if np.isfinite(ground).all():
             seen += f" and {_lengths(ground)} on the ground (east, north, up)"
         lines.append(f"{len(run.check_points.names)} check points, not used above, are met to {seen} (RMS).")
+    return lines
+
+
+def _held_lines(run: Run, gcps: GroundPoints, known: str) -> list[str]:
+    """What ground control says of the scene's place; `known` is what the adjustment states of it."""
+    assert run.adjustment is not None
+    is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
+    tested, lines = run.adjustment.control, []
+    held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
+    with_points = f"With {_count(held, 'GCP')}"
+    scale = 1.0 if tested is None or tested.agreed is None else tested.agreed.scale
+    if tested is None or tested.agrees:
+        lines.append(f"{with_points} {known}{'' if held else ' only'}.")
+    elif not held:
+        lines.append(f"Without ground control that agrees {known} only.")
+    elif scale > 1.0:
+        lines.append(f"{with_points}, taken for {scale:.0f} times less accurate than stated, {known}.")
+    else:
+        lines.append(
+            f"{_count(held, 'GCP')} that hold the scene do not agree: what is known of its place they do not tell."
+        )
+    if held and tested is not None and tested.agrees and not tested.checked:
+        lines.append(f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show.")
+    alone = np.unique(gcps.view)
+    if held and len(alone) == 1 and len(run.views) > 1:
+        name = run.views[alone[0]].name
+        lines.append(f"They are seen in {name} alone, which says nothing along its lines of sight.")
     return lines
 
 

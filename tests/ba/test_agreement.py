@@ -178,9 +178,7 @@ def test_what_a_block_says_of_points_has_the_covariance_that_it_states_of_them()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("barpc.ba.solution.offsets_of", spy)
         options = AdjustOptions(drift=0, jitter="off", **INDEPENDENT)
-        adjust_tracks(
-            block.views, block.tracks, options, gcps, centers=centers_of(block), hold_out=False
-        )
+        adjust_tracks(block.views, block.tracks, options, gcps, centers=centers_of(block), hold_out=False)
     covariance, first, offsets = taken[-1]
     enu = enu_basis(gcps.lonlatalt)
     stated = enu @ covariance.points(first + np.arange(4)) @ np.swapaxes(enu, 1, 2)
@@ -218,16 +216,16 @@ def test_control_of_a_world_is_used_where_it_is_right_and_never_bends_the_images
         assert {tuple(points) for points in tested.sets} == {tuple(wrong), tuple(~wrong)}
         assert (one.gauge.sigma > 4.0).all()
         assert any("GCPs contradict each other" in reason for reason in summary.reasons)
-        assert any("Without ground control that agrees its place is known" in line for line in summary.verdict)
+        assert any(
+            "Without ground control that agrees its place is known" in line for line in summary.verdict
+        )
         assert any("0 of" in line and "none outweighs" in line for line in decisions(summary))
     else:
         assert [word != "used" for word in status] == wrong.tolist()
         assert any(line.startswith("With") and "its place is known to" in line for line in summary.verdict)
     assert summary.passed == (tested.agrees and not wrong.any())
     assert any("Nothing checks" in line for line in summary.verdict) == (kind == "1 point")
-    assert any("is their datum" in line for line in summary.verdict) == (
-        "another datum" in kind
-    )
+    assert any("is their datum" in line for line in summary.verdict) == ("another datum" in kind)
 
 
 def test_points_that_none_outweighs_are_undecided_and_agree_with_nothing() -> None:
