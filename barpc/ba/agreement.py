@@ -33,12 +33,13 @@ _TRIPLE = 3  # points that tell shift, tilts, turn and scale
 _USUAL = 0.05  # of chance: sets are looked at where all points together are farther off
 _KEPT = 64  # of the sets looked at, those that are looked at again with every scale
 _NEAR = 16.0  # squared deviation of a point that goes with a set: that of `snooping.CRITICAL`
+_ROOM = 20_000  # points of sets at a time: some 10 MB
 _SCALES = (1.0, 3.0, 2.0, 5.0)  # every set with the first two; more than five times is wrong, not optimistic
 _MOTIONS = (1.0, 3.0)
 _OPTIMISTIC = (
-    3.0  # nats for each factor of e in the accuracies. Measured, 60 draws each: with 2, 3, 4 one of five
+    3.5  # nats for each factor of e in the accuracies. Measured, 60 draws each: with 3, 3.5, 4 one of five
 )
-# points 3 m off is found in 55, 57, 60; six with sigmas 3 x too small stay together in 60, 59, 56
+# points 3 m off is found in 55, 57, 57; six with sigmas 3 x too small stay together in 59, 59, 59
 _FLOPPY = 2.0  # nats, the same for the motions
 _WRONG = 2.9  # nats that it costs to call a point wrong: one in twenty is
 _ANYWHERE = 4.8  # nats: the density at one sigma of an error between one and 10,000, alike in its logarithm
@@ -119,8 +120,9 @@ def offsets_of(covariance: Covariance, block: Block, points: Array) -> Offsets:
     own = turned @ np.swapaxes(turned, 1, 2) + gcps.sigma[:, :, None] ** 2 * np.eye(3)
     whitening = np.linalg.inv(np.linalg.cholesky(own))
     flat = (whitening @ of_cameras).reshape(3 * count, -1)
-    size, modes = np.linalg.eigh(flat @ covariance.joint(views) @ flat.T)
-    modes = (modes * np.sqrt(np.maximum(size, 0.0)))[:, size > _SEEN].reshape(count, 3, -1)
+    size, root = np.linalg.eigh(covariance.joint(views))
+    modes, size, _ = np.linalg.svd(flat @ (root * np.sqrt(np.maximum(size, 0.0))), full_matrices=False)
+    modes = (modes * size)[:, size**2 > _SEEN].reshape(count, 3, -1)
     motions = np.concatenate([modes, _SHIFT * whitening @ enu], axis=2)
     offset = enu_offsets(points[index], gcps.lonlatalt)
     return Offsets((whitening @ offset[..., None])[..., 0], motions)
@@ -211,24 +213,21 @@ class _Search:
                 yield mask
 
     def _refine(self, n: int) -> None:
-        """Put single points in and out of a set as long as that is better."""
-        mask, score = self.masks[n], self.score[n]
+        """Put single points that may as well be in as out of a set where that is better, as long as it is."""
         for _ in range(self.count):
-            tried = mask[None] ^ np.eye(self.count, dtype=bool)
-            scores, scales = self._scored(tried)
-            k = int(scores.argmax())
-            if scores[k] <= score:
+            squared = _evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
+            doubtful = np.flatnonzero((squared > 0.5 * _NEAR) & (squared < 2.0 * _NEAR))
+            before = self.score[n]
+            self._add(self.masks[n] ^ np.eye(self.count, dtype=bool)[doubtful])
+            n = int(self.score.argmax())
+            if self.score[n] <= before:
                 break
-            mask, score = tried[k], scores[k]
-            self._append(tried[k : k + 1], scores[k : k + 1], scales[k : k + 1])
 
     def _add(self, masks: BoolArray) -> None:
-        self._append(masks, *self._scored(masks))
-
-    def _append(self, masks: BoolArray, score: Array, scale: Array) -> None:
+        """Sets that are looked at, too."""
+        score, scale = self._scored(masks)
         self.masks = np.concatenate([self.masks, masks])
-        self.score = np.concatenate([self.score, score])
-        self.scale = np.concatenate([self.scale, scale])
+        self.score, self.scale = np.append(self.score, score), np.append(self.scale, scale)
 
     def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
         """Evidence (B,) of sets (B, G), and the scale of the accuracies that it has it with."""
@@ -255,6 +254,10 @@ def _evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, 
     that of all points of a set together (B,).
     """
     own, motions, variance = offsets.own, offsets.motions, scale**2
+    if len(masks) > (room := max(_ROOM // len(own), 1)):
+        parts = [_evidence(offsets, masks[n : n + room], scale) for n in range(0, len(masks), room)]
+        score, squared, squares = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return score, squared, squares
     chosen = masks.astype(np.float64)
     count, r = motions.shape[0], motions.shape[2]
     gram = np.einsum("gir,gis->grs", motions, motions).reshape(count, -1) / variance

@@ -85,8 +85,6 @@ def test_the_right_points_are_used_and_no_other(count, wrong, size, least) -> No
         one = found(count, seed, any_way(seed, wrong, size))
         assert one.used[wrong:].all() or one.sets  # a right one is never blamed
         exact += int(one.used[wrong:].all() and not one.used[:wrong].any())
-        if one.used[:wrong].any():
-            assert one.scale > 1.0  # kept, it makes all of them worse
     assert exact >= (least if count < 9 else 4)
 
 
