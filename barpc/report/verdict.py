@@ -416,7 +416,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         held_by = "Without ground control" if run.reference is None or run.reference.control is None else "So"
         lines.append(f"{held_by} {known}{' only' if held_by != 'So' else ''}.")
     else:
-        lines += _held_lines(run, run.gcps, known)
+        lines += _held_lines(run, run.gcps, views, known)
     lines += _dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()
@@ -427,7 +427,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     return lines
 
 
-def _held_lines(run: Run, gcps: GroundPoints, known: str) -> list[str]:
+def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known: str) -> list[str]:
     """What ground control says of the scene's place; `known` is what the adjustment states of it."""
     assert run.adjustment is not None
     is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
@@ -448,8 +448,8 @@ def _held_lines(run: Run, gcps: GroundPoints, known: str) -> list[str]:
     if held and tested is not None and tested.agrees and not tested.checked:
         lines.append(f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show.")
     alone = np.unique(gcps.view)
-    if held and len(alone) == 1 and len(run.views) > 1:
-        name = run.views[alone[0]].name
+    if held and len(alone) == 1 and len(views) > 1:
+        name = views[alone[0]].name
         lines.append(f"They are seen in {name} alone, which says nothing along its lines of sight.")
     return lines
 
