@@ -36,6 +36,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
@@ -93,7 +94,14 @@ def command(world: World) -> Outcome:
             write_rpc(view.sensor, folder / f"{view.name}_RPC.TXT")
             paths.append(folder / view.path)
         write_matches(folder / "ties.npz", world.tracks, [view.name for view in world.views])
-        given = {"images": "none", "matches": str(folder / "ties.npz"), "matches_only": True}
+        given: dict[str, Any] = {
+            "images": "none",
+            "matches": str(folder / "ties.npz"),
+            "matches_only": True,
+        }
+        if world.gcps is not None:
+            _write_gcps(world, folder / "gcps.csv")
+            given["gcp"] = (str(folder / "gcps.csv"),)
         try:
             result = barpc.adjust(paths, folder / "out", with_values(RunOptions(), given))
         except BarpcError as error:
@@ -124,11 +132,21 @@ def command(world: World) -> Outcome:
     )
 
 
+def _write_gcps(world: World, path: Path) -> None:
+    """Ground control as a table."""
+    points, lines = world.gcps, ["id,lon,lat,alt,image,col,row,sigma_e,sigma_n,sigma_u,sigma_px"]
+    assert points is not None
+    for point, view, xy, sigma in zip(points.point, points.view, points.xy, points.xy_sigma, strict=True):
+        place = (*points.lonlatalt[point], world.views[view].name, *xy, *points.sigma[point], sigma)
+        lines.append(",".join([points.names[point], *map(str, place)]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
 def solver(world: World) -> Outcome:
     """`adjust_tracks` alone, which says nothing."""
     start = time.process_time()
     try:
-        found = adjust_tracks(world.views, world.tracks)
+        found = adjust_tracks(world.views, world.tracks, None, world.gcps)
     except BarpcError as error:
         none = tuple(view.sensor for view in world.views)
         return Outcome(
@@ -445,6 +463,20 @@ def _want_angles(r: Result, _plan: Plan) -> list[str]:
     return [f"height {r.files.move[2]:.0f} m, said {r.sigma[2]:.0f}"] if not abs(r.z[2]) <= 3 else []
 
 
+def _want_control(r: Result, plan: Plan) -> list[str]:
+    assert plan.control is not None
+    wrong = {f"P{g}" for g in np.flatnonzero(np.abs(plan.control.wrong).sum(axis=1))}
+    told = [reason for reason in r.reasons if re.match(r"\d+ GCPs? rejected", reason)]
+    blamed = set(re.findall(r"\bP\d+", " ".join(told)))
+    undecided = any("GCPs contradict each other" in reason for reason in r.reasons)
+    faults = [f"blames {', '.join(sorted(blamed - wrong))}"] if blamed - wrong else []
+    if r.code >= 0 and wrong - blamed and not undecided:
+        faults.append(f"believes {', '.join(sorted(wrong - blamed))}")
+    if not r.files.shape <= r.before.shape + 0.7:
+        faults.append(f"shape {r.before.shape:.2f} -> {r.files.shape:.2f}")
+    return faults + _far(r) + _unsaid(r)
+
+
 WANTED: dict[str, tuple[str, Callable[[Result, Plan], list[str]]]] = {
     "local": ("none good above 0.15 px; 34 of 40 with 0.05 px left at most", _want_local),
     "swing": (
@@ -462,6 +494,10 @@ WANTED: dict[str, tuple[str, Callable[[Result, Plan], list[str]]]] = {
     "clean": ("good, and nothing widened or invented", _want_clean),
     "two": ("none good above 0.15 px", _want_two),
     "angles": ("mean height within 3 sigma", _want_angles),
+    "control": (
+        "wrong points named, right ones not; the scene within 3 sigma, its shape kept",
+        _want_control,
+    ),
 }
 
 

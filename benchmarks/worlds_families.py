@@ -16,7 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from barpc.scene import BoolArray, IntArray, Tracks, View
+from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View
 from barpc.sensor.rpc import RPC
 from benchmarks.worlds_cameras import (
     CHIPS,
@@ -73,6 +73,16 @@ class Injected:
         return f"{self.kind} {names}{where} {self.size:.3g} px{' ' if self.note else ''}{self.note}"
 
 
+@dataclass(frozen=True, eq=False)
+class Control:
+    """Ground control points, measured to 0.3 px: (G, 3) what is wrong with their places, east, north, up [m]."""
+
+    kind: str
+    wrong: Array
+    sigma: tuple[float, float, float] = (0.3, 0.3, 0.3)  # as stated [m]
+    times: float = 1.0  # as large are the errors of right ones
+
+
 @dataclass(eq=False)
 class Plan:
     """What is drawn, before anything is flown."""
@@ -91,6 +101,7 @@ class Plan:
     injected: list[Injected] = field(default_factory=list)
     deliver: dict[int, Callable[[RPC, Pass, tuple[float, float]], RPC]] = field(default_factory=dict)
     moves: list[Callable[[Array, float], tuple[Array, Array]]] = field(default_factory=list)
+    control: Control | None = None
 
     def flaw(self, view: int, **changed: Any) -> None:
         """Change a view's flaw; a `pointing` is added to those that are there."""
@@ -432,6 +443,45 @@ def _angles(seed: int, rng: np.random.Generator) -> Plan:
     return plan
 
 
+def _wrong(count: int, *groups: Array) -> Array:
+    """Errors (count, 3) of points, those of the groups (n, 3) first."""
+    given = np.concatenate([np.zeros((0, 3)), *groups])
+    return np.concatenate([given, np.zeros((count - len(given), 3))])
+
+
+def _any(rng: np.random.Generator, count: int, low: float, high: float) -> Array:
+    """Errors (count, 3) in any direction, their lengths alike in the logarithm."""
+    error = rng.normal(size=(count, 3)) * [1.0, 1.0, 0.5]
+    length = np.exp(rng.uniform(np.log(low), np.log(high), count))
+    return np.asarray(error / np.linalg.norm(error, axis=1)[:, None] * length[:, None])
+
+
+_EAST, _UP = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]])
+CONTROL: tuple[tuple[str, Callable[[np.random.Generator], tuple[Array, dict[str, Any]]]], ...] = (
+    ("6 clean", lambda _: (_wrong(6), {})),
+    ("6 clean, sigmas 3 x too small", lambda _: (_wrong(6), {"times": 3.0})),
+    ("1 of 2 wrong by 25 m", lambda rng: (_wrong(2, _any(rng, 1, 25, 25)), {})),
+    ("2 of 4 up 40 m", lambda _: (_wrong(4, 40 * _UP, 40 * _UP), {})),
+    ("3 of 6 wrong", lambda rng: (_wrong(6, _any(rng, 3, 10, 60)), {})),
+    ("1 of 5 30 m east", lambda _: (_wrong(5, 30 * _EAST), {})),
+    ("1 of 5 3 m wrong", lambda rng: (_wrong(5, _any(rng, 1, 3, 3)), {})),
+    ("12 with 4 of another datum", lambda rng: (_wrong(12, np.repeat(_any(rng, 1, 8, 60), 4, axis=0)), {})),
+    ("40 with 10 wrong", lambda rng: (_wrong(40, _any(rng, 10, 3, 100)), {})),
+    ("3 and 3", lambda rng: (_wrong(6, np.repeat(_any(rng, 1, 10, 60), 3, axis=0)), {})),
+    ("1 point", lambda _: (_wrong(1), {})),
+    ("6 in height only", lambda _: (_wrong(6), {"sigma": (1000.0, 1000.0, 0.3)})),
+)
+
+
+def _control(seed: int, rng: np.random.Generator) -> Plan:
+    plan = draw(rng, (3, 2, 4)[(seed // len(CONTROL)) % 3], side=(8000, 24000))
+    kind, make_it = CONTROL[seed % len(CONTROL)]
+    wrong, more = make_it(rng)
+    plan.control = Control(kind, wrong, **more)
+    plan.injected.append(Injected(kind, (), 1, 0, 0, 0.0))
+    return plan
+
+
 FAMILIES: dict[str, Callable[[int, np.random.Generator], Plan]] = {
     "local": _local,
     "swing": _swing,
@@ -443,6 +493,7 @@ FAMILIES: dict[str, Callable[[int, np.random.Generator], Plan]] = {
     "clean": _clean,
     "two": _two,
     "angles": _angles,
+    "control": _control,
 }
 
 
@@ -463,6 +514,7 @@ class World:
     check: Tracks
     ground: Array
     fit: float  # largest error of an RPC against its sound camera [px]
+    gcps: GroundPoints | None = None
 
     def without(self, odd: int) -> World:
         """The same without a view."""
@@ -531,7 +583,29 @@ def fly(plan: Plan, family: str = "", seed: int = 0) -> World:
             rpc = plan.deliver[v](rpc, camera.orbit, alt)
         views.append(View(NAMES[v], f"{NAMES[v]}.tif", plan.size, rpc, alt))
     assert worst < 0.01, f"{family} {seed}: an RPC misses its camera by {worst:.3g} px"
-    return World(family, seed, plan, tuple(cameras), tuple(views), tracks, bad, check, ground, worst)
+    gcps = (
+        None
+        if plan.control is None
+        else _points(plan, cameras, scatter(20 * len(plan.control.wrong), False)[0])
+    )
+    return World(family, seed, plan, tuple(cameras), tuple(views), tracks, bad, check, ground, worst, gcps)
+
+
+def _points(plan: Plan, cameras: Sequence[Camera], ground: Array) -> GroundPoints:
+    """Control points where at least two views see the ground."""
+    control, rng = plan.control, plan.rng
+    assert control is not None
+    count = len(control.wrong)
+    view, point, xy = _seen(cameras, plan.flaws, [ground] * len(cameras), plan.size, count)
+    kept, point = np.unique(point, return_inverse=True)
+    true, sigma = ground[kept], np.array(control.sigma)
+    own = rng.normal(size=true.shape) * np.minimum(sigma, 50.0) * control.times
+    moved = np.einsum("ni,nij->nj", control.wrong + own, compass(true))
+    xy = xy + rng.normal(0, 0.3, xy.shape)
+    names, lonlatalt = tuple(f"P{g}" for g in range(count)), geodetic(ecef(true) + moved)
+    return GroundPoints(
+        names, lonlatalt, np.tile(sigma, (count, 1)), point, view, xy, np.full(len(view), 0.3)
+    )
 
 
 def _ties(plan: Plan, cameras: Sequence[Camera], ground: Array, uv: Array) -> tuple[Tracks, BoolArray]:

@@ -199,9 +199,6 @@ def _choose_model(
         found, parts, judged = without_moving(found, parts, options, solve)
         found = without_strips(found, judged, parts.inner, parts.outer, options)
     block, outer = parts.inner, parts.outer
-    trend = found.is_skew or found.has_trend or found.has_waves
-    if trend and not given and _bent_by_control(found, block, outer, options, dem, centers):
-        return found, None, parts
     if found is not before:
         in_image = None if given else _in_image(found, parts, options, dem)
     chosen, in_space = (found, None) if in_image is None else (in_image, found.after.whole_rms)
@@ -225,21 +222,6 @@ def _in_image(found: Solution, parts: Parts, options: AdjustOptions, dem: Terrai
 def _is_calm(found: Solution, block: Block, floor: float) -> bool:
     """Whether nothing is left of which a part of an image, or what moves, might be the cause."""
     return not (found.has_trend or found.has_waves or standing_out(found.outcome, block, floor))
-
-
-def _bent_by_control(
-    found: Solution,
-    block: Block,
-    outer: Block,
-    options: AdjustOptions,
-    dem: Terrain | None,
-    centers: Array | None,
-) -> bool:
-    """Whether a trend is there only because control points that contradict something pull at the cameras."""
-    if found.tested is None or found.tested.agrees:
-        return False
-    free = solve_block(block.without(block.point >= block.num_tracks), outer, options, dem, centers, None)
-    return not (free.is_skew or free.has_trend or free.has_waves)
 
 
 def _adjustment(

@@ -163,6 +163,13 @@ class Heights:
     options: AdjustOptions  # `dem_sigma`, `dem_for_all`
     dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
     reference: Reference | None = None  # whose heights are the DEM's
+    has_control: bool = False  # whether GCPs hold the scene's place
+
+    def loose(self, sigma: float) -> Heights:
+        """The same where the places of GCPs are known to `sigma` [m] only."""
+        first = self.control[0]
+        rows = enu_basis(ground_from_ecef(first.mean)) / sigma
+        return replace(self, control=(replace(first, rows=rows), *self.control[1:]), has_control=False)
 
     def hold(self, problem: Problem, points: Array) -> Problem:
         """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""

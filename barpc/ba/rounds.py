@@ -81,7 +81,7 @@ class Rounds:
         of_reference = block.point >= block.num_known
         self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie, of_reference)
         self.smooth = Smooth(problem.structure, problem.xy, unknowns)
-        self.variances = Variances.of(problem.camera_prior, unknowns, options, bool(block.gcps.names))
+        self.variances = Variances.of(problem.camera_prior, unknowns, options, heights.has_control)
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)

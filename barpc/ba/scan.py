@@ -70,7 +70,7 @@ def scan(
             gain[:, ~np.triu(np.ones((BINS + 1, BINS + 1), dtype=bool), 1)] = 0.0
             gain[:, 0, BINS] = 0.0  # all of an image is no interval
             for v in range(views):
-                i, j = np.unravel_index(int(gain[v].argmax()), gain[v].shape)
+                i, j = divmod(int(gain[v].argmax()), BINS + 1)
                 if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
                     i, j = (0, i) if j == BINS else (j, BINS)  # means tell of two parts: the smaller one lies off
                 step = size[axis, v] / BINS

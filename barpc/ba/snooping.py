@@ -16,6 +16,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.special import chdtri
 
+from barpc.ba.agreement import Agreement
 from barpc.ba.covariance import Covariance
 from barpc.ba.heldout import enu_offsets
 from barpc.ba.normal import solve_transposed
@@ -26,7 +27,6 @@ from barpc.scene import BoolArray, GroundPoints, IntArray
 
 CRITICAL = 4.0
 """A normalised residual that is larger is no chance: 6e-5 for a component, a thousandth for five points."""
-_PART = 3  # of so many points one may be wrong, or the stated accuracies are
 _LEAST = 1e-6  # redundancy of a direction that nothing else tells about: along the ray of a point seen once
 CHECKED = 0.1  # redundancy of a point that something beside the cameras' priors tells about
 _TOGETHER = 60  # observations whose cameras are solved for at a time
@@ -54,6 +54,8 @@ class ControlTest:
         Root mean square residual of the points used over what is expected; NaN where too little is told.
     fits : bool
         Whether that may be chance.
+    agreed : Agreement or None
+        How the points used were found.
     """
 
     used: BoolArray
@@ -62,6 +64,7 @@ class ControlTest:
     redundancy: Array
     scatter: float = np.nan
     fits: bool = True
+    agreed: Agreement | None = None
 
     @property
     def checked(self) -> bool:
@@ -70,26 +73,24 @@ class ControlTest:
 
     @property
     def agrees(self) -> bool:
-        """Whether the points used contradict nothing, each and all together."""
-        return self.fits and not any(self.status(g) == "contradicts" for g in range(len(self.used)))
+        """Whether the points used contradict nothing, each and all together, and one set of them outweighs others."""
+        status = [self.status(g) for g in range(len(self.used))]
+        return self.fits and not {"contradicts", "undecided"} & set(status)
 
-    def culprit(self) -> int | None:
-        """The point that is most clearly wrong; None where none is, or where too many would be."""
-        told = np.isfinite(self.w)
-        count, w = int(told.sum()), np.where(self.used & told, self.w, 0.0)
-        if count < _PART or (told & ~self.used).sum() >= count // _PART or w.max() <= CRITICAL:
-            return None
-        return int(w.argmax())
+    @property
+    def sets(self) -> tuple[BoolArray, ...]:
+        """Two sets of points (G,) that contradict each other and weigh the same; none is used. Empty where one is."""
+        return () if self.agreed is None else self.agreed.sets
 
     def status(self, point: int) -> str:
         """What became of a point, in a word."""
         if not self.used[point]:
-            return "rejected"
+            return "undecided" if self.sets else "rejected"
         return "contradicts" if self.w[point] > CRITICAL else "used"
 
 
 def control_test(
-    covariance: Covariance, points: Array, first: int, gcps: GroundPoints, used: BoolArray
+    covariance: Covariance, points: Array, first: int, gcps: GroundPoints, agreed: Agreement
 ) -> ControlTest:
     """The test at a solution.
 
@@ -103,31 +104,33 @@ def control_test(
         Number of tracks.
     gcps : GroundPoints
         As given.
-    used : (G,)
-        Whose place was held.
+    agreed : Agreement
+        Whose place was held, and how.
     """
-    count = len(gcps.names)
+    count, used, sigmas = len(gcps.names), agreed.used, gcps.sigma * agreed.scale
     seen = np.bincount(gcps.point, minlength=count)
     enu = enu_basis(gcps.lonlatalt)
     offset = enu_offsets(points[first : first + count], gcps.lonlatalt)
     adjusted = enu @ covariance.points(first + np.arange(count)) @ np.swapaxes(enu, 1, 2)
     residual, w, redundancy = np.full((count, 3), np.nan), np.full(count, np.nan), np.zeros(count)
     for g in range(count):
-        stated = np.diag(gcps.sigma[g] ** 2)
+        stated = np.diag(sigmas[g] ** 2)
         if seen[g] == 0 or (not used[g] and seen[g] < 2):
             continue
         left = stated - adjusted[g] if used[g] else stated + adjusted[g]
         redundancy[g] = min(float((np.diag(left) / np.diag(stated)).mean()), 1.0)
-        told, axes = np.linalg.eigh(left / np.outer(gcps.sigma[g], gcps.sigma[g]))
+        told, axes = np.linalg.eigh(left / np.outer(sigmas[g], sigmas[g]))
         if told[-1] < _LEAST:
             continue
         axes = axes[:, told > _LEAST]
-        whitened = offset[g] / gcps.sigma[g] @ axes
+        whitened = offset[g] / sigmas[g] @ axes
         shown = axes @ (whitened / told[told > _LEAST]) if used[g] else axes @ whitened
-        residual[g] = gcps.sigma[g] * shown
-        spread = np.sqrt(np.maximum(np.diag(left) / gcps.sigma[g] ** 2, _LEAST))
-        w[g] = (np.abs(offset[g] / gcps.sigma[g]) / spread).max()
-    return ControlTest(used, residual, w, redundancy, *_together(offset / gcps.sigma, redundancy, used))
+        residual[g] = sigmas[g] * shown
+        spread = np.sqrt(np.maximum(np.diag(left) / sigmas[g] ** 2, _LEAST))
+        w[g] = (np.abs(offset[g] / sigmas[g]) / spread).max()
+    scatter, fits = _together(offset / sigmas, redundancy, used)
+    fits &= agreed.scale == 1.0
+    return ControlTest(used, residual, w, redundancy, scatter * agreed.scale, fits, agreed)
 
 
 def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[float, bool]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from barpc.ba.agreement import LOOSE, Agreement, agreement, offsets_of
 from barpc.ba.block import Block
 from barpc.ba.consensus import agreeing
 from barpc.ba.ground import Heights, Terrain
@@ -49,6 +50,7 @@ class Solution:
     # "drift", "jitter" -> what was smooth before another degree was taken, splines or steps followed
     asked: Mapping[str, SmoothTest] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()  # what explains ties beside the cameras, the first taken first
+    agreed: Agreement | None = None  # which control points hold it
 
     @property
     def final(self) -> State:
@@ -107,13 +109,21 @@ def solve_block(
 ) -> Solution:
     """Rounds with the model of the options, again from an agreement or with more drift where they ask for it.
 
-    Measured on the observations of `outer`.
+    By its tie points first; then with the control points that agree with each other there. Measured on the
+    observations of `outer`.
     """
     problem = make_problem(block, options, centers, prior)
-    state, heights = first_state(problem, block, options, dem)
+    state, given = first_state(problem, block, options, dem)
+    heights = given.loose(LOOSE) if block.gcps.names else given
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, options, heights, block.use)
-    before, outcome = rounds.residual, rounds.run()
+    before, agreed = rounds.residual, None
+    if (
+        block.gcps.names and not (block.point < block.num_tracks).any()
+    ):  # control is all that holds the cameras
+        agreed, heights = _with_control(block, given, rounds.run(once=True))
+        rounds = Rounds(problem, block, state, options, heights, block.use)
+    outcome = rounds.run()
     if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
         agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
@@ -128,50 +138,39 @@ def solve_block(
         there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
         asked = {"drift": outcome.smooth}
         problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
-    first = Solution(problem, state, before, heights, outcome, start, start, None, asked)
+    if block.gcps.names and agreed is None:
+        agreed, heights = _with_control(block, given, outcome)
+        outcome = Rounds(problem, block, outcome.minimum.state, options, heights, block.use, outcome).run()
+    first = Solution(problem, state, before, heights, outcome, start, start, None, asked, agreed=agreed)
     return finished(first, problem, block, outer, options, outcome)
+
+
+def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agreement, Heights]:
+    """The control points that agree with each other at an outcome that none of them holds, and what holds them."""
+    count, first = len(block.gcps.names), block.num_tracks
+    mine = (block.point >= first) & (block.point < block.num_known)
+    lost = np.isin(
+        np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first
+    )  # by hundreds of sigmas
+    told = np.isin(np.arange(count), block.point[mine & outcome.inlier] - first) & ~lost
+    covariance = outcome.minimum.covariance(outcome.problem.free)
+    found = agreement(offsets_of(covariance, block, outcome.minimum.state.points), told)
+    found = replace(found, used=found.used & ~lost)
+    kept = heights.control[0].select(found.used[heights.control[0].index - first])
+    kept = replace(kept, rows=kept.rows / found.scale)
+    return found, replace(heights, control=(kept, *heights.control[1:]), has_control=bool(found.used.any()))
 
 
 def finished(
     found: Solution, problem: Problem, block: Block, outer: Block, options: AdjustOptions, outcome: Outcome
 ) -> Solution:
     """What the rounds of a problem ended with, its control tested and measured; where it started is `found`'s."""
-    heights, tested = found.heights, None
-    if block.gcps.names:
-        outcome, heights, tested = _tested(problem, block, options, outcome, heights, found.state)
+    tested = None
+    if found.agreed is not None:
+        covariance, points = outcome.minimum.covariance(problem.free), outcome.minimum.state.points
+        tested = control_test(covariance, points, block.num_tracks, block.gcps, found.agreed)
     after = measure(problem, outcome.minimum.state.params, outer)
-    return replace(found, problem=problem, heights=heights, outcome=outcome, after=after, tested=tested)
-
-
-def _tested(
-    problem: Problem, block: Block, options: AdjustOptions, outcome: Outcome, heights: Heights, start: State
-) -> tuple[Outcome, Heights, ControlTest]:
-    """The block without the control points that the rounds cut, then without those that the rest finds wrong, one at a
-    time and the worst first; each time solved from the start, as a gross error takes good tie points with it.
-    """
-    control, start = heights.control[0], replace(start, params=problem.camera_prior.mean)
-    points, weight = start.points.copy(), block.use / block.sigma
-    of_points = np.arange(block.num_tracks, block.num_known)
-    cut = np.isin(of_points, block.point[block.use & ~outcome.inlier])
-    used = np.isin(of_points, control.index)  # what an earlier solve let go of is gone
-    while True:
-        if cut.any():
-            used = used & ~cut
-            kept = control.select(used[control.index - block.num_tracks])
-            heights = replace(heights, control=(kept, *heights.control[1:]))
-            let_go = heights.hold(problem, points)
-            for _ in range(FIRST_STEPS + 1):  # where their rays see them
-                moved = let_go.triangulate(points, let_go.project_points(start.params, points), weight)
-                points[of_points[cut]] = moved[of_points[cut]]
-            there = replace(start, points=points.copy())
-            outcome = Rounds(problem, block, there, options, heights, block.use).run()
-        covariance = outcome.minimum.covariance(problem.free)
-        final = outcome.minimum.state.points
-        tested = control_test(covariance, final, block.num_tracks, block.gcps, used)
-        culprit = tested.culprit()
-        if culprit is None:
-            return outcome, heights, tested
-        cut = np.arange(len(used)) == culprit
+    return replace(found, problem=problem, outcome=outcome, after=after, tested=tested)
 
 
 def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:

@@ -227,7 +227,10 @@ def _control(gcps: Sequence[GcpEntry]) -> list[str]:
     if not seen:
         return []
     rejected = [point.name for point in seen if point.status == "rejected"]
-    words = f"{len(seen) - len(rejected)} of {len(seen)} GCPs that are seen hold the block"
+    undecided = sum(point.status == "undecided" for point in seen)
+    words = f"{len(seen) - len(rejected) - undecided} of {len(seen)} GCPs that are seen hold the block"
+    if undecided:
+        return [f"{words}: they fall into sets that contradict each other, and none outweighs the others."]
     return [f"{words}; the rest contradicts {listed(rejected, _NAMED)}." if rejected else f"{words}."]
 
 

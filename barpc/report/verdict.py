@@ -11,11 +11,13 @@ import numpy as np
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import APART, Apart
 from barpc.ba.scan import SURE
+from barpc.ba.snooping import ControlTest
 from barpc.geodesy import Array
 from barpc.report.records import plain
 from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
 from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_over, strangeness
+from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
@@ -342,20 +344,40 @@ def _control_reasons(run: Run) -> list[str]:
     if run.gcps is not None and tested is not None:
         for status, words in _CONTROL_WORDS.items():
             names = [
-                f"{name} ({metres(float(np.linalg.norm(tested.residual[g])))}, w = {tested.w[g]:.1f})"
+                f"{name} ({_enu(tested.residual[g])}, w = {tested.w[g]:.1f})"
                 if np.isfinite(tested.w[g])
                 else f"{name} (too few images show it to tell by how much)"
                 for g, name in enumerate(run.gcps.names)
                 if tested.status(g) == status
             ]
             if names:
-                out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.")
+                alike = status == "rejected" and tested.agreed is not None and tested.agreed.alike
+                datum = " They agree with each other: is their datum, or their height, another one?" * alike
+                out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.{datum}")
+        out += _undecided(run.gcps.names, tested)
         if not tested.fits and not any(tested.status(g) == "contradicts" for g in range(len(tested.used))):
             out.append(
                 f"{_count(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
                 "accuracies are too good, or more than one is wrong."
             )
     return out + [f"{line}." for p in (run.gcps, run.check_points) if p is not None for line in p.left_out]
+
+
+def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
+    """Sets of GCPs that contradict each other and weigh the same."""
+    if not tested.sets:
+        return []
+    one, other = (
+        listed([names[g] for g in np.flatnonzero(points).tolist()], _MOST_NAMED) for points in tested.sets
+    )
+    middle = [tested.residual[points & np.isfinite(tested.w)] for points in tested.sets]
+    apart = ""
+    if all(len(residual) for residual in middle):
+        apart = f" ({_enu(middle[0].mean(axis=0) - middle[1].mean(axis=0))} between them)"
+    return [
+        f"GCPs contradict each other, and no set of them outweighs the others: {one} against {other}{apart}. None of "
+        "them was used: check coordinates, axes, datum and image positions, or add a point."
+    ]
 
 
 def _count(number: int, what: str) -> str:
@@ -396,17 +418,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         held_by = "Without ground control" if run.reference is None or run.reference.control is None else "So"
         lines.append(f"{held_by} {known}{' only' if held_by != 'So' else ''}.")
     else:
-        is_seen = np.bincount(run.gcps.point, minlength=len(run.gcps.names)) > 0
-        tested = run.adjustment.control
-        held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
-        lines.append(f"With {_count(held, 'GCP')} {known}{'' if held else ' only'}.")
-        if held and tested is not None and tested.agrees and not tested.checked:
-            lines.append(f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show.")
-        alone = np.unique(run.gcps.view)
-        if held and len(alone) == 1 and len(views) > 1:
-            lines.append(
-                f"They are seen in {views[alone[0]].name} alone, which says nothing along its lines of sight."
-            )
+        lines += _held_lines(run, run.gcps, views, known)
     lines += _dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()
@@ -414,6 +426,33 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         if np.isfinite(ground).all():
             seen += f" and {_lengths(ground)} on the ground (east, north, up)"
         lines.append(f"{len(run.check_points.names)} check points, not used above, are met to {seen} (RMS).")
+    return lines
+
+
+def _held_lines(run: Run, gcps: GroundPoints, views: Sequence[ViewEntry], known: str) -> list[str]:
+    """What ground control says of the scene's place; `known` is what the adjustment states of it."""
+    assert run.adjustment is not None
+    is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
+    tested, lines = run.adjustment.control, []
+    held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
+    with_points = f"With {_count(held, 'GCP')}"
+    scale = 1.0 if tested is None or tested.agreed is None else tested.agreed.scale
+    if tested is None or tested.agrees:
+        lines.append(f"{with_points} {known}{'' if held else ' only'}.")
+    elif not held:
+        lines.append(f"Without ground control that agrees {known} only.")
+    elif scale > 1.0:
+        lines.append(f"{with_points}, taken for {scale:.0f} times less accurate than stated, {known}.")
+    else:
+        lines.append(
+            f"{_count(held, 'GCP')} that hold the scene do not agree: what is known of its place they do not tell."
+        )
+    if held and tested is not None and tested.agrees and not tested.checked:
+        lines.append(f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show.")
+    alone = np.unique(gcps.view)
+    if held and len(alone) == 1 and len(views) > 1:
+        name = views[alone[0]].name
+        lines.append(f"They are seen in {name} alone, which says nothing along its lines of sight.")
     return lines
 
 

@@ -19,7 +19,7 @@ from barpc.ba.starting import first_state, make_problem
 from barpc.ba.structure import make_structure
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
-from barpc.scene import Tracks
+from barpc.scene import GroundPoints, Tracks
 from barpc.sensor.corrected import ImageAffine, ImageCorrected
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
@@ -405,7 +405,7 @@ def script(
     monkeypatch.setattr(solved, "revived", lambda problem, state, *_: (state, None))
     monkeypatch.setattr(solved, "finished", lambda found, problem, block, outer, options, outcome: found)
     use = np.ones(100)
-    block: Any = SimpleNamespace(use=use, sigma=1.0, views=("a", "b"))
+    block: Any = SimpleNamespace(use=use, sigma=1.0, views=("a", "b"), gcps=GroundPoints.none())
     options = AdjustOptions() if options is None else options
     made = solved.solve_block(block, None, options, None, None, prior)  # type: ignore[arg-type]
     named = [
@@ -520,28 +520,3 @@ def test_what_follows_the_model_in_space_is_taken_before_an_affine_that_is_not_m
     assert followed(monkeypatch, 0.9, affine=0.71) == ("followed", None)  # no affine was chosen
     assert followed(monkeypatch, 0.1, prior="an earlier block") == ("auto", None)
     assert followed(monkeypatch, 0.1, geometric=False) == ("affine", 1.0)
-
-
-@pytest.mark.parametrize(
-    ("agrees", "left", "bent"),
-    [
-        (None, "", False),  # no control
-        (True, "", False),
-        (False, "", True),
-        (False, "is_skew", False),
-        (False, "has_trend", False),
-        (False, "has_waves", False),
-    ],
-)
-def test_a_trend_that_control_alone_bends_asks_for_no_other_model(monkeypatch, agrees, left, bent) -> None:
-    tested = None if agrees is None else SimpleNamespace(agrees=agrees)
-    block: Any = SimpleNamespace(point=np.arange(5), num_tracks=3, without=lambda rows: rows.tolist())
-
-    def solve_block(free: Any, outer: Any, options: Any, dem: Any, centers: Any, prior: Any) -> Any:
-        assert free == [False] * 3 + [True] * 2  # without the points that are known
-        assert prior is None
-        return SimpleNamespace(**{name: name == left for name in ("is_skew", "has_trend", "has_waves")})
-
-    monkeypatch.setattr(adjustment, "solve_block", solve_block)
-    found: Any = SimpleNamespace(tested=tested)
-    assert adjustment._bent_by_control(found, block, None, AdjustOptions(), None, None) == bent  # type: ignore[arg-type]

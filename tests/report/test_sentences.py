@@ -355,9 +355,10 @@ def test_control_that_is_wrong_is_named_with_how_far_it_is_off():
         adjusted(control=control(residual=residual, w=w, used=np.array([False, True, True]))), gcps=gcps()
     )
     assert found == [
-        "1 GCP rejected, contradicted by the rest: check coordinates, axes and image positions: P0 (5.0 m, w = 6.0).",
+        "1 GCP rejected, contradicted by the rest: check coordinates, axes and image positions: P0 (+3.00 m east, "
+        "+4.00 m north, +0.00 m up, w = 6.0).",
         "1 GCP off by more than 4 standard deviations, used all the same: the stated accuracies are too good, or more "
-        "than one is wrong: P2 (2.0 cm, w = 4.5).",
+        "than one is wrong: P2 (+0.00 m east, +0.00 m north, +0.02 m up, w = 4.5).",
     ]
     two = reasons(
         adjusted(control=control(used=np.zeros(3, bool), w=np.array([9.0, np.nan, 9.0]))), gcps=gcps()
