@@ -10,6 +10,7 @@ import numpy as np
 
 from barpc.ba.cameras import Projected
 from barpc.ba.priors import PointPrior
+from barpc.ba.relief import Bands, believe, DEBUG
 from barpc.ba.problem import Problem
 from barpc.ba.structure import Structure
 from barpc.errors import BarpcWarning
@@ -162,6 +163,8 @@ class Heights:
     alt_range: tuple[float, float]  # altitudes [m] to expect where no other track tells
     options: AdjustOptions  # `dem_sigma`, `dem_for_all`
     dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
+    bands: Bands | None = None
+    sharp: Array | None = None
     reference: Reference | None = None  # whose heights are the DEM's
 
     def hold(self, problem: Problem, points: Array) -> Problem:
@@ -171,7 +174,7 @@ class Heights:
     def _held(self, points: Array) -> PointPrior | None:
         dem, options = self.dem, self.options
         weak = self.weak[self.tracks]
-        index = self.tracks if dem is not None and self._whole else self.tracks[weak]
+        index = self.tracks if dem is not None and (self.bands is not None or self.reference is not None) else self.tracks[weak]
         if not len(index):
             return None
         if dem is not None:
@@ -179,6 +182,20 @@ class Heights:
             if self.reference is not None:
                 alike, span = max(len(index) / ALIKE, 1.0), self.control[1].mean
             sigma = options.dem_sigma * alike**0.5
+            if self.reference is None and self.bands is not None:
+                g = ground_from_ecef(points[index])
+                b = believe(self.bands, g, self.sharp[index])
+                import os
+                if os.environ.get('DBG'): print(len(g), np.round(b.gains,2), round(b.sigma,2), round(b.design,2), b.agrees.mean().round(3), DEBUG[-1].round(1).tolist())
+                normal = np.stack([-b.slopes[:, 0], -b.slopes[:, 1], np.ones(len(g))], axis=1)
+                sg = b.sigma * (b.design**.5 if os.environ.get('DES') else 1.0)
+                out = _heights(g, index, np.where(b.agrees, b.target, np.nan), normal, sg, self._bias, span)
+                if os.environ.get('BUMPS'):
+                    from barpc.ba.relief import bends
+                    at = self.bands.local(g)[b.agrees]; flat = (at - at.mean(axis=0)) / np.abs(at - at.mean(axis=0)).max(axis=0)
+                    c = np.zeros((len(out.index), 3, 10)); c[:, 0] = bends(flat) * self._bias / sg
+                    out = replace(out, common=c)
+                return out
             return terrain_heights(points, index, dem, sigma, self._bias, span)
         others = self.tracks[~weak]
         if len(others) >= 10:
