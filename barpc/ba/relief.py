@@ -1,10 +1,11 @@
 """How much of a DEM's relief is believed: scale by scale, as far as the tie points' own heights show it.
 
-A DEM is h = t + e, terrain and error. Where its small slopes are error they pull nowhere, but least squares that
-take them for the terrain's find a place where the errors happen to fit, and believe it. What counts is the best
-guess of the terrain, given the DEM: sum of gain x band over bands of scales, gain = var t / (var t + var e), for the
-rest of the terrain then has nothing to do with the guess and its slopes. The gains come from a regression of the tie points'
-heights on the bands (regression calibration: Carroll et al., Measurement Error in Nonlinear Models, ch. 4).
+A DEM is h = t + e, terrain and errors. Where its small slopes are errors, least squares that take them for the
+terrain's find a place where the errors happen to fit, and believe it. What may pull is the best guess of the terrain
+given the DEM: the sum of gain x band over bands of scales, gain = var t / (var t + var e), for what the terrain has
+beyond it has nothing to do with its slopes. The gains are those of a regression of the tie points' heights on the
+bands (regression calibration: Carroll, Ruppert, Stefanski, Crainiceanu, Measurement Error in Nonlinear Models, 2006,
+chapter 4). What is left of single heights, and how far neighbours share it, is taken from the residuals.
 """
 
 from __future__ import annotations
@@ -23,20 +24,29 @@ Terrain = Callable[[Array, Array], Array]
 """lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN where it is unknown."""
 
 SLOPE_STEP = 15.0  # m: slopes of the DEM itself are taken over twice this distance
-_NODES = 600  # of the grid on which a DEM is smoothed, along the scene's longer side
+DEGREE = 3  # of the surfaces of which a DEM's are taken whole, wrong by what all its heights are
+NUM_BENDS = (DEGREE + 1) * (DEGREE + 2) // 2
+_NODES = 300  # of the grid on which a DEM is smoothed, along the scene's longer side: 30 m of 10 km
 _FINEST = 5.0  # m between them, at least
 _WIDEST = 16  # the widest smoothing is the scene's longer side over this, as a standard deviation
-_MARGIN = 0.1  # of the scene, and
-_LEAST_MARGIN = 300.0  # m, as cameras may be off
+_MARGIN, _LEAST_MARGIN = 0.1, 300.0  # of the scene and m around it: cameras may be off
+_ENOUGH = 60  # points: three for each number that is estimated
+_ROUNDS = 5  # gains, then what does not fit, in turn
+_FAR = 5.0  # robust standard deviations: heights farther off are holes that were filled, or what was built
+_CELLS = (6, 10, 16)  # along the scene's longer side: 36 sums tell a variance to a quarter
+_STATED = 4.0  # observations that the stated standard deviation of single heights is worth
+_SHOWN = 0.5  # DEMs whose relief is farther from once that of the tie points than this, in
+_SURE = 4.0  # standard deviations, too, and
+_GROSS = 2.0  # times what is stated for single heights, are of another terrain
 
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """A DEM in bands of scales over a scene, the finest first, and their slopes."""
+    """A DEM in bands of scales over a scene, the finest first."""
 
     terrain: Terrain
     origin: Array  # (2,) lon, lat of the first node [deg]
-    unit: Array  # (2,) metres a degree there
+    unit: Array  # (2,) metres a degree
     step: float  # m between nodes
     smoothed: tuple[Array, ...]  # the DEM smoothed, each twice as wide as the one before
 
@@ -46,129 +56,203 @@ class Bands:
         lon = wrap_longitude(ground[:, 0], ground[0, 0])
         low = np.array([lon.min(), ground[:, 1].min()])
         high = np.array([lon.max(), ground[:, 1].max()])
-        unit = metres_per_unit(np.append((low + high) / 2.0, ground[0, 2]))[:2]
+        unit = metres_per_unit(np.append((low + high) / 2.0, np.median(ground[:, 2])))[:2]
         side = (high - low) * unit
         extent = float(side.max())
         margin = max(_MARGIN * extent, _LEAST_MARGIN)
-        step = max((extent + 2 * margin) / _NODES, _FINEST)
+        step = max((extent + 2.0 * margin) / _NODES, _FINEST)
         origin = low - margin / unit
-        cols, rows = (np.arange(int((s + 2 * margin) / step) + 2) * step for s in side)
+        cols, rows = (np.arange(int((s + 2.0 * margin) / step) + 2) * step for s in side)
         lon, lat = np.meshgrid(origin[0] + cols / unit[0], origin[1] + rows / unit[1])
         heights = np.asarray(terrain(lon.ravel(), lat.ravel()), dtype=np.float64).reshape(lon.shape)
         known = np.isfinite(heights)
         middle = float(np.median(heights[known])) if known.any() else 0.0
         filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
         while width * _WIDEST <= max(extent, _WIDEST * step):
-            of = [gaussian_filter(a, width / step, mode="nearest") for a in (filled, known.astype(np.float64))]
-            smoothed.append(middle + of[0] / np.maximum(of[1], 1e-6))
+            total, weight = (
+                gaussian_filter(a, width / step, mode="nearest", truncate=3.0)
+                for a in (filled, known.astype(np.float64))
+            )
+            smoothed.append(middle + total / np.maximum(weight, 1e-6))
             width *= 2.0
         return cls(terrain, origin, unit, step, tuple(smoothed))
 
     def local(self, ground: Array) -> Array:
-        """Metres east and north (n, 2) of the first node."""
+        """Metres east and north (n, 2) of the first node of ground points (n, 3)."""
         lon = wrap_longitude(ground[:, 0], self.origin[0])
-        return (np.column_stack([lon, ground[:, 1]]) - self.origin) * self.unit
+        return np.asarray((np.column_stack([lon, ground[:, 1]]) - self.origin) * self.unit)
 
     def at(self, ground: Array) -> tuple[Array, Array]:
-        """Heights (K, n) [m] of the bands at ground points (n, 3), which add up to the DEM's, and slopes (K, n, 2)."""
-        step = SLOPE_STEP / metres_per_unit(ground)[:, :2]
-        lon, lat = ground[:, 0], ground[:, 1]
-        east = self.terrain(lon + step[:, 0], lat) - self.terrain(lon - step[:, 0], lat)
-        north = self.terrain(lon, lat + step[:, 1]) - self.terrain(lon, lat - step[:, 1])
-        heights = [np.asarray(self.terrain(lon, lat), dtype=np.float64)]
-        slopes = [np.nan_to_num(np.column_stack([east, north]) / (2.0 * SLOPE_STEP))]
+        """Heights (K, n) [m] of the bands at ground points (n, 3), which add up to the DEM's; slopes (K, n, 2)."""
+        heights = [np.asarray(self.terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)]
+        slopes = [np.nan_to_num(terrain_slopes(self.terrain, ground))]
         at = self.local(ground).T[::-1] / self.step
         for layer in self.smoothed:
-            sloping = [a / self.step for a in np.gradient(layer)][::-1]
+            rising = [a / self.step for a in np.gradient(layer)][::-1]
             heights.append(map_coordinates(layer, at, order=1, mode="nearest"))
-            slopes.append(np.column_stack([map_coordinates(a, at, order=1, mode="nearest") for a in sloping]))
+            slopes.append(np.column_stack([map_coordinates(a, at, order=1, mode="nearest") for a in rising]))
         return _differences(np.array(heights)), _differences(np.array(slopes))
 
 
+def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
+    """Slopes (n, 2) of a terrain towards east and north at ground points (n, 3); NaN where it is unknown."""
+    step = SLOPE_STEP / metres_per_unit(ground)[:, :2]
+    lon, lat = ground[:, 0], ground[:, 1]
+    east = terrain(lon + step[:, 0], lat) - terrain(lon - step[:, 0], lat)
+    north = terrain(lon, lat + step[:, 1]) - terrain(lon, lat - step[:, 1])
+    return np.column_stack([east, north]) / (2.0 * SLOPE_STEP)
+
+
 def _differences(layers: Array) -> Array:
-    """Bands of layers (K, ...), each without the next, which is smoother."""
+    """Bands (K, ...) of layers (K, ...), each without the next, which is smoother."""
     return np.concatenate([layers[:-1] - layers[1:], layers[-1:]])
+
+
+def bends(at: Array) -> Array:
+    """Level, slopes and bends (n, `NUM_BENDS`) of a surface at places (n, 2)."""
+    x, y = at.T
+    return np.column_stack(
+        [x ** (n - j) * y**j for n in range(DEGREE + 1) for j in range(n + 1)]  # level, x, y, x^2, ...
+    )
+
+
+def _bend_slopes(at: Array) -> Array:
+    """Derivatives (n, `NUM_BENDS`, 2) of `bends` by the places."""
+    x, y = at.T
+    terms = [(n - j, j) for n in range(DEGREE + 1) for j in range(n + 1)]
+    by_x = [i * x ** max(i - 1, 0) * y**j for i, j in terms]
+    by_y = [j * x**i * y ** max(j - 1, 0) for i, j in terms]
+    return np.stack([np.column_stack(by_x), np.column_stack(by_y)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """What is believed of a DEM at points."""
+    """What is believed of a DEM at n points."""
 
-    alt: Array  # (n,) the terrain's altitude [m]; NaN where the DEM has none
-    slopes: Array  # (n, 2) towards east and north
+    alt: Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
+    slopes: Array  # (n, 2) of the terrain towards east and north
+    bends: Array  # (n, `NUM_BENDS`) at most about 1 at the scene's edges: what all heights may be wrong by
     gains: Array  # (K,) of the bands, the finest first
     sigma: float  # standard deviation of single altitudes [m]
-    design: float  # as many points are worth one
-    agrees: BoolArray  # (n,)
-    target: Array
+    alike: float  # as many points are worth one: their errors resemble each other
+    relief: float  # the DEM's relief as a multiple of the tie points'
+    shows: bool  # whether that may be one
+
+    @property
+    def effective_sigma(self) -> float:
+        """Standard deviation of single altitudes, as if their errors were independent [m]."""
+        return self.sigma * self.alike**0.5
 
 
-def bends(flat: Array, degree: int = 3) -> Array:
-    x, y = flat.T
-    return np.column_stack([x**i * y**j for n in range(degree + 1) for i in range(n, -1, -1) for j in [n - i]])
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """A DEM beside the heights that rays alone give to tie points."""
+
+    bands: Bands
+    tell: BoolArray  # (P,) points whose rays tell their heights better than the DEM does
+    delivered: Array  # (3,) how they lie to the DEM as delivered: level, rise to the east, to the north [m]
+
+    @classmethod
+    def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array) -> Relief:
+        """Of points (P, 3) where rays put them; heights of those that are `strong` (P,) are known to `sharp` (P,) [m].
+
+        Rises are measured at the RMS distance of the points from their middle.
+        """
+        index = np.flatnonzero(strong)
+        off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
+        index, off = index[np.isfinite(off)], off[np.isfinite(off)]
+        tell, delivered = np.zeros(len(strong), dtype=bool), np.full(3, np.nan)
+        bands = Bands.of(terrain, ground[strong] if strong.any() else ground)
+        if len(index) < _ENOUGH:
+            return cls(bands, tell, delivered)
+        at = bands.local(ground[index])
+        at -= at.mean(axis=0)
+        flat = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
+        near = np.ones(len(off), dtype=bool)
+        for _ in range(_ROUNDS):
+            delivered = np.linalg.lstsq(flat[near], off[near], rcond=None)[0]
+            left = np.abs(off - flat @ delivered)
+            near = left <= _FAR * 1.4826 * np.median(left)
+        tell[index[sharp[index] < 1.4826 * np.median(left)]] = True
+        return cls(bands, tell, delivered)
 
 
-def believe(bands: Bands, ground: Array, tell: BoolArray) -> Believed:
-    """What is believed of a DEM at points (n, 3), by the heights of those that `tell` (n,)."""
-    heights, slopes = bands.at(ground)
-    alt = heights.sum(axis=0)
-    known = np.isfinite(alt)
-    at = bands.local(ground)
-    scale = max(np.ptp(at, axis=0).max() / 2, 1.0)
-    flat = (at - at.mean(axis=0)) / scale
-    tell = tell & known
-    smooth = bends(flat)
-    eps = 1e-4
-    by = np.stack([(bends(flat + eps * d) - bends(flat - eps * d)) / (2 * eps * scale) for d in np.eye(2)], -1)  # n, m, 2
-    trend = np.linalg.lstsq(smooth[tell], heights[:, tell].T, rcond=1e-9)[0]  # (m, K)
-    bent = heights - (smooth @ trend).T
-    slopes_bent = slopes - np.einsum("nmx,mk->knx", by, trend)
-    kept, slope_kept = (smooth @ trend).sum(axis=1), np.einsum("nmx,mk->nx", by, trend)
-    agrees = known.copy()
-    gains = np.ones(len(bent))
-    above = ground[:, 2] - kept
-    for _ in range(5):
-        sloping = np.einsum("k,knx->nx", gains, slopes_bent)
-        shifts = np.column_stack([a * b for a in sloping.T for b in (np.ones(len(flat)), *flat.T)])
-        moved = np.column_stack([smooth, shifts])
-        use = tell & agrees
-        both = np.column_stack([above, bent.T])
-        free = both[use] - moved[use] @ np.linalg.lstsq(moved[use], both[use], rcond=1e-9)[0]
+def believe(relief: Relief, index: Array, ground: Array, stated: float) -> Believed | None:
+    """What is believed of a DEM at the points `index` (n,), at (n, 3); None where too few heights tell.
+
+    Single altitudes are stated to be known to `stated` [m]. Points that tell are held where they are, less what a
+    motion or a bend of the scene explains of their distance: what else they have is the DEM's error, and no ray is
+    bent for it.
+    """
+    heights, slopes = relief.bands.at(ground)
+    known = np.isfinite(heights[0])
+    tell = relief.tell[index] & known
+    if tell.sum() < _ENOUGH:
+        return None
+    at = relief.bands.local(ground)
+    at = at - at[tell].mean(axis=0)
+    half = max(float(np.abs(at[tell]).max()), 1.0)
+    smooth, by_place = bends(at / half), _bend_slopes(at / half) / half
+    trend = _coefficients(smooth[tell], heights[:, tell].T)
+    kept, bent = (smooth @ trend).sum(axis=1), heights.T - smooth @ trend
+    bent_slopes = slopes - np.einsum("nmx,mk->knx", by_place, trend)
+    above, gains = ground[:, 2] - kept, np.ones(bent.shape[1])
+    fits, spread = tell.copy(), np.inf
+    for _ in range(_ROUNDS):
+        rising = np.einsum("k,knx->nx", gains, bent_slopes)
+        moved = np.column_stack([smooth, *((rising * a[:, None]) for a in (np.ones(len(at)), *at.T / half))])
+        both = np.column_stack([above, bent])
+        free = both[fits] - moved[fits] @ _coefficients(moved[fits], both[fits])
         gains = lsq_linear(free[:, 1:], free[:, 0], (0.0, 1.0)).x
-        rest = above - bent.T @ gains
-        part = moved @ np.linalg.lstsq(moved[use], rest[use], rcond=1e-9)[0]
+        rest = above - bent @ gains
+        part = moved @ _coefficients(moved[fits], rest[fits])
         left = rest - part
-        spread = 1.4826 * np.median(np.abs(left[use]))
-        agrees = known & (np.abs(left) < 5.0 * spread)
-    sigma = float(np.sqrt(np.mean(left[use] ** 2)))
-    score = sloping[use]
-    score = score - smooth[use] @ np.linalg.lstsq(smooth[use], score, rcond=1e-9)[0]
-    design = _design(at[use], score, left[use])
-    guess = kept + gains @ bent
-    target = np.where(tell, ground[:, 2] - part, guess)
-    return Believed(guess, sloping + slope_kept, gains, sigma, design, agrees, target)
+        spread = 1.4826 * float(np.median(np.abs(left[fits])))
+        near = np.abs(left) <= max(_FAR * spread, 1e-6)
+        fits = tell & near
+    freedom = max(int(fits.sum()) - moved.shape[1] - len(gains), 1)
+    sigma = float(np.sqrt((_STATED * stated**2 + (left[fits] ** 2).sum()) / (_STATED + freedom)))
+    pull = rising[fits] - smooth[fits] @ _coefficients(smooth[fits], rising[fits])
+    alt = np.where(tell, ground[:, 2] - part, kept + bent @ gains)
+    times, shows = _shown(bent[fits].sum(axis=1), above[fits], smooth[fits], stated)
+    return Believed(
+        np.where(known & (near | ~tell), alt, np.nan),
+        rising + np.einsum("nmx,mk->nx", by_place, trend),
+        smooth,
+        gains,
+        sigma,
+        _alike(at[fits], pull * left[fits, None]),
+        times,
+        shows,
+    )
 
 
-def _design(at: Array, slopes: Array, left: Array) -> float:
-    """How many points are worth one: sums of their pull over cells against sums of independent ones."""
-    score = slopes * left[:, None]
-    found = []
-    for cells in (6, 10, 16):
-        cell = np.floor((at - at.min(axis=0)) / max(np.ptp(at, axis=0).max(), 1.0) * cells).astype(int)
-        number = np.unique(cell @ [1000, 1], return_inverse=True)[1]
-        sums = np.stack([np.bincount(number, s) for s in score.T])
-        found.append((sums**2).sum(axis=1) / (score**2).sum(axis=0))
-    DEBUG.append(np.array(found))
-    return float(max(np.max(found), 1.0))
-DEBUG = []
+def _coefficients(design: Array, values: Array) -> Array:
+    found: Array = np.linalg.lstsq(design, values, rcond=1e-9)[0]
+    return found
 
 
-def telling(bands, ground, strong, sharp):
-    alt = bands.terrain(ground[:, 0], ground[:, 1])
-    tell = strong & np.isfinite(alt)
-    at = bands.local(ground)
-    smooth = bends((at - at[tell].mean(axis=0)) / max(np.ptp(at[tell], axis=0).max() / 2, 1.0))
-    off = ground[:, 2] - alt
-    off = off - smooth @ np.linalg.lstsq(smooth[tell], off[tell], rcond=1e-9)[0]
-    tell &= sharp < 0.25 * 1.4826 * np.median(np.abs(off[tell]))
-    return tell
+def _alike(at: Array, pull: Array) -> float:
+    """How many points at places (n, 2) are worth one, by their pulls (n, 2) to the east and north.
+
+    Sums over cells against those of independent errors, at the size of cells at which they are largest.
+    """
+    size, of_single, found = max(float(np.ptp(at, axis=0).max()), 1.0), (pull**2).sum(axis=0), 1.0
+    for count in _CELLS:
+        column, row = np.floor((at - at.min(axis=0)) / size * count).astype(np.int64).T
+        cell = np.unique(column * (count + 1) + row, return_inverse=True)[1]
+        sums = np.stack([np.bincount(cell, one) for one in pull.T])
+        found = max(found, float(((sums**2).sum(axis=1) / np.maximum(of_single, 1e-30)).max()))
+    return found
+
+
+def _shown(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[float, bool]:
+    """A DEM's relief (n,) as a multiple of that of the tie points (n,) [m], and whether it may be theirs."""
+    seen = above - smooth @ _coefficients(smooth, above)
+    size = max(float(seen @ seen), 1e-12)
+    times = float(relief @ seen) / size
+    off, rest = relief - seen, relief - times * seen
+    sigma = float(np.sqrt(rest @ rest / size / len(seen)) if len(seen) else np.inf)
+    far = abs(times - 1.0)
+    wrong = far > _SHOWN and far > _SURE * sigma and float(off @ off) > len(off) * (_GROSS * stated) ** 2
+    return times, not wrong

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 import numpy as np
 
 from barpc.ba.block import Block
@@ -15,9 +14,7 @@ from barpc.ba.solve import State
 from barpc.ba.structure import make_structure
 from barpc.ba.unknowns import make_unknowns
 from barpc.ba.waves import Waves
-from barpc.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.ba.normal import cholesky3, point_products, solve_lower
-from barpc.ba.relief import Bands, telling
+from barpc.geodesy import Array
 from barpc.options import AdjustOptions
 
 FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
@@ -87,16 +84,12 @@ def first_state(
     angles = convergence_angles(problem.structure, projected, points)
     weak = seen & (angles < np.radians(options.min_convergence))
     tracks = np.flatnonzero(seen[: block.num_tracks])
-    heights = Heights(tuple(control), weak, tracks, block.alt_range, options, dem, None, block.reference)
+    heights = Heights(tuple(control), weak, tracks, block.alt_range, options, dem, block.reference)
     weight = block.use / block.sigma
     for _ in range(FIRST_STEPS):
         points = heights.hold(problem, points).triangulate(points, projected, weight)
         projected = problem.project_points(params, points)
     points = heights.hold(problem, points).triangulate(points, projected, weight)
-    if dem is not None and block.reference is None and len(tracks):
-        ground = ground_from_ecef(points)
-        bands = Bands.of(dem, ground[tracks])
-        sums = problem.structure.sum_points(point_products(projected.by_point * weight, np.zeros_like(problem.xy))[:6])
-        up = solve_lower(cholesky3(sums), enu_basis(ground)[:, 2].T)
-        heights = replace(heights, bands=bands, sharp=telling(bands, ground, seen & ~weak & (np.arange(len(seen)) < block.num_tracks), np.linalg.norm(up, axis=0)))
+    if heights.is_judged and len(tracks):
+        heights = heights.beside(problem, points, projected, weight)
     return State(params, points), heights
