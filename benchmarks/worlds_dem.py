@@ -97,9 +97,7 @@ def _beside(place: Array, lon: Array, lat: Array) -> Array:
 
 def main() -> None:
     """Say what this is for."""
-    argparse.ArgumentParser(
-        description="DEMs for benchmarks/worlds.py, which has the commands."
-    ).parse_args()
+    argparse.ArgumentParser(description="DEMs for benchmarks/worlds.py, which has the commands.").parse_args()
 
 
 if __name__ == "__main__":

@@ -435,8 +435,8 @@ def _angles(seed: int, rng: np.random.Generator) -> Plan:
 
 
 WRONG = (
-    Wrong("offset", 10.0), Wrong("offset", 40.0), Wrong("tilt", 40.0), Wrong("void", 1000.0), Wrong("elsewhere", 9000.0),
-    Wrong("flat"), Wrong("offset", -50.0), Wrong("offset", 300.0),
+    Wrong("offset", 10.0), Wrong("offset", 40.0), Wrong("tilt", 40.0), Wrong("void", 1000.0),
+    Wrong("elsewhere", 9000.0), Wrong("flat"), Wrong("offset", -50.0), Wrong("offset", 300.0),
 )  # fmt: skip
 """DEMs that are not as stated."""
 

@@ -16,7 +16,7 @@ from barpc.ba.covariance import Covariance
 from barpc.ba.datum import datum_shares
 from barpc.ba.following import follow, without_strips
 from barpc.ba.gauge import GaugeReport, gauge_report
-from barpc.ba.ground import Terrain, TerrainTest
+from barpc.ba.ground import Terrain
 from barpc.ba.heldout import enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import Finding, left_over, standing_out
@@ -301,7 +301,7 @@ def _adjustment(
         in_space_rms=in_space,
         two_groups=two_groups(found.problem.structure, outcome.residual, projected, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],
-        terrain=_terrain(found, gauge),
+        terrain=found.heights.test(final.points, seen),
         left_out=block.left_out,
         apart=None,
         **_control(found, block, covariance, inlier[ties.stop :]),
@@ -356,14 +356,6 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
         at_end = (found.final, outcome.residual, outcome.weight)
         w[rows] = image_test(covariance, outcome.problem, *at_end, rows)
     return w
-
-
-def _terrain(found: Solution, gauge: GaugeReport) -> TerrainTest | None:
-    """What a terrain did, and how far from it the cameras as stated let the scene be: level, rise to east and north."""
-    tested, stated = found.heights.test(found.final.points, found.seen), found.problem.camera_prior.sigma
-    variance = np.where(np.isfinite(stated), stated, 0.0).ravel() ** 2
-    let = np.sqrt(gauge.by_unknown[2:5] ** 2 @ variance)
-    return None if tested is None else replace(tested, cameras=tuple(map(float, let)))
 
 
 def _place(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.cameras import Projected
-from barpc.ba.normal import cholesky3, point_products, solve_lower
 from barpc.ba.priors import PointPrior
 from barpc.ba.problem import Problem
 from barpc.ba.relief import NUM_BENDS, Believed, Relief, Terrain, believe, terrain_slopes
@@ -89,13 +88,14 @@ def terrain_heights(
     return _heights(ground, index, alt, normal, sigma, common_sigma, span)
 
 
-def _believed_heights(ground: Array, index: IntArray, believed: Believed, common_sigma: float) -> PointPrior:
+def _believed_heights(ground: Array, index: IntArray, believed: Believed, common_sigma: Array) -> PointPrior:
     """Points `index` (Q,) at ground points (Q, 3) held to what is believed of a DEM.
 
-    All of it may be wrong by `common_sigma` [m], and by slopes and bends that are as much at the scene's edges.
+    All of it may be wrong by a level, slopes and bends that are as much as `common_sigma` (`NUM_BENDS`,) [m] at the
+    scene's edges.
     """
     normal, sigma = np.column_stack([-believed.slopes, np.ones(len(ground))]), believed.effective_sigma
-    held = _heights(ground, index, believed.alt, normal, sigma, common_sigma)
+    held = _heights(ground, index, believed.alt, normal, sigma, 0.0)
     common = np.zeros((len(held.index), 3, NUM_BENDS))
     common[:, 0] = believed.bends[np.isfinite(believed.alt)] * (common_sigma / sigma)
     return replace(held, common=common)
@@ -162,7 +162,9 @@ class TerrainTest:
     offset: float  # median of the adjusted altitudes minus the terrain's [m]; NaN where it has none
     spread: float  # 1.4826 times their median absolute deviation [m]
     bias: float  # what its heights may be wrong by together [m]
-    sigma: float = np.nan  # standard deviation of single heights, as the tie points show it [m]; NaN: as stated
+    sigma: float = (
+        np.nan
+    )  # standard deviation of single heights, as the tie points show it [m]; NaN: as stated
     alike: float = 1.0  # as many single heights are worth one
     gains: tuple[float, ...] = ()  # how much of its relief is believed, scale by scale, the finest first
     relief: float = np.nan  # its relief as a multiple of the tie points'
@@ -170,11 +172,8 @@ class TerrainTest:
     is_known: bool = True  # whether it is known what its heights count from
     # (3,) how the tie points lie to it as delivered, level, rise to the east and to the north [m]
     delivered: tuple[float, ...] = (np.nan,) * 3
-    cameras: tuple[float, ...] = (np.nan,) * 3  # what the cameras' accuracies let expect of that
 
-    def beyond(self) -> Array:
-        """How the tie points lie to it as delivered, over what its own accuracy and the cameras' let expect (3,)."""
-        return np.asarray(self.delivered) / np.hypot(self.cameras, self.bias)
+    beyond: tuple[float, ...] = (np.nan,) * 3  # times what its accuracy and the cameras' let expect of that
 
 
 @dataclass(frozen=True)
@@ -196,17 +195,6 @@ class Heights:
         given = self.dem is None or self.reference is not None
         return not given and not self.options.dem_for_weak and self.options.learn_priors
 
-    def beside(self, problem: Problem, points: Array, projected: Projected, weight: Array) -> Heights:
-        """The same with the DEM beside points (P, 3) [m] that stand where rays alone put them."""
-        assert self.dem is not None
-        structure = problem.structure
-        sums = structure.sum_points(point_products(projected.by_point * weight, np.zeros_like(problem.xy))[:6])
-        ground = ground_from_ecef(points)
-        sharp = np.linalg.norm(solve_lower(cholesky3(sums), enu_basis(ground)[:, 2].T), axis=0)
-        strong = np.zeros(len(points), dtype=bool)
-        strong[self.tracks[~self.weak[self.tracks]]] = True
-        return replace(self, relief=Relief.of(self.dem, ground, strong, sharp))
-
     def hold(self, problem: Problem, points: Array) -> Problem:
         """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
         return replace(problem, point_prior=_join([*self.control, self._held(points)]))
@@ -214,13 +202,16 @@ class Heights:
     def _believed(self, points: Array) -> Believed | None:
         if self.relief is None:
             return None
-        return believe(self.relief, self.tracks, ground_from_ecef(points[self.tracks]), self.options.dem_sigma)
+        return believe(
+            self.relief, self.tracks, ground_from_ecef(points[self.tracks]), self.options.dem_sigma
+        )
 
     def _held(self, points: Array) -> PointPrior | None:
         weak, believed = self.weak[self.tracks], self._believed(points)
         if believed is not None and believed.shows:
             ground = ground_from_ecef(points[self.tracks])
-            return _believed_heights(ground, self.tracks, believed, self._bias)
+            assert self.relief is not None
+            return _believed_heights(ground, self.tracks, believed, self.relief.common_sigma(self._bias))
         dem = self.dem if believed is None else None
         judged_later = self.is_judged and self.relief is None
         index = self.tracks if dem is not None and self._whole and not judged_later else self.tracks[weak]
@@ -277,7 +268,8 @@ class Heights:
         found = TerrainTest(count, int(known.sum()), len(index), offset, spread, self._bias)
         found = replace(found, is_known=self._is_known is not False)
         if self.relief is not None:
-            found = replace(found, delivered=tuple(map(float, self.relief.delivered)))
+            delivered, beyond = self.relief.delivered, self.relief.beyond(self._bias)
+            found = replace(found, delivered=tuple(map(float, delivered)), beyond=tuple(map(float, beyond)))
         if believed is None:
             return found
         judged = {name: getattr(believed, name) for name in ("sigma", "alike", "relief", "shows")}

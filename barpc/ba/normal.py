@@ -162,7 +162,7 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
     rows = np.flatnonzero(place[structure.point] >= 0)
     bounds, q = np.searchsorted(rows, structure.bounds), cross.shape[2]
     by_camera = np.empty((m, structure.num_views, q))
-    for v, of_view in enumerate(rows[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)):
+    for v, of_view in enumerate(np.split(rows, bounds[1:-1])):
         of_points = whitened[place[structure.point[of_view]]].reshape(-1, m)
         by_camera[:, v] = -of_points.T @ cross[of_view].reshape(-1, q)
     by_camera = by_camera.reshape(m, -1)

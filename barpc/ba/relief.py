@@ -35,6 +35,8 @@ _ROUNDS = 5  # gains, then what does not fit, in turn
 _FAR = 5.0  # robust standard deviations: heights farther off are holes that were filled, or what was built
 _CELLS = (6, 10, 16)  # along the scene's longer side: 36 sums tell a variance to a quarter
 _STATED = 4.0  # observations that the stated standard deviation of single heights is worth
+BEYOND = 3.0  # times what is allowed: a DEM and the cameras contradict each other
+_EDGE = 2.0  # the scene's edges lie at most about so many times as far out as its points' RMS distance
 _SHOWN = 0.5  # DEMs whose relief is farther from once that of the tie points than this, in
 _SURE = 4.0  # standard deviations, too, and
 _GROSS = 2.0  # times what is stated for single heights, are of another terrain
@@ -129,7 +131,9 @@ def _bend_slopes(at: Array) -> Array:
 class Believed:
     """What is believed of a DEM at n points."""
 
-    alt: Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
+    alt: (
+        Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
+    )
     slopes: Array  # (n, 2) of the terrain towards east and north
     bends: Array  # (n, `NUM_BENDS`) at most about 1 at the scene's edges: what all heights may be wrong by
     gains: Array  # (K,) of the bands, the finest first
@@ -151,6 +155,19 @@ class Relief:
     bands: Bands
     tell: BoolArray  # (P,) points whose rays tell their heights better than the DEM does
     delivered: Array  # (3,) how they lie to the DEM as delivered: level, rise to the east, to the north [m]
+    fit: Array  # (3, P) that by the heights of the points
+    cameras: Array  # (3,) what the cameras' accuracies let expect of that [m]; NaN where they do not say
+
+    def beyond(self, bias: float) -> Array:
+        """How far from the DEM they lie as delivered (3,), over what cameras and a DEM wrong by `bias` [m] allow."""
+        return np.asarray(np.abs(self.delivered) / np.hypot(self.cameras, bias))
+
+    def common_sigma(self, bias: float) -> Array:
+        """What all heights may be wrong by (`NUM_BENDS`,) [m] at the scene's edges: `bias`, and what contradicts it."""
+        sigma = np.full(NUM_BENDS, bias)
+        contradicts = self.beyond(bias) > BEYOND
+        sigma[:3][contradicts] = _EDGE * np.abs(self.delivered)[contradicts]
+        return sigma
 
     @classmethod
     def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array) -> Relief:
@@ -161,20 +178,21 @@ class Relief:
         index = np.flatnonzero(strong)
         off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
         index, off = index[np.isfinite(off)], off[np.isfinite(off)]
-        tell, delivered = np.zeros(len(strong), dtype=bool), np.full(3, np.nan)
+        tell, fit, unknown = np.zeros(len(strong), dtype=bool), np.zeros((3, len(strong))), np.full(3, np.nan)
         bands = Bands.of(terrain, ground[strong] if strong.any() else ground)
         if len(index) < _ENOUGH:
-            return cls(bands, tell, delivered)
+            return cls(bands, tell, unknown, fit, unknown)
         at = bands.local(ground[index])
         at -= at.mean(axis=0)
         flat = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
         near = np.ones(len(off), dtype=bool)
         for _ in range(_ROUNDS):
-            delivered = np.linalg.lstsq(flat[near], off[near], rcond=None)[0]
+            delivered = _coefficients(flat[near], off[near])
             left = np.abs(off - flat @ delivered)
             near = left <= _FAR * 1.4826 * np.median(left)
         tell[index[sharp[index] < 1.4826 * np.median(left)]] = True
-        return cls(bands, tell, delivered)
+        fit[:, index] = np.linalg.pinv(flat)
+        return cls(bands, tell, delivered, fit, unknown)
 
 
 def believe(relief: Relief, index: Array, ground: Array, stated: float) -> Believed | None:

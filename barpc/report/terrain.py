@@ -6,9 +6,9 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.ground import TerrainTest
+from barpc.ba.relief import BEYOND
 from barpc.report.summary import metres
 
-BEYOND = 3.0  # times what its accuracy and the cameras' let expect: one of them is not as stated
 _GEOID = 110.0  # m: no geoid lies farther from the ellipsoid
 
 
@@ -30,7 +30,10 @@ def dem_lines(adjustment: Adjustment) -> list[str]:
         held += ": it has no height where it is needed"
     share = 100 * terrain.known / max(terrain.total, 1)
     lie = f"they lie {terrain.offset:+.1f} m above it (median; spread {terrain.spread:.1f} m)"
-    lines = [f"{held}.", f"It has a height for {share:.0f} % of the tie points{f'; {lie}' if terrain.known else ''}."]
+    lines = [
+        f"{held}.",
+        f"It has a height for {share:.0f} % of the tie points{f'; {lie}' if terrain.known else ''}.",
+    ]
     if not terrain.is_known:
         lines.append(
             "Nothing says that its heights count from the ellipsoid: give --geoid, or they may be wrong by up to 100 m."
@@ -54,25 +57,25 @@ def dem_reasons(adjustment: Adjustment | None) -> list[str]:
 
 def _against(terrain: TerrainTest) -> list[str]:
     """How the DEM contradicts the cameras as delivered."""
-    level, *rises = terrain.beyond()
+    level, *rises = terrain.beyond
     out = []
-    if abs(level) > BEYOND:
+    if level > BEYOND:
         off = terrain.delivered[0]
         why = "its heights, the datum that they count from, or the cameras are not as stated"
         if not terrain.is_known and abs(off) < _GEOID:
             why = "nothing says that its heights count from the ellipsoid: a geoid was left out, give --geoid"
         out.append(
-            f"The DEM is {abs(off):.1f} m {'below' if off > 0 else 'above'} the place where the cameras as delivered put "
-            f"the tie points, {abs(level):.1f} times what the accuracies of both let expect: {why}."
+            f"The DEM is {abs(off):.1f} m {'below' if off > 0 else 'above'} the tie points as the delivered cameras put "
+            f"them, {level:.1f} times what the accuracies of both let expect: {why}."
         )
     tilts = [
         f"{abs(off):.1f} m to the {'east' if axis == 0 else 'north'}"
         for axis, (off, times) in enumerate(zip(terrain.delivered[1:], rises, strict=True))
-        if abs(times) > BEYOND
+        if times > BEYOND
     ]
     if tilts:
         out.append(
-            f"The DEM is tilted against the tie points as delivered, by {' and '.join(tilts)} at the scene's edge, more "
-            f"than {BEYOND:g} times what the accuracies of it and of the cameras let expect."
+            f"The DEM is tilted against the tie points as delivered, by {' and '.join(tilts)} at the scene's edge, "
+            f"more than {BEYOND:g} times what the accuracies of it and of the cameras let expect."
         )
     return out
