@@ -559,6 +559,10 @@ class RunOptions(Options):
 # --- what is made of them ---------------------------------------------------------------------------------
 
 
+FORMER = {"dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only"}
+"""Former option -> how it is said now."""
+
+
 def with_values(options: Record, values: Mapping[str, Any], where: str = "options") -> Record:
     """A copy of a record with some fields changed, nested records by nested mappings.
 
@@ -566,6 +570,8 @@ def with_values(options: Record, values: Mapping[str, Any], where: str = "option
     """
     known, changed = declared(type(options)), dict(values)
     for name, value in values.items():
+        if name in FORMER:
+            raise InputError(f"{where}: {name} is said otherwise now: {FORMER[name]}")
         if name not in known:
             raise InputError(f"{where}: unknown option {name!r}; known are {', '.join(known)}")
         nested = getattr(options, name)

@@ -161,11 +161,11 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
     place[index] = np.arange(len(index))
     rows = np.flatnonzero(place[structure.point] >= 0)
     bounds, q = np.searchsorted(rows, structure.bounds), cross.shape[2]
-    by_camera = np.empty((m, structure.num_views, q))
+    by_view = np.empty((m, structure.num_views, q))
     for v, of_view in enumerate(np.split(rows, bounds[1:-1])):
         of_points = whitened[place[structure.point[of_view]]].reshape(-1, m)
-        by_camera[:, v] = -of_points.T @ cross[of_view].reshape(-1, q)
-    by_camera = by_camera.reshape(m, -1)
+        by_view[:, v] = -of_points.T @ cross[of_view].reshape(-1, q)
+    by_camera = by_view.reshape(m, -1)
     gradient = -np.einsum("qim,iq->m", whitened, half[:, index])
     return Common(
         index,

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import lsq_linear
 
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, IntArray
 
 Terrain = Callable[[Array, Array], Array]
 """lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN where it is unknown."""
@@ -91,9 +91,13 @@ class Bands:
         at = self.local(ground).T[::-1] / self.step
         for layer in self.smoothed:
             rising = [a / self.step for a in np.gradient(layer)][::-1]
-            heights.append(map_coordinates(layer, at, order=1, mode="nearest"))
-            slopes.append(np.column_stack([map_coordinates(a, at, order=1, mode="nearest") for a in rising]))
+            heights.append(_sampled(layer, at))
+            slopes.append(np.column_stack([_sampled(a, at) for a in rising]))
         return _differences(np.array(heights)), _differences(np.array(slopes))
+
+
+def _sampled(layer: Array, at: Array) -> Array:
+    return np.asarray(map_coordinates(layer, at, order=1, mode="nearest"), dtype=np.float64)
 
 
 def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
@@ -145,7 +149,7 @@ class Believed:
     @property
     def effective_sigma(self) -> float:
         """Standard deviation of single altitudes, as if their errors were independent [m]."""
-        return self.sigma * self.alike**0.5
+        return float(self.sigma * self.alike**0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +199,7 @@ class Relief:
         return cls(bands, tell, delivered, fit, unknown)
 
 
-def believe(relief: Relief, index: Array, ground: Array, stated: float) -> Believed | None:
+def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Believed | None:
     """What is believed of a DEM at the points `index` (n,), at (n, 3); None where too few heights tell.
 
     Single altitudes are stated to be known to `stated` [m]. Points that tell are held where they are, less what a
@@ -246,8 +250,7 @@ def believe(relief: Relief, index: Array, ground: Array, stated: float) -> Belie
 
 
 def _coefficients(design: Array, values: Array) -> Array:
-    found: Array = np.linalg.lstsq(design, values, rcond=1e-9)[0]
-    return found
+    return np.asarray(np.linalg.lstsq(design, values, rcond=1e-9)[0], dtype=np.float64)
 
 
 def _alike(at: Array, pull: Array) -> float:

@@ -8,12 +8,12 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.cameras import Cameras
-from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control, reference_control
+from barpc.ba.ground import Heights, convergence_angles, ground_control, reference_control
 from barpc.ba.incremental import BlockPrior, apply_prior
 from barpc.ba.normal import cholesky3, point_products, solve_lower, solve_transposed
 from barpc.ba.priors import CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
-from barpc.ba.relief import Relief
+from barpc.ba.relief import Relief, Terrain
 from barpc.ba.solve import State
 from barpc.ba.structure import make_structure
 from barpc.ba.unknowns import make_unknowns

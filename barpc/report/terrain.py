@@ -65,8 +65,8 @@ def _against(terrain: TerrainTest) -> list[str]:
         if not terrain.is_known and abs(off) < _GEOID:
             why = "nothing says that its heights count from the ellipsoid: a geoid was left out, give --geoid"
         out.append(
-            f"The DEM is {abs(off):.1f} m {'below' if off > 0 else 'above'} the tie points as the delivered cameras put "
-            f"them, {level:.1f} times what the accuracies of both let expect: {why}."
+            f"The DEM is {abs(off):.1f} m {'below' if off > 0 else 'above'} the tie points as the delivered cameras "
+            f"put them, {level:.1f} times what the accuracies of both let expect: {why}."
         )
     tilts = [
         f"{abs(off):.1f} m to the {'east' if axis == 0 else 'north'}"

@@ -162,8 +162,8 @@ def test_a_dem_that_holds_ventoux_moves_it_by_no_more_than_is_stated(shared_data
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BarpcWarning)
         dem = Dem.open(shared_data / "dem/N44E005.hgt", geoid)
-    found = adjust_tracks(ventoux, tracks, AdjustOptions(dem_for_all=True), dem=dem)
-    free = adjust_tracks(ventoux, tracks, dem=dem)
+    found = adjust_tracks(ventoux, tracks, AdjustOptions(), dem=dem)
+    free = adjust_tracks(ventoux, tracks, AdjustOptions(dem_for_weak=True), dem=dem)
     moved = _shift(ventoux, found, checks)
     assert np.linalg.norm(moved[:2]) < 7.0  # with errors that average away it was 15 m
     assert (np.abs(moved) < 2.5 * free.gauge.sigma).all()
