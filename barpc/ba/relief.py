@@ -67,7 +67,9 @@ class Bands:
         cols, rows = (np.arange(int((s + 2.0 * margin) / step) + 2) * step for s in side)
         lon, lat = np.meshgrid(origin[0] + cols / unit[0], origin[1] + rows / unit[1])
         heights = np.asarray(terrain(lon.ravel(), lat.ravel()), dtype=np.float64).reshape(lon.shape)
-        known = np.isfinite(heights)
+        low, high = np.percentile(ground[:, 2], [1, 99])
+        room = high - low + _LEAST_MARGIN
+        known = (heights > low - room) & (heights < high + room)  # a hole may be filled with any number
         middle = float(np.median(heights[known])) if known.any() else 0.0
         filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
         while width * _WIDEST <= max(extent, _WIDEST * step):
@@ -90,9 +92,9 @@ class Bands:
         slopes = [np.nan_to_num(terrain_slopes(self.terrain, ground))]
         at = self.local(ground).T[::-1] / self.step
         for layer in self.smoothed:
-            rising = [a / self.step for a in np.gradient(layer)][::-1]
+            rising = [np.gradient(layer, self.step, axis=axis) for axis in (1, 0)]
             heights.append(_sampled(layer, at))
-            slopes.append(np.column_stack([_sampled(a, at) for a in rising]))
+            slopes.append(np.column_stack([_sampled(np.asarray(a), at) for a in rising]))
         return _differences(np.array(heights)), _differences(np.array(slopes))
 
 
@@ -174,9 +176,12 @@ class Relief:
         return sigma
 
     @classmethod
-    def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array) -> Relief:
+    def of(
+        cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0
+    ) -> Relief:
         """Of points (P, 3) where rays put them; heights of those that are `strong` (P,) are known to `sharp` (P,) [m].
 
+        Those tell that are known better than single heights of the DEM are, as `stated` [m] or as they lie to it.
         Rises are measured at the RMS distance of the points from their middle.
         """
         index = np.flatnonzero(strong)
@@ -189,12 +194,12 @@ class Relief:
         at = bands.local(ground[index])
         at -= at.mean(axis=0)
         flat = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
-        near = np.ones(len(off), dtype=bool)
+        near = _middling(off)
         for _ in range(_ROUNDS):
             delivered = _coefficients(flat[near], off[near])
             left = np.abs(off - flat @ delivered)
             near = left <= _FAR * 1.4826 * np.median(left)
-        tell[index[sharp[index] < 1.4826 * np.median(left)]] = True
+        tell[index[sharp[index] < max(1.4826 * float(np.median(left)), stated)]] = True
         fit[:, index] = np.linalg.pinv(flat)
         return cls(bands, tell, delivered, fit, unknown)
 
@@ -209,6 +214,8 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
     heights, slopes = relief.bands.at(ground)
     known = np.isfinite(heights[0])
     tell = relief.tell[index] & known
+    if tell.any():
+        tell[tell] = _middling((ground[:, 2] - heights.sum(axis=0))[tell])
     if tell.sum() < _ENOUGH:
         return None
     at = relief.bands.local(ground)
@@ -237,8 +244,9 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
     pull = rising[fits] - smooth[fits] @ _coefficients(smooth[fits], rising[fits])
     alt = np.where(tell, ground[:, 2] - part, kept + bent @ gains)
     times, shows = _shown(bent[fits].sum(axis=1), above[fits], smooth[fits], stated)
+    missed = relief.tell[index] & ~(tell & near)
     return Believed(
-        np.where(known & (near | ~tell), alt, np.nan),
+        np.where(known & ~missed, alt, np.nan),
         rising + np.einsum("nmx,mk->nx", by_place, trend),
         smooth,
         gains,
@@ -247,6 +255,12 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
         times,
         shows,
     )
+
+
+def _middling(values: Array) -> BoolArray:
+    """Which of n values lie about their median."""
+    off = np.abs(values - np.median(values))
+    return np.asarray(off <= _FAR * 1.4826 * np.median(off))
 
 
 def _coefficients(design: Array, values: Array) -> Array:

@@ -112,7 +112,8 @@ def _relief(problem: Problem, heights: Heights, points: Array, weight: Array) ->
     up = enu_basis(ground)[:, 2].T
     strong = np.zeros(len(points), dtype=bool)
     strong[heights.tracks[~heights.weak[heights.tracks]]] = True
-    found = Relief.of(heights.dem, ground, strong, np.linalg.norm(solve_lower(lower, up), axis=0))
+    sharp = np.linalg.norm(solve_lower(lower, up), axis=0)
+    found = Relief.of(heights.dem, ground, strong, sharp, heights.options.dem_sigma)
     let = np.zeros(3)
     for m, fit in enumerate(found.fit):
         moved = solve_transposed(lower, solve_lower(lower, up * fit))
