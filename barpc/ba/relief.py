@@ -56,8 +56,9 @@ class Bands:
     def of(cls, terrain: Terrain, ground: Array) -> Bands:
         """The bands over ground points (n, 3)."""
         lon = wrap_longitude(ground[:, 0], ground[0, 0])
-        low = np.array([lon.min(), ground[:, 1].min()])
-        high = np.array([lon.max(), ground[:, 1].max()])
+        low, high = np.percentile(
+            np.column_stack([lon, ground[:, 1]]), [1, 99], axis=0
+        )  # wrong matches lie far out
         unit = metres_per_unit(np.append((low + high) / 2.0, np.median(ground[:, 2])))[:2]
         side = (high - low) * unit
         extent = float(side.max())
@@ -67,9 +68,9 @@ class Bands:
         cols, rows = (np.arange(int((s + 2.0 * margin) / step) + 2) * step for s in side)
         lon, lat = np.meshgrid(origin[0] + cols / unit[0], origin[1] + rows / unit[1])
         heights = np.asarray(terrain(lon.ravel(), lat.ravel()), dtype=np.float64).reshape(lon.shape)
-        low, high = np.percentile(ground[:, 2], [1, 99])
-        room = high - low + _LEAST_MARGIN
-        known = (heights > low - room) & (heights < high + room)  # a hole may be filled with any number
+        least, most = np.percentile(ground[:, 2], [1, 99])
+        room = most - least + _LEAST_MARGIN
+        known = (heights > least - room) & (heights < most + room)  # a hole may be filled with any number
         middle = float(np.median(heights[known])) if known.any() else 0.0
         filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
         while width * _WIDEST <= max(extent, _WIDEST * step):
@@ -158,7 +159,7 @@ class Believed:
 class Relief:
     """A DEM beside the heights that rays alone give to tie points."""
 
-    bands: Bands
+    bands: Bands | None  # None where there are too few points
     tell: BoolArray  # (P,) points whose rays tell their heights better than the DEM does
     delivered: Array  # (3,) how they lie to the DEM as delivered: level, rise to the east, to the north [m]
     fit: Array  # (3, P) that by the heights of the points
@@ -188,9 +189,9 @@ class Relief:
         off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
         index, off = index[np.isfinite(off)], off[np.isfinite(off)]
         tell, fit, unknown = np.zeros(len(strong), dtype=bool), np.zeros((3, len(strong))), np.full(3, np.nan)
-        bands = Bands.of(terrain, ground[strong] if strong.any() else ground)
         if len(index) < _ENOUGH:
-            return cls(bands, tell, unknown, fit, unknown)
+            return cls(None, tell, unknown, fit, unknown)
+        bands = Bands.of(terrain, ground[index])
         at = bands.local(ground[index])
         at -= at.mean(axis=0)
         flat = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
@@ -211,6 +212,8 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
     motion or a bend of the scene explains of their distance: what else they have is the DEM's error, and no ray is
     bent for it.
     """
+    if relief.bands is None:
+        return None
     heights, slopes = relief.bands.at(ground)
     known = np.isfinite(heights[0])
     tell = relief.tell[index] & known
@@ -225,36 +228,54 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Be
     trend = _coefficients(smooth[tell], heights[:, tell].T)
     kept, bent = (smooth @ trend).sum(axis=1), heights.T - smooth @ trend
     bent_slopes = slopes - np.einsum("nmx,mk->knx", by_place, trend)
-    above, gains = ground[:, 2] - kept, np.ones(bent.shape[1])
-    fits, spread = tell.copy(), np.inf
+    above = ground[:, 2] - kept
+    found = _compared(above, bent, bent_slopes, smooth, tell)
+    fits, left, rising = found.fits, found.left, found.rising
+    freedom = max(int(fits.sum()) - found.unknowns, 1)
+    pull = rising[fits] - smooth[fits] @ _coefficients(smooth[fits], rising[fits])
+    alt = np.where(tell, ground[:, 2] - found.part, kept + bent @ found.gains)
+    is_held = known & (fits | ~relief.tell[index])
+    times, shows = _shown(bent[fits].sum(axis=1), above[fits], smooth[fits], stated)
+    return Believed(
+        np.where(is_held, alt, np.nan),
+        rising + np.einsum("nmx,mk->nx", by_place, trend),
+        smooth,
+        found.gains,
+        float(np.sqrt((_STATED * stated**2 + (left[fits] ** 2).sum()) / (_STATED + freedom))),
+        _alike(at[fits], pull * left[fits, None]),
+        times,
+        shows,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """Heights of n points against the bands of a DEM."""
+
+    gains: Array  # (K,) of the bands
+    rising: Array  # (n, 2) slopes of what is believed of them
+    part: Array  # (n,) what moving and bending the scene explains [m]
+    left: Array  # (n,) what is left [m]
+    fits: BoolArray  # (n,) points that tell, and are not far off
+    unknowns: int
+
+
+def _compared(above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray) -> _Compared:
+    """Heights (n,) [m] of points that `tell` (n,) by bands (n, K) of slopes (K, n, 2), a motion and a bend (n, m)."""
+    gains, fits, both = np.ones(bent.shape[1]), tell, np.column_stack([above, bent])
     for _ in range(_ROUNDS):
-        rising = np.einsum("k,knx->nx", gains, bent_slopes)
-        moved = np.column_stack([smooth, *((rising * a[:, None]) for a in (np.ones(len(at)), *at.T / half))])
-        both = np.column_stack([above, bent])
+        rising = np.einsum("k,knx->nx", gains, slopes)
+        moved = np.column_stack(
+            [smooth, *(rising * smooth[:, k, None] for k in range(3))]
+        )  # shift, turn, scale
         free = both[fits] - moved[fits] @ _coefficients(moved[fits], both[fits])
         gains = lsq_linear(free[:, 1:], free[:, 0], (0.0, 1.0)).x
         rest = above - bent @ gains
         part = moved @ _coefficients(moved[fits], rest[fits])
         left = rest - part
         spread = 1.4826 * float(np.median(np.abs(left[fits])))
-        near = np.abs(left) <= max(_FAR * spread, 1e-6)
-        fits = tell & near
-    freedom = max(int(fits.sum()) - moved.shape[1] - len(gains), 1)
-    sigma = float(np.sqrt((_STATED * stated**2 + (left[fits] ** 2).sum()) / (_STATED + freedom)))
-    pull = rising[fits] - smooth[fits] @ _coefficients(smooth[fits], rising[fits])
-    alt = np.where(tell, ground[:, 2] - part, kept + bent @ gains)
-    times, shows = _shown(bent[fits].sum(axis=1), above[fits], smooth[fits], stated)
-    missed = relief.tell[index] & ~(tell & near)
-    return Believed(
-        np.where(known & ~missed, alt, np.nan),
-        rising + np.einsum("nmx,mk->nx", by_place, trend),
-        smooth,
-        gains,
-        sigma,
-        _alike(at[fits], pull * left[fits, None]),
-        times,
-        shows,
-    )
+        fits = tell & (np.abs(left) <= max(_FAR * spread, 1e-6))
+    return _Compared(gains, rising, part, left, fits, moved.shape[1] + len(gains))
 
 
 def _middling(values: Array) -> BoolArray:
