@@ -56,8 +56,6 @@ def test_a_terrain_holds_heights_and_no_more_than_its_common_error_lets_it():
     assert 0.02 < loose[2] < 0.9
     assert tight[:2].max() < tight[2]
     assert (solved(dem=level, dem_for_weak=True).datum["heights"] == 0.0).all()
-    # heights that are all alike, of a scene of hills, are not its own
-    assert (solved(dem=level).datum["heights"] == 0.0).all()
 
 
 def test_views_that_are_fixed_hold_it():

@@ -228,5 +228,5 @@ def test_a_dem_that_holds_a_good_block_is_not_believed_to_the_centimetre(bias):
     assert (np.abs(true) < 2 * found.gauge.sigma).all()
     assert 5.0 < found.gauge.sigma[2] < 20.0
     assert np.sign(true[2]) == np.sign(bias)
-    assert found.terrain.held == found.terrain.total
+    assert found.terrain.held > 0.99 * found.terrain.total
     assert found.datum["heights"][2] > 0.3
