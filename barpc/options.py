@@ -323,16 +323,21 @@ class AdjustOptions(Options):
     view_weights: Mapping[str, float] = option(
         {}, "Weight of a view's observations (1 where absent): their sigmas are divided by it.", above=0
     )
-    dem_sigma: float = option(10.0, "Standard deviation of single heights of the DEM.", unit="m", above=0)
-    dem_bias_sigma: float | None = option(
-        None,
-        """Standard deviation of what all heights of the DEM are wrong by together, and of its slopes at the scene's
-        edges. Without: 20 m (a geoid left out is as much), or 5 m with a reference and heights of a known datum.""",
+    dem_sigma: float = option(
+        10.0,
+        """Standard deviation of single heights of the DEM, until the tie points show it.""",
         unit="m",
         above=0,
     )
-    dem_for_all: bool = option(
-        False, "Hold every track to the DEM; otherwise only those seen under too small an angle."
+    dem_bias_sigma: float | None = option(
+        None,
+        """Standard deviation of what all heights of the DEM are wrong by together, and of its slopes and bends at the
+        scene's edges. Without: 5 m where it is known what they count from, else 20 m (a geoid left out is as much).""",
+        unit="m",
+        above=0,
+    )
+    dem_for_weak: bool = option(
+        False, "The DEM holds only tracks whose rays meet under less than `min_convergence`, not all."
     )
     min_convergence: float = option(
         1.0, "Tracks whose rays meet under a smaller angle are held in height.", unit="deg", least=0, most=180
@@ -511,7 +516,7 @@ class RunOptions(Options):
     )
     dem: str | None = option(
         None,
-        "Terrain heights: they hold tie points seen under less than `min_convergence`, with `dem_for_all` all of them.",
+        "Terrain heights: they hold the scene's height and, as far as its relief tells, its place.",
         unit="file",
     )
     geoid: str | None = option(None, "Geoid grid for a DEM of orthometric heights.", unit="file")
@@ -554,6 +559,10 @@ class RunOptions(Options):
 # --- what is made of them ---------------------------------------------------------------------------------
 
 
+FORMER = {"dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only"}
+"""Former option -> how it is said now."""
+
+
 def with_values(options: Record, values: Mapping[str, Any], where: str = "options") -> Record:
     """A copy of a record with some fields changed, nested records by nested mappings.
 
@@ -561,6 +570,8 @@ def with_values(options: Record, values: Mapping[str, Any], where: str = "option
     """
     known, changed = declared(type(options)), dict(values)
     for name, value in values.items():
+        if name in FORMER:
+            raise InputError(f"{where}: {name} is said otherwise now: {FORMER[name]}")
         if name not in known:
             raise InputError(f"{where}: unknown option {name!r}; known are {', '.join(known)}")
         nested = getattr(options, name)

@@ -33,6 +33,7 @@ from benchmarks.worlds_cameras import (
     geodetic,
     rpc_of,
 )
+from benchmarks.worlds_dem import Grid, Wrong, make_dem
 
 NAMES = ("alfa", "bravo", "coca", "delta", "echo", "fox", "golf", "hotel", "india", "julia", "kilo", "lima")
 CHECKS, NOISE = 600, 0.1
@@ -102,6 +103,7 @@ class Plan:
     deliver: dict[int, Callable[[RPC, Pass, tuple[float, float]], RPC]] = field(default_factory=dict)
     moves: list[Callable[[Array, float], tuple[Array, Array]]] = field(default_factory=list)
     control: Control | None = None
+    dem: Wrong | None = None  # what is wrong with the DEM that is given, if one is
 
     def flaw(self, view: int, **changed: Any) -> None:
         """Change a view's flaw; a `pointing` is added to those that are there."""
@@ -482,6 +484,30 @@ def _control(seed: int, rng: np.random.Generator) -> Plan:
     return plan
 
 
+WRONG = (
+    Wrong("offset", 10.0), Wrong("offset", 40.0), Wrong("tilt", 40.0), Wrong("void", 1000.0),
+    Wrong("elsewhere", 9000.0), Wrong("flat"), Wrong("offset", -50.0), Wrong("offset", 300.0),
+)  # fmt: skip
+"""DEMs that are not as stated."""
+
+
+def _dem(seed: int, rng: np.random.Generator) -> Plan:
+    """Plains of 4 to 19 m, and hills of 190 m, with a DEM as it is stated."""
+    plan = draw(rng, 2 + seed % 3, side=(8000, 16000))
+    plan.relief = 190.0 if seed % 2 else plan.some(4, 19)
+    plan.dem = Wrong()
+    plan.injected.append(Injected("dem", (), 1, 0, 0, 0.0, "hills" if seed % 2 else "plains"))
+    return plan
+
+
+def _wrong_dem(seed: int, rng: np.random.Generator) -> Plan:
+    plan = draw(rng, 2 + seed % 2, side=(8000, 16000))
+    plan.relief = 190.0 if (seed // len(WRONG)) % 2 == 0 else plan.some(4, 19)
+    plan.dem = WRONG[seed % len(WRONG)]
+    plan.injected.append(Injected(f"dem {plan.dem.kind}", (), 1, 0, 0, 0.0, f"{plan.dem.size:g} m"))
+    return plan
+
+
 FAMILIES: dict[str, Callable[[int, np.random.Generator], Plan]] = {
     "local": _local,
     "swing": _swing,
@@ -494,6 +520,8 @@ FAMILIES: dict[str, Callable[[int, np.random.Generator], Plan]] = {
     "two": _two,
     "angles": _angles,
     "control": _control,
+    "dem": _dem,
+    "wrong_dem": _wrong_dem,
 }
 
 
@@ -515,6 +543,7 @@ class World:
     ground: Array
     fit: float  # largest error of an RPC against its sound camera [px]
     gcps: GroundPoints | None = None
+    dem: Grid | None = None
 
     def without(self, odd: int) -> World:
         """The same without a view."""
@@ -588,7 +617,10 @@ def fly(plan: Plan, family: str = "", seed: int = 0) -> World:
         if plan.control is None
         else _points(plan, cameras, scatter(20 * len(plan.control.wrong), False)[0])
     )
-    return World(family, seed, plan, tuple(cameras), tuple(views), tracks, bad, check, ground, worst, gcps)
+    dem = None if plan.dem is None else make_dem(relief, extent, rng, plan.dem)
+    return World(
+        family, seed, plan, tuple(cameras), tuple(views), tracks, bad, check, ground, worst, gcps, dem
+    )
 
 
 def _points(plan: Plan, cameras: Sequence[Camera], ground: Array) -> GroundPoints:

@@ -16,11 +16,11 @@ from barpc.ba.covariance import Covariance
 from barpc.ba.datum import datum_shares
 from barpc.ba.following import follow, without_strips
 from barpc.ba.gauge import GaugeReport, gauge_report
-from barpc.ba.ground import Terrain
 from barpc.ba.heldout import enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import Finding, left_over, standing_out
 from barpc.ba.placing import place
+from barpc.ba.relief import Terrain
 from barpc.ba.result import Adjustment
 from barpc.ba.rounds import Outcome
 from barpc.ba.scan import neighbours_alike

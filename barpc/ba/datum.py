@@ -22,7 +22,7 @@ from barpc.scene import BoolArray
 SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference")
 """The priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; the DEM or assumed
 altitudes, with what these are wrong by together; a reference orthoimage, with what it is wrong by as a whole."""
-_OF_HEIGHTS = 3  # errors in common that are a terrain's, in front of the reference's own
+_OF_HEIGHTS = 3  # with a reference: errors in common that are a terrain's, in front of its own
 
 
 def datum_shares(
@@ -95,8 +95,9 @@ def _known_points(
         held[kind][prior.index] = own
         paid[kind][:] += left[own].sum(axis=0)
         rest &= ~own
-    paid["heights"][:] += left[rest].sum(axis=0) + (shared[:_OF_HEIGHTS] ** 2).sum(axis=0)
-    paid["reference"][:] += (shared[_OF_HEIGHTS:] ** 2).sum(axis=0)
+    of_heights = _OF_HEIGHTS if held["reference"].any() else len(shared)
+    paid["heights"][:] += left[rest].sum(axis=0) + (shared[:of_heights] ** 2).sum(axis=0)
+    paid["reference"][:] += (shared[of_heights:] ** 2).sum(axis=0)
     return held
 
 

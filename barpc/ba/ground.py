@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,17 +11,15 @@ import numpy as np
 from barpc.ba.cameras import Projected
 from barpc.ba.priors import PointPrior
 from barpc.ba.problem import Problem
+from barpc.ba.relief import NUM_BENDS, Believed, Relief, Terrain, believe, terrain_slopes
 from barpc.ba.structure import Structure
 from barpc.errors import BarpcWarning
-from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
 
-Terrain = Callable[[Array, Array], Array]
-"""lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN where it is unknown."""
-
-_SLOPE_STEP = 15.0  # m: terrain slopes are taken over twice this distance
 DEM_BIAS = 20.0  # m, where none is stated
+KNOWN_BIAS = 5.0  # m: the same, where it is known what its heights count from
 ALIKE = (
     25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
 )
@@ -72,21 +70,35 @@ def terrain_heights(
     sigma: float,
     common_sigma: float,
     span: Array | None = None,
+    level: BoolArray | None = None,
 ) -> PointPrior:
     """Points `index` (Q,) of (P, 3) held to a terrain: the height above its tangent plane where they stand now.
 
     Single altitudes are known to `sigma` [m]; all of them may be wrong by `common_sigma` [m], and by a slope that
     is as much at the scene's edges. Points where the terrain is unknown are left out.
-    The edges are the points' own, or those of `span` (n, 3) [m], with which they share these errors.
+    The edges are the points' own, or those of `span` (n, 3) [m], with which they share these errors. Points that are
+    `level` (Q,) are held in height alone.
     """
     ground = ground_from_ecef(points[index])
-    step = _SLOPE_STEP / metres_per_unit(ground)[:, :2]
-    lon, lat = ground[:, 0], ground[:, 1]
-    alt = terrain(lon, lat)
-    slope_east = (terrain(lon + step[:, 0], lat) - terrain(lon - step[:, 0], lat)) / (2.0 * _SLOPE_STEP)
-    slope_north = (terrain(lon, lat + step[:, 1]) - terrain(lon, lat - step[:, 1])) / (2.0 * _SLOPE_STEP)
-    normal = np.stack([-np.nan_to_num(slope_east), -np.nan_to_num(slope_north), np.ones(len(alt))], axis=1)
+    alt = terrain(ground[:, 0], ground[:, 1])
+    slopes = np.nan_to_num(terrain_slopes(terrain, ground))
+    if level is not None:
+        slopes[level] = 0.0
+    normal = np.column_stack([-slopes, np.ones(len(alt))])
     return _heights(ground, index, alt, normal, sigma, common_sigma, span)
+
+
+def _believed_heights(ground: Array, index: IntArray, believed: Believed, common_sigma: Array) -> PointPrior:
+    """Points `index` (Q,) at ground points (Q, 3) held to what is believed of a DEM.
+
+    All of it may be wrong by a level, slopes and bends that are as much as `common_sigma` (`NUM_BENDS`,) [m] at the
+    scene's edges.
+    """
+    normal, sigma = np.column_stack([-believed.slopes, np.ones(len(ground))]), believed.effective_sigma
+    held = _heights(ground, index, believed.alt, normal, sigma, 0.0)
+    common = np.zeros((len(held.index), 3, NUM_BENDS))
+    common[:, 0] = believed.bends[np.isfinite(believed.alt)] * (common_sigma / sigma)
+    return replace(held, common=common)
 
 
 def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
@@ -150,6 +162,18 @@ class TerrainTest:
     offset: float  # median of the adjusted altitudes minus the terrain's [m]; NaN where it has none
     spread: float  # 1.4826 times their median absolute deviation [m]
     bias: float  # what its heights may be wrong by together [m]
+    sigma: float = (
+        np.nan
+    )  # standard deviation of single heights, as the tie points show it [m]; NaN: as stated
+    alike: float = 1.0  # as many single heights are worth one
+    gains: tuple[float, ...] = ()  # how much of its relief is believed, scale by scale, the finest first
+    relief: float = np.nan  # its relief as a multiple of the tie points'
+    shows: bool = True  # whether that may be one: else it is of another terrain, and holds nothing
+    is_known: bool = True  # whether it is known what its heights count from
+    # (3,) how the tie points lie to it as delivered, level, rise to the east and to the north [m]
+    delivered: tuple[float, ...] = (np.nan,) * 3
+
+    beyond: tuple[float, ...] = (np.nan,) * 3  # times what its accuracy and the cameras' let expect of that
 
 
 @dataclass(frozen=True)
@@ -160,10 +184,11 @@ class Heights:
     weak: BoolArray  # (P,) points whose rays meet under too small an angle
     tracks: IntArray  # (T,) points that are tracks (GCPs are held already)
     alt_range: tuple[float, float]  # altitudes [m] to expect where no other track tells
-    options: AdjustOptions  # `dem_sigma`, `dem_for_all`
+    options: AdjustOptions  # `dem_sigma`, `dem_bias_sigma`, `dem_for_weak`
     dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
     reference: Reference | None = None  # whose heights are the DEM's
     has_control: bool = False  # whether GCPs hold the scene's place
+    relief: Relief | None = None  # the DEM beside what rays alone say of heights, where these may judge it
 
     def loose(self, sigma: float) -> Heights:
         """The same where the places of GCPs are known to `sigma` [m] only."""
@@ -171,22 +196,43 @@ class Heights:
         rows = enu_basis(ground_from_ecef(first.mean)) / sigma
         return replace(self, control=(replace(first, rows=rows), *self.control[1:]), has_control=False)
 
+    @property
+    def is_judged(self) -> bool:
+        """Whether tie points are to tell how much of the DEM is believed."""
+        given = self.dem is None or self.reference is not None
+        return not given and not self.options.dem_for_weak and self.options.learn_priors
+
     def hold(self, problem: Problem, points: Array) -> Problem:
         """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
         return replace(problem, point_prior=_join([*self.control, self._held(points)]))
 
+    def _believed(self, points: Array) -> Believed | None:
+        if self.relief is None:
+            return None
+        return believe(
+            self.relief, self.tracks, ground_from_ecef(points[self.tracks]), self.options.dem_sigma
+        )
+
     def _held(self, points: Array) -> PointPrior | None:
-        dem, options = self.dem, self.options
-        weak = self.weak[self.tracks]
-        index = self.tracks if dem is not None and self._whole else self.tracks[weak]
+        weak, believed = self.weak[self.tracks], self._believed(points)
+        if believed is not None and believed.shows:
+            ground = ground_from_ecef(points[self.tracks])
+            assert self.relief is not None
+            return _believed_heights(ground, self.tracks, believed, self.relief.common_sigma(self._bias))
+        dem = self.dem if believed is None else None
+        judged_later = self.is_judged and self.relief is None
+        index = self.tracks if dem is not None and self._whole and not judged_later else self.tracks[weak]
         if not len(index):
             return None
         if dem is not None:
             alike, span = 1.0, None
             if self.reference is not None:
                 alike, span = max(len(index) / ALIKE, 1.0), self.control[1].mean
-            sigma = options.dem_sigma * alike**0.5
-            return terrain_heights(points, index, dem, sigma, self._bias, span)
+            elif self.relief is not None:
+                alike = max(len(index) / ALIKE, 1.0)
+            level = None if self.relief is None else ~weak
+            sigma = self.options.dem_sigma * alike**0.5
+            return terrain_heights(points, index, dem, sigma, self._bias, span, level)
         others = self.tracks[~weak]
         if len(others) >= 10:
             low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
@@ -199,14 +245,19 @@ class Heights:
     @property
     def _whole(self) -> bool:
         """Whether a terrain holds all tracks."""
-        return self.options.dem_for_all or self.reference is not None
+        return not self.options.dem_for_weak or self.reference is not None
 
     @property
     def _bias(self) -> float:
         """What a terrain may be wrong by as a whole [m]."""
-        return float(
-            self.options.dem_bias_sigma or DEM_BIAS if self.reference is None else self.reference.bias[2]
-        )
+        if self.reference is not None:
+            return float(self.reference.bias[2])
+        return self.options.dem_bias_sigma or (KNOWN_BIAS if self._is_known is True else DEM_BIAS)
+
+    @property
+    def _is_known(self) -> bool | None:
+        """Whether it is known what a DEM's heights count from; None of a function."""
+        return getattr(self.dem, "known", None)
 
     def test(self, points: Array, seen: BoolArray) -> TerrainTest | None:
         """What the terrain did to the tracks that are `seen` (P,), at their adjusted places; None without one."""
@@ -216,10 +267,20 @@ class Heights:
         lon, lat, alt = ground_from_ecef(points[index]).T
         above = alt - self.dem(lon, lat)
         known = np.isfinite(above)
-        is_held = known if self._whole else known & self.weak[index]
+        believed = self._believed(points)
+        held, shows = self._held(points), believed is None or believed.shows
+        count = 0 if held is None or not shows else int(np.isin(index[known], held.index).sum())
         offset = float(np.median(above[known])) if known.any() else np.nan
         spread = 1.4826 * float(np.median(np.abs(above[known] - offset))) if known.any() else np.nan
-        return TerrainTest(int(is_held.sum()), int(known.sum()), len(index), offset, spread, self._bias)
+        found = TerrainTest(count, int(known.sum()), len(index), offset, spread, self._bias)
+        found = replace(found, is_known=self._is_known is not False)
+        if self.relief is not None:
+            delivered, beyond = self.relief.delivered, self.relief.beyond(self._bias)
+            found = replace(found, delivered=tuple(map(float, delivered)), beyond=tuple(map(float, beyond)))
+        if believed is None:
+            return found
+        judged = {name: getattr(believed, name) for name in ("sigma", "alike", "relief", "shows")}
+        return replace(found, gains=tuple(map(float, believed.gains)), **judged)
 
     def warn(self) -> None:
         """Say that tracks are held in height without a DEM."""

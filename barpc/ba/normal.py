@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as la
-import scipy.sparse as sp
 
 from barpc.ba.linear import Factor, Matrix, factorize, factorize_blocks
 from barpc.ba.multifrontal import Blocks
@@ -161,10 +160,12 @@ def _common(structure: Structure, prior: PointPrior, lower: Array, half: Array, 
     place = np.full(structure.num_points, -1)
     place[index] = np.arange(len(index))
     rows = np.flatnonzero(place[structure.point] >= 0)
-    products = np.swapaxes(whitened[place[structure.point[rows]]], 1, 2) @ cross[rows]
-    by_view = np.arange(len(rows)), np.searchsorted(rows, structure.bounds)
-    sums = sp.csr_array((np.ones(len(rows)), *by_view)) @ products.reshape(len(rows), -1)
-    by_camera = -sums.reshape(-1, m, cross.shape[2]).swapaxes(0, 1).reshape(m, -1)
+    bounds, q = np.searchsorted(rows, structure.bounds), cross.shape[2]
+    by_view = np.empty((m, structure.num_views, q))
+    for v, of_view in enumerate(np.split(rows, bounds[1:-1])):
+        of_points = whitened[place[structure.point[of_view]]].reshape(-1, m)
+        by_view[:, v] = -of_points.T @ cross[of_view].reshape(-1, q)
+    by_camera = by_view.reshape(m, -1)
     gradient = -np.einsum("qim,iq->m", whitened, half[:, index])
     return Common(
         index,

@@ -72,7 +72,9 @@ def scan(
             for v in range(views):
                 i, j = divmod(int(gain[v].argmax()), BINS + 1)
                 if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
-                    i, j = (0, i) if j == BINS else (j, BINS)  # means tell of two parts: the smaller one lies off
+                    i, j = (
+                        (0, i) if j == BINS else (j, BINS)
+                    )  # means tell of two parts: the smaller one lies off
                 step = size[axis, v] / BINS
                 share = float(bad[v, i, j] / max(count[v, i, j], 1.0))
                 at = float(i * step), float(j * step)

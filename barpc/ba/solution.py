@@ -10,12 +10,13 @@ import numpy as np
 from barpc.ba.agreement import LOOSE, Agreement, agreement, offsets_of
 from barpc.ba.block import Block
 from barpc.ba.consensus import agreeing
-from barpc.ba.ground import Heights, Terrain
+from barpc.ba.ground import Heights
 from barpc.ba.heldout import HeldOut, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import Finding
 from barpc.ba.priors import DRIFT_SIGMA
 from barpc.ba.problem import Problem
+from barpc.ba.relief import Terrain
 from barpc.ba.rounds import Outcome, Rounds, revived
 from barpc.ba.smooth import SmoothTest
 from barpc.ba.snooping import ControlTest, control_test

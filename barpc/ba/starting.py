@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.cameras import Cameras
-from barpc.ba.ground import Heights, Terrain, convergence_angles, ground_control, reference_control
+from barpc.ba.ground import Heights, convergence_angles, ground_control, reference_control
 from barpc.ba.incremental import BlockPrior, apply_prior
+from barpc.ba.normal import cholesky3, point_products, solve_lower, solve_transposed
 from barpc.ba.priors import CameraPrior, prior_sigmas
 from barpc.ba.problem import Problem
+from barpc.ba.relief import Relief, Terrain
 from barpc.ba.solve import State
 from barpc.ba.structure import make_structure
 from barpc.ba.unknowns import make_unknowns
 from barpc.ba.waves import Waves
-from barpc.geodesy import Array
+from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.options import AdjustOptions
 
 FIRST_STEPS = 1  # and one more: what is left is far below a pixel, and the solver takes it
@@ -90,4 +94,33 @@ def first_state(
         points = heights.hold(problem, points).triangulate(points, projected, weight)
         projected = problem.project_points(params, points)
     points = heights.hold(problem, points).triangulate(points, projected, weight)
+    if heights.is_judged and len(tracks):
+        heights = replace(heights, relief=_relief(problem, heights, points, weight))
     return State(params, points), heights
+
+
+def _relief(problem: Problem, heights: Heights, points: Array, weight: Array) -> Relief:
+    """The DEM beside points (P, 3) [m] that stand where the rays of the delivered cameras put them.
+
+    What the cameras let expect of how these lie to it is first-order: points move by -V^-1 A^T B with the cameras.
+    """
+    assert heights.dem is not None
+    structure, sigma = problem.structure, problem.camera_prior.sigma
+    projected, ground = problem.linearise(problem.camera_prior.mean, points), ground_from_ecef(points)
+    by_point = projected.by_point * weight
+    lower = cholesky3(structure.sum_points(point_products(by_point, np.zeros_like(problem.xy))[:6]))
+    up = enu_basis(ground)[:, 2].T
+    strong = np.zeros(len(points), dtype=bool)
+    strong[heights.tracks[~heights.weak[heights.tracks]]] = True
+    sharp = np.linalg.norm(solve_lower(lower, up), axis=0)
+    found = Relief.of(heights.dem, ground, strong, sharp, heights.options.dem_sigma)
+    let = np.zeros(3)
+    for m, fit in enumerate(found.fit):
+        moved = solve_transposed(lower, solve_lower(lower, up * fit))
+        pull = np.einsum("cxk,xk->ck", by_point, moved.take(structure.point, axis=1)) * weight
+        by_unknown = structure.sum_views(np.einsum("ck,cqk->qk", pull, projected.by_unknown))
+        free = problem.free.reshape(by_unknown.shape)
+        let[m] = (
+            np.sqrt(((by_unknown * sigma)[free] ** 2).sum()) if np.isfinite(sigma[free]).all() else np.nan
+        )
+    return replace(found, cameras=let)

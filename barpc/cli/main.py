@@ -76,6 +76,7 @@ MOVED = {
     "--max-pairwise-matches": "[tie] points_per_image of a file given with --options",
     "--min-triangulation-angle": "[tie] angles of a file given with --options",
     "--joint": "[fit] method of a file given with --options",
+    "--dem-for-all": "--dem, which holds all tie points (--dem-for-weak: those under a small angle only)",
     "--for-format": "[fit] precision of a file given with --options",
 }
 """Former verb or flag -> how it is said now; options that have no flag are found in `barpc.options`."""

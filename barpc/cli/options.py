@@ -41,7 +41,7 @@ GROUND = (
     "fixed_run",
     "dem",
     "adjust.dem_sigma",
-    "adjust.dem_for_all",
+    "adjust.dem_for_weak",
     "geoid",
     "reference",
     "reference_sigma",

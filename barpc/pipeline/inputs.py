@@ -37,8 +37,8 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
         points = load_gcps(paths, views, options)
         for line in () if points is None else points.left_out:
             logger.warning("%s", line)
-    if options.adjust.dem_for_all and options.dem is None:
-        raise InputError("dem_for_all is given without dem: there are no heights to hold the tie points to")
+    if options.adjust.dem_for_weak and options.dem is None:
+        raise InputError("dem_for_weak is given without dem: there are no heights to hold the tie points to")
     for path in options.reference:
         Sheet.read(path)
     dem = None if options.dem is None else Dem.open(options.dem, options.geoid)

@@ -17,7 +17,7 @@ from uuid import uuid4
 import numpy as np
 
 from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
-from barpc.ba.ground import DEM_BIAS
+from barpc.ba.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.dem import Dem
 from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError
 from barpc.fit import RpcFit, fit_rpc
@@ -56,7 +56,6 @@ from barpc.workspace import Workspace, timed
 logger = logging.getLogger(__name__)
 
 _GROUP = 8  # views that are fitted in one task, whose result is kept
-REFERENCE_BIAS = 5.0  # m: of the heights that go with a reference, where it is known what they count from
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -293,7 +292,7 @@ def _registered(
 ) -> Registration:
     """What the reference says of the cameras as delivered."""
     given = options.adjust.dem_bias_sigma
-    bias = (REFERENCE_BIAS if dem.known else DEM_BIAS) if given is None else given
+    bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
     return register(
         run.views,
         _references(options),

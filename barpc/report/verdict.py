@@ -17,6 +17,7 @@ from barpc.report.records import plain
 from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
 from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_over, strangeness
+from barpc.report.terrain import dem_lines, dem_reasons
 from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
@@ -305,7 +306,7 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
     look = [view for view in views if view.advice and view.status != "failed"]
     reasons = [f"{view.name}: {STATUS_WORDS[view.status]}: {view.advice}." for view in bad + look]
     reasons += [f"{path} was left out: {reason}" for path, reason in run.left_out]
-    whole, points = _block_reasons(run), _control_reasons(run)
+    whole, points = _block_reasons(run) + dem_reasons(run.adjustment), _control_reasons(run)
     reasons += whole + points
     words = {"adjust": _adjusted_lines, "check": _checked_lines, "match": _matched_lines}[run.kind]
     num_bad = len(bad) + len(run.left_out)
@@ -419,7 +420,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
         lines.append(f"{held_by} {known}{' only' if held_by != 'So' else ''}.")
     else:
         lines += _held_lines(run, run.gcps, views, known)
-    lines += _dem_lines(run.adjustment)
+    lines += dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         image, ground = check_residuals(run.after, run.check_points).rms()
         seen = f"{np.hypot(*image):.2f} px in the images"
@@ -487,30 +488,6 @@ def _radar_lines(views: Sequence[ViewEntry]) -> list[str]:
         if (one := view.correction) is not None and (sigma := one.timing_sigma) is not None
     ]
     return [f"Radar images are corrected by their clocks: {listed(found, _MOST_NAMED)}."] if found else []
-
-
-def _dem_lines(adjustment: Adjustment) -> list[str]:
-    """What the DEM did."""
-    terrain, options = adjustment.terrain, adjustment.options
-    if terrain is None:
-        return []
-    held = f"The DEM holds {terrain.held} of {terrain.total} tie points"
-    if not terrain.held:
-        least = f"{options.min_convergence:g} degree{'' if options.min_convergence == 1 else 's'}"
-        why = f"all rays meet under more than {least}; --dem-for-all holds the scene"
-        needed = options.dem_for_all or adjustment.held.any()
-        held += f": {'it has no height where it is needed' if needed else why}"
-    else:
-        single, common = metres(options.dem_sigma), metres(terrain.bias)
-        held += f", each to {single} and all together to {common}"
-    share = 100 * terrain.known / max(terrain.total, 1)
-    lie = f"they lie {terrain.offset:+.1f} m above it (median; spread {terrain.spread:.1f} m)" * bool(
-        terrain.known
-    )
-    return [
-        f"{held}.",
-        f"It has a height for {share:.0f} % of the tie points{'; ' if lie else ''}{lie}.",
-    ]
 
 
 def _reference_lines(run: Run) -> list[str]:

@@ -50,12 +50,12 @@ def test_control_points_hold_it_by_their_accuracy():
 
 def test_a_terrain_holds_heights_and_no_more_than_its_common_error_lets_it():
     tight, loose = (
-        solved(dem=level, dem_for_all=True, dem_bias_sigma=sigma).datum["heights"] for sigma in (0.5, 20.0)
+        solved(dem=level, learn_priors=False, dem_bias_sigma=sigma).datum["heights"] for sigma in (0.5, 20.0)
     )
     assert tight[2] > 0.95
     assert 0.02 < loose[2] < 0.9
     assert tight[:2].max() < tight[2]
-    assert (solved(dem=level).datum["heights"] == 0.0).all()
+    assert (solved(dem=level, dem_for_weak=True).datum["heights"] == 0.0).all()
 
 
 @pytest.mark.slow
@@ -96,12 +96,12 @@ def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
     ("options", "dem", "says"),
     [
         (
-            {},
+            {"dem_for_weak": True},
             level,
-            "The DEM holds 0 of 396 tie points: all rays meet under more than 0.01 degrees; --dem-for-all holds",
+            "The DEM holds 0 of 396 tie points: all rays meet under more than 0.01 degrees; without --dem-for-weak it",
         ),
         (
-            {"dem_for_all": True},
+            {"learn_priors": False},
             level,
             "The DEM holds 400 of 400 tie points, each to 10.0 m and all together to 20.0 m.",
         ),
@@ -109,7 +109,7 @@ def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
             {"min_convergence": 90.0}, level, "The DEM holds 400 of 400 tie points", marks=pytest.mark.slow
         ),
         (
-            {"dem_for_all": True},
+            {},
             lambda lon, lat: np.full(len(lon), np.nan),
             "it has no height where it is needed",
         ),
@@ -139,7 +139,8 @@ def test_what_a_terrain_did_is_said(options, dem, says):
 
 def test_the_scene_lies_above_a_terrain_that_is_too_low():
     low, high = (
-        solved(dem=lambda lon, lat, alt=alt: np.full(len(lon), alt)).terrain for alt in (130.0, 230.0)
+        solved(dem=lambda lon, lat, alt=alt: np.full(len(lon), alt), dem_for_weak=True).terrain
+        for alt in (130.0, 230.0)
     )
     assert low.offset == pytest.approx(high.offset + 100.0)
     assert low.spread == pytest.approx(high.spread)

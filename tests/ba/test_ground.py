@@ -144,9 +144,9 @@ def test_blocks_with_and_without_errors_in_common_are_joined() -> None:
 @pytest.mark.parametrize(
     ("options", "index", "bias"),
     [
-        ({}, [4, 5], DEM_BIAS),
-        ({"dem_bias_sigma": 3.0}, [4, 5], 3.0),
-        ({"dem_for_all": True}, [0, 1, 2, 3, 4, 5], DEM_BIAS),
+        ({"dem_for_weak": True}, [4, 5], DEM_BIAS),
+        ({"dem_for_weak": True, "dem_bias_sigma": 3.0}, [4, 5], 3.0),
+        ({"learn_priors": False}, [0, 1, 2, 3, 4, 5], DEM_BIAS),
     ],
 )
 def test_a_terrain_holds_weak_tracks_or_all(options: dict[str, Any], index: list[int], bias: float) -> None:
@@ -187,7 +187,9 @@ def test_how_tie_points_lie_to_a_terrain_is_a_median_and_its_deviation(whole: bo
     east = np.array([0.0, 100.0, 200.0, 300.0, -2500.0, 500.0])
     above = np.array([3.0, 7.0, 4.0, 900.0, 7.0, 9.0])
     points = placed(east, 0.0, np.nan_to_num(300.0 + 0.2 * east) + above)
-    made = replace(heights(dem=hill, options={"dem_for_all": whole}), weak=np.arange(6) >= 3)
+    made = replace(
+        heights(dem=hill, options={"dem_for_weak": not whole, "learn_priors": False}), weak=np.arange(6) >= 3
+    )
     seen = np.array([1, 1, 1, 1, 1, 0], dtype=bool)
     found = made.test(points, seen)
     assert found is not None

@@ -95,17 +95,25 @@ ROWS = [
     Row("estimate_noise", False, True, variance, 1, 1.5, rest={"robust_threshold": 9.0}),
     Row("fixed", (), ("view_0000",), lambda found: 1e-9 + np.abs(found.params[0]).max(), -1, 1e6),
     Row("view_weights", {}, {"view_0000": 20.0}, first_residual, -1, 1.05, rest={"loss": "linear"}),
-    Row("dem_sigma", 0.5, 500.0, off_dem, 1, rest={"dem_for_all": True, "dem_bias_sigma": 0.5}, dem=400.0),
+    Row("dem_sigma", 0.5, 500.0, off_dem, 1, rest={"dem_bias_sigma": 0.5, "learn_priors": False}, dem=400.0),
     Row(
         "dem_bias_sigma",
         0.5,
         50.0,
         lambda found: found.gauge.sigma[2],
         1,
-        rest={"dem_for_all": True, "dem_sigma": 0.5},
+        rest={"dem_sigma": 0.5, "learn_priors": False},
         dem=400.0,
     ),
-    Row("dem_for_all", False, True, off_dem, -1, rest={"dem_sigma": 0.5, "dem_bias_sigma": 0.5}, dem=400.0),
+    Row(
+        "dem_for_weak",
+        False,
+        True,
+        off_dem,
+        1,
+        rest={"dem_sigma": 0.5, "dem_bias_sigma": 0.5, "learn_priors": False},
+        dem=400.0,
+    ),
     Row("min_convergence", 0.01, 90.0, lambda found: 1 + found.held.sum(), 1, 10.0),
     Row("max_steps", 1, 30, steps, 1, rest={"loss": "linear", "tolerance": 1e-15, "solver": "sparse"}),
     Row("tolerance", 1e-14, 1e-2, steps, -1, rest={"loss": "linear", "solver": "sparse"}),
@@ -115,7 +123,7 @@ ELSEWHERE = {
     "solver": "test_the_solver_that_is_asked_for_is_the_one_that_runs",
 }
 ELSEWHERE_TOO = (
-    "model", "drift", "jitter", "detectors", "fixed", "dem_sigma", "dem_for_all", "tolerance", "max_steps",
+    "model", "drift", "jitter", "detectors", "fixed", "dem_sigma", "dem_for_weak", "tolerance", "max_steps",
     "sigma_position", "learn_priors", "num_passes", "estimate_noise",
 )  # fmt: skip
 """What tests of its own have among the fast ones, too."""

@@ -250,7 +250,7 @@ def test_a_single_view_is_refined_by_gcps_alone():
 
 def test_a_dem_holds_the_height_of_the_scene():
     block = simulate_block(3, 600, seed=8, alt_range=(200.0, 201.0))
-    options = AdjustOptions(**{**INDEPENDENT, "dem_for_all": True, "dem_sigma": 2.0, "dem_bias_sigma": 0.3})
+    options = AdjustOptions(**{**INDEPENDENT, "dem_sigma": 2.0, "dem_bias_sigma": 0.3})
     free = solve(block)
     held = adjust_tracks(
         block.views,

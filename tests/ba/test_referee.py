@@ -227,11 +227,11 @@ def test_heights_of_a_dem_are_wrong_together(bias):
 @pytest.mark.parametrize("bias", [-30.0, 30.0])
 def test_a_dem_that_holds_a_good_block_is_not_believed_to_the_centimetre(bias):
     scene = make(replace(TABLE["no drift"], seed=2), hills)
-    options = AdjustOptions(dem_for_all=True, sigma_attitude=10.4, sigma_position=2.0)
+    options = AdjustOptions(sigma_attitude=10.4, sigma_position=2.0)
     found = adjust_tracks(scene.views, scene.tracks, options, dem=lambda lon, lat: hills(lon, lat) + bias)
     true = judge(scene, found.sensors).move
     assert (np.abs(true) < 2 * found.gauge.sigma).all()
     assert 5.0 < found.gauge.sigma[2] < 20.0
     assert np.sign(true[2]) == np.sign(bias)
-    assert found.terrain.held == found.terrain.total
+    assert found.terrain.held > 0.99 * found.terrain.total
     assert found.datum["heights"][2] > 0.3

@@ -148,7 +148,9 @@ def test_two_views_are_widened_together() -> None:
 
 def test_of_a_few_views_the_evidence_is_asked_however_small_the_corrections_are() -> None:
     with pytest.raises(AttributeError):
-        variances(4)._widened(FEW, params_of(variances(4), [11.0, 3.0, 3.0, 3.0]), np.ones((4, 3)), np.ones(0))
+        variances(4)._widened(
+            FEW, params_of(variances(4), [11.0, 3.0, 3.0, 3.0]), np.ones((4, 3)), np.ones(0)
+        )
 
 
 @pytest.mark.parametrize(("usual", "wrong"), [(3.0, 300.0), (12.0, 900.0), (12.0, 14.0), (3.0, 11.0)])

@@ -239,7 +239,7 @@ def _height(found: AdjustResult) -> float:
     return float(np.median(ground_from_ecef(points[np.isfinite(points[:, 0])])[:, 2]))
 
 
-TIGHT = AdjustOptions(dem_for_all=True, dem_sigma=0.01, dem_bias_sigma=0.01)
+TIGHT = AdjustOptions(dem_sigma=0.01, dem_bias_sigma=0.01)
 
 
 def _held(run: Run) -> AdjustResult:
@@ -254,7 +254,7 @@ def dem(run: Run, out: Path, scene: Path) -> None:
     assert abs(_height(held) - 340.0) < 0.2 * abs(_height(run.plain) - 340.0)
     with pytest.raises(InputError):
         run("c", dem=str(out / "nowhere.tif"))
-    with pytest.raises(InputError, match="dem_for_all is given without dem"):
+    with pytest.raises(InputError, match="dem_for_weak is given without dem"):
         run("d", adjust=TIGHT)
 
 

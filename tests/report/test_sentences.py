@@ -32,7 +32,7 @@ def adjusted(**fields: Any) -> Any:
         "prior": SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=()),
         "smooth": SmoothTest(np.zeros(3), np.ones(3), np.full(3, NO_NUMBER), np.zeros(3)),
         "held_out_noise": np.ones(3), "held_out_rms": np.full(3, 0.2), "held": np.zeros(9, bool), "terrain": None,
-        "options": SimpleNamespace(drift=None, fixed=(), dem_for_all=False, min_convergence=1.0, dem_sigma=2.0),
+        "options": SimpleNamespace(drift=None, fixed=(), dem_for_weak=True, min_convergence=1.0, dem_sigma=2.0),
         "gauge": SimpleNamespace(shift=np.array([1.0, -2.0, 3.0]), sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  delivered_sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0, 0.8, 9.0, 0.1])),
@@ -326,7 +326,7 @@ def test_a_scene_that_moved_far_is_said_to_where_nothing_but_the_cameras_holds_i
     assert reasons(moved(6.1), options=SimpleNamespace(dem="x")) == []
     assert reasons(moved(6.1), options=SimpleNamespace(fixed_run="x")) == []
     assert len(reasons(moved(6.1), options=SimpleNamespace(dem=None, fixed_run=None))) == 1
-    fixed = SimpleNamespace(drift=None, fixed=("A",), dem_for_all=False, min_convergence=1.0, dem_sigma=2.0)
+    fixed = SimpleNamespace(drift=None, fixed=("A",), dem_for_weak=True, min_convergence=1.0, dem_sigma=2.0)
     assert reasons(moved(6.1, options=fixed)) == []
     for used, num in ((True, 0), (False, 1)):
         test = ControlTest(np.array([used]), np.zeros((1, 3)), np.zeros(1), np.ones(1))
@@ -494,13 +494,64 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
     assert lines(known=0)[1] == "It has a height for 0 % of the tie points."
     assert lines(known=0, total=0, held=0)[1] == "It has a height for 0 % of the tie points."
     held = "The DEM holds 0 of 40 tie points: "
-    assert lines(held=0)[0] == f"{held}all rays meet under more than 1 degree; --dem-for-all holds the scene."
-    options = {"drift": None, "fixed": (), "dem_for_all": False, "min_convergence": 2.5, "dem_sigma": 2.0}
+    assert (
+        lines(held=0)[0]
+        == f"{held}all rays meet under more than 1 degree; without --dem-for-weak it holds the scene."
+    )
+    options = {"drift": None, "fixed": (), "dem_for_weak": True, "min_convergence": 2.5, "dem_sigma": 2.0}
     assert "more than 2.5 degrees;" in lines(held=0, options=SimpleNamespace(**options))[0]
     nowhere = f"{held}it has no height where it is needed."
-    assert lines(held=0, options=SimpleNamespace(**{**options, "dem_for_all": True}))[0] == nowhere
+    assert lines(held=0, options=SimpleNamespace(**{**options, "dem_for_weak": False}))[0] == nowhere
     terrain = TerrainTest(0, 20, 40, 2.0, 3.0, 0.5)
     assert said(run_of(adjusted(terrain=terrain, held=np.array([False, True]))))[-2] == nowhere
+
+
+def test_how_much_of_a_dem_is_believed_is_said():
+    told = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 0.5), sigma=4.0, alike=3.5, relief=0.98)
+    assert said(run_of(adjusted(terrain=told)))[-2] == (
+        "The DEM holds 30 of 40 tie points, each to 4.0 m, of which 3.5 are worth one, and all together to 50.0 cm."
+    )
+    assert wrong(told) == []
+    unknown = said(told_of(replace(told, is_known=False)))[-1]
+    assert unknown.startswith("Nothing says that its heights count from the ellipsoid: give --geoid")
+    assert wrong(replace(told, is_known=False)) == []
+
+
+def told_of(terrain: TerrainTest) -> Any:
+    return run_of(adjusted(terrain=terrain))
+
+
+def wrong(terrain: TerrainTest) -> list[str]:
+    return reasons(adjusted(terrain=terrain))
+
+
+def test_what_is_wrong_with_a_dem_is_said_and_needs_a_look():
+    right = replace(
+        TerrainTest(30, 30, 40, 2.0, 3.0, 5.0), delivered=(-14.0, 9.0, -9.0), beyond=(2.9, 2.9, 2.9)
+    )
+    assert wrong(right) == []
+    below = replace(right, delivered=(51.0, 9.0, -9.0), beyond=(3.4, 1.0, 1.0))
+    (why,) = wrong(below)
+    assert why.startswith(
+        "The DEM is 51.0 m below the tie points as the delivered cameras put them, 3.4 times what the accuracies"
+    )
+    assert "geoid" not in why
+    (why,) = wrong(replace(below, is_known=False))
+    assert why.endswith("a geoid was left out, give --geoid.")
+    (why,) = wrong(replace(below, is_known=False, delivered=(-300.0, 0.0, 0.0)))
+    assert "300.0 m above the tie points" in why  # no geoid is as far off
+    assert "geoid" not in why
+    (why,) = wrong(replace(right, beyond=(1.0, 2.0, 3.1)))
+    assert why.startswith("The DEM is tilted against the tie points as delivered, by 9.0 m to the north at")
+    (why,) = wrong(replace(right, beyond=(1.0, 9.0, 3.1)))
+    assert "by 9.0 m to the east and 9.0 m to the north at" in why
+    other = replace(below, shows=False, relief=3.28)
+    (why,) = wrong(other)
+    assert "does not show the terrain of the tie points: its relief is 3.3 times theirs" in why
+    assert why.endswith("It was not used, and moved nothing.")
+    verdict = block_verdict(told_of(other), views())
+    assert verdict["status"] == "look"
+    assert not any("The DEM holds" in line for line in verdict["lines"])
 
 
 def test_a_reference_is_said_to_hold_what_and_how_far_off_the_cameras_were():

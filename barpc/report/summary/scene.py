@@ -99,6 +99,13 @@ class DemEntry(Record):
     num_tracks: Count = said("Tie points that count")
     offset_m: Number = said("Median of the tie points' altitudes minus the DEM's", "m")
     spread_m: Number = said("1.4826 times the median absolute deviation of these", "m")
+    sigma_m: Number = said(
+        "Standard deviation of single heights, where the tie points tell", "m", default=None
+    )
+    alike: Number = said("As many heights are worth one, as their errors resemble each other", default=None)
+    relief: Number = said(
+        "The DEM's relief as a multiple of the tie points'; far from 1: another terrain", default=None
+    )
 
 
 class AskedEntry(Record):
@@ -162,7 +169,7 @@ class SceneEntry(Record):
     )
 
 
-_DEM = attrgetter("held", "known", "total", "offset", "spread")
+_DEM = attrgetter("held", "known", "total", "offset", "spread", "sigma", "alike", "relief")
 
 
 def measure_scene(run: Run) -> SceneEntry | None:

@@ -1,0 +1,327 @@
+"""How much of a DEM's relief is believed: scale by scale, as far as the tie points' own heights show it.
+
+A DEM is h = t + e, terrain and errors. Where its small slopes are errors, least squares that take them for the
+terrain's find a place where the errors happen to fit, and believe it. What may pull is the best guess of the terrain
+given the DEM: the sum of gain x band over bands of scales, gain = var t / (var t + var e), for what the terrain has
+beyond it has nothing to do with its slopes. The gains are those of a regression of the tie points' heights on the
+bands (regression calibration: Carroll, Ruppert, Stefanski, Crainiceanu, Measurement Error in Nonlinear Models, 2006,
+chapter 4). What is left of single heights, and how far neighbours share it, is taken from the residuals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.optimize import lsq_linear
+
+from barpc.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.scene import BoolArray, IntArray
+
+Terrain = Callable[[Array, Array], Array]
+"""lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN where it is unknown."""
+
+SLOPE_STEP = 15.0  # m: slopes of the DEM itself are taken over twice this distance
+DEGREE = 3  # of the surfaces of which a DEM's are taken whole, wrong by what all its heights are
+NUM_BENDS = (DEGREE + 1) * (DEGREE + 2) // 2
+_NODES = 300  # of the grid on which a DEM is smoothed, along the scene's longer side: 30 m of 10 km
+_FINEST = 5.0  # m between them, at least
+_WIDEST = 16  # the widest smoothing is the scene's longer side over this, as a standard deviation
+_MARGIN, _LEAST_MARGIN = 0.1, 300.0  # of the scene and m around it: cameras may be off
+_ENOUGH = 60  # points: three for each number that is estimated
+_ROUNDS = 5  # gains, then what does not fit, in turn
+_FAR = 5.0  # robust standard deviations: heights farther off are holes that were filled, or what was built
+_CELLS = (6, 10, 16)  # along the scene's longer side: 36 sums tell a variance to a quarter
+_HILLS = (
+    45.0  # slopes that are alike count as one: 49-133 of them in the scenes that hold, 33 in 250 m by SRTM
+)
+_STATED = 4.0  # observations that the stated standard deviation of single heights is worth
+BEYOND = 3.0  # times what is allowed: a DEM and the cameras contradict each other
+_EDGE = 2.0  # the scene's edges lie at most about so many times as far out as its points' RMS distance
+_SHOWN = 0.5  # DEMs whose relief is farther from once that of the tie points than this, in
+_SURE = 4.0  # standard deviations, too, and
+_GROSS = 2.0  # times what is stated for single heights, are of another terrain
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """A DEM in bands of scales over a scene, the finest first."""
+
+    terrain: Terrain
+    origin: Array  # (2,) lon, lat of the first node [deg]
+    unit: Array  # (2,) metres a degree
+    step: float  # m between nodes
+    smoothed: tuple[Array, ...]  # the DEM smoothed, each twice as wide as the one before
+
+    @classmethod
+    def of(cls, terrain: Terrain, ground: Array) -> Bands:
+        """The bands over ground points (n, 3)."""
+        lon = wrap_longitude(ground[:, 0], ground[0, 0])
+        low, high = np.percentile(
+            np.column_stack([lon, ground[:, 1]]), [1, 99], axis=0
+        )  # wrong matches lie far out
+        unit = metres_per_unit(np.append((low + high) / 2.0, np.median(ground[:, 2])))[:2]
+        side = (high - low) * unit
+        extent = float(side.max())
+        margin = max(_MARGIN * extent, _LEAST_MARGIN)
+        step = max((extent + 2.0 * margin) / _NODES, _FINEST)
+        origin = low - margin / unit
+        cols, rows = (np.arange(int((s + 2.0 * margin) / step) + 2) * step for s in side)
+        lon, lat = np.meshgrid(origin[0] + cols / unit[0], origin[1] + rows / unit[1])
+        heights = np.asarray(terrain(lon.ravel(), lat.ravel()), dtype=np.float64).reshape(lon.shape)
+        least, most = np.percentile(ground[:, 2], [1, 99])
+        room = most - least + _LEAST_MARGIN
+        known = (heights > least - room) & (heights < most + room)  # a hole may be filled with any number
+        middle = float(np.median(heights[known])) if known.any() else 0.0
+        filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
+        while width * _WIDEST <= max(extent, _WIDEST * step):
+            total, weight = (
+                gaussian_filter(a, width / step, mode="nearest", truncate=3.0)
+                for a in (filled, known.astype(np.float64))
+            )
+            smoothed.append(middle + total / np.maximum(weight, 1e-6))
+            width *= 2.0
+        return cls(terrain, origin, unit, step, tuple(smoothed))
+
+    def local(self, ground: Array) -> Array:
+        """Metres east and north (n, 2) of the first node of ground points (n, 3)."""
+        lon = wrap_longitude(ground[:, 0], self.origin[0])
+        return np.asarray((np.column_stack([lon, ground[:, 1]]) - self.origin) * self.unit)
+
+    def at(self, ground: Array) -> tuple[Array, Array]:
+        """Heights (K, n) [m] of the bands at ground points (n, 3), which add up to the DEM's; slopes (K, n, 2)."""
+        heights = [np.asarray(self.terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)]
+        slopes = [np.nan_to_num(terrain_slopes(self.terrain, ground))]
+        at = self.local(ground).T[::-1] / self.step
+        for layer in self.smoothed:
+            rising = [np.gradient(layer, self.step, axis=axis) for axis in (1, 0)]
+            heights.append(_sampled(layer, at))
+            slopes.append(np.column_stack([_sampled(np.asarray(a), at) for a in rising]))
+        return _differences(np.array(heights)), _differences(np.array(slopes))
+
+
+def _sampled(layer: Array, at: Array) -> Array:
+    return np.asarray(map_coordinates(layer, at, order=1, mode="nearest"), dtype=np.float64)
+
+
+def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
+    """Slopes (n, 2) of a terrain towards east and north at ground points (n, 3); NaN where it is unknown."""
+    step = SLOPE_STEP / metres_per_unit(ground)[:, :2]
+    lon, lat = ground[:, 0], ground[:, 1]
+    east = terrain(lon + step[:, 0], lat) - terrain(lon - step[:, 0], lat)
+    north = terrain(lon, lat + step[:, 1]) - terrain(lon, lat - step[:, 1])
+    return np.column_stack([east, north]) / (2.0 * SLOPE_STEP)
+
+
+def _differences(layers: Array) -> Array:
+    """Bands (K, ...) of layers (K, ...), each without the next, which is smoother."""
+    return np.concatenate([layers[:-1] - layers[1:], layers[-1:]])
+
+
+def bends(at: Array) -> Array:
+    """Level, slopes and bends (n, `NUM_BENDS`) of a surface at places (n, 2)."""
+    x, y = at.T
+    return np.column_stack(
+        [x ** (n - j) * y**j for n in range(DEGREE + 1) for j in range(n + 1)]  # level, x, y, x^2, ...
+    )
+
+
+def _bend_slopes(at: Array) -> Array:
+    """Derivatives (n, `NUM_BENDS`, 2) of `bends` by the places."""
+    x, y = at.T
+    terms = [(n - j, j) for n in range(DEGREE + 1) for j in range(n + 1)]
+    by_x = [i * x ** max(i - 1, 0) * y**j for i, j in terms]
+    by_y = [j * x**i * y ** max(j - 1, 0) for i, j in terms]
+    return np.stack([np.column_stack(by_x), np.column_stack(by_y)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """What is believed of a DEM at n points."""
+
+    alt: (
+        Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
+    )
+    slopes: Array  # (n, 2) of the terrain towards east and north
+    bends: Array  # (n, `NUM_BENDS`) at most about 1 at the scene's edges: what all heights may be wrong by
+    gains: Array  # (K,) of the bands, the finest first
+    sigma: float  # standard deviation of single altitudes [m]
+    alike: float  # as many points are worth one: their errors resemble each other
+    relief: float  # the DEM's relief as a multiple of the tie points'
+    shows: bool  # whether that may be one
+
+    @property
+    def effective_sigma(self) -> float:
+        """Standard deviation of single altitudes, as if their errors were independent [m]."""
+        return float(self.sigma * self.alike**0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """A DEM beside the heights that rays alone give to tie points."""
+
+    bands: Bands | None  # None where there are too few points
+    tell: BoolArray  # (P,) points whose rays tell their heights better than the DEM does
+    delivered: Array  # (3,) how they lie to the DEM as delivered: level, rise to the east, to the north [m]
+    fit: Array  # (3, P) that by the heights of the points
+    cameras: Array  # (3,) what the cameras' accuracies let expect of that [m]; NaN where they do not say
+
+    def beyond(self, bias: float) -> Array:
+        """How far from the DEM they lie as delivered (3,), over what cameras and a DEM wrong by `bias` [m] allow."""
+        return np.asarray(np.abs(self.delivered) / np.hypot(self.cameras, bias))
+
+    def common_sigma(self, bias: float) -> Array:
+        """What all heights may be wrong by (`NUM_BENDS`,) [m] at the scene's edges: `bias`, and what contradicts it."""
+        sigma = np.full(NUM_BENDS, bias)
+        contradicts = self.beyond(bias) > BEYOND
+        sigma[:3][contradicts] = _EDGE * np.abs(self.delivered)[contradicts]
+        return sigma
+
+    @classmethod
+    def of(
+        cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0
+    ) -> Relief:
+        """Of points (P, 3) where rays put them; heights of those that are `strong` (P,) are known to `sharp` (P,) [m].
+
+        Those tell that are known better than single heights of the DEM are, as `stated` [m] or as they lie to it.
+        Rises are measured at the RMS distance of the points from their middle.
+        """
+        index = np.flatnonzero(strong)
+        off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
+        index, off = index[np.isfinite(off)], off[np.isfinite(off)]
+        tell, fit, unknown = np.zeros(len(strong), dtype=bool), np.zeros((3, len(strong))), np.full(3, np.nan)
+        if len(index) < _ENOUGH:
+            return cls(None, tell, unknown, fit, unknown)
+        bands = Bands.of(terrain, ground[index])
+        at = bands.local(ground[index])
+        at -= at.mean(axis=0)
+        flat = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
+        near = _middling(off)
+        for _ in range(_ROUNDS):
+            delivered = _coefficients(flat[near], off[near])
+            left = np.abs(off - flat @ delivered)
+            near = left <= _FAR * 1.4826 * np.median(left)
+        tell[index[sharp[index] < max(1.4826 * float(np.median(left)), stated)]] = True
+        fit[:, index] = np.linalg.pinv(flat)
+        return cls(bands, tell, delivered, fit, unknown)
+
+
+def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Believed | None:
+    """What is believed of a DEM at the points `index` (n,), at (n, 3); None where too few heights tell.
+
+    Single altitudes are stated to be known to `stated` [m]. Points that tell are held where they are, less what a
+    motion or a bend of the scene explains of their distance: what else they have is the DEM's error, and no ray is
+    bent for it.
+    """
+    if relief.bands is None:
+        return None
+    heights, slopes = relief.bands.at(ground)
+    known = np.isfinite(heights[0])
+    tell = relief.tell[index] & known
+    if tell.any():
+        tell[tell] = _middling((ground[:, 2] - heights.sum(axis=0))[tell])
+    if tell.sum() < _ENOUGH:
+        return None
+    at = relief.bands.local(ground)
+    at = at - at[tell].mean(axis=0)
+    half = max(float(np.abs(at[tell]).max()), 1.0)
+    smooth, by_place = bends(at / half), _bend_slopes(at / half) / half
+    trend = _coefficients(smooth[tell], heights[:, tell].T)
+    kept, bent = (smooth @ trend).sum(axis=1), heights.T - smooth @ trend
+    bent_slopes = slopes - np.einsum("nmx,mk->knx", by_place, trend)
+    above = ground[:, 2] - kept
+    found = _compared(at, above, bent, bent_slopes, smooth, tell)
+    fits, left, rising = found.fits, found.left, found.rising
+    freedom = max(int(fits.sum()) - found.unknowns, 1)
+    pull = rising[fits] - smooth[fits] @ _coefficients(smooth[fits], rising[fits])
+    alt = np.where(tell, ground[:, 2] - found.part, kept + bent @ found.gains)
+    is_held = known & (fits | ~relief.tell[index])
+    times, shows = _shown(bent[fits].sum(axis=1), above[fits], smooth[fits], stated)
+    return Believed(
+        np.where(is_held, alt, np.nan),
+        rising + np.einsum("nmx,mk->nx", by_place, trend),
+        smooth,
+        found.gains,
+        float(np.sqrt((_STATED * stated**2 + (left[fits] ** 2).sum()) / (_STATED + freedom))),
+        _summed(at[fits], pull * left[fits, None]),
+        times,
+        shows,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """Heights of n points against the bands of a DEM."""
+
+    gains: Array  # (K,) of the bands
+    rising: Array  # (n, 2) slopes of what is believed of them
+    part: Array  # (n,) what moving and bending the scene explains [m]
+    left: Array  # (n,) what is left [m]
+    fits: BoolArray  # (n,) points that tell, and are not far off
+    unknowns: int
+
+
+def _compared(
+    at: Array, above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray
+) -> _Compared:
+    """Heights (n,) [m] of points that `tell` (n,) by bands (n, K) of slopes (K, n, 2), a motion and a bend (n, m).
+
+    Where hills are too few to be told from what errors happen to be, no slope is believed.
+    """
+    gains, fits, both, believes = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
+    for _ in range(_ROUNDS):
+        rising = np.einsum("k,knx->nx", gains, slopes)
+        believes = believes and fits.sum() > _HILLS * _summed(
+            at[fits], rising[fits] - rising[fits].mean(axis=0)
+        )
+        moved = smooth
+        if believes:  # a shift, a turn, a growth
+            moved = np.column_stack([smooth, *(rising * smooth[:, k, None] for k in range(3))])
+            free = both[fits] - moved[fits] @ _coefficients(moved[fits], both[fits])
+            gains = lsq_linear(free[:, 1:], free[:, 0], (0.0, 1.0)).x
+        else:
+            gains, rising = np.zeros(bent.shape[1]), np.zeros_like(rising)
+        rest = above - bent @ gains
+        part = moved @ _coefficients(moved[fits], rest[fits])
+        left = rest - part
+        spread = 1.4826 * float(np.median(np.abs(left[fits])))
+        fits = tell & (np.abs(left) <= max(_FAR * spread, 1e-6))
+    return _Compared(gains, rising, part, left, fits, moved.shape[1] + len(gains))
+
+
+def _middling(values: Array) -> BoolArray:
+    """Which of n values lie about their median."""
+    off = np.abs(values - np.median(values))
+    return np.asarray(off <= _FAR * 1.4826 * np.median(off))
+
+
+def _coefficients(design: Array, values: Array) -> Array:
+    return np.asarray(np.linalg.lstsq(design, values, rcond=1e-9)[0], dtype=np.float64)
+
+
+def _summed(at: Array, pull: Array) -> float:
+    """How many points at places (n, 2) are worth one, by their pulls (n, 2) to the east and north.
+
+    Squared sums over cells against those of independent pulls, at the size of cells at which they are largest.
+    """
+    size, of_single, found = max(float(np.ptp(at, axis=0).max()), 1.0), (pull**2).sum(axis=0), 1.0
+    for count in _CELLS:
+        column, row = np.floor((at - at.min(axis=0)) / size * count).astype(np.int64).T
+        cell = np.unique(column * (count + 1) + row, return_inverse=True)[1]
+        sums = np.stack([np.bincount(cell, one) for one in pull.T])
+        found = max(found, float(((sums**2).sum(axis=1) / np.maximum(of_single, 1e-30)).max()))
+    return found
+
+
+def _shown(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[float, bool]:
+    """A DEM's relief (n,) as a multiple of that of the tie points (n,) [m], and whether it may be theirs."""
+    seen = above - smooth @ _coefficients(smooth, above)
+    size = max(float(seen @ seen), 1e-12)
+    times = float(relief @ seen) / size
+    off, rest = relief - seen, relief - times * seen
+    sigma = float(np.sqrt(rest @ rest / size / len(seen)) if len(seen) else np.inf)
+    far = abs(times - 1.0)
+    wrong = far > _SHOWN and far > _SURE * sigma and float(off @ off) > len(off) * (_GROSS * stated) ** 2
+    return times, not wrong

@@ -1,0 +1,249 @@
+"""What is believed of a DEM: of terrains made of waves, DEMs with errors of their own, and points at known places."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba.ground import Heights
+from barpc.ba.relief import NUM_BENDS, Believed, Relief, believe, bends
+from barpc.dem import Dem
+from benchmarks.worlds import judge
+from benchmarks.worlds_families import make
+
+LON, LAT, ALT = 5.0, 43.0, 300.0
+UNIT = np.array([81460.0, 111090.0])  # m a degree, about
+SIDE = 10000.0
+Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def waves(seed: int, size: float, shortest: float, longest: float) -> Surface:
+    """A surface of 24 waves, `size` m RMS, by lon and lat."""
+    rng = np.random.default_rng(seed)
+    length = np.exp(rng.uniform(np.log(shortest), np.log(longest), 24))
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, 24))
+    number = 2 * np.pi / length
+
+    def at(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        x, y = (np.asarray(lon) - LON) * UNIT[0], (np.asarray(lat) - LAT) * UNIT[1]
+        found = np.zeros(x.shape)
+        for k in range(24):
+            found += np.sin(number[k] * (np.cos(angle[k]) * x + np.sin(angle[k]) * y) + phase[k])
+        return size * found / np.sqrt(12.0)
+
+    return at
+
+
+HILLS = waves(1, 40.0, 700.0, 4000.0)
+SINGLE = waves(2, 5.0, 80.0, 160.0)
+LONG = waves(3, 3.0, 1500.0, 4000.0)
+
+
+def points(count: int = 900, east: float = 0.0, terrain: Surface = HILLS) -> np.ndarray:
+    """Points of a terrain, put too far to the east by so many metres."""
+    xy = np.random.default_rng(7).uniform(-SIDE / 2, SIDE / 2, (count, 2))
+    lon, lat = LON + xy[:, 0] / UNIT[0], LAT + xy[:, 1] / UNIT[1]
+    return np.column_stack([lon + east / UNIT[0], lat, ALT + terrain(lon, lat)])
+
+
+def sum_of(*parts: Surface) -> Surface:
+    return lambda lon, lat: ALT + sum(part(lon, lat) for part in parts)
+
+
+def judged(dem: Surface, ground: np.ndarray, stated: float = 5.0, **given: Any) -> Believed | None:
+    every = np.ones(len(ground), dtype=bool)
+    relief = Relief.of(dem, ground, given.get("strong", every), np.full(len(ground), 0.3), stated)
+    return believe(relief, np.arange(len(ground)), ground, stated)
+
+
+def sure(found: Believed | None) -> Believed:
+    assert found is not None
+    return found
+
+
+def test_what_is_error_is_not_believed_and_what_is_terrain_is() -> None:
+    """Errors that are short waves: their bands have no gain, those of the hills have all."""
+    found = sure(judged(sum_of(HILLS, SINGLE), points()))
+    assert found.gains[0] < 0.15
+    assert (found.gains[1:] > 0.93).all()
+    exact = sure(judged(sum_of(HILLS), points()))
+    assert (exact.gains[-2:] > 0.99).all()
+    # slopes: of the hills, and not of the errors, which are five times as steep
+    step = 1.0 / UNIT
+    ground = points()
+    lon, lat = ground[:, 0], ground[:, 1]
+    true = np.stack(
+        [
+            (HILLS(lon + step[0], lat) - HILLS(lon - step[0], lat)) / 2,
+            (HILLS(lon, lat + step[1]) - HILLS(lon, lat - step[1])) / 2,
+        ],
+        axis=1,
+    )
+    for believed in (found, exact):
+        assert np.sqrt(np.mean((believed.slopes - true) ** 2)) < 0.2 * np.sqrt(np.mean(true**2))
+
+
+@pytest.mark.parametrize("east", [-25.0, 0.0, 25.0])
+def test_points_are_asked_to_move_back_to_where_the_terrain_is(east: float) -> None:
+    """Heights to hold to fall short along the slopes by as much as points lie too far to the east, and no more."""
+    ground = points(east=east)
+    found = sure(judged(sum_of(HILLS, SINGLE), ground))
+    off = ground[:, 2] - found.alt
+    design = np.column_stack([found.slopes, bends((ground[:, :2] - [LON, LAT]) * UNIT / SIDE)])
+    moved = np.linalg.lstsq(design, off, rcond=None)[0]
+    assert moved[0] == pytest.approx(-east, abs=2.5)
+    assert moved[1] == pytest.approx(0.0, abs=2.5)
+    # what single heights differ by beside that is left to them
+    assert np.std(off - design @ moved) < 0.5
+    assert 0.7 < found.sigma < 1.6  # with a DEM whose errors, of 5 m, are not believed
+
+
+def test_errors_that_neighbours_share_make_heights_count_less() -> None:
+    alone = sure(judged(sum_of(HILLS, SINGLE), points()))
+    together = sure(judged(sum_of(HILLS, SINGLE, LONG), points()))
+    assert 1.0 <= alone.alike < 1.7
+    assert 1.9 < together.alike < 20.0
+    assert together.effective_sigma == pytest.approx(together.sigma * together.alike**0.5)
+
+
+def test_a_dem_of_another_terrain_is_told_from_one_that_is_only_coarse() -> None:
+    ground = points()
+    flat = sure(judged(lambda lon, lat: np.full(len(lon), ALT), ground))
+    assert (flat.shows, flat.relief) == (False, pytest.approx(0.0, abs=1e-6))
+    feet = sure(judged(lambda lon, lat: sum_of(HILLS)(lon, lat) / 0.3048, ground))
+    assert not feet.shows
+    assert feet.relief == pytest.approx(1 / 0.3048, rel=1e-3)
+    elsewhere = sure(judged(sum_of(waves(9, 40.0, 700.0, 4000.0)), ground))
+    assert not elsewhere.shows
+    for dem in (sum_of(HILLS, SINGLE, LONG), lambda lon, lat: sum_of(HILLS)(lon, lat) + 300.0):
+        right = sure(judged(dem, ground))
+        assert right.shows
+        assert right.relief == pytest.approx(1.0, abs=0.05)
+    plain = waves(1, 1.0, 700.0, 4000.0)  # of a metre: a DEM known to 5 m need not show it
+    assert sure(judged(lambda lon, lat: np.full(len(lon), ALT), points(terrain=plain))).shows
+
+
+def test_holes_and_what_fills_them_hold_nothing() -> None:
+    def holed(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        x = (lon - LON) * UNIT[0]
+        height = np.where(x < -2000.0, np.nan, sum_of(HILLS, SINGLE)(lon, lat))
+        return np.where(x > 3500.0, -9999.0, height)  # voids that nobody declared
+
+    ground = points()
+    found = sure(judged(holed, ground))
+    x = (ground[:, 0] - LON) * UNIT[0]
+    inside = (x > -1980.0) & (x < 3480.0)
+    assert np.isnan(found.alt[(x < -2000.0) | (x > 3500.0)]).all()
+    assert np.isfinite(found.alt[inside]).mean() > 0.98
+    assert found.sigma < 7.0
+    assert found.shows
+
+
+def test_few_points_or_none_that_tell_believe_nothing() -> None:
+    assert judged(sum_of(HILLS), points(59)) is None
+    ground = points(100)
+    assert judged(sum_of(HILLS), ground, strong=np.zeros(100, dtype=bool)) is None
+    assert judged(lambda lon, lat: np.full(len(lon), np.nan), ground) is None
+
+
+def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
+    ground = points(200)
+    tilted = lambda lon, lat: sum_of(HILLS)(lon, lat) + 40.0 * (lon - LON) * UNIT[0] / (SIDE / 2)  # noqa: E731
+    made = Relief.of(tilted, ground, np.ones(200, dtype=bool), np.full(200, 0.3))
+    assert made.delivered[1] == pytest.approx(
+        -40.0 * 0.816, rel=0.05
+    )  # at the RMS distance of a square's points
+    assert np.abs(made.delivered[[0, 2]]).max() < 2.5
+    assert np.isnan(made.beyond(2.0)).all()  # nothing is known of the cameras yet
+    np.testing.assert_array_equal(made.common_sigma(2.0), np.full(NUM_BENDS, 2.0))
+    object.__setattr__(made, "cameras", np.array([30.0, 0.5, 0.5]))
+    sigma = made.common_sigma(2.0)
+    assert sigma[1] == pytest.approx(-2.0 * made.delivered[1])
+    np.testing.assert_array_equal(np.delete(sigma, 1), np.full(NUM_BENDS - 1, 2.0))
+    np.testing.assert_array_equal(
+        made.common_sigma(20.0), np.full(NUM_BENDS, 20.0)
+    )  # it may be as wrong as that
+
+
+def test_a_dem_of_a_known_datum_is_wrong_together_by_less() -> None:
+    def bias(dem: Any, **options: Any) -> float:
+        none = np.zeros(0, dtype=bool)
+        heights = Heights((), none, np.zeros(0, dtype=np.int64), (0.0, 1.0), AdjustOptions(**options), dem)
+        return heights._bias
+
+    known, unknown = (Dem(None, None, "", known) for known in (True, False))  # type: ignore[arg-type]
+    assert (bias(known), bias(unknown), bias(lambda lon, lat: lon)) == (5.0, 20.0, 20.0)
+    assert bias(known, dem_bias_sigma=0.7) == 0.7
+
+
+def test_bends_are_a_level_two_slopes_and_what_is_curved() -> None:
+    at = np.random.default_rng(0).uniform(-1, 1, (30, 2))
+    found = bends(at)
+    assert found.shape == (30, NUM_BENDS)
+    np.testing.assert_array_equal(found[:, 0], 1.0)
+    np.testing.assert_array_equal(found[:, 1:3], at)
+    assert np.linalg.matrix_rank(found) == NUM_BENDS
+
+
+# --- whole blocks, flown by other cameras ---------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hills", [False, True])
+def test_a_dem_with_waves_places_a_scene_as_well_as_it_is_said_to(hills: bool) -> None:
+    """Twelve draws; before, errors over what was said were 3.8 (plains) and 3.0 (hills), RMS, at worst 8.9."""
+    over, off, delivered = [], [], []
+    for seed in range(int(hills), 24, 2):
+        world = make("dem", seed)
+        found = adjust_tracks(
+            world.views, world.tracks, AdjustOptions(dem_sigma=5.0, dem_bias_sigma=2.0), dem=world.dem
+        )
+        move = np.array(judge(world, found.sensors).move)
+        over.append(move / found.gauge.sigma)
+        off.append(np.hypot(*move[:2]))
+        delivered.append(np.hypot(*judge(world, [view.sensor for view in world.views]).move[:2]))
+        assert found.terrain is not None
+        assert found.terrain.shows
+    rms = np.sqrt(np.mean(np.square(over), axis=0))
+    assert (rms[:2] < 1.3).all()
+    assert (rms[:2] > 0.4).all()
+    assert rms[2] < 1.3
+    assert np.sqrt(np.mean(np.square(off))) < (0.7 if hills else 0.85) * np.sqrt(
+        np.mean(np.square(delivered))
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "kind"), [(2, "tilt"), (10, "tilt"), (7, "level"), (15, "level"), (4, "shows"), (5, "shows")]
+)
+def test_a_wrong_dem_neither_bends_nor_moves_a_scene(seed: int, kind: str) -> None:
+    world = make("wrong_dem", seed)
+    options = AdjustOptions(dem_sigma=5.0, dem_bias_sigma=2.0)
+    found = adjust_tracks(world.views, world.tracks, options, dem=world.dem)
+    after = judge(world, found.sensors)
+    assert found.terrain is not None
+    beyond = np.array(found.terrain.beyond)
+    assert found.terrain.shows == (kind != "shows")
+    assert {"tilt": beyond[1] > 10, "level": beyond[0] > 7, "shows": found.terrain.held == 0}[kind]
+    assert after.left < 0.05
+    assert after.tilt < 1.0
+    assert (np.abs(np.array(after.move) / found.gauge.sigma) < 3.0).all()
+
+
+@pytest.mark.slow
+def test_a_small_block_is_held_by_the_terrain_and_points_by_their_rays() -> None:
+    """Two views of hills, whose cameras say where they are to some metres; the DEM to half of one."""
+    world = make("dem", 9)
+    options = AdjustOptions(dem_sigma=5.0, dem_bias_sigma=2.0, jitter="off")
+    found = adjust_tracks(world.views, world.tracks, options, dem=world.dem)
+    assert found.terrain is not None
+    assert found.terrain.held > 0.99 * found.terrain.known
+    assert found.gauge.sigma[2] < 2.2
+    assert 1.0 < found.gauge.sigma[0] < 4.0
+    assert found.datum["heights"][0] > 0.5
+    assert found.inlier[found.view >= 0].mean() > 0.8
