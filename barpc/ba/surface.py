@@ -1,0 +1,251 @@
+"""The surface of the tie points, and the motion that brings it onto heights measured from elsewhere.
+
+Around every tie point its neighbours give a plane, with the covariance of its height and slopes and what the ground
+scatters about it. Where a height is given, the plane of the nearest tie point predicts it; the slopes tell how the
+prediction changes where the whole surface moves. Slopes are themselves uncertain: what they claim to know is taken off
+the normal matrix, as in errors-in-variables regression (Fuller, "Measurement error models", 1987).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from barpc.geodesy import Array
+from barpc.scene import BoolArray, IntArray
+
+NEIGHBOURS = 9  # tie points of a plane: its three unknowns are checked by six
+_FREEDOM = NEIGHBOURS - 3
+_SHARED_FREEDOM = 4.0  # degrees of freedom that the whole surface's scatter counts for in that of a plane
+_LEAST_SCATTER = 0.01  # m: no ground is flatter
+_SIDE = 25  # trials along each axis of the search
+_SEARCHED = 1000  # heights that the search looks at, at most
+_STEPS = 40
+_SETTLED = 1e-3  # m
+_BIWEIGHT = 4.685  # Tukey's: 95 % as efficient as least squares where all is normal
+_NEAR = 3.0  # standard deviations within which a height agrees
+_MOST_NOISE = 3.0  # times what is stated: more is not agreement
+_KNOWN = 0.2  # of the information that slopes claim: below, they are their own noise
+_FEWEST_GROUPS = 12  # of neighbours, that a variance is told by
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Planes around tie points, in a local frame (east, north, up) about their middle."""
+
+    points: Array  # (P, 3) [m]
+    plane: Array  # (P, 3) height [m], slope to the east and north
+    covariance: Array  # (P, 3, 3)
+    scatter: Array  # (P,) standard deviation of the ground about the plane [m]
+    reach: Array  # (P,) where the plane's farthest neighbour lies [m]
+    tree: cKDTree
+
+    @classmethod
+    def of(cls, points: Array) -> Surface:
+        """The surface of at least `NEIGHBOURS` points (P, 3)."""
+        tree = cKDTree(points[:, :2])
+        distance, near = tree.query(points[:, :2], k=NEIGHBOURS)
+        delta = points[near] - points[:, None]
+        design = np.concatenate([np.ones((*near.shape, 1)), delta[..., :2]], axis=2)
+        normal = np.swapaxes(design, 1, 2) @ design
+        reach = np.maximum(distance[:, -1], 1e-3)
+        ridge = 1e-9 * NEIGHBOURS * np.stack([np.ones_like(reach), reach**2, reach**2], axis=1)
+        inverse = np.linalg.inv(normal + ridge[:, :, None] * np.eye(3))
+        plane = np.einsum("pij,pkj,pk->pi", inverse, design, delta[..., 2])
+        squares = ((delta[..., 2] - np.einsum("pkj,pj->pk", design, plane)) ** 2).sum(axis=1)
+        usual = max(float(np.median(squares)) / _FREEDOM, _LEAST_SCATTER**2)
+        variance = (squares + _SHARED_FREEDOM * usual) / (_FREEDOM + _SHARED_FREEDOM)
+        plane[:, 0] += points[:, 2]
+        return cls(points, plane, variance[:, None, None] * inverse, np.sqrt(variance), reach, tree)
+
+    def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
+        """Height (n,) at places (n, 2), the tie point (n,) whose plane says so, and whether it reaches there."""
+        distance, nearest = self.tree.query(place)
+        design = self._design(place, nearest)
+        return (design * self.plane[nearest]).sum(axis=1), nearest, distance <= self.reach[nearest]
+
+    def variance(self, place: Array, nearest: IntArray) -> Array:
+        """Of the height of the ground at places (n, 2) minus what the planes say [m^2]."""
+        design = self._design(place, nearest)
+        of_plane = np.einsum("ni,nij,nj->n", design, self.covariance[nearest], design)
+        return np.asarray(of_plane + self.scatter[nearest] ** 2)
+
+    def _design(self, place: Array, nearest: IntArray) -> Array:
+        return np.column_stack([np.ones(len(place)), place - self.points[nearest, :2]])
+
+
+@dataclass(frozen=True)
+class Given:
+    """Heights given from elsewhere, in the frame of a surface."""
+
+    place: Array  # (n, 3) east, north, up [m]
+    sigma: Array  # (n,) of the height [m]
+    sigma_flat: Array  # (n,) of the place, along an axis [m]
+
+    def select(self, keep: BoolArray) -> Given:
+        """Those of a mask (n,)."""
+        return Given(self.place[keep], self.sigma[keep], self.sigma_flat[keep])
+
+
+@dataclass(frozen=True)
+class Registration:
+    """The motion of a surface that brings it onto the heights given, and how well these agree on it."""
+
+    motion: Array  # (7,) east, north, up, tilts, turn, scale [m], as `barpc.ba.gauge.MOTIONS`
+    covariance: Array  # (7, 7) of it, what was known before left out but for a hundredth
+    near: BoolArray  # (n,) heights that lie on the surface's planes
+    agree: BoolArray  # (n,) those of them that agree with the motion
+    residual: Array  # (n,) given minus surface, moved [m]; NaN where there is no surface
+    sigma: Array  # (n,) its standard deviation as stated [m]
+
+    @property
+    def share(self) -> float:
+        """How many of the heights on the surface agree, 0 to 1."""
+        return float(self.agree.sum() / max(self.near.sum(), 1))
+
+
+def displacement(local: Array) -> Array:
+    """(n, 3, 7): moves east, north, up of points at `local` (n, 2) radii by the seven motions of a scene."""
+    e, o = local.T
+    moves = np.zeros((len(e), 3, 7))
+    moves[:, (0, 1, 2), (0, 1, 2)] = 1.0
+    moves[:, 2, 3], moves[:, 2, 4] = e, o
+    moves[:, 0, 5], moves[:, 1, 5] = -o, e
+    moves[:, 0, 6], moves[:, 1, 6] = e, o
+    return moves
+
+
+def register(surface: Surface, given: Given, radius: float, before: Array) -> Registration:
+    """Find the motion of a surface onto heights, of which the larger part is right.
+
+    `before` (7,) are the standard deviations of the motions without these heights [m]: how far is looked, and where
+    the heights tell nothing, that stays open.
+    """
+    free = np.diag((10.0 * before) ** -2)
+    motion, noise = _search(surface, given, before), _MOST_NOISE
+    for step in range(_STEPS):
+        seen = _Seen.of(surface, given, motion, radius)
+        whitened = seen.residual / seen.sigma
+        near = seen.near & (np.abs(whitened) < _BIWEIGHT * noise)
+        if near.sum() < len(motion):
+            break
+        rows = np.where(near, np.maximum(1.0 - (whitened / (_BIWEIGHT * noise)) ** 2, 0.0), 0.0)
+        weight = (rows / seen.sigma) ** 2  # rows^2 is the biweight
+        normal = (seen.rows * weight[:, None]).T @ seen.rows + free
+        change = np.linalg.solve(normal, seen.rows.T @ (weight * np.where(near, seen.residual, 0.0)) - free @ motion)
+        motion = motion + change
+        among = np.abs(whitened[seen.near & (np.abs(whitened) < 2.0 * _BIWEIGHT * noise)])
+        noise = float(np.clip(1.4826 * np.median(among), 0.5, max(noise, 1.0))) if step >= 2 else noise
+        if step > 5 and np.abs(change).max() < _SETTLED:
+            break
+    return _told(surface, given, motion, radius, noise, free)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Heights against a surface that was moved."""
+
+    residual: Array  # (n,) given minus predicted [m]
+    sigma: Array  # (n,) [m]
+    rows: Array  # (n, 7) the prediction by the motions
+    near: BoolArray  # (n,)
+    nearest: IntArray  # (n,)
+    moves: Array  # (n, 3, 7)
+
+    @classmethod
+    def of(cls, surface: Surface, given: Given, motion: Array, radius: float) -> _Seen:
+        moves = displacement(given.place[:, :2] / radius)
+        moved = moves @ motion
+        place = given.place[:, :2] - moved[:, :2]
+        height, nearest, near = surface.at(place)
+        slope = surface.plane[nearest, 1:]
+        variance = surface.variance(place, nearest) + given.sigma**2
+        variance += (slope**2).sum(axis=1) * given.sigma_flat**2
+        normal = np.column_stack([-slope, np.ones(len(slope))])
+        rows = np.einsum("nc,ncm->nm", normal, moves)
+        return cls(
+            given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves
+        )
+
+
+def _search(surface: Surface, given: Given, before: Array) -> Array:
+    """The shift (7,; tilts, turn and scale 0) on which the most heights agree, east and north within 4 sigma."""
+    few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // _SEARCHED) == 0)
+    first = _Seen.of(surface, few, np.zeros(7), 1.0)
+    steep = float(np.sqrt((surface.plane[:, 1:] ** 2).mean()))
+    wide = float(np.median(first.sigma))
+    reach = 4.0 * before[:2]
+    step = np.maximum(1.5 * wide / max(steep, 1e-6), 2.0 * reach / (_SIDE - 1))
+    sides = [np.arange(-(r // s), r // s + 1) * s for r, s in zip(reach, step, strict=True)]
+    half = 2.0 * float(np.hypot(wide, 0.5 * steep * np.hypot(*np.minimum(step, reach))))
+    best, found = -1.0, np.zeros(7)
+    for east in sides[0]:
+        for north in sides[1]:
+            height, _, near = surface.at(few.place[:, :2] - [east, north])
+            off = np.sort((few.place[:, 2] - height)[near])
+            if not len(off):
+                continue
+            count = np.searchsorted(off, off + 2.0 * half) - np.arange(len(off))
+            start = int(count.argmax())
+            inside = off[start : start + count[start]]
+            score = float(count[start]) - float(((inside - inside.mean()) ** 2).sum()) / half**2
+            if score > best:
+                best, found = score, np.array([east, north, np.median(inside), 0, 0, 0, 0])
+    return found
+
+
+def _told(
+    surface: Surface, given: Given, motion: Array, radius: float, noise: float, free: Array
+) -> Registration:
+    """The covariance at the end, and which heights agree."""
+    seen = _Seen.of(surface, given, motion, radius)
+    scale = min(max(noise, 1.0), _MOST_NOISE)
+    agree = seen.near & (np.abs(seen.residual) < _NEAR * scale * seen.sigma)
+    residual = np.where(seen.near, seen.residual, np.nan)
+    rows, inverse = seen.rows[agree], 1.0 / (scale * seen.sigma[agree]) ** 2
+    normal = (rows * inverse[:, None]).T @ rows
+    slopes = np.zeros((len(rows), 3, 3))
+    slopes[:, :2, :2] = surface.covariance[seen.nearest[agree], 1:, 1:]
+    moves = seen.moves[agree]
+    doubt = np.einsum("n,ncm,ncd,ndk->mk", inverse, moves, slopes, moves)
+    forms = inverse[:, None] * rows * np.where(agree, seen.residual, 0.0)[agree, None]
+    group = _inflation(given.place[agree], forms, np.diag(normal), surface)
+    # whitened by what slopes claim: axes along which they know `told` of it
+    root = np.linalg.cholesky(normal + free)
+    half = np.linalg.inv(root)
+    told, axes = np.linalg.eigh(half @ (normal - doubt + free) @ half.T)
+    told = np.maximum(told, 0.0)
+    axes = half.T @ axes
+    meat = axes.T @ (group[:, None] * normal * group[None, :] + free) @ axes
+    known = np.where(told > _KNOWN, 1.0 / np.maximum(told, _KNOWN), 0.0)
+    covariance = axes @ (known[:, None] * meat * known) @ axes.T
+    lost = axes[:, told <= _KNOWN]
+    covariance += lost @ lost.T / _KNOWN**2 if lost.size else 0.0
+    open_ = np.linalg.inv(free)
+    covariance = np.linalg.inv(np.linalg.inv(covariance + 1e-12 * open_) + free)
+    return Registration(motion, covariance, seen.near, agree, residual, seen.sigma)
+
+
+def _inflation(place: Array, forms: Array, alone: Array, surface: Surface) -> Array:
+    """Factors (7,) of standard deviations: what neighbours share, by groups of growing size (a sandwich estimate).
+
+    `forms` (n, 7) are the weighted residuals by the motions, `alone` (7,) the variances of their sums if each were
+    independent.
+    """
+    size, most = 2.0 * float(np.median(surface.reach)), np.ones(7)
+    while True:
+        cell = np.floor(place[:, :2] / size).astype(np.int64)
+        _, group = np.unique(cell, axis=0, return_inverse=True)
+        count = int(group.max(initial=-1)) + 1
+        if count < _FEWEST_GROUPS:
+            return most
+        sums = np.stack([np.bincount(group.ravel(), column, minlength=count) for column in forms.T], axis=1)
+        ratio = (sums**2).sum(axis=0) / np.maximum(alone, 1e-300) * count / (count - 1.0)
+        up, flat = [2, 3, 4], [0, 1, 5, 6]
+        for part in (up, flat):
+            most[part] = np.maximum(most[part], np.sqrt(ratio[part].mean()))
+        size *= 2.0
+
+
