@@ -19,10 +19,12 @@ from barpc.ba.solve import State
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
-SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference")
+SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference", "altimetry")
 """The priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; the DEM or assumed
-altitudes, with what these are wrong by together; a reference orthoimage, with what it is wrong by as a whole."""
+altitudes, with what these are wrong by together; a reference orthoimage, with what it is wrong by as a whole; heights
+without image coordinates."""
 _OF_HEIGHTS = 3  # errors in common that are a terrain's, in front of the reference's own
+_OF_REFERENCE = 6  # and these, in front of altimetry's
 
 
 def datum_shares(
@@ -95,8 +97,10 @@ def _known_points(
         held[kind][prior.index] = own
         paid[kind][:] += left[own].sum(axis=0)
         rest &= ~own
-    paid["heights"][:] += left[rest].sum(axis=0) + (shared[:_OF_HEIGHTS] ** 2).sum(axis=0)
-    paid["reference"][:] += (shared[_OF_HEIGHTS:] ** 2).sum(axis=0)
+    placed = rest & prior.common[:, :, _OF_REFERENCE:].any(axis=(1, 2))
+    paid["altimetry"][:] += left[placed].sum(axis=0) + (shared[_OF_REFERENCE:] ** 2).sum(axis=0)
+    paid["heights"][:] += left[rest & ~placed].sum(axis=0) + (shared[:_OF_HEIGHTS] ** 2).sum(axis=0)
+    paid["reference"][:] += (shared[_OF_HEIGHTS:_OF_REFERENCE] ** 2).sum(axis=0)
     return held
 
 

@@ -163,15 +163,18 @@ class Heights:
     options: AdjustOptions  # `dem_sigma`, `dem_for_all`
     dem: Terrain | None  # none: weak tracks are held to the altitude of the others, within their spread
     reference: Reference | None = None  # whose heights are the DEM's
+    placed: PointPrior | None = None  # tracks that altimetry holds, which nothing else does then
 
     def hold(self, problem: Problem, points: Array) -> Problem:
         """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
-        return replace(problem, point_prior=_join([*self.control, self._held(points)]))
+        return replace(problem, point_prior=_join([*self.control, self._held(points), self.placed]))
 
     def _held(self, points: Array) -> PointPrior | None:
         dem, options = self.dem, self.options
         weak = self.weak[self.tracks]
-        index = self.tracks if dem is not None and self._whole else self.tracks[weak]
+        index = self.tracks if self.is_whole else self.tracks[weak]
+        if self.placed is not None:
+            index = index[~np.isin(index, self.placed.index)]
         if not len(index):
             return None
         if dem is not None:
@@ -190,9 +193,9 @@ class Heights:
         return flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)
 
     @property
-    def _whole(self) -> bool:
+    def is_whole(self) -> bool:
         """Whether a terrain holds all tracks."""
-        return self.options.dem_for_all or self.reference is not None
+        return self.dem is not None and (self.options.dem_for_all or self.reference is not None)
 
     @property
     def _bias(self) -> float:
@@ -209,7 +212,7 @@ class Heights:
         lon, lat, alt = ground_from_ecef(points[index]).T
         above = alt - self.dem(lon, lat)
         known = np.isfinite(above)
-        is_held = known if self._whole else known & self.weak[index]
+        is_held = known if self.is_whole else known & self.weak[index]
         offset = float(np.median(above[known])) if known.any() else np.nan
         spread = 1.4826 * float(np.median(np.abs(above[known] - offset))) if known.any() else np.nan
         return TerrainTest(int(is_held.sum()), int(known.sum()), len(index), offset, spread, self._bias)

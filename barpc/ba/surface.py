@@ -28,7 +28,7 @@ _BIWEIGHT = 4.685  # Tukey's: 95 % as efficient as least squares where all is no
 _NEAR = 3.0  # standard deviations within which a height agrees
 _MOST_NOISE = 3.0  # times what is stated: more is not agreement
 _KNOWN = 0.2  # of the information that slopes claim: below, they are their own noise
-_FEWEST_GROUPS = 12  # of neighbours, that a variance is told by
+_FEWEST_GROUPS = 14  # of neighbours, that a variance is told by: twice the unknowns
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def _inflation(place: Array, forms: Array, alone: Array, surface: Surface) -> Ar
         if count < _FEWEST_GROUPS:
             return most
         sums = np.stack([np.bincount(group.ravel(), column, minlength=count) for column in forms.T], axis=1)
-        ratio = (sums**2).sum(axis=0) / np.maximum(alone, 1e-300) * count / (count - 1.0)
+        ratio = (sums**2).sum(axis=0) / np.maximum(alone, 1e-300) * count / (count - 7.0)  # seven are fitted
         up, flat = [2, 3, 4], [0, 1, 5, 6]
         for part in (up, flat):
             most[part] = np.maximum(most[part], np.sqrt(ratio[part].mean()))

@@ -32,6 +32,7 @@ _DATUM_HEADS = {
     "gcps": "GCPs",
     "heights": "heights",
     "reference": "reference",
+    "altimetry": "altimetry",
 }
 DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
 
@@ -64,6 +65,7 @@ class DatumEntry(Record):
     gcps: Number = said("Ground control points")
     heights: Number = said("The DEM, or altitudes assumed for tie points seen under too small an angle")
     reference: Number = said("A reference orthoimage", default=None)
+    altimetry: Number = said("Heights without image coordinates", default=None)
 
     @classmethod
     def columns(cls, entries: Sequence[DatumEntry]) -> str:
