@@ -1,8 +1,8 @@
 """Altimetry as control: heights without image coordinates hold the block where its surface lies on them.
 
 The block is solved without them first. The motion that brings the surface of its tie points onto the heights is found
-where most of them agree (`barpc.ba.surface`), and held, with its covariance, at tie points spread over the scene. Tilts,
-turn, scale and bending that the heights do not tell stay as open as they were.
+where most of them agree (`barpc.ba.surface`), and held, with its covariance, at the tie points. Tilts, turn, scale and
+bending that the heights do not tell stay as open as they were.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ FEWEST = 2 * len(MOTIONS)
 _MOST = 5000  # heights used: of more, every n-th; their neighbours tell the same
 _HELD = 10_000  # tie points at which the motion is held, at most: the noise of each counts among so many
 _OWN = 0.3  # of the motion's standard deviation: what the points' own add to it is 4 % of it
-_BEFORE = 6  # errors in common that a terrain's heights and a reference have, in front of these (`barpc.ba.ground`)
+_BEFORE = (
+    6  # errors in common that a terrain's heights and a reference have, in front of these (`barpc.ba.ground`)
+)
 _OPEN = 10.0  # times what is known without: what the heights do not tell
 _BENT = 3  # ways in which the scene bends that stay open
 
@@ -68,7 +70,9 @@ def hold_by_altimetry(
         near = np.flatnonzero(((place[:, :2] >= low) & (place[:, :2] <= high)).all(axis=1))
         near = near[:: -(-len(near) // _MOST) or 1]
     if len(near) < FEWEST:
-        return found, _nothing(many, len(near), f"at least {FEWEST} heights on the tie points' surface are needed")
+        return found, _nothing(
+            many, len(near), f"at least {FEWEST} heights on the tie points' surface are needed"
+        )
     surface = Surface.of(local)
     heights = Given(place[near], given.sigma[near], given.sigma_flat[near])
     registered = register(surface, heights, radius, np.sqrt(np.diag(known)))

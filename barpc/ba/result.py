@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.apart import Apart
 from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import TwoGroups
 from barpc.ba.covariance import Covariance
 from barpc.ba.gauge import GaugeReport
-from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.ground import TerrainTest
 from barpc.ba.judge import Finding
 from barpc.ba.scan import Interval

@@ -46,7 +46,7 @@ class Surface:
     def of(cls, points: Array) -> Surface:
         """The surface of at least `NEIGHBOURS` points (P, 3)."""
         tree = cKDTree(points[:, :2])
-        distance, near = tree.query(points[:, :2], k=NEIGHBOURS)
+        distance, near = (np.asarray(part) for part in tree.query(points[:, :2], k=NEIGHBOURS))
         delta = points[near] - points[:, None]
         design = np.concatenate([np.ones((*near.shape, 1)), delta[..., :2]], axis=2)
         normal = np.swapaxes(design, 1, 2) @ design
@@ -62,7 +62,7 @@ class Surface:
 
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
         """Height (n,) at places (n, 2), the tie point (n,) whose plane says so, and whether it reaches there."""
-        distance, nearest = self.tree.query(place)
+        distance, nearest = (np.asarray(part) for part in self.tree.query(place))
         design = self._design(place, nearest)
         return (design * self.plane[nearest]).sum(axis=1), nearest, distance <= self.reach[nearest]
 
@@ -134,7 +134,9 @@ def register(surface: Surface, given: Given, radius: float, before: Array) -> Re
         rows = np.where(near, np.maximum(1.0 - (whitened / (_BIWEIGHT * noise)) ** 2, 0.0), 0.0)
         weight = (rows / seen.sigma) ** 2  # rows^2 is the biweight
         normal = (seen.rows * weight[:, None]).T @ seen.rows + free
-        change = np.linalg.solve(normal, seen.rows.T @ (weight * np.where(near, seen.residual, 0.0)) - free @ motion)
+        change = np.linalg.solve(
+            normal, seen.rows.T @ (weight * np.where(near, seen.residual, 0.0)) - free @ motion
+        )
         motion = motion + change
         among = np.abs(whitened[seen.near & (np.abs(whitened) < 2.0 * _BIWEIGHT * noise)])
         noise = float(np.clip(1.4826 * np.median(among), 0.5, max(noise, 1.0))) if step >= 2 else noise
@@ -165,9 +167,7 @@ class _Seen:
         variance += (slope**2).sum(axis=1) * given.sigma_flat**2
         normal = np.column_stack([-slope, np.ones(len(slope))])
         rows = np.einsum("nc,ncm->nm", normal, moves)
-        return cls(
-            given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves
-        )
+        return cls(given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves)
 
 
 def _search(surface: Surface, given: Given, before: Array) -> Array:
@@ -225,7 +225,9 @@ def _told(
     covariance += lost @ lost.T / _KNOWN**2 if lost.size else 0.0
     open_ = np.linalg.inv(free)
     covariance = np.linalg.inv(np.linalg.inv(covariance + 1e-12 * open_) + free)
-    return Registration(motion, covariance, seen.near, agree, residual, seen.sigma)
+    return Registration(
+        motion, np.asarray(covariance, dtype=np.float64), seen.near, agree, residual, seen.sigma
+    )
 
 
 def _inflation(place: Array, forms: Array, alone: Array, surface: Surface) -> Array:
@@ -247,5 +249,3 @@ def _inflation(place: Array, forms: Array, alone: Array, surface: Surface) -> Ar
         for part in (up, flat):
             most[part] = np.maximum(most[part], np.sqrt(ratio[part].mean()))
         size *= 2.0
-
-

@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from barpc.ba import Adjustment
+from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.gauge import MOTIONS, Mode
 from barpc.report.records import Column, Number, Record, said
 from barpc.report.summary.causes import ExplanationEntry, LeftEntry, explanations, left_over
@@ -84,6 +85,19 @@ class DemEntry(Record):
     spread_m: Number = said("1.4826 times the median absolute deviation of these", "m")
 
 
+class AltimetryEntry(Record):
+    """What heights without image coordinates did."""
+
+    num_given: Count = said("Heights in the files")
+    num_near: Count = said("Those looked at that lie on the surface of the tie points")
+    num_agreeing: Count = said("Those of them that agree on where the scene lies")
+    spread_m: Number = said("1.4826 times the median absolute difference of those to the surface", "m")
+    expected_m: Number = said("What was expected of it by the accuracies stated and the surface", "m")
+    motion_enu_m: Vector = said("By how much they ask the scene to move, once tie points agree", "m")
+    sigma_enu_m: Vector = said("How well they know that by themselves", "m")
+    why_not: str = said("Why they hold nothing; empty where they hold the scene")
+
+
 class AskedEntry(Record):
     """What was left in the image with most of it, before more was solved for."""
 
@@ -116,6 +130,9 @@ class SceneEntry(Record):
     solver: str = said("What the solver did")
     datum: tuple[DatumEntry, ...] = said("What holds the scene", default=())
     dem: DemEntry | None = said("What the DEM did; null without one", default=None)
+    altimetry: AltimetryEntry | None = said(
+        "What heights without image coordinates did; null without any", default=None
+    )
     gcp_scatter: Number = said(
         "RMS residual of the GCPs used over what their accuracies let expect", default=None
     )
@@ -161,6 +178,7 @@ def measure_scene(adjustment: Adjustment) -> SceneEntry:
         datum=tuple(datum),
         gcp_scatter=None if adjustment.control is None else adjustment.control.scatter,
         dem=None if terrain is None else DemEntry(*_DEM(terrain)),
+        altimetry=_altimetry(adjustment.altimetry),
         noise=adjustment.noise,
         num_held_out=int(np.count_nonzero(adjustment.held_out)),
         model=adjustment.cameras.unknowns.model,
@@ -177,6 +195,13 @@ def measure_scene(adjustment: Adjustment) -> SceneEntry:
         explanations=explanations(adjustment),
         left=left_over(adjustment),
     )
+
+
+def _altimetry(test: AltimetryTest | None) -> AltimetryEntry | None:
+    if test is None:
+        return None
+    counts, spreads = (test.given, test.near, test.agree), (test.spread, test.expected)
+    return AltimetryEntry(*counts, *spreads, tuple(test.motion), tuple(test.sigma), test.why_not)
 
 
 def _asked(adjustment: Adjustment, what: str) -> AskedEntry | None:
