@@ -16,8 +16,10 @@ from scipy.spatial import cKDTree
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-NEIGHBOURS = 9  # tie points of a plane: its three unknowns are checked by six
-_FREEDOM = NEIGHBOURS - 3
+NEIGHBOURS = 15  # tie points of a patch: its six unknowns are checked by nine
+_TERMS = 6
+_FREEDOM = NEIGHBOURS - _TERMS
+_RIDGE = 1e-6  # of a neighbour's weight: neighbours on a line tell of no more than a line
 _SHARED_FREEDOM = 4.0  # degrees of freedom that the whole surface's scatter counts for in that of a plane
 _LEAST_SCATTER = 0.01  # m: no ground is flatter
 _SIDE = 25  # trials along each axis of the search
@@ -33,13 +35,16 @@ _FEWEST_GROUPS = 14  # of neighbours, that a variance is told by: twice the unkn
 
 @dataclass(frozen=True)
 class Surface:
-    """Planes around tie points, in a local frame (east, north, up) about their middle."""
+    """Quadratic patches around tie points, in a local frame (east, north, up) about their middle.
+
+    A patch is in lengths of its reach: height, slopes and half the curvatures times 1, u, v, u^2, u v, v^2.
+    """
 
     points: Array  # (P, 3) [m]
-    plane: Array  # (P, 3) height [m], slope to the east and north
-    covariance: Array  # (P, 3, 3)
-    scatter: Array  # (P,) standard deviation of the ground about the plane [m]
-    reach: Array  # (P,) where the plane's farthest neighbour lies [m]
+    patch: Array  # (P, 6) [m]
+    covariance: Array  # (P, 6, 6) [m^2]
+    scatter: Array  # (P,) standard deviation of the ground about the patch [m]
+    reach: Array  # (P,) where the patch's farthest neighbour lies [m]
     tree: cKDTree
 
     @classmethod
@@ -47,33 +52,48 @@ class Surface:
         """The surface of at least `NEIGHBOURS` points (P, 3)."""
         tree = cKDTree(points[:, :2])
         distance, near = (np.asarray(part) for part in tree.query(points[:, :2], k=NEIGHBOURS))
-        delta = points[near] - points[:, None]
-        design = np.concatenate([np.ones((*near.shape, 1)), delta[..., :2]], axis=2)
-        normal = np.swapaxes(design, 1, 2) @ design
         reach = np.maximum(distance[:, -1], 1e-3)
-        ridge = 1e-9 * NEIGHBOURS * np.stack([np.ones_like(reach), reach**2, reach**2], axis=1)
-        inverse = np.linalg.inv(normal + ridge[:, :, None] * np.eye(3))
-        plane = np.einsum("pij,pkj,pk->pi", inverse, design, delta[..., 2])
-        squares = ((delta[..., 2] - np.einsum("pkj,pj->pk", design, plane)) ** 2).sum(axis=1)
+        delta = points[near] - points[:, None]
+        design = _powers(delta[..., :2] / reach[:, None, None])
+        normal = np.swapaxes(design, 1, 2) @ design
+        inverse = np.linalg.inv(normal + _RIDGE * np.eye(_TERMS))
+        patch = np.einsum("pij,pkj,pk->pi", inverse, design, delta[..., 2])
+        squares = ((delta[..., 2] - np.einsum("pkj,pj->pk", design, patch)) ** 2).sum(axis=1)
         usual = max(float(np.median(squares)) / _FREEDOM, _LEAST_SCATTER**2)
         variance = (squares + _SHARED_FREEDOM * usual) / (_FREEDOM + _SHARED_FREEDOM)
-        plane[:, 0] += points[:, 2]
-        return cls(points, plane, variance[:, None, None] * inverse, np.sqrt(variance), reach, tree)
+        patch[:, 0] += points[:, 2]
+        return cls(points, patch, variance[:, None, None] * inverse, np.sqrt(variance), reach, tree)
 
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
-        """Height (n,) at places (n, 2), the tie point (n,) whose plane says so, and whether it reaches there."""
+        """Height (n,) at places (n, 2), the tie point (n,) whose patch says so, and whether it reaches there."""
         distance, nearest = (np.asarray(part) for part in self.tree.query(place))
-        design = self._design(place, nearest)
-        return (design * self.plane[nearest]).sum(axis=1), nearest, distance <= self.reach[nearest]
+        design = _powers(self._from(place, nearest))
+        return (design * self.patch[nearest]).sum(axis=1), nearest, distance <= self.reach[nearest]
 
     def variance(self, place: Array, nearest: IntArray) -> Array:
-        """Of the height of the ground at places (n, 2) minus what the planes say [m^2]."""
-        design = self._design(place, nearest)
-        of_plane = np.einsum("ni,nij,nj->n", design, self.covariance[nearest], design)
-        return np.asarray(of_plane + self.scatter[nearest] ** 2)
+        """Of the height of the ground at places (n, 2) minus what the patches say [m^2]."""
+        design = _powers(self._from(place, nearest))
+        of_patch = np.einsum("ni,nij,nj->n", design, self.covariance[nearest], design)
+        return np.asarray(of_patch + self.scatter[nearest] ** 2)
 
-    def _design(self, place: Array, nearest: IntArray) -> Array:
-        return np.column_stack([np.ones(len(place)), place - self.points[nearest, :2]])
+    def slope(self, place: Array, nearest: IntArray) -> tuple[Array, Array]:
+        """Slopes (n, 2) to the east and north at places (n, 2), and their covariance (n, 2, 2)."""
+        u, v = self._from(place, nearest).T
+        zero, one = np.zeros_like(u), np.ones_like(u)
+        rates = np.array([[zero, one, zero, 2.0 * u, v, zero], [zero, zero, one, zero, u, 2.0 * v]])
+        rates = rates.transpose(2, 0, 1) / self.reach[nearest, None, None]
+        covariance = rates @ self.covariance[nearest] @ np.swapaxes(rates, 1, 2)
+        return np.einsum("nci,ni->nc", rates, self.patch[nearest]), covariance
+
+    def _from(self, place: Array, nearest: IntArray) -> Array:
+        """Places from a tie point, in lengths of its patch's reach."""
+        away = (place - self.points[nearest, :2]) / self.reach[nearest, None]
+        return np.asarray(np.clip(away, -1.0, 1.0))
+
+
+def _powers(away: Array) -> Array:
+    u, v = away[..., 0], away[..., 1]
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -155,6 +175,7 @@ class _Seen:
     near: BoolArray  # (n,)
     nearest: IntArray  # (n,)
     moves: Array  # (n, 3, 7)
+    doubt: Array  # (n, 2, 2) covariance of the slopes
 
     @classmethod
     def of(cls, surface: Surface, given: Given, motion: Array, radius: float) -> _Seen:
@@ -162,19 +183,19 @@ class _Seen:
         moved = moves @ motion
         place = given.place[:, :2] - moved[:, :2]
         height, nearest, near = surface.at(place)
-        slope = surface.plane[nearest, 1:]
+        slope, doubt = surface.slope(place, nearest)
         variance = surface.variance(place, nearest) + given.sigma**2
         variance += (slope**2).sum(axis=1) * given.sigma_flat**2
         normal = np.column_stack([-slope, np.ones(len(slope))])
         rows = np.einsum("nc,ncm->nm", normal, moves)
-        return cls(given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves)
+        return cls(given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves, doubt)
 
 
 def _search(surface: Surface, given: Given, before: Array) -> Array:
     """The shift (7,; tilts, turn and scale 0) on which the most heights agree, east and north within 4 sigma."""
     few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // _SEARCHED) == 0)
     first = _Seen.of(surface, few, np.zeros(7), 1.0)
-    steep = float(np.sqrt((surface.plane[:, 1:] ** 2).mean()))
+    steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
     wide = float(np.median(first.sigma))
     reach = 4.0 * before[:2]
     step = np.maximum(1.5 * wide / max(steep, 1e-6), 2.0 * reach / (_SIDE - 1))
@@ -207,7 +228,7 @@ def _told(
     rows, inverse = seen.rows[agree], 1.0 / (scale * seen.sigma[agree]) ** 2
     normal = (rows * inverse[:, None]).T @ rows
     slopes = np.zeros((len(rows), 3, 3))
-    slopes[:, :2, :2] = surface.covariance[seen.nearest[agree], 1:, 1:]
+    slopes[:, :2, :2] = seen.doubt[agree]
     moves = seen.moves[agree]
     doubt = np.einsum("n,ncm,ncd,ndk->mk", inverse, moves, slopes, moves)
     forms = inverse[:, None] * rows * np.where(agree, seen.residual, 0.0)[agree, None]
