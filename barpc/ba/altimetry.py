@@ -109,9 +109,9 @@ def _is_held(found: Solution, block: Block) -> bool:
 
 def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
     """Why heights are not to hold the block; empty where they may."""
-    if registered.near.sum() < FEWEST:
+    if registered.near.sum() < FEWEST or (registered.is_most and registered.agree.sum() < FEWEST):
         return f"at least {FEWEST} heights on the tie points' surface are needed"
-    if registered.share <= 0.5:
+    if not registered.is_most:
         return "no place of the scene is found on which most of them agree"
     together = known[:3, :3] + registered.covariance[:3, :3]
     off = registered.motion[:3]

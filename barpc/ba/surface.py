@@ -1,9 +1,9 @@
 """The surface of the tie points, and the motion that brings it onto heights measured from elsewhere.
 
-Around every tie point its neighbours give a plane, with the covariance of its height and slopes and what the ground
-scatters about it. Where a height is given, the plane of the nearest tie point predicts it; the slopes tell how the
-prediction changes where the whole surface moves. Slopes are themselves uncertain: what they claim to know is taken off
-the normal matrix, as in errors-in-variables regression (Fuller, "Measurement error models", 1987).
+Around every tie point its neighbours give a curved patch, with its covariance and what the ground scatters about it.
+Where a height is given, the patch of the nearest tie point predicts it; its slopes tell how that changes where the
+whole surface moves. Slopes are themselves uncertain: what they claim to know is taken off the normal matrix, as in
+errors-in-variables regression (Fuller, "Measurement error models", 1987).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import chdtri
 
 from barpc.geodesy import Array
 from barpc.scene import BoolArray, IntArray
@@ -20,7 +21,10 @@ NEIGHBOURS = 15  # tie points of a patch: its six unknowns are checked by nine
 _TERMS = 6
 _FREEDOM = NEIGHBOURS - _TERMS
 _RIDGE = 1e-6  # of a neighbour's weight: neighbours on a line tell of no more than a line
-_SHARED_FREEDOM = 4.0  # degrees of freedom that the whole surface's scatter counts for in that of a plane
+_SHARED_FREEDOM = 4.0  # degrees of freedom that the whole surface's scatter counts for in that of a patch
+_BROKEN = float(
+    chdtri(_FREEDOM, 1e-3)
+)  # of its squares over the usual variance: by chance, one in a thousand
 _LEAST_SCATTER = 0.01  # m: no ground is flatter
 _SIDE = 25  # trials along each axis of the search
 _SEARCHED = 1000  # heights that the search looks at, at most
@@ -45,6 +49,7 @@ class Surface:
     covariance: Array  # (P, 6, 6) [m^2]
     scatter: Array  # (P,) standard deviation of the ground about the patch [m]
     reach: Array  # (P,) where the patch's farthest neighbour lies [m]
+    whole: BoolArray  # (P,) whether the patch scatters as most do: edges of houses and cliffs are no patches
     tree: cKDTree
 
     @classmethod
@@ -59,16 +64,25 @@ class Surface:
         inverse = np.linalg.inv(normal + _RIDGE * np.eye(_TERMS))
         patch = np.einsum("pij,pkj,pk->pi", inverse, design, delta[..., 2])
         squares = ((delta[..., 2] - np.einsum("pkj,pj->pk", design, patch)) ** 2).sum(axis=1)
-        usual = max(float(np.median(squares)) / _FREEDOM, _LEAST_SCATTER**2)
-        variance = (squares + _SHARED_FREEDOM * usual) / (_FREEDOM + _SHARED_FREEDOM)
+        usual = max(float(np.sqrt(np.median(squares) / _FREEDOM)), _LEAST_SCATTER)
+        variance = (squares + _SHARED_FREEDOM * usual**2) / (_FREEDOM + _SHARED_FREEDOM)
         patch[:, 0] += points[:, 2]
-        return cls(points, patch, variance[:, None, None] * inverse, np.sqrt(variance), reach, tree)
+        return cls(
+            points,
+            patch,
+            variance[:, None, None] * inverse,
+            np.sqrt(variance),
+            reach,
+            squares <= _BROKEN * usual**2,
+            tree,
+        )
 
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
         """Height (n,) at places (n, 2), the tie point (n,) whose patch says so, and whether it reaches there."""
         distance, nearest = (np.asarray(part) for part in self.tree.query(place))
         design = _powers(self._from(place, nearest))
-        return (design * self.patch[nearest]).sum(axis=1), nearest, distance <= self.reach[nearest]
+        near = (distance <= self.reach[nearest]) & self.whole[nearest]
+        return (design * self.patch[nearest]).sum(axis=1), nearest, near
 
     def variance(self, place: Array, nearest: IntArray) -> Array:
         """Of the height of the ground at places (n, 2) minus what the patches say [m^2]."""
@@ -115,15 +129,27 @@ class Registration:
 
     motion: Array  # (7,) east, north, up, tilts, turn, scale [m], as `barpc.ba.gauge.MOTIONS`
     covariance: Array  # (7, 7) of it, what was known before left out but for a hundredth
-    near: BoolArray  # (n,) heights that lie on the surface's planes
+    near: BoolArray  # (n,) heights on patches of the surface
     agree: BoolArray  # (n,) those of them that agree with the motion
     residual: Array  # (n,) given minus surface, moved [m]; NaN where there is no surface
     sigma: Array  # (n,) its standard deviation as stated [m]
+    rivals: int  # heights that agree on another level of the surface: the most that do
 
     @property
     def share(self) -> float:
         """How many of the heights on the surface agree, 0 to 1."""
         return float(self.agree.sum() / max(self.near.sum(), 1))
+
+    @property
+    def is_most(self) -> bool:
+        """Whether those that agree may be most of all, and are clearly more than any other group.
+
+        Clearly is two standard deviations of a count; of n heights, half of them right, as many less than a half agree
+        by chance.
+        """
+        agree, count = int(self.agree.sum()), int(self.near.sum())
+        clearly = agree - self.rivals > 2.0 * np.sqrt(agree + self.rivals)
+        return bool(clearly and agree > 0.5 * count - np.sqrt(count))
 
 
 def displacement(local: Array) -> Array:
@@ -188,7 +214,9 @@ class _Seen:
         variance += (slope**2).sum(axis=1) * given.sigma_flat**2
         normal = np.column_stack([-slope, np.ones(len(slope))])
         rows = np.einsum("nc,ncm->nm", normal, moves)
-        return cls(given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves, doubt)
+        return cls(
+            given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves, doubt
+        )
 
 
 def _search(surface: Surface, given: Given, before: Array) -> Array:
@@ -225,30 +253,46 @@ def _told(
     scale = min(max(noise, 1.0), _MOST_NOISE)
     agree = seen.near & (np.abs(seen.residual) < _NEAR * scale * seen.sigma)
     residual = np.where(seen.near, seen.residual, np.nan)
-    rows, inverse = seen.rows[agree], 1.0 / (scale * seen.sigma[agree]) ** 2
+    # of an M-estimate (Huber, "Robust statistics", 1981, 7.6): what wrong heights among the right ones cost is in it
+    part = np.where(seen.near, seen.residual / (_BIWEIGHT * scale * seen.sigma), 1.0) ** 2
+    inside = part < 1.0
+    rate = np.where(inside, (1.0 - part) * (1.0 - 5.0 * part), 0.0)[inside].mean() if inside.any() else 0.0
+    rows, inverse = seen.rows[inside], max(float(rate), _KNOWN) / (scale * seen.sigma[inside]) ** 2
+    pull = (1.0 - part[inside]) ** 2 * seen.residual[inside] / (scale * seen.sigma[inside])
+    forms = rows * (pull / (scale * seen.sigma[inside]))[:, None]
     normal = (rows * inverse[:, None]).T @ rows
     slopes = np.zeros((len(rows), 3, 3))
-    slopes[:, :2, :2] = seen.doubt[agree]
-    moves = seen.moves[agree]
+    slopes[:, :2, :2] = seen.doubt[inside]
+    moves = seen.moves[inside]
     doubt = np.einsum("n,ncm,ncd,ndk->mk", inverse, moves, slopes, moves)
-    forms = inverse[:, None] * rows * np.where(agree, seen.residual, 0.0)[agree, None]
-    group = _inflation(given.place[agree], forms, np.diag(normal), surface)
+    alone = forms.T @ forms
+    group = _inflation(given.place[inside], forms, np.diag(alone), surface)
     # whitened by what slopes claim: axes along which they know `told` of it
     root = np.linalg.cholesky(normal + free)
     half = np.linalg.inv(root)
     told, axes = np.linalg.eigh(half @ (normal - doubt + free) @ half.T)
     told = np.maximum(told, 0.0)
     axes = half.T @ axes
-    meat = axes.T @ (group[:, None] * normal * group[None, :] + free) @ axes
+    meat = axes.T @ (group[:, None] * alone * group[None, :] + free) @ axes
     known = np.where(told > _KNOWN, 1.0 / np.maximum(told, _KNOWN), 0.0)
     covariance = axes @ (known[:, None] * meat * known) @ axes.T
     lost = axes[:, told <= _KNOWN]
     covariance += lost @ lost.T / _KNOWN**2 if lost.size else 0.0
     open_ = np.linalg.inv(free)
     covariance = np.linalg.inv(np.linalg.inv(covariance + 1e-12 * open_) + free)
-    return Registration(
-        motion, np.asarray(covariance, dtype=np.float64), seen.near, agree, residual, seen.sigma
-    )
+    covariance = np.asarray(covariance, dtype=np.float64)
+    rivals = _rivals(seen, agree, scale)
+    return Registration(motion, covariance, seen.near, agree, residual, seen.sigma, rivals)
+
+
+def _rivals(seen: _Seen, agree: BoolArray, scale: float) -> int:
+    """The most of the heights that do not agree and lie within each other's noise."""
+    others = seen.near & ~agree
+    off = np.sort(seen.residual[others])
+    if not len(off):
+        return 0
+    width = 2.0 * _NEAR * scale * float(np.median(seen.sigma[others]))
+    return int((np.searchsorted(off, off + width) - np.arange(len(off))).max())
 
 
 def _inflation(place: Array, forms: Array, alone: Array, surface: Surface) -> Array:
