@@ -220,6 +220,17 @@ def gcp(run: Run, out: Path, scene: Path) -> None:
     assert (np.array(sigmas[0]) < 0.5 * np.array(sigmas[1])).all()
 
 
+def altimetry(run: Run, out: Path, scene: Path) -> None:
+    known = json.loads((scene / "truth.json").read_text())["check_points"]
+    rows = [",".join(map(str, point["ground"])) for point in known]
+    (out / "heights.csv").write_text("\n".join(["lon,lat,alt", *rows]))
+    free = run.plain
+    held = run("b", altimetry=(str(out / "heights.csv"),), stop_after="adjustment").summary["scene"]
+    assert free.summary["scene"].get("altimetry") is None
+    assert held["altimetry"]["num_given"] == len(rows)
+    assert bool(held["altimetry"]["why_not"]) == (held["sigma_enu_m"][2] > 1.0)
+
+
 def check_points(run: Run, out: Path, scene: Path) -> None:
     known = (str(scene / "gcps.geojson"),)
     free, checked = run.plain, run("b", check_points=known, stop_after="adjustment")
@@ -329,7 +340,7 @@ ROWS = {
     "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
     "pictures": pictures, "grids": grids, "tiles": tiles, "resample": resample,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
-    "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "check_points": check_points,
+    "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "altimetry": altimetry, "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
     "reference": reference, "reference_sigma": reference_sigma,
     "allow_remote": allow_remote, "store": store, "tie": tie, "adjust": adjust_, "fit": fit,
