@@ -506,6 +506,12 @@ class RunOptions(Options):
         unit="file",
     )
     gcp: tuple[str, ...] = option((), "Ground control points: CSV, .gcp, GeoJSON, image tags.", unit="file")
+    altimetry: tuple[str, ...] = option(
+        (),
+        """Heights without image coordinates (ICESat-2, GEDI, lidar): CSV of lon, lat, alt above the ellipsoid, perhaps
+        sigma and sigma_flat [m]. They hold the scene where most of them agree with the surface of the tie points.""",
+        unit="file",
+    )
     check_points: tuple[str, ...] = option(
         (), "Ground points that stay out of the adjustment and are measured after it.", unit="file"
     )

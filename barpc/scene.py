@@ -196,6 +196,32 @@ class Reference(Frozen):
         self._array("offset", (None, 2), finite=False)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Altimetry(Frozen):
+    """Heights of the ground from elsewhere (a laser), without image coordinates.
+
+    Parameters
+    ----------
+    lonlatalt : (A, 3), lon, lat [deg], alt [m above the ellipsoid]
+    sigma : (A,), standard deviation of the altitude [m]
+    sigma_flat : (A,), standard deviation of the place along an axis, each point's own [m]
+    """
+
+    lonlatalt: Array
+    sigma: Array
+    sigma_flat: Array
+
+    def __post_init__(self) -> None:
+        count = len(self._array("lonlatalt", (None, 3)))
+        sigma, flat = self._array("sigma", (count,)), self._array("sigma_flat", (count,))
+        low, high = SIGMA_RANGE
+        if not ((sigma >= low) & (sigma <= high) & (flat >= 0.0) & (flat <= high)).all():
+            raise InputError(f"altimetry: sigmas positive, from {low:g} to {high:g}, are needed")
+
+    def _told(self) -> str:
+        return f"{len(self.sigma)} heights"
+
+
 def _seen(view: IntArray, sigma: Array) -> str:
     """Observations in a few words."""
     if not len(view):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from barpc.ba.altimetry import hold_by_altimetry
 from barpc.ba.apart import Apart, find_apart
 from barpc.ba.block import Block, join
 from barpc.ba.consensus import two_groups
@@ -30,7 +31,7 @@ from barpc.ba.standing import Parts, without_moving
 from barpc.errors import AdjustError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import AUTO, AdjustOptions
-from barpc.scene import BoolArray, GroundPoints, Reference, Tracks, View
+from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 
 _WORTH = 0.004  # px that an affine must take away: it leaves the tilts of the scene open
 _CLEARLY_BETTER = 0.9  # the same, where the drift that was learnt is no drift
@@ -47,6 +48,7 @@ def adjust_tracks(
     centers: Array | None = None,
     prior: BlockPrior | None = None,
     reference: Reference | None = None,
+    altimetry: Altimetry | None = None,
     keep_largest: bool = False,
     hold_out: bool = True,
 ) -> Adjustment:
@@ -66,6 +68,7 @@ def adjust_tracks(
         An earlier block, whose views are among these: its corrections and their joint covariance are the
         prior. `tracks` then holds new observations only.
     reference : Reference or None, control of an orthoimage and the terrain `dem`
+    altimetry : Altimetry or None, heights that no image coordinates go with
     keep_largest, hold_out : bool
         Go on with the largest group of views where they are not all connected; keep a tenth of the tracks out, to
         measure the result on.
@@ -94,8 +97,11 @@ def adjust_tracks(
         if apart is not None and apart.clear:
             parts = parts.without_view(apart.view)
         found, in_space, parts = _choose_model(parts, options, dem, centers, prior, first)
+        heights = None
+        if altimetry is not None:
+            found, heights = hold_by_altimetry(found, parts.inner, parts.outer, options, altimetry)
         found.heights.warn()
-        whole = _adjustment(found, parts, options, in_space, start)
+        whole = replace(_adjustment(found, parts, options, in_space, start), altimetry=heights)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
         return _with_apart(whole, apart, found, parts.inner, given, options.robust_threshold)

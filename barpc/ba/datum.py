@@ -13,15 +13,17 @@ from dataclasses import replace
 import numpy as np
 
 from barpc.ba.covariance import Covariance
+from barpc.ba.ground import FIRST_PLACED
 from barpc.ba.normal import Reduced
 from barpc.ba.problem import Problem
 from barpc.ba.solve import State
 from barpc.geodesy import Array
 from barpc.scene import BoolArray
 
-SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference")
+SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference", "altimetry")
 """The priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; the DEM or assumed
-altitudes, with what these are wrong by together; a reference orthoimage, with what it is wrong by as a whole."""
+altitudes, with what these are wrong by together; a reference orthoimage, with what it is wrong by as a whole; heights
+without image coordinates."""
 _OF_HEIGHTS = 3  # with a reference: errors in common that are a terrain's, in front of its own
 
 
@@ -95,9 +97,11 @@ def _known_points(
         held[kind][prior.index] = own
         paid[kind][:] += left[own].sum(axis=0)
         rest &= ~own
-    of_heights = _OF_HEIGHTS if held["reference"].any() else len(shared)
-    paid["heights"][:] += left[rest].sum(axis=0) + (shared[:of_heights] ** 2).sum(axis=0)
-    paid["reference"][:] += (shared[of_heights:] ** 2).sum(axis=0)
+    of_heights = _OF_HEIGHTS if held["reference"].any() else FIRST_PLACED
+    placed = rest & prior.common[:, :, FIRST_PLACED:].any(axis=(1, 2))
+    paid["altimetry"][:] += left[placed].sum(axis=0) + (shared[FIRST_PLACED:] ** 2).sum(axis=0)
+    paid["heights"][:] += left[rest & ~placed].sum(axis=0) + (shared[:of_heights] ** 2).sum(axis=0)
+    paid["reference"][:] += (shared[of_heights:FIRST_PLACED] ** 2).sum(axis=0)
     return held
 
 

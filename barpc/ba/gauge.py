@@ -31,6 +31,8 @@ MOTIONS = (
 """The scene's motions [m]: shift; then rise to the east and north, turn and scale, at the scene's edge; what heights do
 that go with the product of east and north and with the square of each, beside a plane, from the lowest to the highest
 place of the scene. A rotation that changes with the row does the last: rows follow each other along the flight."""
+SIMILAR = MOTIONS.index("twist")
+"""The first of these that bend the scene: those before keep its shape."""
 
 _SAMPLE = 5000  # points that stand for the scene's shape
 

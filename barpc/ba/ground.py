@@ -18,6 +18,8 @@ from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
 
+FIRST_PLACED = NUM_BENDS
+"""Errors in common in front of altimetry's own: a terrain's bends, or a terrain's and a reference's."""
 DEM_BIAS = 20.0  # m, where none is stated
 KNOWN_BIAS = 5.0  # m: the same, where it is known what its heights count from
 ALIKE = (
@@ -189,6 +191,7 @@ class Heights:
     reference: Reference | None = None  # whose heights are the DEM's
     has_control: bool = False  # whether GCPs hold the scene's place
     relief: Relief | None = None  # the DEM beside what rays alone say of heights, where these may judge it
+    placed: PointPrior | None = None  # tracks that altimetry holds, which nothing else does then
 
     def loose(self, sigma: float) -> Heights:
         """The same where the places of GCPs are known to `sigma` [m] only."""
@@ -204,7 +207,7 @@ class Heights:
 
     def hold(self, problem: Problem, points: Array) -> Problem:
         """The problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
-        return replace(problem, point_prior=_join([*self.control, self._held(points)]))
+        return replace(problem, point_prior=_join([*self.control, self._held(points), self.placed]))
 
     def _believed(self, points: Array) -> Believed | None:
         if self.relief is None:
@@ -215,13 +218,19 @@ class Heights:
 
     def _held(self, points: Array) -> PointPrior | None:
         weak, believed = self.weak[self.tracks], self._believed(points)
+        free = np.ones(len(weak), dtype=bool)
+        if self.placed is not None:
+            free = ~np.isin(self.tracks, self.placed.index)
         if believed is not None and believed.shows:
             ground = ground_from_ecef(points[self.tracks])
             assert self.relief is not None
-            return _believed_heights(ground, self.tracks, believed, self.relief.common_sigma(self._bias))
+            common = self.relief.common_sigma(self._bias)
+            held = _believed_heights(ground, self.tracks, believed, common)
+            return held.select(np.isin(held.index, self.tracks[free]))
         dem = self.dem if believed is None else None
         judged_later = self.is_judged and self.relief is None
-        index = self.tracks if dem is not None and self._whole and not judged_later else self.tracks[weak]
+        is_whole = dem is not None and self.is_whole and not judged_later
+        index = self.tracks[free if is_whole else free & weak]
         if not len(index):
             return None
         if dem is not None:
@@ -243,9 +252,9 @@ class Heights:
         return flat_heights(points, index, float(middle), sigma, _TOGETHER * sigma)
 
     @property
-    def _whole(self) -> bool:
+    def is_whole(self) -> bool:
         """Whether a terrain holds all tracks."""
-        return not self.options.dem_for_weak or self.reference is not None
+        return self.dem is not None and (not self.options.dem_for_weak or self.reference is not None)
 
     @property
     def _bias(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.apart import Apart
 from barpc.ba.cameras import Cameras
 from barpc.ba.consensus import TwoGroups
@@ -94,6 +95,8 @@ class Adjustment:
         Tracks held in height because their rays meet under too small an angle.
     terrain : TerrainTest or None
         What a terrain did; None without one.
+    altimetry : AltimetryTest or None
+        What heights without image coordinates did; None without any.
     left_out : tuple of str
         Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
     apart : Apart or None
@@ -157,6 +160,7 @@ class Adjustment:
     gcp_residuals: Array
     seconds: float
     options: AdjustOptions = field(repr=False)
+    altimetry: AltimetryTest | None = None
 
     def __repr__(self) -> str:
         used = f"{np.count_nonzero(self.inlier)} of {len(self.inlier)} observations"

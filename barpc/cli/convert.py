@@ -14,6 +14,7 @@ import numpy as np
 
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.images import expanded
+from barpc.cli.moving import moved, read_move
 from barpc.cli.terminal import as_json, echo, say, tell_gate
 from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, opened_dem
 from barpc.dem import Dem
@@ -21,6 +22,7 @@ from barpc.errors import FitError, InputError, OutputError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
+from barpc.geodesy import Array
 from barpc.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
 from barpc.raster import open_raster
 from barpc.rpcio import (
@@ -61,6 +63,17 @@ Box = tuple[float, float, float, float]
     help=f"Of {', '.join(f'{name} ({row.suffixes[0]})' for name, row in WRITABLE.items())}."
     "  [default: TARGET's name; txt]",
 )
+@click.option(
+    "--move",
+    callback=read_move,
+    metavar="E,N,U",
+    help="With -o: move the ground by metres east, north, up, from where the cameras put it to its true place.",
+)
+@click.option(
+    "--transform",
+    metavar="FILE",
+    help="With -o: the same by a 4 x 4 (or 3 x 4) matrix of ECEF coordinates, as pc_align writes it.",
+)
 @click.option("--window", type=(int, int, int, int), help="Cut out COL ROW WIDTH HEIGHT [px].")
 @click.option("--bbox", type=(float, float, float, float), help="Cut out WEST SOUTH EAST NORTH [deg].")
 @click.option(
@@ -78,6 +91,8 @@ def convert(
     rpcs: str | None,
     carrier: str | None,
     formats: str | None,
+    move: Array | None,
+    transform: str | None,
     window: Window | None,
     bbox: Box | None,
     alt: float | None,
@@ -92,7 +107,8 @@ def convert(
     _grid.tif is a localisation grid. A SOURCE that is a grid goes into an RPC where one holds it. With
     --window or --bbox the GeoTIFF TARGET is a part of the image, with the RPC of exactly that part. With -o images get
     their RPCs, or those of --rpc, in a new folder; every file is then opened as GDAL, rpcm and others do, and what
-    lies beside an image and would hide an RPC put into it is named. Images stay as they are.
+    lies beside an image and would hide an RPC put into it is named. Images stay as they are. --move and --transform
+    bring an alignment of a DEM or a point cloud back into the cameras that it was made with.
 
     \b
     Examples:
@@ -100,16 +116,23 @@ def convert(
       barpc convert image.tif,camera=vendor.XML with_rpc.vrt
       barpc convert image.tif part.tif --bbox 5.43 43.25 5.44 43.26 --alt 180
       barpc convert scene/*.tif --rpc adjusted -o handoff
+      barpc convert scene/*.tif --rpc adjusted -o aligned --transform run-transform.txt
     """
+    if move is not None and transform is not None:
+        raise click.UsageError("give either --move or --transform")
     if out_dir is not None:
         if window or bbox:
             raise click.UsageError("--window and --bbox go with a TARGET, not with -o")
         names = [name.strip() for name in (formats or "txt").split(",") if name.strip()]
-        return _hand_off(
-            tuple(expanded(files)), Path(out_dir), rpcs, carrier or "vrt", names, overwrite, as_json
-        )
-    if len(files) != 2 or rpcs or carrier:
-        raise click.UsageError("give SOURCE and TARGET, or images and -o DIR (with it: --rpc, --images)")
+        images = tuple(expanded(files))
+        _check([Path(split_spec(image)[0]) for image in images], Path(out_dir), names)
+        cameras = _cameras(images, rpcs)
+        if move is not None or transform is not None:
+            cameras = moved(cameras, move, transform, carrier or "vrt")
+        return _hand_off(images, cameras, Path(out_dir), carrier or "vrt", names, overwrite, as_json)
+    if len(files) != 2 or rpcs or carrier or move is not None or transform:
+        with_it = "--rpc, --images, --move, --transform"
+        raise click.UsageError(f"give SOURCE and TARGET, or images and -o DIR (with it: {with_it})")
     source, target = files
     camera, image, cut = open_camera(source), Path(split_spec(source)[0]), bool(window or bbox)
     if target.endswith(GRID) and not cut:
@@ -221,10 +244,22 @@ def _window(
 # --- a folder ---------------------------------------------------------------------------------------------
 
 
+def _cameras(images: Sequence[str], rpcs: str | None) -> list[Camera]:
+    """The cameras of images: their own, or those of a file or a folder of RPCs, for images of that size."""
+    if rpcs is None:
+        return [open_camera(image) for image in images]
+    cameras = []
+    for file in (Path(split_spec(image)[0]) for image in images):
+        camera = open_camera(str(find_rpc(Path(rpcs), file)) if Path(rpcs).is_dir() else rpcs)
+        with open_raster(file) as dataset:
+            cameras.append(replace(camera, size=(dataset.width, dataset.height)))
+    return cameras
+
+
 def _hand_off(
     images: tuple[str, ...],
+    cameras: Sequence[Camera],
     folder: Path,
-    rpcs: str | None,
     carrier: str,
     formats: list[str],
     overwrite: bool,
@@ -232,10 +267,6 @@ def _hand_off(
 ) -> int:
     """Write images with their RPCs, open every file as its readers do, and say what they see."""
     files = [Path(split_spec(image)[0]) for image in images]
-    _check(files, folder, formats)
-    if rpcs is not None:
-        images = tuple(str(find_rpc(Path(rpcs), f)) if Path(rpcs).is_dir() else rpcs for f in files)
-    cameras = [open_camera(image) for image in images]
     ends = [CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in formats)]
     names = [[file.stem + end for end in ends] for file in files]
     together = [name for row in names for name in row]

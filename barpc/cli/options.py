@@ -37,6 +37,7 @@ CAMERA = (
 )
 GROUND = (
     "gcp",
+    "altimetry",
     "check_points",
     "fixed_run",
     "dem",

@@ -16,6 +16,7 @@ from barpc.dem import Dem
 from barpc.errors import InputError
 from barpc.options import RunOptions, declared
 from barpc.pipeline.control import load_gcps
+from barpc.pipeline.heights import load_altimetry
 from barpc.pointio.names import ViewNames
 from barpc.remote import Remote, located
 from barpc.scene import BoolArray, Tracks, View
@@ -37,6 +38,7 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None,
         points = load_gcps(paths, views, options)
         for line in () if points is None else points.left_out:
             logger.warning("%s", line)
+    load_altimetry(options.altimetry, views)
     if options.adjust.dem_for_weak and options.dem is None:
         raise InputError("dem_for_weak is given without dem: there are no heights to hold the tie points to")
     for path in options.reference:

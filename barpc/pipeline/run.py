@@ -30,6 +30,7 @@ from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.given import given_matches, given_tracks
 from barpc.pipeline.grids import write_grids
 from barpc.pipeline.hashed import hash_inputs
+from barpc.pipeline.heights import load_altimetry
 from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs, with_located
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.views import Image, image_path, load_views
@@ -321,6 +322,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
         centers=np.array([center.ecef for center in centers]),
         prior=prior,
         reference=None if run.reference is None else run.reference.control,
+        altimetry=load_altimetry(options.altimetry, run.views),
         keep_largest=options.keep_going,
     )
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment)

@@ -97,10 +97,10 @@ def _read_csv(path: Path, views: ViewNames) -> Iterator[_Point]:
             continue
         if not columns:
             delimiter = next((sign for sign in "\t;," if sign in raw), " ")
-            columns = _gcp_columns(path, _cells(raw, delimiter), views)
+            columns = _gcp_columns(path, cells_of(raw, delimiter), views)
             continue
         try:
-            row = _cells(raw, delimiter)
+            row = cells_of(raw, delimiter)
             cells = {name: row[i] for name, i in columns.items()}
             image = cells.pop("image", "")
             name = cells.pop("id", "")
@@ -126,7 +126,7 @@ def _csv_point(name: str, view: int, of: Mapping[str, float]) -> _Point:
 
 def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str, int]:
     """Column of each quantity; a file of one image need not name it."""
-    found = _header(words, {**_COLUMNS, **_NAMES, **_SIGMAS})
+    found = header_of(words, {**_COLUMNS, **_NAMES, **_SIGMAS})
     needed = [*_COLUMNS, "image"][: len(_COLUMNS) + (len(views.names) > 1)]
     if missing := [name for name in needed if name not in found]:
         raise InputError(f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line")
@@ -138,7 +138,8 @@ def _gcp_columns(path: Path, words: Sequence[str], views: ViewNames) -> dict[str
     return found
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
+def cells_of(line: str, delimiter: str) -> list[str]:
+    """The cells of a line of a table, those that are empty too unless blanks part them."""
     row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     return [from_cell(cell.strip()) for cell in row if delimiter != " " or cell]
 
@@ -148,7 +149,7 @@ def _names_columns(head: bytes) -> bool:
     lines = head.decode("utf-8-sig", errors="replace").splitlines()
     first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
     words = _split(first)
-    return not any(_numbers([word]) for word in words[1:4]) and bool(_header(words))
+    return not any(numbers_of([word]) for word in words[1:4]) and bool(header_of(words))
 
 
 def _read_geojson(path: Path, views: ViewNames) -> Iterator[_Point]:
@@ -287,21 +288,22 @@ def _is_table(head: bytes) -> bool:
         return False
     first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
     words = _split(first)
-    return (_numbers(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(_header(words))
+    return (numbers_of(words) is not None and len(words) >= 5) or {"lon", "lat"} <= set(header_of(words))
 
 
 def _split(line: str) -> list[str]:
     return [word.strip().strip('"') for word in re.split(r"[,;\t]|\s+", line.strip()) if word.strip()]
 
 
-def _numbers(words: Sequence[str]) -> list[float] | None:
+def numbers_of(words: Sequence[str]) -> list[float] | None:
+    """Words as numbers; None where one is none."""
     try:
         return [float(word) for word in words]
     except ValueError:
         return None
 
 
-def _header(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = None) -> dict[str, int]:
+def header_of(words: Sequence[str], names: Mapping[str, Sequence[str]] | None = None) -> dict[str, int]:
     """Column of each quantity that a header names, by default of `_COLUMNS` and the points' sigma [px]."""
     lower = [re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_") for word in words]
     names = {**_COLUMNS, "sigma": ("sigma", "sigma_px")} if names is None else names
@@ -320,9 +322,9 @@ def _read_table(path: Path) -> Correspondences:
     columns: dict[str, int] = {}
     for number, raw in enumerate(read_text(path, TABLE).splitlines(), start=1):
         words = _split(raw.split("#", 1)[0])
-        values = _numbers(words)
+        values = numbers_of(words)
         if not columns and words:
-            columns = dict(zip(_COLUMNS, range(5), strict=True)) if values else _header(words)
+            columns = dict(zip(_COLUMNS, range(5), strict=True)) if values else header_of(words)
             if missing := [name for name in _COLUMNS if name not in columns]:
                 raise InputError(
                     f"{path}: no column {', '.join(missing)} among the {len(words)} of its first line"
@@ -347,7 +349,7 @@ def _read_npz(path: Path) -> Correspondences:
         raise InputError(f"{path}: not an npz of numbers ({error})") from error
     if "ground" in arrays and "image" in arrays:
         return _checked(path, arrays["ground"], arrays["image"], arrays.get("sigma"))
-    columns = {key: arrays[list(arrays)[i]] for key, i in _header(list(arrays)).items()}
+    columns = {key: arrays[list(arrays)[i]] for key, i in header_of(list(arrays)).items()}
     if missing := [name for name in _COLUMNS if name not in columns]:
         raise InputError(
             f"{path}: neither ground and image nor {', '.join(missing)}; has {', '.join(arrays)}"
@@ -414,7 +416,7 @@ def read_grid(path: Place, altitudes: Sequence[float] | None = None) -> Correspo
         to_image, tags = dataset.transform, dataset.tags()
     layers = len(bands) // 2
     if altitudes is None:
-        stated = [_numbers([tags.get(f"ALTITUDE_B{2 * i}", "nan")]) for i in range(layers)]
+        stated = [numbers_of([tags.get(f"ALTITUDE_B{2 * i}", "nan")]) for i in range(layers)]
         altitudes = [np.nan if value is None else value[0] for value in stated]
     if len(bands) % 2 or len(altitudes) != layers or not np.isfinite(altitudes).all():
         raise InputError(

@@ -293,6 +293,8 @@ def _place_is_free(run: Run) -> bool:
     assert run.adjustment is not None
     tested = run.adjustment.control
     held = tested is not None and bool(tested.used.any())
+    heights = run.adjustment.altimetry
+    held |= heights is not None and not heights.why_not
     return not held and not run.adjustment.options.fixed and not any(given)
 
 
@@ -341,6 +343,12 @@ def _control_reasons(run: Run) -> list[str]:
             f"deviations, {PEAK:g} are needed): another place, too old, or without texture. It was not used, and moved "
             "nothing."
         )
+    heights = None if run.adjustment is None else run.adjustment.altimetry
+    if heights is not None and heights.why_not:
+        counts = (
+            f"{heights.agree} of {heights.near} on the tie points' surface agree, of {heights.given} given"
+        )
+        out.append(f"The altimetry holds nothing: {heights.why_not} ({counts}).")
     tested = None if run.adjustment is None else run.adjustment.control
     if run.gcps is not None and tested is not None:
         for status, words in _CONTROL_WORDS.items():
@@ -413,10 +421,14 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> list[str]:
     ]
     if len(run.tracks) or run.gcps is not None:
         lines.append(f"The scene as a whole moved by {_enu(gauge.shift)}.")
-    lines += _reference_lines(run)
+    lines += _reference_lines(run) + _altimetry_lines(run.adjustment)
     known = f"its place is known to {_lengths(gauge.sigma)} (east, north, up; one sigma)"
     if run.gcps is None:
-        held_by = "Without ground control" if run.reference is None or run.reference.control is None else "So"
+        heights = run.adjustment.altimetry
+        by_others = (run.reference is not None and run.reference.control is not None) or (
+            heights is not None and not heights.why_not
+        )
+        held_by = "So" if by_others else "Without ground control"
         lines.append(f"{held_by} {known}{' only' if held_by != 'So' else ''}.")
     else:
         lines += _held_lines(run, run.gcps, views, known)
@@ -488,6 +500,17 @@ def _radar_lines(views: Sequence[ViewEntry]) -> list[str]:
         if (one := view.correction) is not None and (sigma := one.timing_sigma) is not None
     ]
     return [f"Radar images are corrected by their clocks: {listed(found, _MOST_NAMED)}."] if found else []
+
+
+def _altimetry_lines(adjustment: Adjustment) -> list[str]:
+    """What heights without image coordinates did."""
+    test = adjustment.altimetry
+    if test is None or test.why_not:
+        return []
+    agree = f"{test.agree} of {test.near} altimetry heights agree with the surface of the tie points"
+    return [
+        f"{agree} to {metres(test.spread)} ({metres(test.expected)} expected); they moved it by {_enu(test.motion)}."
+    ]
 
 
 def _reference_lines(run: Run) -> list[str]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from barpc.errors import RpcError
 from barpc.frozen import Frozen
@@ -88,7 +89,7 @@ def _by_view(matrices: Array, rows: Array, bounds: IntArray) -> Array:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Correction(Frozen):
-    """Rotation and translation of one view about its camera centre.
+    """Rotation, translation and scale of the ground of one view: s R (X - T - C) + C, C its camera centre.
 
     Parameters
     ----------
@@ -99,6 +100,7 @@ class Correction(Frozen):
         A second rotation [rad] after the first: the vectors times the powers u, u^2, ... of the normalised image
         row u = (row - row_offset) / row_scale at which the point is seen; D = 0: none.
     row_offset, row_scale : float, row of u = 0 and rows to u = 1 [px]
+    scale : float, s; 1 in an adjustment, else of a similarity that another tool found
     """
 
     rotation: Array
@@ -107,6 +109,7 @@ class Correction(Frozen):
     drift: Array = field(default_factory=lambda: np.zeros((0, 3)))
     row_offset: float = 0.0
     row_scale: float = 1.0
+    scale: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("rotation", "translation", "center"):
@@ -114,11 +117,14 @@ class Correction(Frozen):
         self._array("drift", (None, 3), RpcError)
         if not (np.isfinite(self.row_offset) and np.isfinite(self.row_scale) and self.row_scale != 0):
             raise RpcError(f"correction rows: offset {self.row_offset}, scale {self.row_scale}")
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise RpcError(f"correction scale {self.scale}, expected a number above 0")
 
     def _told(self) -> str:
         turn, move, *drift = (np.linalg.norm(v) for v in (self.rotation, self.translation, *self.drift))
         bent = "".join(f", drift {1e6 * d:.3g} urad" for d in drift)
-        return f"rotation {1e6 * turn:.3g} urad, translation {move:.3g} m{bent}"
+        grown = f", scale {self.scale:.12g}" if self.scale != 1 else ""
+        return f"rotation {1e6 * turn:.3g} urad, translation {move:.3g} m{bent}{grown}"
 
     def motion(self, ecef: Array, row: Array | None = None) -> Motion:
         """The motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
@@ -127,7 +133,8 @@ class Correction(Frozen):
             u = (row - self.row_offset) / self.row_scale
             drift = self.drift.T @ u ** np.arange(1, len(self.drift) + 1)[:, None]
         bounds = np.array([0, ecef.shape[1]])
-        return Motion(ecef, self.rotation[None], self.translation[None], self.center[None], bounds, drift)
+        shift = self.scale * self.translation + (self.scale - 1.0) * self.center  # T of the points s X
+        return Motion(self.scale * ecef, self.rotation[None], shift[None], self.center[None], bounds, drift)
 
     def drift_rate(self, row: Array) -> Array:
         """Derivative of the drift by the row (3, n) [rad/px] at rows (n,) [px]."""
@@ -135,10 +142,24 @@ class Correction(Frozen):
         return np.asarray(self.drift.T @ (degree * u ** (degree - 1)) / self.row_scale)
 
     def apply(self, ecef: Array, row: Array | None = None) -> Array:
-        """R (X - T - C) + C for ECEF points X (..., 3) [m]; turned on by the drift at the rows (...) if given."""
+        """Points s R (X - T - C) + C of ECEF points X (..., 3) [m]; turned on by the drift at rows (...) if given."""
         ecef = np.asarray(ecef, dtype=np.float64)
         rows = None if row is None else np.broadcast_to(row, ecef.shape[:-1]).reshape(-1)
         return self.motion(ecef.reshape(-1, 3).T, rows).ecef.T.reshape(ecef.shape)
+
+
+def correction_of(matrix: Array, at: Array) -> Correction:
+    """The correction that brings a motion of the ground into a camera: it shows X where it showed X before the motion.
+
+    Parameters
+    ----------
+    matrix : (3, 4), [s R | t]: the motion X -> s R X + t, ECEF [m]
+    at : (3,), a point of the scene [m], ECEF, which moves as the matrix says to the last digit
+    """
+    left, stretch, right = np.linalg.svd(matrix[:, :3])  # the rotation that a rounded matrix is nearest to
+    motion = matrix @ np.append(at, 1.0) - at
+    turn = Rotation.from_matrix((left @ right).T).as_rotvec()
+    return Correction(turn, motion, at, scale=1.0 / float(stretch.mean()))
 
 
 @dataclass(frozen=True)
@@ -187,6 +208,7 @@ class Corrected:
         image, by_ground = self.sensor.project_jacobian(ground)
         by_moved = np.moveaxis(by_ground @ ground_from_ecef_jacobian(ground), 0, -1)
         by_point, by_rotation, by_drift = motion.derivatives(by_moved)
+        by_point *= self.correction.scale
         parts = [by_point, by_rotation, -by_point]
         if row is not None:  # the point moves the row, and the row the drift
             by_row = (by_drift * self.correction.drift_rate(row)).sum(axis=1)

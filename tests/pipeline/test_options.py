@@ -220,6 +220,23 @@ def gcp(run: Run, out: Path, scene: Path) -> None:
     assert (np.array(sigmas[0]) < 0.5 * np.array(sigmas[1])).all()
 
 
+def altimetry(run: Run, out: Path, scene: Path) -> None:
+    """The tie points' own surface, 12 m higher."""
+    free = run.plain
+    ground = ground_from_ecef(free.adjustment.points)
+    ground = ground[np.isfinite(ground).all(axis=1)]
+    rows = [f"{lon:.9f},{lat:.9f},{alt + 12.0:.3f},0.2,0" for lon, lat, alt in ground]
+    (scene / "heights.csv").write_text("\n".join(["lon,lat,alt,sigma,sigma_flat", *rows]))
+    held = run("b", altimetry=(str(scene / "heights.csv"),), stop_after="adjustment")
+    told = held.summary["scene"]["altimetry"]
+    assert free.summary["scene"].get("altimetry") is None
+    assert told["num_given"] == len(rows)
+    assert told["why_not"] == ""
+    assert held.summary["scene"]["sigma_enu_m"][2] < 0.1 * free.summary["scene"]["sigma_enu_m"][2]
+    ups = [one.summary["scene"]["shift_enu_m"][2] for one in (held, free)]
+    assert 11.0 < ups[0] - ups[1] < 13.0
+
+
 def check_points(run: Run, out: Path, scene: Path) -> None:
     known = (str(scene / "gcps.geojson"),)
     free, checked = run.plain, run("b", check_points=known, stop_after="adjustment")
@@ -330,7 +347,7 @@ ROWS = {
     "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
     "pictures": pictures, "grids": grids, "tiles": tiles, "resample": resample,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
-    "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "check_points": check_points,
+    "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "altimetry": altimetry, "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
     "reference": reference, "reference_sigma": reference_sigma,
     "allow_remote": allow_remote, "store": store, "tie": tie, "adjust": adjust_, "fit": fit,

@@ -36,7 +36,7 @@ def adjusted(**fields: Any) -> Any:
         "gauge": SimpleNamespace(shift=np.array([1.0, -2.0, 3.0]), sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  delivered_sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0, 0.8, 9.0, 0.1])),
-        "apart": None, "cameras": SimpleNamespace(unknowns=SimpleNamespace(drift=1)),
+        "apart": None, "altimetry": None, "cameras": SimpleNamespace(unknowns=SimpleNamespace(drift=1)),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
 

@@ -34,6 +34,7 @@ from barpc.report.summary.pairs import OffsetEntry, PairEntry, measure_pairs
 from barpc.report.summary.place import EllipseEntry, shift_in_image
 from barpc.report.summary.scene import (
     DATUM,
+    AltimetryEntry,
     AskedEntry,
     DatumEntry,
     DemEntry,
@@ -60,6 +61,7 @@ __all__ = [
     "GCPS",
     "SCHEMA",
     "STATUS_WORDS",
+    "AltimetryEntry",
     "AskedEntry",
     "CenterEntry",
     "CheckPointEntry",

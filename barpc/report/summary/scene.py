@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from barpc.ba import Adjustment
+from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.gauge import MOTIONS, Mode
 from barpc.report.records import Column, Number, Record, said
 from barpc.report.run import Run
@@ -44,6 +45,7 @@ _DATUM_HEADS = {
     "gcps": "GCPs",
     "heights": "heights",
     "reference": "reference",
+    "altimetry": "altimetry",
 }
 DATUM = "What holds the scene: how well its motions are known, and what share of that comes from where"
 
@@ -83,6 +85,7 @@ class DatumEntry(Record):
     gcps: Number = said("Ground control points")
     heights: Number = said("The DEM, or altitudes assumed for tie points seen under too small an angle")
     reference: Number = said("A reference orthoimage", default=None)
+    altimetry: Number = said("Heights without image coordinates", default=None)
 
     @classmethod
     def columns(cls, entries: Sequence[DatumEntry]) -> str:
@@ -106,6 +109,19 @@ class DemEntry(Record):
     relief: Number = said(
         "The DEM's relief as a multiple of the tie points'; far from 1: another terrain", default=None
     )
+
+
+class AltimetryEntry(Record):
+    """What heights without image coordinates did."""
+
+    num_given: Count = said("Heights in the files")
+    num_near: Count = said("Those looked at that lie on the surface of the tie points")
+    num_agreeing: Count = said("Those of them that agree on where the scene lies")
+    spread_m: Number = said("1.4826 times the median absolute difference of those to the surface", "m")
+    expected_m: Number = said("What was expected of it by the accuracies stated and the surface", "m")
+    motion_enu_m: Vector = said("By how much they ask the scene to move, once tie points agree", "m")
+    sigma_enu_m: Vector = said("How well they know that by themselves", "m")
+    why_not: str = said("Why they hold nothing; empty where they hold the scene")
 
 
 class AskedEntry(Record):
@@ -140,6 +156,9 @@ class SceneEntry(Record):
     solver: str = said("What the solver did")
     datum: tuple[DatumEntry, ...] = said("What holds the scene", default=())
     dem: DemEntry | None = said("What the DEM did; null without one", default=None)
+    altimetry: AltimetryEntry | None = said(
+        "What heights without image coordinates did; null without any", default=None
+    )
     gcp_scatter: Number = said(
         "RMS residual of the GCPs used over what their accuracies let expect", default=None
     )
@@ -195,6 +214,7 @@ def measure_scene(run: Run) -> SceneEntry | None:
         datum=tuple(datum),
         gcp_scatter=None if adjustment.control is None else adjustment.control.scatter,
         dem=None if terrain is None else DemEntry(*_DEM(terrain)),
+        altimetry=_altimetry(adjustment.altimetry),
         noise=adjustment.noise,
         num_held_out=int(np.count_nonzero(adjustment.held_out)),
         model=adjustment.cameras.unknowns.model,
@@ -213,6 +233,13 @@ def measure_scene(run: Run) -> SceneEntry | None:
         left=left_over(adjustment),
         held_out_places=held_out_places(run.met_worse, adjustment.names),
     )
+
+
+def _altimetry(test: AltimetryTest | None) -> AltimetryEntry | None:
+    if test is None:
+        return None
+    counts, spreads = (test.given, test.near, test.agree), (test.spread, test.expected)
+    return AltimetryEntry(*counts, *spreads, tuple(test.motion), tuple(test.sigma), test.why_not)
 
 
 def _asked(adjustment: Adjustment, what: str) -> AskedEntry | None:

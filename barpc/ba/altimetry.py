@@ -1,0 +1,164 @@
+"""Altimetry as control: heights without image coordinates hold the block where its surface lies on them.
+
+The block is solved without them first. The motion that brings the surface of its tie points onto the heights is found
+where most of them agree (`barpc.ba.surface`), and held, with its covariance, at the tie points. Tilts, turn, scale and
+bending that the heights do not tell stay as open as they were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barpc.ba.block import Block
+from barpc.ba.covariance import Covariance
+from barpc.ba.gauge import SIMILAR, gauge_report
+from barpc.ba.ground import FIRST_PLACED
+from barpc.ba.heldout import is_better
+from barpc.ba.priors import PointPrior
+from barpc.ba.rounds import Rounds
+from barpc.ba.snooping import CRITICAL
+from barpc.ba.solution import Solution, finished
+from barpc.ba.surface import NEIGHBOURS, Given, Registration, Surface, displacement, register
+from barpc.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.options import AdjustOptions
+from barpc.scene import Altimetry, IntArray
+
+FEWEST = 2 * SIMILAR
+"""Heights on the surface that are needed: of fewer, most may agree by chance."""
+_MOST = 5000  # heights used: of more, every n-th; their neighbours tell the same
+_HELD = 10_000  # tie points at which the motion is held, at most: the noise of each counts among so many
+_OWN = 0.3  # of the motion's standard deviation: what the points' own add to it is 4 % of it
+_OPEN = 10.0  # times what is known without: what the heights do not tell
+_BENT = 3  # ways in which the scene bends that stay open
+
+
+@dataclass(frozen=True)
+class AltimetryTest:
+    """What heights without image coordinates did to the block."""
+
+    given: int  # heights in the files
+    near: int  # that lie on the surface of the tie points, of those looked at
+    agree: int  # of these, that agree on its place
+    spread: float  # robust standard deviation of the differences that agree [m]
+    expected: float  # of these, by the stated accuracies and the surface [m], the median
+    motion: Array  # (3,) by which they ask the block to move, east, north, up [m]
+    sigma: Array  # (3,) how well they know that, by themselves [m]
+    why_not: str = ""  # why they hold nothing, in words; empty where they do
+
+
+def hold_by_altimetry(
+    found: Solution, block: Block, outer: Block, options: AdjustOptions, given: Altimetry
+) -> tuple[Solution, AltimetryTest]:
+    """The block held by heights too, or as it was where they do not agree with each other or with other control."""
+    ties = np.flatnonzero(found.seen[: block.num_tracks])
+    points = found.final.points
+    near, many = np.zeros(0, dtype=np.int64), len(given.sigma)
+    if len(ties) > NEIGHBOURS:
+        middle = points[ties].mean(axis=0)
+        enu = enu_basis(ground_from_ecef(middle))
+        local = (points[ties] - middle) @ enu.T
+        place = (ecef_from_ground(given.lonlatalt) - middle) @ enu.T
+        radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
+        covariance = found.outcome.minimum.covariance(found.problem.free)
+        known = _known(covariance, found, ties)
+        margin = 4.0 * np.sqrt(np.diag(known)[:2])
+        low, high = local[:, :2].min(axis=0) - margin, local[:, :2].max(axis=0) + margin
+        near = np.flatnonzero(((place[:, :2] >= low) & (place[:, :2] <= high)).all(axis=1))
+        near = near[:: -(-len(near) // _MOST) or 1]
+    if len(near) < FEWEST:
+        return found, _nothing(
+            many, len(near), f"at least {FEWEST} heights on the tie points' surface are needed"
+        )
+    surface = Surface.of(local)
+    heights = Given(place[near], given.sigma[near], given.sigma_flat[near])
+    registered = register(surface, heights, radius, np.sqrt(np.diag(known)))
+    test = _tested(registered, many)
+    why_not = _why_not(registered, known, _is_held(found, block))
+    if why_not:
+        return found, replace(test, why_not=why_not)
+    least = 2 if found.heights.is_whole else 1  # a terrain keeps every second one
+    chosen = np.arange(0, len(ties), max(-(-len(ties) // _HELD), least))
+    placed = _placed(points, ties[chosen], local[chosen], enu, radius, registered, np.sqrt(np.diag(known)))
+    tried = _solved(found, block, outer, options, placed)
+    if is_better(found.after, tried.after, outer):
+        return found, replace(test, why_not="held by them, the images would agree less with each other")
+    return tried, test
+
+
+def _known(covariance: Covariance, found: Solution, ties: IntArray) -> Array:
+    """Covariance (7, 7) of the scene's motions without the heights [m^2]."""
+    use = np.zeros(len(found.seen), dtype=bool)
+    use[ties] = True
+    report = gauge_report(covariance, found.final.points, found.final.points, use)
+    by_unknown = report.by_unknown[:SIMILAR]
+    matrix = by_unknown @ covariance.solve(by_unknown.T)
+    floor = 1e-3 * report.motion_sigma[:SIMILAR].max() + 1e-3
+    return np.asarray(matrix + floor**2 * np.eye(SIMILAR))
+
+
+def _is_held(found: Solution, block: Block) -> bool:
+    """Whether other control, an earlier run or fixed views know the scene's place."""
+    problem = found.problem
+    others = block.gcps.names or block.reference is not None or problem.joint_prior is not None
+    return bool(others) or not problem.free.all()
+
+
+def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
+    """Why heights are not to hold the block; empty where they may."""
+    if registered.near.sum() < FEWEST or (registered.is_most and registered.agree.sum() < FEWEST):
+        return f"at least {FEWEST} heights on the tie points' surface are needed"
+    if not registered.is_most:
+        return "no place of the scene is found on which most of them agree"
+    together = known[:3, :3] + registered.covariance[:3, :3]
+    off = registered.motion[:3]
+    if is_held and float(off @ np.linalg.solve(together, off)) > CRITICAL**2:
+        return "they contradict the control that holds the scene"
+    return ""
+
+
+def _placed(
+    points: Array,
+    index: IntArray,
+    local: Array,
+    enu: Array,
+    radius: float,
+    registered: Registration,
+    before: Array,
+) -> PointPrior:
+    """Tie points held where the motion takes them, with its errors in common and ways to bend that stay open."""
+    at = local[:, :2] / radius
+    moves = displacement(at)
+    own = _OWN * float(np.sqrt(np.diag(registered.covariance)[:3].min() * len(index)))
+    bent = np.zeros((len(index), 3, _BENT))
+    bent[:, 2] = np.stack([at[:, 0] ** 2, at[:, 0] * at[:, 1], at[:, 1] ** 2], axis=1)
+    wide = _OPEN * float(before[3:5].max())
+    shared = np.concatenate([moves @ np.linalg.cholesky(registered.covariance), wide * bent], axis=2) / own
+    common = np.concatenate([np.zeros((len(index), 3, FIRST_PLACED)), shared], axis=2)
+    mean = points[index] + (moves @ registered.motion) @ enu
+    return PointPrior(index, mean, np.tile(enu / own, (len(index), 1, 1)), common)
+
+
+def _solved(
+    found: Solution, block: Block, outer: Block, options: AdjustOptions, placed: PointPrior
+) -> Solution:
+    """The block solved again from where it ended, held at some tie points."""
+    held = replace(found, heights=replace(found.heights, placed=placed))
+    state = found.final
+    rounds = Rounds(found.problem, block, state, options, held.heights, block.use, found.outcome)
+    return finished(held, found.problem, block, outer, options, rounds.run())
+
+
+def _tested(registered: Registration, many: int) -> AltimetryTest:
+    agree = registered.agree
+    spread = 1.4826 * float(np.median(np.abs(registered.residual[agree]))) if agree.any() else np.nan
+    expected = float(np.median(registered.sigma[agree])) if agree.any() else np.nan
+    sigma = np.sqrt(np.diag(registered.covariance)[:3])
+    counts = int(registered.near.sum()), int(agree.sum())
+    return AltimetryTest(many, *counts, spread, expected, registered.motion[:3], sigma)
+
+
+def _nothing(many: int, near: int, why_not: str) -> AltimetryTest:
+    unknown = np.full(3, np.nan)
+    return AltimetryTest(many, near, 0, np.nan, np.nan, unknown, unknown, why_not)

@@ -1,0 +1,266 @@
+"""Heights without image coordinates: they place a block, say how well, and do not when they do not agree.
+
+The truth is a terrain of sines and cameras that are the samples' with errors of their own; heights are drawn from the
+terrain itself and not from the tie points.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import pytest
+
+from barpc.ba import adjust_tracks
+from barpc.ba.surface import NEIGHBOURS, Given, Registration, Surface, displacement, register
+from barpc.cameras import open_camera
+from barpc.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.scene import Altimetry, GroundPoints, Tracks, View
+from barpc.sensor.corrected import Corrected, Correction
+
+SAMPLES = Path(__file__).parents[2] / "data_samples"
+BEFORE = np.array([9.0, 9.0, 55.0, 0.2, 0.6, 0.1, 0.1])
+
+
+def relief(east: np.ndarray, north: np.ndarray, size: float = 1.0) -> np.ndarray:
+    """Altitudes (n,) [m]: slopes of 0.3 m a metre where size is 1."""
+    return size * (9.0 * np.sin(east / 28.0 + 0.4) + 8.0 * np.cos(north / 31.0 + east / 90.0))
+
+
+def surface(rng: np.random.Generator, size: float = 1.0, noise: float = 0.1, n: int = 1500) -> np.ndarray:
+    xy = rng.uniform(-260.0, 260.0, (n, 2))
+    return np.column_stack([xy, relief(*xy.T, size) + rng.normal(0, noise, n)])
+
+
+def given(
+    rng: np.random.Generator, n: int, moved: Any, size: float = 1.0, sigma: float = 0.3, wrong: float = 0.0
+) -> Given:
+    """Heights of the relief after it was moved by (east, north, up); a share is wrong by up to 60 m, upwards."""
+    xy = rng.uniform(-230.0, 230.0, (n, 2))
+    alt = relief(*xy.T, size) + rng.normal(0, sigma, n)
+    alt += np.where(rng.random(n) < wrong, rng.uniform(3.0, 60.0, n), 0.0)
+    return Given(np.column_stack([xy, alt]) + moved, np.full(n, sigma), np.zeros(n))
+
+
+def registered(rng: np.random.Generator, heights: Given, **scene: Any) -> Registration:
+    return register(Surface.of(surface(rng, **scene)), heights, 200.0, BEFORE)
+
+
+def test_a_patch_has_its_own_height_and_slopes():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0.0, 100.0, (300, 2))
+    found = Surface.of(np.column_stack([xy, 5.0 + 0.3 * xy[:, 0] - 0.2 * xy[:, 1]]))
+    slope, _ = found.slope(xy, np.arange(300))
+    np.testing.assert_allclose(slope, np.tile([0.3, -0.2], (300, 1)), atol=1e-5)
+    height, nearest, near = found.at(np.array([[40.0, 60.0], [500.0, 50.0]]))
+    assert height[0] == pytest.approx(5.0, abs=1e-4)
+    assert near.tolist() == [True, False]
+    assert np.hypot(*(found.points[nearest[0], :2] - [40.0, 60.0])) <= 12.0
+
+
+def test_motions_are_those_that_are_reported():
+    local = np.array([[0.5, -0.25], [1.0, 2.0]])
+    moves = displacement(local)
+    np.testing.assert_array_equal(moves[1] @ [1, 2, 3, 0, 0, 0, 0], [1, 2, 3])
+    np.testing.assert_array_equal(moves[0] @ [0, 0, 0, 2, 4, 0, 0], [0, 0, 0])  # 2 x 0.5 - 4 x 0.25
+    np.testing.assert_array_equal(moves[1] @ [0, 0, 0, 1, 0, 0, 0], [0, 0, 1])  # up in the east
+    np.testing.assert_array_equal(moves[1] @ [0, 0, 0, 0, 0, 1, 0], [-2, 1, 0])  # counterclockwise
+    np.testing.assert_array_equal(moves[1] @ [0, 0, 0, 0, 0, 0, 1], [1, 2, 0])
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.4])
+def test_a_surface_finds_its_place_with_the_right_sign_and_says_how_well(wrong: float):
+    moved, ratio = np.array([5.0, -7.0, 90.0]), []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        found = registered(rng, given(rng, 300, moved, wrong=wrong))
+        sigma = np.sqrt(np.diag(found.covariance))[:3]
+        assert (sigma < [0.5, 0.5, 0.1]).all()
+        assert (sigma > [0.02, 0.02, 0.005]).all()
+        assert found.share == pytest.approx(1.0 - wrong, abs=0.1)
+        ratio.append((found.motion[:3] - moved) / sigma)
+    assert 0.4 < np.sqrt(np.mean(np.square(ratio))) < 1.5
+
+
+def test_heights_that_mostly_disagree_agree_on_nothing():
+    rng = np.random.default_rng(1)
+    assert not registered(rng, given(rng, 300, [5.0, -7.0, 90.0], wrong=0.8)).is_most
+    scattered = given(rng, 300, 0.0)
+    elsewhere = Given(rng.permutation(scattered.place), scattered.sigma, scattered.sigma_flat)
+    elsewhere.place[:, 2] = rng.uniform(0.0, 60.0, 300)
+    assert not registered(rng, elsewhere).is_most
+
+
+def test_two_groups_of_equal_weight_are_no_majority():
+    """Half of the heights in another datum, 30 m off: which half is right nobody knows."""
+    rng = np.random.default_rng(3)
+    heights = given(rng, 300, [5.0, -7.0, 90.0])
+    heights.place[::2, 2] += 30.0
+    found = registered(rng, heights)
+    assert found.share == pytest.approx(0.5, abs=0.05)
+    assert not found.is_most
+    heights.place[::4, 2] -= 30.0  # three of four are right now
+    found = registered(rng, heights)
+    assert found.is_most
+    np.testing.assert_allclose(found.motion[:3], [5.0, -7.0, 90.0], atol=0.6)
+
+
+def test_a_plain_tells_heights_and_no_place():
+    """Slopes of a plain are its noise: they do not know where it is."""
+    rng = np.random.default_rng(2)
+    found = registered(rng, given(rng, 400, [5.0, -7.0, 90.0], size=0.0), size=0.0, noise=0.3)
+    sigma = np.sqrt(np.diag(found.covariance))[:3]
+    assert (sigma[:2] > 9.0).all()
+    assert sigma[2] < 0.5
+    assert found.motion[2] == pytest.approx(90.0, abs=4.0 * sigma[2])
+
+
+def test_noise_that_neighbours_share_is_no_knowledge():
+    """Along twelve tracks a canopy moves stretches of 40 m by a metre or so: said is what is met."""
+    ratio = []
+    for seed in range(6):
+        rng = np.random.default_rng(50 + seed)
+        along = np.tile(np.arange(-230.0, 230.0, 4.0), 12)
+        xy = np.column_stack([np.repeat(rng.uniform(-220, 220, 12), len(along) // 12), along])
+        shared = np.repeat(rng.normal(0, 1.0, len(along) // 10 + 1), 10)[: len(along)]
+        place = np.column_stack([xy, relief(*xy.T) + shared + rng.normal(0, 0.2, len(along))])
+        heights = Given(place + [3.0, 2.0, -20.0], np.full(len(along), 0.5), np.zeros(len(along)))
+        found = registered(rng, heights)
+        ratio.append((found.motion[:3] - [3.0, 2.0, -20.0]) / np.sqrt(np.diag(found.covariance))[:3])
+    assert np.sqrt(np.mean(np.square(ratio))) < 1.5
+
+
+# --- blocks -----------------------------------------------------------------------------------------------
+
+GEOD = pyproj.Geod(ellps="WGS84")
+LON, LAT = 5.4, 43.3002
+
+
+def ground(east: np.ndarray, north: np.ndarray, up: np.ndarray) -> np.ndarray:
+    azimuth, n = np.degrees(np.arctan2(east, north)), len(east)
+    lon, lat, _ = GEOD.fwd([LON] * n, [LAT] * n, azimuth.tolist(), np.hypot(east, north).tolist())
+    return np.column_stack([lon, lat, up])
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[list[View], Tracks, np.ndarray]:
+    """Three views whose cameras are off by 10 urad and some metres, and ties of 0.1 px on the relief."""
+    rng = np.random.default_rng(7)
+    xy = rng.uniform(-200.0, 200.0, (900, 2))
+    true = ground(*xy.T, 230.0 + relief(*xy.T))
+    views, rows = [], []
+    for number in range(3):
+        camera = open_camera(SAMPLES / f"view_0{number}.tif")
+        center = ecef_from_ground([LON, LAT, 7e5])
+        exact = Corrected(camera.model, Correction(rng.normal(0, 1e-5, 3), rng.normal(0, 1.0, 3), center))
+        seen = exact.project(true) + rng.normal(0, 0.1, (len(true), 2))
+        rows.append(seen)
+        views.append(View(f"v{number}", "", (1000, 1000), camera.model, camera.alt_range))
+    point, view = np.repeat(np.arange(900), 3), np.tile(np.arange(3), 900)
+    return views, Tracks(view, point, np.stack(rows, axis=1).reshape(-1, 2), np.full(2700, 0.1)), true
+
+
+def heights(seed: int, wrong: float = 0.0, off: float = 0.0, n: int = 300) -> Altimetry:
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(-190.0, 190.0, (n, 2))
+    alt = 230.0 + off + relief(*xy.T) + rng.normal(0, 0.3, n)
+    alt += np.where(rng.random(n) < wrong, rng.uniform(3.0, 60.0, n), 0.0)
+    return Altimetry(ground(*xy.T, alt), np.full(n, 0.3), np.zeros(n))
+
+
+def error(adjusted: Any, true: np.ndarray) -> np.ndarray:
+    """Mean east, north, up [m] of the adjusted tie points minus the truth."""
+    found = ground_from_ecef(adjusted.points)
+    kept = np.isfinite(found).all(axis=1)
+    azimuth, _, distance = (np.array(x) for x in GEOD.inv(*true[kept, :2].T, *found[kept, :2].T))
+    level = distance * np.array([np.sin(np.radians(azimuth)), np.cos(np.radians(azimuth))])
+    return np.array([*level.mean(axis=1), (found[kept, 2] - true[kept, 2]).mean()])
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.4])
+def test_a_block_is_placed_by_heights_within_what_it_says(scene: Any, wrong: float):
+    views, tracks, true = scene
+    before = adjust_tracks(views, tracks)
+    assert np.abs(error(before, true)[2]) > 5.0  # the sign is told by where the heights lie
+    after = adjust_tracks(views, tracks, altimetry=heights(3, wrong))
+    test = after.altimetry
+    assert test is not None
+    assert not test.why_not
+    assert (after.gauge.sigma < [1.0, 1.0, 0.5]).all()
+    assert (np.abs(error(after, true)) < 3.0 * after.gauge.sigma).all()
+    assert (np.abs(error(after, true)) < [1.0, 1.0, 0.3]).all()
+    assert after.datum["altimetry"][:3].min() > 0.9
+    assert np.nanmax(after.held_out_rms) < 1.02 * np.nanmax(before.held_out_rms)
+    assert before.altimetry is None
+    assert not before.datum["altimetry"].any()
+    asked = error(before, true) + test.motion
+    assert (np.abs(asked) < 4.0 * np.hypot(test.sigma, 0.05)).all()
+
+
+def test_heights_that_disagree_move_nothing(scene: Any):
+    views, tracks, _ = scene
+    before = adjust_tracks(views, tracks)
+    for given_heights in (heights(4, wrong=0.8), heights(5, n=10)):
+        after = adjust_tracks(views, tracks, altimetry=given_heights)
+        assert after.altimetry is not None
+        assert after.altimetry.why_not
+        np.testing.assert_array_equal(after.params, before.params)
+        np.testing.assert_array_equal(after.gauge.sigma, before.gauge.sigma)
+
+
+def test_heights_that_contradict_control_points_are_not_used(scene: Any):
+    views, tracks, true = scene
+    rng = np.random.default_rng(0)
+    chosen = np.arange(0, 900, 180)
+    point, view = np.repeat(np.arange(5), 3), np.tile(np.arange(3), 5)
+    rows = (3 * chosen[:, None] + np.arange(3)).ravel()
+    gcps = GroundPoints(
+        tuple("abcde"),
+        true[chosen],
+        np.full((5, 3), 0.3),
+        point,
+        view,
+        tracks.xy[rows] + rng.normal(0, 0.1, (15, 2)),
+        np.full(15, 0.3),
+    )
+    alone = adjust_tracks(views, tracks, gcps=gcps)
+    geoid = adjust_tracks(views, tracks, gcps=gcps, altimetry=heights(6, off=-48.0))
+    assert geoid.altimetry is not None
+    assert "contradict the control" in geoid.altimetry.why_not
+    assert geoid.altimetry.motion[2] == pytest.approx(-48.0, abs=1.0)
+    np.testing.assert_array_equal(geoid.params, alone.params)
+    right = adjust_tracks(views, tracks, gcps=gcps, altimetry=heights(6))
+    assert right.altimetry is not None
+    assert not right.altimetry.why_not
+    assert (right.gauge.sigma <= 1.001 * alone.gauge.sigma).all()
+
+
+def test_heights_and_a_terrain_hold_together(scene: Any):
+    """A terrain 3 m too high with 5 m stated does not move what the heights know."""
+    from barpc.options import AdjustOptions
+
+    views, tracks, true = scene
+
+    def terrain(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        n = len(lon)
+        azimuth, _, distance = (
+            np.array(x) for x in GEOD.inv([LON] * n, [LAT] * n, lon.tolist(), lat.tolist())
+        )
+        east, north = distance * np.sin(np.radians(azimuth)), distance * np.cos(np.radians(azimuth))
+        return 233.0 + relief(east, north)
+
+    options = AdjustOptions(dem_sigma=2.0, dem_bias_sigma=5.0)
+    after = adjust_tracks(views, tracks, options, dem=terrain, altimetry=heights(8))
+    assert after.altimetry is not None
+    assert not after.altimetry.why_not
+    assert np.abs(error(after, true)[2]) < 0.4
+
+
+def test_fewer_tie_points_than_a_patch_needs_are_said(scene: Any):
+    views, tracks, _ = scene
+    few = tracks.select(tracks.point < NEIGHBOURS)
+    after = adjust_tracks(views, few, altimetry=heights(3), hold_out=False)
+    assert after.altimetry is not None
+    assert "are needed" in after.altimetry.why_not

@@ -1,0 +1,171 @@
+"""`barpc convert --move` and `--transform`: the cameras follow the ground, with the sign that was said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from barpc.cameras import open_camera
+from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.rpcio import read_rpc, write_rpc_copy
+from barpc.sensor.geometry import triangulate
+from tests.cli.test_main import run
+from tests.rpcio.conftest import make_rpc, write_image
+
+SAMPLES = Path(__file__).parents[2] / "data_samples"
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    raw = write_image(tmp_path / "raw.tif", shape=(1, 200, 300))
+    write_rpc_copy(make_rpc().crop(900, 900), raw, tmp_path / "in" / "scene.tif")
+    return tmp_path / "in" / "scene.tif"
+
+
+def _seen(camera, count=50):
+    """Ground points that a camera sees, and where."""
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(0, camera.extent, (count, 2))
+    return camera.model.localize(xy, rng.uniform(*camera.alt_range, count)), xy
+
+
+def _similarity(at, scale):
+    """A matrix (4, 4) that moves a point (3,) by 60 m or so, turns about it and scales."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * Rotation.from_rotvec([1e-4, -2e-4, 5e-5]).as_matrix()
+    matrix[:3, 3] = at + [20.0, -30.0, 50.0] - matrix[:3, :3] @ at
+    return matrix
+
+
+def test_the_cameras_show_points_after_a_move_where_they_showed_them_before(
+    image: Path, tmp_path: Path, capsys
+):
+    before = open_camera(image)
+    ground, xy = _seen(before)
+    assert run("convert", str(image), "-o", str(tmp_path / "out"), "--move", "-30,40,90") == 0
+    after = open_camera(tmp_path / "out" / "scene.vrt")
+    # told from the points themselves: up is up, and a motion against the sign would be twice as far
+    at = ground_from_ecef(ecef_from_ground(ground).mean(axis=0))
+    moved = ground_from_ecef(ecef_from_ground(ground) + enu_basis(at).T @ [-30.0, 40.0, 90.0])
+    np.testing.assert_allclose((moved - ground)[:, 2], 90.0, atol=0.1)
+    np.testing.assert_allclose(
+        after.model.project(moved), xy, rtol=0, atol=2e-3
+    )  # the middle is the image's own
+    assert np.abs(after.model.project(ground) - xy).min() > 1.0
+    assert after.alt_range[0] == pytest.approx(before.alt_range[0] + 90, abs=60)
+    assert "-30.000 m east, +40.000 m north, +90.000 m up" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.00002, 0.99998])
+def test_a_matrix_is_followed_to_the_last_digit(image: Path, tmp_path: Path, scale: float, capsys):
+    ground, xy = _seen(open_camera(image))
+    ecef = ecef_from_ground(ground)
+    matrix = _similarity(ecef.mean(axis=0), scale)
+    np.savetxt(tmp_path / "t.txt", matrix, fmt="%.17g")
+    out = tmp_path / "out"
+    assert run("convert", str(image), "-o", str(out), "--transform", str(tmp_path / "t.txt"), "--json") == 0
+    there = ground_from_ecef(ecef @ matrix[:3, :3].T + matrix[:3, 3])
+    np.testing.assert_allclose(read_rpc(out / "scene_RPC.TXT").project(there), xy, rtol=0, atol=1e-7)
+    said = capsys.readouterr()
+    assert all(row["max_px"] < 1e-6 for row in json.loads(said.out) if row["max_px"] is not None)
+    assert "turned by 229 urad" in said.err
+    assert "few digits" not in said.err
+
+
+def test_back_and_forth_is_where_it_was(image: Path, tmp_path: Path):
+    ground, xy = _seen(open_camera(image))
+    matrix = _similarity(ecef_from_ground(ground[0]), 1.00001)
+    np.savetxt(tmp_path / "t.txt", matrix, fmt="%.17g")
+    np.savetxt(tmp_path / "back.txt", np.linalg.inv(matrix)[:3], fmt="%.17g", delimiter=",")
+    once, twice = tmp_path / "once", tmp_path / "twice"
+    assert run("convert", str(image), "-o", str(once), "--transform", str(tmp_path / "t.txt")) == 0
+    words = ("--rpc", str(once), "-o", str(twice), "--transform", str(tmp_path / "back.txt"))
+    assert run("convert", str(image), *words) == 0
+    np.testing.assert_allclose(read_rpc(twice / "scene.vrt").project(ground), xy, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("words", [("--move", "200,-100,50"), ("--transform", "t.txt")])
+def test_rays_of_three_images_meet_where_the_motion_takes_the_point(tmp_path: Path, words):
+    files = sorted(SAMPLES.glob("view_0?.tif"))
+    old = [open_camera(file).model for file in files]
+    rng = np.random.default_rng(1)
+    alt = rng.uniform(150, 250, 20)
+    ground = old[0].localize(rng.uniform(200, 800, (20, 2)), alt)
+    ecef = ecef_from_ground(ground)
+    matrix = _similarity(ecef.mean(axis=0), 1.00001)
+    np.savetxt(tmp_path / "t.txt", matrix, fmt="%.17g")
+    flag, value = words
+    value = str(tmp_path / value) if flag == "--transform" else value
+    assert run("convert", *map(str, files), "-o", str(tmp_path / "out"), flag, value) == 0
+    new = [read_rpc(tmp_path / "out" / f"{file.stem}_RPC.TXT") for file in files]
+    seen = np.stack([model.project(ground) for model in old])
+    point, view = np.tile(np.arange(20), 3), np.repeat(np.arange(3), 20)
+    found = triangulate(new, view, point, seen.reshape(-1, 2)).points
+    off = np.concatenate([new[v].project(ground_from_ecef(found)) - seen[v] for v in range(3)])
+    np.testing.assert_allclose(off, 0.0, atol=1e-6)
+    if flag == "--transform":
+        there = ecef @ matrix[:3, :3].T + matrix[:3, 3]
+        np.testing.assert_allclose(found, there, rtol=0, atol=1e-4)
+    else:
+        shift = found - ecef
+        np.testing.assert_allclose(shift - shift[0], 0, atol=1e-4)
+        np.testing.assert_allclose(enu_basis(ground[0]) @ shift[0], [200, -100, 50], atol=0.1)
+
+
+def test_few_digits_are_told_in_metres(image: Path, tmp_path: Path, capsys):
+    ground, _ = _seen(open_camera(image))
+    np.savetxt(tmp_path / "t.txt", _similarity(ecef_from_ground(ground).mean(axis=0), 1.0), fmt="%f")
+    assert run("convert", str(image), "-o", str(tmp_path / "o"), "--transform", str(tmp_path / "t.txt")) == 0
+    assert "few digits: it places the ground to some" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("move", "told"),
+    [
+        ("1,2", "not three numbers"),
+        ("1,2,3,4", "not three numbers"),
+        ("1 2 3", "not three numbers"),
+        ("1,2,x", "not three numbers"),
+        ("1,2,nan", "less than 22 km"),
+        ("1,inf,3", "less than 22 km"),
+        ("602000,4795000,100", "less than 22 km"),
+    ],
+)
+def test_a_move_is_three_numbers_of_metres(image: Path, tmp_path: Path, capsys, move: str, told: str):
+    assert run("convert", str(image), "-o", str(tmp_path / "o"), "--move", move) == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_longitude_and_latitude_in_the_images_is_no_move(image: Path, tmp_path: Path, capsys):
+    lon, lat, _ = open_camera(image).model.localize(np.array([150.0, 100.0]), np.array(100.0))
+    for words in (f"{lon:.5f},{lat:.5f},180", f"{lat:.5f},{lon:.5f},180"):
+        assert run("convert", str(image), "-o", str(tmp_path / "o"), "--move", words) == 1
+        assert "is a longitude and latitude in the images" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_matrix_that_leaves_the_earth_writes_nothing(image: Path, tmp_path: Path, capsys):
+    matrix = np.eye(4)
+    for matrix[:3, :3] in (
+        2.0 * np.eye(3),
+        1.01 * np.eye(3),
+    ):  # as of map coordinates in feet, or of a local frame
+        np.savetxt(tmp_path / "t.txt", matrix)
+        assert (
+            run("convert", str(image), "-o", str(tmp_path / "o"), "--transform", str(tmp_path / "t.txt")) == 1
+        )
+        assert "a matrix of other coordinates than ECEF?" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_motion_goes_with_a_folder_and_there_is_one(image: Path, tmp_path: Path, capsys):
+    assert run("convert", str(image), str(tmp_path / "a_RPC.TXT"), "--move", "1,2,3") == 2
+    assert "with it: --rpc, --images, --move, --transform" in capsys.readouterr().err
+    both = ("--move", "1,2,3", "--transform", "t.txt")
+    assert run("convert", str(image), "-o", str(tmp_path / "o"), *both) == 2
+    assert "give either --move or --transform" in capsys.readouterr().err
