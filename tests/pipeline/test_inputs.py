@@ -183,7 +183,6 @@ def test_a_dem_holds_heights_and_says_what_it_took(shared_data, tmp_path):
         base,
         dem=str(shared_data / "dem/N44E005.hgt"),
         geoid=str(shared_data / "dem/egm96_15.gtx"),
-        adjust=replace(base.adjust, dem_for_weak=True),
     )
     free, held = adjust(images, tmp_path / "free"), adjust(images, tmp_path / "held", options)
     sigma = [run.summary["scene"]["sigma_enu_m"][2] for run in (free, held)]
