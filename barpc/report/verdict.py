@@ -17,7 +17,7 @@ from barpc.report.records import plain
 from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
 from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_over, strangeness
-from barpc.report.terrain import dem_lines, dem_reasons
+from barpc.report.terrain import dem_lines, dem_reasons, holds_reference
 from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
@@ -148,6 +148,13 @@ def _oddity(i: int, adjustment: Adjustment) -> str:
         why = "attitude jitter, optics, or steps between detectors, which one RPC does not follow"
         if adjustment.options.drift == 0:
             why = "a drift was not allowed (--drift 0)"
+        elif holds_reference(adjustment):
+            unstated = adjustment.terrain is not None and not adjustment.terrain.is_known
+            why = (
+                f"the heights of the DEM (no --geoid), or {why}"
+                if unstated
+                else f"{why}; or the reference bends"
+            )
         size = max(smooth.rms[i], smooth.shared[i])
         return f"an error of {size:.2f} px that changes {along} is left: {why}"
     return ""
