@@ -179,7 +179,9 @@ def coarser(path, step: float, folder):
         pixels = file.read(1)[: shape[0] * times, : shape[1] * times]
         pixels = pixels.reshape(shape[0], times, shape[1], times).mean(axis=(1, 3)).astype(pixels.dtype)
         profile = {"width": shape[1], "height": shape[0], "count": 1, "dtype": pixels.dtype, "crs": file.crs}
-        profile |= {"transform": file.transform * rasterio.Affine.scale(times), "nodata": file.nodata}
+        a, b, c, d, e, f = file.transform[:6]
+        place = rasterio.Affine(times * a, times * b, c, times * d, times * e, f)
+        profile |= {"transform": place, "nodata": file.nodata}
     coarse = folder / f"{path.stem}_{step:g}.tif"
     with rasterio.open(coarse, "w", "GTiff", **profile) as file:
         file.write(pixels, 1)
