@@ -184,16 +184,20 @@ class Reference(Frozen):
     points : GroundPoints, their sigmas without the errors in common
     bias : (3,), standard deviation of what all of them are wrong by together, east, north, up [m]
     offset : (N, 2), how far each view was found to be off as delivered, east, north [m]; NaN where it was not matched
+    width : float, of the templates that its points were found with [m]: nearer ones share part of their noise
     """
 
     points: GroundPoints
     bias: Array
     offset: Array
+    width: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self._array("bias", (3,)) > 0).all():
             raise InputError("reference: standard deviations must be positive")
         self._array("offset", (None, 2), finite=False)
+        if not 0.0 <= self.width < np.inf:
+            raise InputError("reference: its templates are as wide as they are, 0 m or more")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

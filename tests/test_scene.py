@@ -161,6 +161,9 @@ def test_a_reference_has_a_positive_bias():
     for bias in ([1.0, 1.0, 0.0], [1.0, -1.0, 1.0]):
         with pytest.raises(InputError, match="positive"):
             Reference(ground_points(), bias, [[0.0, 0.0]])
+    for width in (-1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="templates"):
+            Reference(ground_points(), [1, 2, 3], [[0.0, 0.0]], width)
     assert np.isnan(Reference(ground_points(), [1, 2, 3], [[np.nan, np.nan], [1, 2]]).offset[0]).all()
 
 

@@ -11,6 +11,7 @@ from barpc.ba.block import Block
 from barpc.ba.cameras import Projected
 from barpc.ba.ground import Heights
 from barpc.ba.problem import Problem
+from barpc.ba.resembling import Resemblance
 from barpc.ba.smooth import TERMS, Fit, Smooth, SmoothTest
 from barpc.ba.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
 from barpc.ba.variances import SAME_PRIOR, PriorTest, Variances, same_prior
@@ -80,7 +81,7 @@ class Rounds:
         is_tie = block.point < block.num_tracks
         of_reference = block.point >= block.num_known
         self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie, of_reference)
-        self.smooth = Smooth(problem.structure, problem.xy, unknowns)
+        self.smooth = Smooth(problem.structure, problem.xy, unknowns, Resemblance.of(block, TERMS))
         self.variances = Variances.of(problem.camera_prior, unknowns, options, heights.has_control)
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)

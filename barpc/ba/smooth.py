@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc
 
+from barpc.ba.resembling import Resemblance
 from barpc.ba.structure import Structure
 from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, IntArray
 from barpc.sensor.splined import bsplines
 
 Fit = dict[int, tuple[slice, Array]]
@@ -56,10 +57,12 @@ class SmoothTest:
 
 
 class Smooth:
-    """The smooth model of a block's views, of observations at `xy` (2, K) [px]."""
+    """The smooth model of a block's views, of observations at `xy` (2, K) [px], which may resemble each other."""
 
-    def __init__(self, structure: Structure, xy: Array, unknowns: Unknowns) -> None:
-        self.structure = structure
+    def __init__(
+        self, structure: Structure, xy: Array, unknowns: Unknowns, alike: Resemblance | None = None
+    ) -> None:
+        self.structure, self.alike = structure, alike
         col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
         self._place = xy
         self._col, self._row = col, row
@@ -92,18 +95,25 @@ class Smooth:
         rms, significance, by_row = np.zeros(n), np.ones(n), np.full(n, np.nan)
         weight = use.astype(np.float64)
         residual = np.where(use, residual, 0.0)
+        share, precision = (
+            (weight, weight)
+            if self.alike is None
+            else (weight * self.alike.share, weight * self.alike.precision)
+        )
+        terms = 2.0 * TERMS
         for v, (rows, coefficients) in (self.fit(residual, weight) if fit is None else fit).items():
-            count = 2 * float(weight[rows].sum())
+            count, root = 2 * float(share[rows].sum()), np.sqrt(precision[rows])
             basis = self._basis(rows)
-            smooth = (coefficients @ basis) * weight[rows]
+            smooth = (coefficients @ basis) * root
             explained = float((smooth**2).sum())
-            left = float((residual[:, rows] ** 2).sum()) - explained
-            terms = 2.0 * TERMS
+            along = (coefficients[:, :SPLINES] @ basis[:SPLINES]) * root
+            by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)
+            if count <= terms + 1.0:  # as few as these tell no curve from noise
+                continue
+            left = float(((residual[:, rows] * root) ** 2).sum()) - explained
             scatter = max(left / (count - terms), 1e-30)
             significance[v] = float(fdtrc(terms, count - terms, explained / terms / scatter))
-            rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / (0.5 * count))
-            along = (coefficients[:, :SPLINES] @ basis[:SPLINES]) * weight[rows]
-            by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)
+            rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / float(precision[rows].sum()))
         return SmoothTest(rms, significance, by_row, np.zeros(n))
 
     def test_neighbours(self, tested: SmoothTest, residual: Array, use: BoolArray) -> SmoothTest:
@@ -118,11 +128,24 @@ class Smooth:
         kept = np.arange(rows.start, rows.stop)[use[rows]]
         most = 0.0
         for place in self._place[:, kept]:
-            ordered = residual[:, kept[np.argsort(place, kind="stable")]]
-            product = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0)
-            if product.mean() > _SIGMAS * product.std() / np.sqrt(len(product)):
+            order = kept[np.argsort(place, kind="stable")]
+            ordered = residual[:, order]
+            product, count = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0), len(order) - 1.0
+            if self.alike is not None:
+                product, count = self._beyond_noise(product, (ordered**2).sum(axis=0), order)
+            if product.mean() > _SIGMAS * product.std() / np.sqrt(max(count, 1.0)):
                 most = max(most, float(np.sqrt(product.mean())))
         return most
+
+    def _beyond_noise(self, product: Array, square: Array, order: IntArray) -> tuple[Array, float]:
+        """Products (n - 1,) of neighbours (n,) without what the noise that they share makes of them; their number."""
+        assert self.alike is not None
+        first, second = order[:-1], order[1:]
+        same = self.alike.correlation(first, second)
+        weight = np.sqrt(self.alike.precision[first] * self.alike.precision[second])
+        beyond = weight * (product - same * 0.5 * (square[1:] + square[:-1]))
+        size = max(float((weight * (1.0 - same)).mean()), 1e-12)
+        return beyond / size, float(self.alike.share[second].sum())
 
     def fit(self, residual: Array, weight: Array) -> Fit:
         """What `part` is made of, for views with enough observations that count."""
@@ -137,7 +160,7 @@ class Smooth:
     def _coefficients(self, rows: slice, residual: Array, weight: Array) -> Array:
         """Coefficients (2, terms) of one view."""
         basis = self._basis(rows)
-        weighted = basis * weight[rows]
+        weighted = basis * (weight[rows] if self.alike is None else weight[rows] * self.alike.precision[rows])
         matrix = weighted @ basis.T
         diagonal = np.diag(matrix)
         matrix[np.diag_indices(TERMS)] += _RIDGE * (diagonal + diagonal.mean())

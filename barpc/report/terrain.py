@@ -17,6 +17,8 @@ def dem_lines(adjustment: Adjustment) -> list[str]:
     terrain, options = adjustment.terrain, adjustment.options
     if terrain is None or not terrain.shows:
         return []
+    if not terrain.total and holds_reference(adjustment):  # which stands on it: no tie point does
+        return []
     held = f"The DEM holds {terrain.held} of {terrain.total} tie points"
     if terrain.held:
         single, common = metres(options.dem_sigma), metres(terrain.bias)
@@ -34,7 +36,7 @@ def dem_lines(adjustment: Adjustment) -> list[str]:
         f"{held}.",
         f"It has a height for {share:.0f} % of the tie points{f'; {lie}' if terrain.known else ''}.",
     ]
-    if not terrain.is_known:
+    if not terrain.is_known and not holds_reference(adjustment):
         lines.append(
             "Nothing says that its heights count from the ellipsoid: give --geoid, or they may be wrong by up to 100 m."
         )
@@ -43,16 +45,28 @@ def dem_lines(adjustment: Adjustment) -> list[str]:
 
 def dem_reasons(adjustment: Adjustment | None) -> list[str]:
     """What is wrong with the DEM."""
-    terrain = None if adjustment is None else adjustment.terrain
-    if terrain is None:
+    if adjustment is None or adjustment.terrain is None:
         return []
+    terrain = adjustment.terrain
     if not terrain.shows:
         return [
             f"The DEM does not show the terrain of the tie points: its relief is {terrain.relief:.2g} times theirs. "
             "Another place, other units, heights that are all alike, or cameras that are farther off than its hills "
             "are wide. It was not used, and moved nothing."
         ]
-    return _against(terrain)
+    out = _against(terrain)
+    if not terrain.is_known and holds_reference(adjustment) and not any("--geoid" in line for line in out):
+        out.append(
+            "The reference stands on the DEM, and nothing says that its heights count from the ellipsoid: if a "
+            "geoid was left out, give --geoid, or the scene may lie up to 100 m too high or low, and its images aside "
+            "by what they look aside over that. If they are ellipsoidal, its CRS should say so (EPSG:4979)."
+        )
+    return out
+
+
+def holds_reference(adjustment: Adjustment) -> bool:
+    """Whether points of a reference hold the scene."""
+    return bool(adjustment.reference_inlier.any())
 
 
 def _against(terrain: TerrainTest) -> list[str]:

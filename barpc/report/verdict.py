@@ -17,7 +17,7 @@ from barpc.report.records import plain
 from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
 from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_over, strangeness
-from barpc.report.terrain import dem_lines, dem_reasons
+from barpc.report.terrain import dem_lines, dem_reasons, holds_reference
 from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
@@ -148,6 +148,13 @@ def _oddity(i: int, adjustment: Adjustment) -> str:
         why = "attitude jitter, optics, or steps between detectors, which one RPC does not follow"
         if adjustment.options.drift == 0:
             why = "a drift was not allowed (--drift 0)"
+        elif holds_reference(adjustment):
+            unstated = adjustment.terrain is not None and not adjustment.terrain.is_known
+            why = (
+                f"the heights of the DEM (no --geoid), or {why}"
+                if unstated
+                else f"{why}; or the reference bends"
+            )
         size = max(smooth.rms[i], smooth.shared[i])
         return f"an error of {size:.2f} px that changes {along} is left: {why}"
     return ""
@@ -343,6 +350,7 @@ def _control_reasons(run: Run) -> list[str]:
             f"deviations, {PEAK:g} are needed): another place, too old, or without texture. It was not used, and moved "
             "nothing."
         )
+    out += _bends(run)
     heights = None if run.adjustment is None else run.adjustment.altimetry
     if heights is not None and heights.why_not:
         counts = (
@@ -370,6 +378,20 @@ def _control_reasons(run: Run) -> list[str]:
                 "accuracies are too good, or more than one is wrong."
             )
     return out + [f"{line}." for p in (run.gcps, run.check_points) if p is not None for line in p.left_out]
+
+
+def _bends(run: Run) -> list[str]:
+    """Images in which a reference's points lie farther off each other than finding them leaves: a pixel at most."""
+    if run.reference is None:
+        return []
+    step = run.reference.step
+    wide = [view for view in run.reference.views if view.points and view.scatter > step]
+    named = listed([f"{view.name} ({metres(view.scatter)})" for view in wide], _MOST_NAMED)
+    words = (
+        f"Points of the reference lie off each other, across the lines of sight, by more than the {metres(step)} of a "
+        f"pixel that finding them may leave, in {named}: it bends, or the images do."
+    )
+    return [words] if wide else []
 
 
 def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:

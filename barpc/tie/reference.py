@@ -265,7 +265,8 @@ class _Work:
             names = tuple(f"reference_{n}" for n in used)
             points = GroundPoints(names, ground, single, closed, view_of, xy, xy_sigma)
             offset = np.array([r.offset if r.points else (np.nan, np.nan) for r in reports])
-            control = Reference(points, np.array([sigma, sigma, height_sigma[1]]), offset)
+            bias = np.array([sigma, sigma, height_sigma[1]])
+            control = Reference(points, bias, offset, (2 * _HALF + 1) * self.step)
         return Registration(control, tuple(reports), self.step, sigma)
 
     def _lattice(self, views: Sequence[View]) -> tuple[Array, Array]:

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rasterio
 
 from barpc.cli import main
-from barpc.errors import InputError
+from barpc.errors import InputError, TiePointError
 from barpc.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.pointio.ground import read_gcps
@@ -141,6 +142,81 @@ def test_one_image_is_enough(options, truth, tmp_path):
     )
     assert before > 10.0
     assert after < 3.0  # px of half a metre: 1 m of it the terrain's bias, seen from the side
+
+
+@pytest.fixture(scope="module")
+def quickbird(shared_data, tmp_path_factory):
+    """A QuickBird image of 2003 by aerial orthoimages of 2015 at a resolution: the run, and its five surveyed points.
+
+    Their RMS (2,) in the image [px], which took no part.
+    """
+    folder, optical = shared_data / "cross_sensor" / "ngi_2015", shared_data / "optical" / "qb2_single"
+    out = tmp_path_factory.mktemp("quickbird")
+    image = optical / "qb2_basic1b.tif"
+    points = read_gcps(optical / "gcps.geojson", [image.stem])
+
+    def run(step: float, **options):
+        paths = [coarser(path, step, out) for path in sorted(folder.glob("ortho_*.tif"))]
+        given = RunOptions(
+            dem=str(folder / "dem.tif"), reference=tuple(map(str, paths)), overwrite=True, **options
+        )
+        result = adjust([image], out / "run", given)
+        error = (
+            read_rpc(out / "run" / f"{image.stem}.vrt").project(points.lonlatalt)[points.point] - points.xy
+        )
+        return result, np.sqrt((error**2).mean(axis=0))
+
+    return run
+
+
+def coarser(path, step: float, folder):
+    """An orthoimage with the means of its pixels of 5 m."""
+    with rasterio.open(path) as file:
+        times = round(step / file.res[0])
+        if times == 1:
+            return path
+        shape = file.height // times, file.width // times
+        pixels = file.read(1)[: shape[0] * times, : shape[1] * times]
+        pixels = pixels.reshape(shape[0], times, shape[1], times).mean(axis=(1, 3)).astype(pixels.dtype)
+        profile = {"width": shape[1], "height": shape[0], "count": 1, "dtype": pixels.dtype, "crs": file.crs}
+        a, b, c, d, e, f = file.transform[:6]
+        place = rasterio.Affine(times * a, times * b, c, times * d, times * e, f)
+        profile |= {"transform": place, "nodata": file.nodata}
+    coarse = folder / f"{path.stem}_{step:g}.tif"
+    with rasterio.open(coarse, "w", "GTiff", **profile) as file:
+        file.write(pixels, 1)
+    return coarse
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+@pytest.mark.parametrize(("step", "most"), [(5.0, (0.16, 0.12)), (10.0, (0.25, 0.15)), (20.0, (0.65, 0.25))])
+def test_a_real_image_comes_to_its_place_by_finer_and_coarser_references(quickbird, shared_data, step, most):
+    """2.98, 2.09 px as delivered; what a reference of 20 m leaves (0.5 px of 6.5 m) is its noise, and no jitter."""
+    result, rms = quickbird(step, geoid=str(shared_data / "dem" / "egm96_15.gtx"))
+    assert (rms < most).all()
+    assert (rms > 0.02).all()
+    assert result.passed
+    assert np.hypot(*rms) * 6.5 < 2.0 * np.hypot(*result.summary["scene"]["sigma_enu_m"][:2])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+def test_a_geoid_that_was_left_out_is_the_reason(quickbird):
+    result, rms = quickbird(5.0)
+    assert np.hypot(*rms) > 0.6
+    (why,) = result.summary["reasons"]
+    assert "give --geoid" in why
+    assert "jitter" not in why
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::barpc.errors.BarpcWarning")
+def test_one_image_that_a_reference_does_not_show_is_told_so_and_not_to_loosen_the_matching(quickbird):
+    with pytest.raises(
+        TiePointError, match=r"the reference does not show what the images show \(its highest peak"
+    ):
+        quickbird(60.0)
 
 
 def test_without_a_terrain_it_is_refused():

@@ -29,6 +29,7 @@ def adjusted(**fields: Any) -> Any:
     usual = {
         "left_out": (), "names": NAMES, "noise": 1.0, "in_space_rms": None, "two_groups": (), "control": None,
         "findings": (), "left": (), "alike": np.full(3, 9.0),
+        "reference_inlier": np.zeros(0, bool),
         "prior": SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=()),
         "smooth": SmoothTest(np.zeros(3), np.ones(3), np.full(3, NO_NUMBER), np.zeros(3)),
         "held_out_noise": np.ones(3), "held_out_rms": np.full(3, 0.2), "held": np.zeros(9, bool), "terrain": None,
@@ -598,3 +599,43 @@ def test_tie_points_alone_are_counted():
     found = block_verdict(run_of(kind="match", tracks=tracks), views())
     assert found["lines"] == ["7 tie points of 3 images, 19 observations."]
     assert found["headline"] == "All 3 images are tied together."
+
+
+def test_a_reference_on_heights_that_may_be_above_a_geoid_is_told_so_and_not_jitter():
+    unstated = replace(TerrainTest(0, 0, 0, np.nan, np.nan, 20.0), is_known=False)
+    held = {"terrain": unstated, "reference_inlier": np.array([True, True])}
+    (why,) = reasons(adjusted(**held))
+    assert why.startswith(
+        "The reference stands on the DEM, and nothing says that its heights count from the ellipsoid"
+    )
+    assert "give --geoid" in why
+    assert not [
+        line for line in said(run_of(adjusted(**held))) if "The DEM holds" in line
+    ]  # there is no tie point
+    for less in ({"terrain": replace(unstated, is_known=True)}, {"reference_inlier": np.zeros(2, bool)}):
+        assert reasons(adjusted(**{**held, **less})) == []
+    smooth = SmoothTest(np.array([0.2, 0.0, 0.0]), np.array([1e-9, 1, 1]), np.full(3, 0.9), np.zeros(3))
+    for fields, words in (
+        (held, "is left: the heights of the DEM (no --geoid), or attitude jitter"),
+        ({**held, "terrain": None}, "which one RPC does not follow; or the reference bends"),
+        ({}, "which one RPC does not follow"),
+    ):
+        told = view_status(a_view("A"), run_of(adjusted(**fields, smooth=smooth)))["advice"]
+        assert words in told
+        assert ("reference" in told) == ("reference" in words)
+
+
+@pytest.mark.parametrize(("scatter", "told"), [(9.9, False), (10.1, True)])
+def test_a_reference_whose_points_lie_off_each_other_by_more_than_its_pixel_is_told(scatter, told):
+    matches = (
+        ViewMatch("A", 9.0, (1.0, 0.0), 90, 50, 40, scatter),
+        ViewMatch("B", 9.0, (1.0, 0.0), 90, 50, 40, 2.0),
+        ViewMatch("C", 3.0, (0.0, 0.0)),
+    )
+    found = reasons(reference=Registration(SimpleNamespace(), matches, 10.0, 2.5))
+    assert len(found) == told
+    if told:
+        assert (
+            "by more than the 10.0 m of a pixel that finding them may leave, in A (10.1 m): it bends"
+            in found[0]
+        )

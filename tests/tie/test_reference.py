@@ -242,6 +242,7 @@ def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
         np.tile([0.1 * found.step, 0.1 * found.step, 7.0], (len(points.lonlatalt), 1))
     )
     assert found.control.bias == pytest.approx([found.sigma, found.sigma, 3.0])
+    assert found.control.width == pytest.approx(33 * found.step)  # of a template
     assert np.array(found.control.offset) == pytest.approx(np.array([m.offset for m in found.views]))
     assert np.unique(points.point).tolist() == list(range(len(points.lonlatalt)))  # none is not seen
     assert len(points.lonlatalt) < 0.7 * len(points.point)  # most are seen by both
