@@ -348,8 +348,10 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
 
 def _place(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
     """Where the scene went and how well that is known, and what holds it."""
-    placed = found.seen & (np.arange(len(found.seen)) < block.num_known)
-    counted = placed if placed.any() else found.seen
+    number = np.arange(len(found.seen))
+    # places that were given do not move with the cameras: they tell of the scene only where nothing else does
+    kinds = (found.seen & (number < last) for last in (block.num_tracks, block.num_known, len(number)))
+    counted = next((kind for kind in kinds if kind.any()), found.seen)
     known, outcome = (block.num_tracks, block.num_known), found.outcome
     prior = outcome.problem.camera_prior.sigma
     gauge = gauge_report(covariance, found.final.points, found.first_points(block), counted, prior)

@@ -1,4 +1,4 @@
-"""What the observations cannot tell: the scene's shift, tilt, turn and bending, and the weakest modes.
+"""What the observations cannot tell: the scene's shift, tilt, turn and bending, the weakest first.
 
 A change of the camera unknowns moves the points by dX = -V^-1 W^T dp. The mean of that move and its
 best-fitting tilts, turn, scale, twist and bending are linear in dp: ten numbers with a covariance.
@@ -39,11 +39,12 @@ _SAMPLE = 5000  # points that stand for the scene's shape
 
 @dataclass(frozen=True)
 class Mode:
-    """A way in which the scene may move as a whole, independent of the other modes."""
+    """One of the scene's motions, and how all others go with it."""
 
-    sigma: float  # posterior standard deviation [m]
-    motion: Array  # (10,) the move of one standard deviation in terms of `MOTIONS` [m]
-    meaning: str  # its largest motion
+    sigma: float  # its posterior standard deviation [m]
+    # (10,) all `MOTIONS` where this one is off by that [m]: a column of their covariance over it
+    motion: Array
+    meaning: str  # which it is
 
 
 @dataclass(frozen=True)
@@ -140,12 +141,8 @@ def _bends(east: Array, north: Array) -> Array:
 
 
 def _modes(motion_covariance: Array) -> tuple[Mode, ...]:
-    """Principal axes of the motions' covariance, the weakest first."""
-    values, vectors = np.linalg.eigh(motion_covariance)
-    modes = []
-    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
-        motion = vector * np.sqrt(max(value, 0.0))
-        largest = int(np.abs(motion).argmax())
-        motion = motion * np.sign(motion[largest])
-        modes.append(Mode(float(np.linalg.norm(motion)), motion, MOTIONS[largest]))
-    return tuple(modes)
+    """The scene's motions by their covariance, the weakest first."""
+    sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
+    along = np.where(sigma > 0, motion_covariance, 0.0) / np.where(sigma > 0, sigma, 1.0)
+    weakest = np.argsort(-sigma, kind="stable").tolist()
+    return tuple(Mode(float(sigma[m]), along[:, m], MOTIONS[m]) for m in weakest)

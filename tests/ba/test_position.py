@@ -1,0 +1,92 @@
+"""One truth for position: the scene's move is what its cameras did, one figure a motion, and adding never takes away."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba.gauge import MOTIONS
+from barpc.geodesy import enu_basis, metres_per_unit
+from barpc.report import Run, summarize
+from barpc.scene import GroundPoints, Tracks
+from barpc.sensor.geometry import triangulate
+from barpc.simulate import Block, simulate_block
+from tests.ba.conftest import centers_of
+
+
+def seen(given: Tracks | GroundPoints, ground: np.ndarray, sensors: list, seed: int, noise: float = 0.05):
+    """The observations where sensors show ground points (P, 3), with noise [px]."""
+    xy = np.random.default_rng(seed).normal(0.0, noise, given.xy.shape)
+    for v, sensor in enumerate(sensors):
+        rows = given.view == v
+        xy[rows] += sensor.project(ground[given.point[rows]])
+    return replace(given, xy=xy)
+
+
+def right_cameras(num_tracks: int, num_gcps: int) -> Block:
+    """A block whose delivered cameras are right, with few tie points."""
+    block = simulate_block(3, max(num_tracks, 40), seed=3, num_gcps=num_gcps)
+    sensors = [view.sensor for view in block.views]
+    tracks = block.tracks.select(block.tracks.point < num_tracks)
+    gcps = seen(block.gcps, block.gcps.lonlatalt, sensors, 2)
+    return replace(block, tracks=seen(tracks, block.truth.ground, sensors, 1), gcps=gcps)
+
+
+@pytest.mark.parametrize("wrong", [(300.0, 0.0, 0.0), (0.0, 0.0, 500.0)])
+def test_a_gcp_that_is_rejected_moves_no_scene(wrong: tuple[float, ...]) -> None:
+    """Its place was given and then found: that is no move of what the cameras show (-27.8 m up was said)."""
+    block = right_cameras(12, 4)
+    places = block.gcps.lonlatalt.copy()
+    places[1] += np.array(wrong) / metres_per_unit(places[1])
+    gcps = replace(block.gcps, lonlatalt=places)
+    found = adjust_tracks(block.views, block.tracks, AdjustOptions(), gcps, centers=centers_of(block))
+    assert found.control is not None
+    assert found.control.used.tolist() == [True, False, True, True]
+    assert np.abs(found.scene_shift).max() < 0.2
+
+
+def test_gcps_that_hold_the_scene_move_it_as_far_as_its_rays_meet_elsewhere() -> None:
+    """Three in four points are GCPs, 40 m above where the cameras show them: the scene moved 40 m, not 10."""
+    block = right_cameras(12, 36)
+    gcps = replace(block.gcps, lonlatalt=block.gcps.lonlatalt + [0.0, 0.0, 40.0])
+    found = adjust_tracks(block.views, block.tracks, AdjustOptions(), gcps, centers=centers_of(block))
+    first, last = (
+        triangulate(list(sensors), block.tracks.view, block.tracks.point, block.tracks.xy, alt=300.0).points
+        for sensors in ([view.sensor for view in block.views], found.sensors)
+    )
+    moved = enu_basis(block.truth.ground[0]) @ np.nanmean((last - first)[:12], axis=0)
+    assert moved[2] == pytest.approx(40.0, abs=1.0)
+    np.testing.assert_allclose(found.scene_shift, moved, atol=0.1)
+
+
+@pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
+@pytest.mark.parametrize("wrong", [0.0, 0.1])
+def test_two_images_with_one_rpc_have_no_height_to_move(wrong: float) -> None:
+    """Their rays meet nowhere: what the cameras do to heights of hundreds of metres a pixel is no move."""
+    block = simulate_block(2, 100, seed=1, per_site=2)
+    sensor = block.views[0].sensor
+    tracks = seen(block.tracks, block.truth.ground, [sensor, sensor], 1, 0.1)
+    xy, rng = tracks.xy + np.where(tracks.view[:, None] == 1, [40.0, 300.0], 0.0), np.random.default_rng(2)
+    bad = rng.uniform(size=len(xy)) < wrong
+    xy[bad] += rng.uniform(-30.0, 30.0, (int(bad.sum()), 2))
+    views = (block.views[0], replace(block.views[1], sensor=sensor))
+    found = adjust_tracks(views, replace(tracks, xy=xy), AdjustOptions())
+    assert found.held.any()
+    # both go half of the way, towards each other: the places between them stay
+    assert np.abs(found.scene_shift).max() < 1.0
+
+
+def test_list_table_verdict_and_summary_say_one_figure_of_a_motion() -> None:
+    block = simulate_block(3, 100, seed=3, num_gcps=1)
+    found = adjust_tracks(block.views, block.tracks, AdjustOptions(), block.gcps, centers=centers_of(block))
+    run = Run("adjust", block.views, (), block.tracks, adjustment=found, gcps=block.gcps)
+    scene = summarize(run).scene
+    assert scene is not None
+    table = {entry.part: entry.sigma_m for entry in scene.datum}
+    assert {mode.meaning: mode.sigma_m for mode in scene.weakest_modes} == table
+    assert [table[name] for name in MOTIONS[:3]] == list(scene.sigma_enu_m)
+    for mode in scene.weakest_modes:
+        assert mode.motion_m[MOTIONS.index(mode.meaning)] == pytest.approx(mode.sigma_m)
