@@ -136,6 +136,8 @@ def _bends(east: Array, north: Array) -> Array:
     """Heights (3, n) of a twist and of bending to the east and north without the plane in them, each a metre in all."""
     plane = np.stack([np.ones_like(east), east, north])
     curved = np.stack([east * north, east**2, north**2])
+    if not len(east):
+        return curved
     curved -= np.linalg.lstsq(plane.T, curved.T, rcond=None)[0].T @ plane
     return np.asarray(curved / np.maximum(np.ptp(curved, axis=1, keepdims=True), 1e-6))
 

@@ -662,6 +662,7 @@ def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fix
         "reference": paid[:seen][of_reference].sum(axis=0) + paid[middle : ends[2]].sum(axis=0),
         "heights": paid[ends[2] : ends[3]].sum(axis=0),
         "earlier_run": np.zeros(7),
+        "altimetry": np.zeros(7),
     }
     assert set(found) == set(expected)
     for source, cost in expected.items():  # of what the ties between free views do not pay
