@@ -13,6 +13,7 @@ import scipy.linalg as la
 
 from barpc.ba.covariance import Covariance
 from barpc.ba.normal import solve_lower
+from barpc.ba.priors import EarlierScene, JointPrior
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 
@@ -59,6 +60,7 @@ class GaugeReport:
     # RMS distance of the points from their middle [m]: where tilts, turn and scale are measured
     radius: float
     by_unknown: Array = field(repr=False)  # (10, N q) the motions by the unknowns of the cameras
+    own: Array = field(repr=False)  # (10, 10) their covariance where the cameras are known [m^2]
     # (3,) how far off the delivered cameras let the scene be, east, north, up [m]; NaN where that is not known
     delivered_sigma: Array = field(default_factory=lambda: np.full(3, np.nan))
 
@@ -79,13 +81,32 @@ def gauge_report(
     local = (points[use] - middle) @ enu.T
     radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
     by_unknown, own = _motion_by_unknowns(covariance, local / radius, enu, use, use.sum() / len(index))
-    motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
-    sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
-    found = GaugeReport(enu @ shift_of_all, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown)
+    found = _report(covariance, enu @ shift_of_all, by_unknown, own, radius)
     if prior is None:
         return found
     variance = np.where(np.isfinite(prior), prior, 0.0).ravel() ** 2
     return replace(found, delivered_sigma=np.sqrt(by_unknown[:3] ** 2 @ variance))
+
+
+def earlier_scene(
+    covariance: Covariance, prior: JointPrior, scene: EarlierScene, params: Array
+) -> GaugeReport:
+    """The report for the scene of an earlier block, by unknowns (N, q) of its cameras that were adjusted again.
+
+    Whatever was added tells more of it: new points are another scene, and may know theirs less.
+    """
+    by_unknown = np.zeros((len(MOTIONS), params.size))
+    by_unknown[:, prior.index] = scene.by_unknown
+    moved = scene.by_unknown @ (params.ravel()[prior.index] - prior.mean)
+    return _report(covariance, moved[:3], by_unknown, scene.own, scene.radius)
+
+
+def _report(
+    covariance: Covariance, shift: Array, by_unknown: Array, own: Array, radius: float
+) -> GaugeReport:
+    motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
+    sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
+    return GaugeReport(shift, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown, own)
 
 
 def _motion_by_unknowns(

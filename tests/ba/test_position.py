@@ -1,4 +1,4 @@
-"""One truth for position: the scene's move is what its cameras did, one figure a motion, and adding never takes away."""
+"""One truth for position: a move is what cameras did, a motion has one figure, and adding takes nothing away."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.gauge import MOTIONS
+from barpc.ba.incremental import BlockPrior
 from barpc.geodesy import enu_basis, metres_per_unit
 from barpc.report import Run, summarize
 from barpc.scene import GroundPoints, Tracks
@@ -90,3 +91,36 @@ def test_list_table_verdict_and_summary_say_one_figure_of_a_motion() -> None:
     assert [table[name] for name in MOTIONS[:3]] == list(scene.sigma_enu_m)
     for mode in scene.weakest_modes:
         assert mode.motion_m[MOTIONS.index(mode.meaning)] == pytest.approx(mode.sigma_m)
+
+
+def test_an_image_that_is_added_makes_no_motion_less_known(tmp_path) -> None:
+    """Its ties with the one view that it resembles are another scene, which is tilted more easily."""
+    block, centers = simulate_block(4, 600, seed=4, per_site=4), None
+    centers, tracks = centers_of(block), block.tracks
+    last = np.zeros(tracks.num_points, dtype=int)
+    np.maximum.at(last, tracks.point, tracks.view)
+    old, new = (tracks.select(last[tracks.point] < 3), tracks.select(last[tracks.point] == 3))
+    few = np.isin(new.view, (2, 3)) | np.isin(new.point, np.unique(new.point)[:8])
+    first = adjust_tracks(block.views[:3], old, AdjustOptions(), centers=centers[:3])
+    block_prior(first).save(tmp_path / "prior.npz")
+    prior = BlockPrior.load(tmp_path / "prior.npz")
+    both = adjust_tracks(block.views, new.select(few), AdjustOptions(), centers=centers, prior=prior)
+    assert (both.gauge.motion_sigma <= first.gauge.motion_sigma).all()
+    assert both.gauge.sigma[2] < 0.8 * first.gauge.sigma[2]  # and the image does tell
+    assert sum(both.datum.values()) == pytest.approx(np.ones(10), abs=1e-6)
+    # the move is the earlier scene's, by its own tie points
+    one, other = (
+        triangulate(list(sensors[:3]), old.view, old.point, old.xy, alt=300.0).points
+        for sensors in (first.sensors, both.sensors)
+    )
+    kept = np.unique(old.point[first.inlier])
+    moved = enu_basis(block.truth.ground[0]) @ (other - one)[kept].mean(axis=0)
+    assert abs(moved[2]) > 5.0
+    np.testing.assert_allclose(both.scene_shift, moved, atol=0.02 * np.abs(moved).max())
+    # a third run goes on with the same scene
+    again = block_prior(both).scene
+    assert again is not None
+    np.testing.assert_array_equal(
+        again.by_unknown[:, : first.params.size], block_prior(first).scene.by_unknown
+    )
+    assert not again.by_unknown[:, first.params.size :].any()
