@@ -117,7 +117,13 @@ class PointPrior:
 def stated_accuracy(view: View) -> float:
     """Horizontal accuracy of a view as delivered [m]: what its RPC states where usable, else 7.5 m."""
     stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
-    return stated if stated is not None and stated > USABLE_ACCURACY else DEFAULT_ACCURACY
+    return stated if stated is not None and states_accuracy(view) else DEFAULT_ACCURACY
+
+
+def states_accuracy(view: View) -> bool:
+    """Whether a view's RPC states a usable accuracy."""
+    stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
+    return stated is not None and stated > USABLE_ACCURACY
 
 
 def _stated(view: View) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from barpc.ba.ground import Heights
 from barpc.ba.problem import Problem
 from barpc.ba.smooth import TERMS, Fit, Smooth, SmoothTest
 from barpc.ba.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
-from barpc.ba.variances import SAME_PRIOR, PriorTest, Variances, same_prior
+from barpc.ba.variances import SAME_PRIOR, STANDS, PriorTest, Variances, same_prior
 from barpc.ba.weights import LOSSES, MEDIAN, Observations
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
@@ -81,7 +81,9 @@ class Rounds:
         of_reference = block.point >= block.num_known
         self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie, of_reference)
         self.smooth = Smooth(problem.structure, problem.xy, unknowns)
-        self.variances = Variances.of(problem.camera_prior, unknowns, options, heights.has_control)
+        given, control = problem.camera_prior, heights.has_control
+        self.variances = Variances.of(given, unknowns, options, control, block.views)
+        self.shared = 1.0
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
@@ -133,6 +135,8 @@ class Rounds:
         same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
         settled &= same_prior(prior, self.problem.camera_prior, SAME_PRIOR)
+        settled &= abs(np.log(tested.shared / self.shared)) < STANDS
+        self.shared = tested.shared
         if once or self.passes > MAX_PASSES or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:

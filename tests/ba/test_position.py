@@ -10,6 +10,7 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.gauge import MOTIONS
 from barpc.ba.incremental import BlockPrior
+from barpc.fit import fit_rpc
 from barpc.geodesy import enu_basis, metres_per_unit
 from barpc.report import Run, summarize
 from barpc.scene import GroundPoints, Tracks
@@ -124,3 +125,51 @@ def test_an_image_that_is_added_makes_no_motion_less_known(tmp_path) -> None:
         again.by_unknown[:, : first.params.size], block_prior(first).scene.by_unknown
     )
     assert not again.by_unknown[:, first.params.size :].any()
+
+
+def stating(block: Block, sensors: list, accuracy: float) -> tuple:
+    """The views with RPCs of sensors that state an accuracy [m]."""
+    return tuple(
+        replace(view, sensor=replace(fit_rpc(sensor, view.size, view.alt_range).rpc, err_bias=accuracy))
+        for view, sensor in zip(block.views, sensors, strict=True)
+    )
+
+
+@pytest.mark.parametrize("count", [2, 4, pytest.param(8, marks=pytest.mark.slow)])
+def test_adjusting_what_was_adjusted_makes_its_place_no_better_known(count: int) -> None:
+    """Its errors are shared: n views that each state what the place is known to are not n witnesses (36.6 -> 13.0 m)."""
+    block = simulate_block(count, 100, seed=8, per_site=count)
+    views, sigmas = block.views, []
+    for _ in range(3):
+        found = adjust_tracks(views, block.tracks, AdjustOptions(), centers=centers_of(block))
+        sigmas.append(found.gauge.sigma)
+        views = stating(block, list(found.sensors), float(np.sqrt((found.gauge.sigma[:2] ** 2).mean())))
+    for again in sigmas[1:]:
+        ratio = again / sigmas[0]
+        assert (ratio > 0.95).all()
+        assert (ratio < 1.1).all()  # nor worse
+
+
+def test_accuracies_that_independent_errors_have_are_taken_as_they_are() -> None:
+    """The same views, each off by what it states: their errors average."""
+    block = simulate_block(4, 100, seed=8, per_site=4, attitude=7.5 / 694e3, position=7.5)
+    views = tuple(replace(view, sensor=replace(view.sensor, err_bias=7.5)) for view in block.views)
+    stated, silent = (
+        adjust_tracks(given, block.tracks, AdjustOptions(), centers=centers_of(block))
+        for given in (views, block.views)
+    )
+    assert stated.prior.shared == 1.0
+    np.testing.assert_array_equal(stated.params, silent.params)
+    np.testing.assert_array_equal(stated.gauge.sigma, silent.gauge.sigma)
+
+
+def test_what_the_user_states_of_the_cameras_is_taken_as_stated() -> None:
+    block = simulate_block(4, 100, seed=8, per_site=4, attitude=1e-9, position=1e-3)
+    views = tuple(replace(view, sensor=replace(view.sensor, err_bias=7.5)) for view in block.views)
+    given = AdjustOptions(sigma_attitude=7.5, sigma_position=7.5)
+    found, of_file = (
+        adjust_tracks(views, block.tracks, options, centers=centers_of(block))
+        for options in (given, AdjustOptions())
+    )
+    assert found.prior.shared == 1.0
+    assert of_file.prior.shared > 1.2
