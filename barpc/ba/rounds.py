@@ -83,7 +83,6 @@ class Rounds:
         self.smooth = Smooth(problem.structure, problem.xy, unknowns)
         given, control = problem.camera_prior, heights.has_control
         self.variances = Variances.of(given, unknowns, options, control, block.views)
-        self.shared = 1.0
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
@@ -134,9 +133,9 @@ class Rounds:
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
-        settled &= same_prior(prior, self.problem.camera_prior, SAME_PRIOR)
-        settled &= abs(np.log(tested.shared / self.shared)) < STANDS
-        self.shared = tested.shared
+        # what is known of the place goes with what is shared, and nothing else learns of it
+        share = STANDS if tested.shared > 1.0 else SAME_PRIOR
+        settled &= same_prior(prior, self.problem.camera_prior, share)
         if once or self.passes > MAX_PASSES or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:

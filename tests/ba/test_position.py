@@ -137,7 +137,7 @@ def stating(block: Block, sensors: list, accuracy: float) -> tuple:
 
 @pytest.mark.parametrize("count", [2, 4, pytest.param(8, marks=pytest.mark.slow)])
 def test_adjusting_what_was_adjusted_makes_its_place_no_better_known(count: int) -> None:
-    """Its errors are shared: n views that each state what the place is known to are not n witnesses (36.6 -> 13.0 m)."""
+    """Its errors are shared: n views that state what the place is known to are not n witnesses (36.6 -> 13.0 m)."""
     block = simulate_block(count, 100, seed=8, per_site=count)
     views, sigmas = block.views, []
     for _ in range(3):
