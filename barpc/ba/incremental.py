@@ -139,8 +139,10 @@ class BlockPrior:
             radars = tuple(str(name) for name in file.get("radars", ()))
             strips = file.get("strips", np.zeros((len(names), 0, 5)))
             periods = file.get("periods", np.zeros((len(names), 0)))
-            parts = [file[f"scene_{name}"] for name in _SCENE] if "scene_radius" in file else None
-            scene = None if parts is None else EarlierScene(*parts[:2], float(parts[2]))
+            scene = None
+            if "scene_radius" in file:
+                by_unknown, own, radius = (file[f"scene_{name}"] for name in _SCENE)
+                scene = EarlierScene(by_unknown, own, float(radius))
             prior = cls(names, *known, splines, edges, radars, strips, periods, scene)
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
