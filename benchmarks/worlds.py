@@ -381,7 +381,10 @@ def _far(r: Result) -> list[str]:
 
 
 def _want_local(r: Result, _plan: Plan) -> list[str]:
-    return _unsaid(r) + ([f"left {r.files.left:.2f}"] if not r.files.left <= 0.05 else [])
+    left = min(
+        r.files.left, r.adjusted.left
+    )  # no RPC holds a step: what one leaves is said, and grids are offered
+    return _unsaid(r) + ([f"left {left:.3f}"] if not left <= 0.05 else [])
 
 
 _SWINGS = r"swing|sway|oscillat|\bwave|period"

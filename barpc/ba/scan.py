@@ -100,8 +100,9 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
         if len(rows) < 2:
             continue
         axes, size = np.linalg.svd(residual[:, rows], full_matrices=False)[:2]
-        # of two views all lie along one line: what is left across it is no direction
+        # of two views all lie along one line: what is left across it is no direction, or what large ones bend alike
         along = axes.T[size > _LINE * size[0]] @ residual[:, rows]
+        along[1:] -= np.median(along[1:], axis=1, keepdims=True)
         for axis in (0, 1):
             signs = along[:, np.argsort(place[axis, rows], kind="stable")] > 0.0
             alike, count = (signs[:, 1:] == signs[:, :-1]).sum(axis=1), float(len(rows) - 1)

@@ -31,7 +31,9 @@ _LOG = logging.getLogger(__name__)
 _STRENGTH = 4.0  # degrees of freedom with which the given figure counts beside what the block shows
 _LEVEL = 0.05  # a sum of squares less probable than this is too large
 _SURE = 5.0  # of two explanations whose evidences differ by less (a factor of 150) none is ruled out
-_LIKELIER = 2.3  # but one odd view is named where it is ten times as likely as that all are worse than stated
+_LIKELIER = -np.log(
+    _LEVEL
+)  # but one odd view is named where all being worse than stated is as improbable beside it
 _FREE = 100.0  # times its prior: a view whose camera may be anywhere
 _SEARCH = 10.0  # times the drift's standard deviation while outliers are looked for
 _MOVING = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken

@@ -115,6 +115,10 @@ def test_wrong_matches_lie_in_any_direction() -> None:
                 [off[0], 0.1 + 0.002 * off[1]]
             )  # a trace of the other direction, all the same way
             assert (neighbours_alike(view, place, biased, 2) <= SURE).all()
+            curved = np.stack(
+                [off[0], off[0] ** 2 / 90.0]
+            )  # far along a ray relief bends the other, all the same way
+            assert (neighbours_alike(view, place, curved, 2) <= SURE).all()
             bent = off[:, view == 0] - 15.0 * np.sign(off[:, view == 0])
             assert np.isneginf(neighbours_alike(view[view == 0], place[:, view == 0], bent, 2)[1])
 

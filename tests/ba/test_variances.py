@@ -181,10 +181,10 @@ def evidences(monkeypatch, v: Variances, alone: float, together: float) -> tuple
 def test_of_two_explanations_the_clearly_likelier_one_is_taken_and_else_both(monkeypatch) -> None:
     v = variances(3)
     common, choice = np.sqrt((4 + 606) / (4 + 9)), np.log(3.0)  # of one of three views
-    scale, odd = evidences(monkeypatch, v, 2.4 + choice, 0.0)  # eleven times as likely
+    scale, odd = evidences(monkeypatch, v, 3.1 + choice, 0.0)  # more than twenty times as likely
     assert odd.tolist() == [True, False, False]
     np.testing.assert_allclose(scale, [9.0, 1.0, 1.0])
-    for alone in (2.2, 0.0, -4.9):
+    for alone in (2.9, 0.0, -4.9):
         scale, odd = evidences(monkeypatch, v, alone + choice, 0.0)
         assert not odd.any()
         np.testing.assert_allclose(scale, [max(9.0, common), common, common])
