@@ -16,7 +16,7 @@ from barpc.ba.consensus import two_groups
 from barpc.ba.covariance import Covariance
 from barpc.ba.datum import datum_shares
 from barpc.ba.following import follow, without_strips
-from barpc.ba.gauge import GaugeReport, gauge_report
+from barpc.ba.gauge import GaugeReport, earlier_scene, gauge_report
 from barpc.ba.heldout import enu_offsets, keep_out, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import Finding, left_over, standing_out
@@ -347,11 +347,20 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
 
 
 def _place(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
-    """Where the scene went and how well that is known, and what holds it."""
-    placed = found.seen & (np.arange(len(found.seen)) < block.num_known)
-    counted = placed if placed.any() else found.seen
+    """Where the scene went and how well that is known, and what holds it; the scene of an earlier run is its own."""
     known, outcome = (block.num_tracks, block.num_known), found.outcome
-    prior = outcome.problem.camera_prior.sigma
-    gauge = gauge_report(covariance, found.final.points, found.first_points(block), counted, prior)
+    gauge = _gauge(found, block, covariance)
     shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, *known)
     return gauge, shares
+
+
+def _gauge(found: Solution, block: Block, covariance: Covariance) -> GaugeReport:
+    joint = found.problem.joint_prior
+    if joint is not None and joint.scene is not None:
+        return earlier_scene(covariance, joint, joint.scene, found.final.params)
+    number = np.arange(len(found.seen))
+    # places that were given do not move with the cameras: they tell of the scene only where nothing else does
+    kinds = (found.seen & (number < last) for last in (block.num_tracks, block.num_known, len(number)))
+    counted = next((kind for kind in kinds if kind.any()), found.seen)
+    prior = found.outcome.problem.camera_prior.sigma
+    return gauge_report(covariance, found.final.points, found.first_points(block), counted, prior)

@@ -1,4 +1,4 @@
-"""What the observations cannot tell: the scene's shift, tilt, turn and bending, and the weakest modes.
+"""What the observations cannot tell: the scene's shift, tilt, turn and bending, the weakest first.
 
 A change of the camera unknowns moves the points by dX = -V^-1 W^T dp. The mean of that move and its
 best-fitting tilts, turn, scale, twist and bending are linear in dp: ten numbers with a covariance.
@@ -13,6 +13,7 @@ import scipy.linalg as la
 
 from barpc.ba.covariance import Covariance
 from barpc.ba.normal import solve_lower
+from barpc.ba.priors import EarlierScene, JointPrior
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray
 
@@ -39,11 +40,12 @@ _SAMPLE = 5000  # points that stand for the scene's shape
 
 @dataclass(frozen=True)
 class Mode:
-    """A way in which the scene may move as a whole, independent of the other modes."""
+    """One of the scene's motions, and how all others go with it."""
 
-    sigma: float  # posterior standard deviation [m]
-    motion: Array  # (10,) the move of one standard deviation in terms of `MOTIONS` [m]
-    meaning: str  # its largest motion
+    sigma: float  # its posterior standard deviation [m]
+    # (10,) all `MOTIONS` where this one is off by that [m]: a column of their covariance over it
+    motion: Array
+    meaning: str  # which it is
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class GaugeReport:
     # RMS distance of the points from their middle [m]: where tilts, turn and scale are measured
     radius: float
     by_unknown: Array = field(repr=False)  # (10, N q) the motions by the unknowns of the cameras
+    own: Array = field(repr=False)  # (10, 10) their covariance where the cameras are known [m^2]
     # (3,) how far off the delivered cameras let the scene be, east, north, up [m]; NaN where that is not known
     delivered_sigma: Array = field(default_factory=lambda: np.full(3, np.nan))
 
@@ -78,13 +81,32 @@ def gauge_report(
     local = (points[use] - middle) @ enu.T
     radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
     by_unknown, own = _motion_by_unknowns(covariance, local / radius, enu, use, use.sum() / len(index))
-    motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
-    sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
-    found = GaugeReport(enu @ shift_of_all, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown)
+    found = _report(covariance, enu @ shift_of_all, by_unknown, own, radius)
     if prior is None:
         return found
     variance = np.where(np.isfinite(prior), prior, 0.0).ravel() ** 2
     return replace(found, delivered_sigma=np.sqrt(by_unknown[:3] ** 2 @ variance))
+
+
+def earlier_scene(
+    covariance: Covariance, prior: JointPrior, scene: EarlierScene, params: Array
+) -> GaugeReport:
+    """The report for the scene of an earlier block, by unknowns (N, q) of its cameras that were adjusted again.
+
+    Whatever was added tells more of it: new points are another scene, and may know theirs less.
+    """
+    by_unknown = np.zeros((len(MOTIONS), params.size))
+    by_unknown[:, prior.index] = scene.by_unknown
+    moved = scene.by_unknown @ (params.ravel()[prior.index] - prior.mean)
+    return _report(covariance, moved[:3], by_unknown, scene.own, scene.radius)
+
+
+def _report(
+    covariance: Covariance, shift: Array, by_unknown: Array, own: Array, radius: float
+) -> GaugeReport:
+    motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
+    sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
+    return GaugeReport(shift, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown, own)
 
 
 def _motion_by_unknowns(
@@ -142,12 +164,8 @@ def _bends(east: Array, north: Array) -> Array:
 
 
 def _modes(motion_covariance: Array) -> tuple[Mode, ...]:
-    """Principal axes of the motions' covariance, the weakest first."""
-    values, vectors = np.linalg.eigh(motion_covariance)
-    modes = []
-    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
-        motion = vector * np.sqrt(max(value, 0.0))
-        largest = int(np.abs(motion).argmax())
-        motion = motion * np.sign(motion[largest])
-        modes.append(Mode(float(np.linalg.norm(motion)), motion, MOTIONS[largest]))
-    return tuple(modes)
+    """The scene's motions by their covariance, the weakest first."""
+    sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
+    along = np.where(sigma > 0, motion_covariance, 0.0) / np.where(sigma > 0, sigma, 1.0)
+    weakest = np.argsort(-sigma, kind="stable").tolist()
+    return tuple(Mode(float(sigma[m]), along[:, m], MOTIONS[m]) for m in weakest)

@@ -25,6 +25,7 @@ KNOWN_BIAS = 5.0  # m: the same, where it is known what its heights count from
 ALIKE = (
     25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
 )
+_STAYS = 1.0  # m: rays of weak points tell heights to hundreds of metres (0.05 m under 0.01 degrees: 290 m)
 _FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
 _TOGETHER = 0.25  # of it: what their mean may be wrong by (RPCs' ranges lie about the terrain, roughly)
 
@@ -108,6 +109,12 @@ def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, commo
     ground = ground_from_ecef(points[index])
     n = len(index)
     return _heights(ground, index, np.full(n, alt), np.tile([0.0, 0.0, 1.0], (n, 1)), sigma, common_sigma)
+
+
+def staying(points: Array, index: IntArray) -> PointPrior:
+    """Points `index` (Q,) of (P, 3), ECEF [m], each held to the altitude where it stands."""
+    ground = ground_from_ecef(points[index])
+    return _heights(ground, index, ground[:, 2], np.tile([0.0, 0.0, 1.0], (len(index), 1)), _STAYS, 0.0)
 
 
 def _heights(

@@ -15,7 +15,8 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from barpc.ba.priors import CameraPrior, JointPrior
+from barpc.ba.gauge import MOTIONS
+from barpc.ba.priors import CameraPrior, EarlierScene, JointPrior
 from barpc.ba.waves import Waves
 from barpc.errors import InputError
 from barpc.frozen import load_npz
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 PRIOR = replace(ARRAYS, words="the prior of an adjusted block")
 _SPARSE = ("data", "indices", "indptr")
+_SCENE = ("by_unknown", "own", "radius")
 _LARGEST = 20_000  # unknowns of a block that is gone on from: its matrix is dense then
 
 
@@ -52,6 +54,8 @@ class BlockPrior:
         Layout of the unknowns in the image (see `barpc.ba.waves`).
     radars : tuple of str
         Those of its views whose unknowns are of a radar's clocks.
+    scene : EarlierScene or None
+        Its scene, by its cameras' unknowns; None: written by an earlier release.
     """
 
     names: tuple[str, ...]
@@ -66,6 +70,7 @@ class BlockPrior:
     radars: tuple[str, ...] = ()
     strips: Array | None = None
     periods: Array | None = None
+    scene: EarlierScene | None = None
 
     def waves(self, names: tuple[str, ...]) -> Waves | None:
         """The unknowns in the image of views that go on from the block; a new one has splines alone."""
@@ -98,6 +103,8 @@ class BlockPrior:
         else:
             arrays |= {name: getattr(self.information, name) for name in _SPARSE}
             arrays["less"] = np.zeros((0, self.params.size)) if self.less is None else self.less
+        if self.scene is not None:
+            arrays |= {f"scene_{name}": np.asarray(getattr(self.scene, name)) for name in _SCENE}
         with Path(path).open("wb") as file:
             np.savez_compressed(
                 file,
@@ -132,7 +139,11 @@ class BlockPrior:
             radars = tuple(str(name) for name in file.get("radars", ()))
             strips = file.get("strips", np.zeros((len(names), 0, 5)))
             periods = file.get("periods", np.zeros((len(names), 0)))
-            prior = cls(names, *known, splines, edges, radars, strips, periods)
+            scene = None
+            if "scene_radius" in file:
+                by_unknown, own, radius = (file[f"scene_{name}"] for name in _SCENE)
+                scene = EarlierScene(by_unknown, own, float(radius))
+            prior = cls(names, *known, splines, edges, radars, strips, periods, scene)
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({error})") from error
         if not prior._is_whole():
@@ -160,6 +171,7 @@ class BlockPrior:
             and self._periods.dtype == np.float64
             and bool((self._periods > 0.0).all())
             and (self.splines == 0 or 4 <= self.splines <= q)
+            and (self.scene is None or _is_scene(self.scene, n * q))
             and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_plain(self.less)))
         )
 
@@ -174,6 +186,16 @@ class BlockPrior:
             )
         matrix: Array = self.information.toarray()
         return matrix if self.less is None else matrix - self.less.T @ self.less
+
+
+def _is_scene(scene: EarlierScene, size: int) -> bool:
+    """Whether the motions of a scene by so many unknowns are what they can be."""
+    arrays, count = (scene.by_unknown, scene.own), len(MOTIONS)
+    return (
+        tuple(array.shape for array in arrays) == ((count, size), (count, count))
+        and all(array.dtype == np.float64 and _is_plain(array) for array in arrays)
+        and 0.0 < scene.radius <= LARGEST
+    )
 
 
 def _is_plain(array: Array | sp.csr_array) -> bool:
@@ -232,6 +254,7 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
         tuple(adjustment.names[v] for v in adjustment.cameras.unknowns.radars if v in views),
         waves.strips[views] if waves and waves.strips.size else None,
         waves.periods[views] if waves and waves.periods.size else None,
+        EarlierScene(adjustment.gauge.by_unknown[:, free], adjustment.gauge.own, adjustment.gauge.radius),
     )
 
 
@@ -276,4 +299,6 @@ def apply_prior(
     mean, sigma = cameras.mean.copy(), cameras.sigma.copy()
     mean[views], sigma[views] = prior.params, np.inf
     index = (views[:, None] * size + np.arange(size)).ravel()
-    return replace(cameras, mean=mean, sigma=sigma), JointPrior(index, prior.params.ravel(), root)
+    return replace(cameras, mean=mean, sigma=sigma), JointPrior(
+        index, prior.params.ravel(), root, prior.scene
+    )

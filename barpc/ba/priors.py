@@ -42,6 +42,15 @@ class CameraPrior:
         return 1.0 / self.sigma
 
 
+@dataclass(frozen=True, eq=False)
+class EarlierScene:
+    """The scene of an earlier block: its motions (`barpc.ba.gauge.MOTIONS`) by the unknowns of its cameras."""
+
+    by_unknown: Array  # (10, n)
+    own: Array  # (10, 10) covariance of the motions where the cameras are known [m^2]
+    radius: float  # where tilts, turn and scale are measured [m]
+
+
 @dataclass(frozen=True)
 class JointPrior:
     """A prior on several views together, with all of their correlations: root (p - mean)."""
@@ -49,6 +58,7 @@ class JointPrior:
     index: IntArray  # (n,) places of the unknowns in the raveled (N, q) array
     mean: Array  # (n,) their prior mean
     root: Array  # (n, n) upper triangular factor of the information matrix
+    scene: EarlierScene | None = None  # that these views knew; None: not known
 
     def residual(self, params: Array) -> Array:
         """Whitened residuals (n,) of unknowns (N, q)."""
@@ -107,7 +117,13 @@ class PointPrior:
 def stated_accuracy(view: View) -> float:
     """Horizontal accuracy of a view as delivered [m]: what its RPC states where usable, else 7.5 m."""
     stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
-    return stated if stated is not None and stated > USABLE_ACCURACY else DEFAULT_ACCURACY
+    return stated if stated is not None and states_accuracy(view) else DEFAULT_ACCURACY
+
+
+def states_accuracy(view: View) -> bool:
+    """Whether a view's RPC states a usable accuracy."""
+    stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
+    return stated is not None and stated > USABLE_ACCURACY
 
 
 def _stated(view: View) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from barpc.ba.problem import Problem
 from barpc.ba.resembling import Resemblance
 from barpc.ba.smooth import TERMS, Fit, Smooth, SmoothTest
 from barpc.ba.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
-from barpc.ba.variances import SAME_PRIOR, PriorTest, Variances, same_prior
+from barpc.ba.variances import SAME_PRIOR, STANDS, PriorTest, Variances, same_prior
 from barpc.ba.weights import LOSSES, MEDIAN, Observations
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
@@ -82,7 +82,8 @@ class Rounds:
         of_reference = block.point >= block.num_known
         self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie, of_reference)
         self.smooth = Smooth(problem.structure, problem.xy, unknowns, Resemblance.of(block, TERMS))
-        self.variances = Variances.of(problem.camera_prior, unknowns, options, heights.has_control)
+        given, control = problem.camera_prior, heights.has_control
+        self.variances = Variances.of(given, unknowns, options, control, block.views)
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
@@ -133,7 +134,9 @@ class Rounds:
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
-        settled &= same_prior(prior, self.problem.camera_prior, SAME_PRIOR)
+        # what is known of the place goes with what is shared, and nothing else learns of it
+        share = STANDS if tested.shared > 1.0 else SAME_PRIOR
+        settled &= same_prior(prior, self.problem.camera_prior, share)
         if once or self.passes > MAX_PASSES or (settled and (same or not self.robust)):
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
             if found.covariance(self.problem.free).is_large:

@@ -10,7 +10,7 @@ import numpy as np
 from barpc.ba.agreement import LOOSE, Agreement, agreement, offsets_of
 from barpc.ba.block import Block
 from barpc.ba.consensus import agreeing
-from barpc.ba.ground import Heights
+from barpc.ba.ground import Heights, staying
 from barpc.ba.heldout import HeldOut, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import Finding
@@ -21,7 +21,7 @@ from barpc.ba.rounds import Outcome, Rounds, revived
 from barpc.ba.smooth import SmoothTest
 from barpc.ba.snooping import ControlTest, control_test
 from barpc.ba.solve import State
-from barpc.ba.starting import FIRST_STEPS, first_state, make_problem
+from barpc.ba.starting import first_state, make_problem
 from barpc.ba.structure import Structure
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
@@ -32,7 +32,7 @@ _TREND = 0.03  # px: another model is tried
 MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
-_MANY_KEPT = 0.99  # of the observations: the others do not tell in a mean
+_STEPS_BACK = 3  # to the delivered cameras: kilometres away, what is left is below a micrometre
 _BETTER = 0.8  # of the noise
 
 
@@ -66,14 +66,18 @@ class Solution:
         return seen
 
     def first_points(self, block: Block) -> Array:
-        """Where the delivered cameras put the points (P, 3) [m] if what was cut is seen where it should be."""
-        points, kept = self.state.points, self.outcome.inlier
-        if kept.sum() < _MANY_KEPT * block.use.sum():
-            problem, final, delivered = self.problem, self.final, self.problem.camera_prior.mean
-            mended = replace(problem, xy=problem.residuals(final.params, final.points) + problem.xy)
-            for _ in range(FIRST_STEPS + 1):
-                projected = problem.project_points(delivered, points)
-                points = mended.triangulate(points, projected, block.use / block.sigma)
+        """Where the delivered cameras put the points (P, 3) [m] that are seen where the adjusted ones show them.
+
+        Nothing but the cameras moves between the two: no observation that was cut, no place that was given, and no
+        height where the rays of a point tell none.
+        """
+        problem, points = self.problem, self.final.points
+        shown = problem.residuals(self.final.params, points) + problem.xy
+        held = staying(points, np.flatnonzero(self.heights.weak))
+        mended = replace(problem, xy=shown, point_prior=held)
+        for _ in range(_STEPS_BACK):
+            projected = problem.project_points(problem.camera_prior.mean, points)
+            points = mended.triangulate(points, projected, block.use / block.sigma)
         return points
 
     @property

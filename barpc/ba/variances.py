@@ -10,6 +10,7 @@ sum is larger than chance allows, some prior was too narrow: that of one view, i
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,13 +18,13 @@ from scipy.special import chdtrc, gammaincinv
 
 from barpc.ba.covariance import Covariance
 from barpc.ba.linear import factorize
-from barpc.ba.priors import CameraPrior
+from barpc.ba.priors import CameraPrior, states_accuracy
 from barpc.ba.problem import Problem
 from barpc.ba.solve import Minimum
 from barpc.ba.unknowns import Unknowns
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, View
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,7 +42,7 @@ _UNEXPECTED = (
 )
 _LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
 _ITERATIONS = 10
-_STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
+STANDS = 0.05  # change of a standard deviation, as a logarithm, below which it stands
 SAME_PRIOR = 0.2  # the same, below which a block is not solved again
 _SMALL = 400  # unknowns up to which every view is tried
 LEAST_WAVES = 0.01  # px: of splines and steps, counting as one observation
@@ -61,6 +62,9 @@ class PriorTest:
     odd: BoolArray  # (N,) views whose camera alone explains the corrections. More than one: any of them would
     # standard deviation of the drift's coefficients in use, degree by degree [m]
     drift_sigma: tuple[float, ...]
+    shared: float = (
+        1.0  # by how much standard deviations that RPCs state were widened, as all views share what is off
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +106,22 @@ class Variances:
     learn_constant: bool  # whether the constants' standard deviations may change
     learn_drift: bool
     cautious: bool  # rather too wide than too narrow: no control holds the scene
+    stated: BoolArray | None = None  # (N,) views whose RPCs state what counts here; None: none does
 
     @classmethod
-    def of(cls, given: CameraPrior, unknowns: Unknowns, options: AdjustOptions, control: bool) -> Variances:
+    def of(
+        cls,
+        given: CameraPrior,
+        unknowns: Unknowns,
+        options: AdjustOptions,
+        control: bool,
+        views: Sequence[View] = (),
+    ) -> Variances:
         """What the options leave to be learnt, with control points or without."""
         geometric = unknowns.geometric and options.learn_priors
-        return cls(given, unknowns, geometric, geometric and options.sigma_drift is None, not control)
+        own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
+        stated = np.array([states_accuracy(view) for view in views]) if own else None
+        return cls(given, unknowns, geometric, geometric and options.sigma_drift is None, not control, stated)
 
     @property
     def constants(self) -> int:
@@ -146,6 +160,7 @@ class Variances:
         known = self._known(covariance, prior if around.small else now, exact)
         total, freedom = (float(part.sum()) for part in self._squares(params, known))
         ratio = total / freedom if freedom > _LEAST else float("nan")
+        shared = self._shared(params, known)
         stands = not self.learn_drift
         for _ in range(2 * _ITERATIONS):
             before = prior
@@ -154,19 +169,39 @@ class Variances:
             wide = self._drift(params, known) if self.learn_drift else wide
             prior = self._prior(scale, wide)
             # a drift that is larger than thought looks like constants that are: it is learnt before they are asked
-            last, least = (before, _STANDS) if around.small else (now, SAME_PRIOR)
+            last, least = (before, STANDS) if around.small else (now, SAME_PRIOR)
             stands |= same_prior(prior, last, least, self._of_drift)
             if stands and self.learn_constant and self._too_large(params, known, scale):
                 scale, odd = self._widened(around, params, known, wide)
                 prior = self._prior(scale, wide)
-            if not around.small or same_prior(prior, before, _STANDS):
+            if not around.small or same_prior(prior, before, STANDS):
                 break
             _, params, covariance = around.under(prior)
             known = self._known(covariance, prior)
         drift = tuple(
             float(np.median(prior.sigma[:, self._drift_part(d).start])) for d in range(self._degrees)
         )
-        return prior, PriorTest(ratio, freedom, scale, odd, drift)
+        sigma = prior.sigma.copy()
+        sigma[:, : self.constants] *= shared[:, None]
+        tested = PriorTest(ratio, freedom, scale, odd, drift, float(shared.max()))
+        return CameraPrior(prior.mean, sigma), tested
+
+    def _shared(self, params: Array, known: Array) -> Array:
+        """By how much views that state an accuracy are to be widened (N,), as they share the error that they state.
+
+        Views that were adjusted together agree: what each is off by, they all are. Independent errors would leave
+        them as large a part of the variance stated as their corrections show, at most. The rest does not average:
+        n views of two unknowns (rotation, translation) a direction would tell the place sqrt(n / 2) times too well.
+        """
+        wider = np.ones(len(params))
+        if self.stated is None or not self.learn_constant:
+            return wider
+        squares, freedom = (part[self.stated].sum() for part in self._squares(params, known))
+        if freedom > _LEAST:
+            alone = min(float(squares / (2.0 * gammaincinv(0.5 * freedom, _UNEXPECTED))), 1.0)
+            count = np.count_nonzero(known[self.stated, : self.constants].any(axis=1))
+            wider[self.stated] = np.sqrt(max(alone + (1.0 - alone) * count * 3.0 / self.constants, 1.0))
+        return wider
 
     @property
     def learn_waves(self) -> bool:

@@ -13,7 +13,7 @@ import pytest
 
 from barpc.ba import ground as on_points
 from barpc.ba.cameras import Cameras
-from barpc.ba.ground import flat_heights, ground_control, reference_control, terrain_heights
+from barpc.ba.ground import flat_heights, ground_control, reference_control, staying, terrain_heights
 from barpc.ba.priors import CameraPrior, JointPrior, PointPrior
 from barpc.ba.unknowns import make_unknowns
 from barpc.ba.waves import Waves
@@ -127,6 +127,7 @@ def _point_priors():
             points, index, lambda lon, lat: 100.0 + 800.0 * (lon - 5.4) + 300.0 * (lat - 43), 3.0, 0.0
         ),
         "flat_heights": flat_heights(points, index, 210.0, 20.0, 0.0),
+        "staying": staying(points + [30.0, 40.0, 50.0], index),
         "with a common error": flat_heights(points, index, 210.0, 20.0, 7.0),
     }
 

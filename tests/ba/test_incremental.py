@@ -11,7 +11,7 @@ import pytest
 import scipy.sparse as sp
 
 from barpc.ba.incremental import BlockPrior, apply_prior, block_prior
-from barpc.ba.priors import CameraPrior
+from barpc.ba.priors import CameraPrior, EarlierScene
 from barpc.errors import InputError
 from barpc.simulate import simulate_block
 from tests.ba.conftest import solve
@@ -67,6 +67,32 @@ def test_swings_are_read_as_they_were_written_and_a_new_view_has_none(tmp_path) 
     for damaged in (periods[:1], periods[0], -periods, periods * np.nan):
         replace(prior_of(), periods=damaged).save(tmp_path / "prior.npz")
         with pytest.raises(InputError, match="not the prior of an adjusted block"):
+            BlockPrior.load(tmp_path / "prior.npz")
+
+
+def test_a_scene_is_read_as_it_was_written_and_a_damaged_one_is_refused(tmp_path) -> None:
+    rng = np.random.default_rng(1)
+    scene = EarlierScene(rng.normal(size=(10, 6)), np.eye(10), 300.0)
+    replace(prior_of(), scene=scene).save(tmp_path / "prior.npz")
+    found = BlockPrior.load(tmp_path / "prior.npz").scene
+    assert found is not None
+    np.testing.assert_array_equal(found.by_unknown, scene.by_unknown)
+    np.testing.assert_array_equal(found.own, scene.own)
+    assert found.radius == 300.0
+    wrong = [
+        replace(scene, by_unknown=scene.by_unknown[:7]),
+        replace(scene, by_unknown=scene.by_unknown[:, :5]),
+        replace(scene, by_unknown=scene.by_unknown * np.nan),
+        replace(scene, own=scene.own[:7]),
+        replace(scene, own=scene.own.astype(int)),
+        replace(scene, own=scene.own * 1e101),
+        *(replace(scene, radius=radius) for radius in (0.0, -1.0, np.nan, np.inf)),
+        replace(scene, radius=np.ones(2)),
+        replace(scene, radius="wide"),
+    ]
+    for damaged in wrong:
+        replace(prior_of(), scene=damaged).save(tmp_path / "prior.npz")
+        with pytest.raises(InputError, match=r"prior\.npz: not the prior of an adjusted block"):
             BlockPrior.load(tmp_path / "prior.npz")
 
 

@@ -276,22 +276,19 @@ def test_a_track_that_one_view_sees_is_weak_and_one_that_none_sees_is_none(made)
     assert np.setdiff1d(np.arange(150), heights.tracks).tolist() == [8]
 
 
-@pytest.mark.parametrize("kept", [1.0, 0.993, 0.985, 0.5])
+@pytest.mark.parametrize("kept", [1.0, 0.993, 0.5])
 def test_the_scenes_move_is_from_where_the_delivered_cameras_put_what_is_seen_now(made, kept: float) -> None:
-    """Where much was cut, what it was cut for is mended before: its places are those of the adjusted cameras."""
+    """What was cut is mended before: places are those of the adjusted cameras."""
     given = uneven(made)
     options = AdjustOptions(drift=0)
     block = join(given.views, given.tracks, None, options)
     problem = make_problem(block, options, centers_of(made), None)
-    state, _ = first_state(problem, block, options, None)
+    state, heights = first_state(problem, block, options, None)
     params = np.random.default_rng(1).normal(0, 3, (3, 6))
     final = replace(state, params=params, points=state.points + 5.0)
     inlier = np.arange(len(block.view)) < kept * len(block.view)
     outcome: Any = SimpleNamespace(inlier=inlier, minimum=SimpleNamespace(state=final))
-    found = Solution(problem, state, None, None, outcome, None, None, None).first_points(block)  # type: ignore[arg-type]
-    if kept > 0.99:
-        np.testing.assert_array_equal(found, state.points)
-        return
+    found = Solution(problem, state, None, heights, outcome, None, None, None).first_points(block)  # type: ignore[arg-type]
     sensors = problem.cameras.unknowns.corrected(params, given.views)
     ground = ground_from_ecef(final.points)
     seen = np.array(

@@ -228,7 +228,9 @@ def passes(
             self.passes, self.noise, self.robust, self.is_known = 0, noise[0], options.loss != "linear", True
             self.heights: Any = SimpleNamespace(hold=lambda problem, points: problem)
             self.observations: Any = SimpleNamespace(sigma=np.ones(10_000))
-            self.variances: Any = SimpleNamespace(learnt=lambda *_: (learnt(self.passes), "tested"))
+            self.variances: Any = SimpleNamespace(
+                learnt=lambda *_: (learnt(self.passes), SimpleNamespace(shared=1.0))
+            )
             self.smooth: Any = SimpleNamespace(test_neighbours=lambda *_: "smooth")
             self.residual = self.weight = np.zeros(1)
             self.found = found

@@ -54,9 +54,10 @@ class ModeEntry(Record):
     """A motion of the scene that the images cannot tell."""
 
     sigma_m: Number = said("Posterior standard deviation", "m")
-    meaning: str = said("Its largest motion", enum=list(_MODE_WORDS))
+    meaning: str = said("Which motion", enum=list(_MODE_WORDS))
     motion_m: tuple[Number, ...] = said(
-        "East, north, up; tilts, turn, scale at the edge; twist and bending, from the lowest to the highest place",
+        "All motions where this one is off by that: east, north, up; tilts, turn, scale at the edge; twist and "
+        "bending, from the lowest to the highest place",
         "m",
         minItems=7,
         maxItems=len(MOTIONS),
