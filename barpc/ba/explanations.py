@@ -21,14 +21,16 @@ from barpc.sensor.splined import swing as waves_of
 
 STRIP = "strip"
 FADE = "fade"
+SETTLING = "settling"
 WANDER = "wander"
 SWING = "swing"
 MOVING = "moving"
 LOCAL = STRIP, FADE
 """Those of a part of an image."""
-FOLLOWED = *LOCAL, SWING
+FOLLOWED = *LOCAL, SETTLING, SWING
 """Those that the adjustment follows; others may be beside them."""
 _LENGTHS = 2.0 ** np.arange(-4.0, 1.0)  # of an interval: over what it may fade
+_SETTLING = 2.0 ** np.arange(-7.0, -1.0)  # of an image, the same at its end
 _A_BIN = 5  # places of a bin at which a curve is looked at
 _SPLINES = 14  # over the rows of an image, where it holds so many
 _WANDER = 0.5  # px
@@ -47,6 +49,7 @@ class Explanation:
     price: float  # of the choice among places and sizes [nats]
     where: Where | None = None
     period: float | None = None  # after which it repeats itself [px]
+    parts: tuple[Explanation, ...] = field(default=(), repr=False)  # one a view, where it is of all
     group: Group | None = field(default=None, repr=False)
 
 
@@ -98,7 +101,7 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
 
 def _untouched(seen: Seen, one: Explanation) -> float:
     """The cost of the same tracks without it: others may be touched by another."""
-    nothing = np.full(2, 1e18)
+    nothing = np.full(len(one.sigma), 1e18)
     return first_guess(seen.few, seen.base, seen.extra, one.extra, nothing)[2]
 
 
@@ -111,10 +114,36 @@ def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Expl
     return Explanation(kind, view, extra, np.full(2, sigma), cost, where)
 
 
+def settling(seen: Seen, _interval: Interval) -> list[Explanation]:
+    """Rows at the beginning, or the end, of all images that lie off, each by its own, and less and less from there.
+
+    So does a satellite that settles after it has turned, before every image.
+    """
+    shapes = [sign / length for sign in (1.0, -1.0) for length in _SETTLING * float(np.median(seen.size[1]))]
+    tried = [_settling(seen, rate, _STRIP) for rate in shapes]
+    costs = [
+        first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2] - _untouched(seen, one)
+        for one in tried
+    ]
+    return [tried[int(np.argmin(costs))]]
+
+
+def _settling(seen: Seen, rate: float, sigma: float) -> Explanation:
+    parts = []
+    for v, size in enumerate(seen.size[1].tolist()):
+        where = (1, *_open_ended(0.0, size, size), 0.0 if rate > 0.0 else size, rate)
+        parts.append(_local(FADE, seen, v, where, sigma))
+    extra = np.concatenate([part.extra for part in parts], axis=1)
+    cost, where = float(np.log(2.0)) + 2.0 * SCALE, (1, -np.inf, np.inf, 0.0, rate)
+    return Explanation(SETTLING, -1, extra, np.full(extra.shape[1], sigma), cost, where, parts=tuple(parts))
+
+
 def bent(seen: Seen, one: Explanation) -> Explanation:
     """What fades, and two unknowns beside its own: what a change of the rate, as a logarithm, does to it."""
     assert one.where is not None
     _, _, _, origin, rate = one.where
+    if one.parts and rate < 0.0:
+        origin = seen.size[1, seen.linear.view]
     slope = -one.extra * np.maximum((seen.place[1] - origin) * rate, 0.0)
     return replace(one, extra=np.concatenate([one.extra, slope], axis=1), sigma=np.tile(one.sigma, 2))
 
@@ -122,7 +151,7 @@ def bent(seen: Seen, one: Explanation) -> Explanation:
 def faster(one: Explanation, found: Fit) -> Explanation:
     """What fades with the rate that a fit of it `bent` asks for, by e at most; only `where` is new."""
     assert one.where is not None
-    moved, slope = np.split(found.extra[-4:], 2)
+    moved, slope = np.split(found.extra[-2 * len(one.sigma) :], 2)
     step = float(np.clip(moved @ slope / max(float(moved @ moved), 1e-30), -1.0, 1.0))
     return replace(one, where=(*one.where[:4], one.where[4] * float(np.exp(step))))
 
@@ -136,6 +165,8 @@ def sharpened(seen: Seen, one: Explanation, found: Fit, others: Array) -> Explan
     sigma = float(np.clip(np.sqrt((moved**2).mean()), _STRIP / 30.0, _STRIP * 30.0))
     if one.where is None:
         return replace(one, sigma=np.full(len(moved), sigma))
+    if one.parts:
+        return _settling(seen, one.where[4], sigma)
     axis = one.where[0]
     rows = np.flatnonzero((seen.linear.view == one.view) & (found.right + 1.0 > 0.0))
     rows = rows[np.argsort(seen.place[axis, rows], kind="stable")]
@@ -239,11 +270,12 @@ def group(seen: Seen, _interval: Interval) -> list[Explanation]:
 EXPLANATIONS: dict[str, Callable[[Seen, Interval], list[Explanation]]] = {
     STRIP: strip,
     FADE: fade,
+    SETTLING: settling,
     WANDER: wander,
     MOVING: group,
 }
 """Name -> unknowns, proposed where an interval of an image stands out; `SWING` is, where a period does."""
-_OF_BLOCK = (MOVING,)
+_OF_BLOCK = (MOVING, SETTLING)
 
 
 def proposed(

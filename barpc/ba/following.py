@@ -8,7 +8,7 @@ import numpy as np
 
 from barpc.ba.block import Block
 from barpc.ba.detectors import find_edges
-from barpc.ba.explanations import FOLLOWED, LOCAL, SWING
+from barpc.ba.explanations import FOLLOWED, LOCAL, SETTLING, SWING
 from barpc.ba.heldout import is_better
 from barpc.ba.judge import Finding, Judgement, standing_out
 from barpc.ba.rounds import Rounds, revived
@@ -84,7 +84,7 @@ def _waves_of(parts: list[Finding], views: int) -> tuple[Waves, Array]:
     """The unknowns in the image that explanations are, and what these found (N, size)."""
     own = [
         [[one for one in parts if one.view == v and one.kind in kinds] for v in range(views)]
-        for kinds in (LOCAL, (SWING,))
+        for kinds in ((*LOCAL, SETTLING), (SWING,))
     ]
     most = [max(map(len, of_kind)) for of_kind in own]
     places, periods = np.full((views, most[0], 5), np.inf), np.full((views, most[1]), np.inf)

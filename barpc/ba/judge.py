@@ -14,6 +14,7 @@ from barpc.ba.explanations import (
     FOLLOWED,
     LOCAL,
     MOVING,
+    SETTLING,
     SWING,
     WANDER,
     Explanation,
@@ -249,7 +250,7 @@ class _Search:
         taken = [row if row.gap > 0.0 else replace(row, gap=margin) for row in best.taken]
         followed = sum(row.one.kind in FOLLOWED for row in taken)
         base = best.seen.base if followed == len(taken) else best.followed
-        found = tuple(_said(taken, n, best.seen) for n in range(len(taken)))
+        found = tuple(one for n in range(len(taken)) for one in _said(taken, n, best.seen))
         return Judgement(found, base.step, base.right)
 
     def _grown(self, states: list[_State]) -> tuple[list[_State], bool]:
@@ -298,7 +299,7 @@ class _Search:
         blunt = max(SURE, made[0][2] / _PARTS) if made and made[0][2] > SURE else -np.inf
         sharp = [
             self._sharpened(one, found)
-            if gain > blunt and (one in local or one.kind in (SWING, WANDER))
+            if gain > blunt and (one in local or one.kind in (SETTLING, SWING, WANDER))
             else (one, found)
             for one, found, gain in made
         ]
@@ -352,7 +353,9 @@ class _Search:
     def _sharpened(self, one: Explanation, found: Fit) -> tuple[Explanation, Fit]:
         for _ in range(_SHARPENED):
             others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
-            tried = [one, faster(one, self._fit(bent(self.seen, one)))] if one.kind == FADE else [one]
+            tried = (
+                [one, faster(one, self._fit(bent(self.seen, one)))] if one.kind in (FADE, SETTLING) else [one]
+            )
             again = [sharpened(self.seen, shape, found, others) for shape in tried]
             better, made = max(
                 ((self._fit(shape), shape) for shape in again), key=lambda row: row[0].evidence
@@ -376,11 +379,15 @@ def _amplitude(unknowns: Array) -> Array:
     return size
 
 
-def _said(rows: list[_Taken], n: int, seen: Seen) -> Finding:
+def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
     taken, one = rows[n], rows[n].one
     start = sum(len(row.one.sigma) for row in rows[:n])
     size = unknowns = seen.base.extra[start : start + len(one.sigma)]
     moved = None
+    for part, own in zip(one.parts, np.split(unknowns, len(one.parts)) if one.parts else (), strict=True):
+        yield Finding(SETTLING, part.view, part.where, own, taken.gain, taken.gap, taken.runner_up, own)
+    if one.parts:
+        return
     if one.group is not None:
         size, moved = np.zeros(2), group_of(seen.linear, seen.ground, one.group, seen.base)
     elif one.kind == SWING:
@@ -389,7 +396,7 @@ def _said(rows: list[_Taken], n: int, seen: Seen) -> Finding:
         of_view = seen.linear.view == one.view
         size = np.sqrt((np.einsum("cek,e->ck", one.extra[:, :, of_view], unknowns) ** 2).mean(axis=1))
     said = taken.gain, taken.gap, taken.runner_up, unknowns, one.period, taken.or_of
-    return Finding(one.kind, one.view, one.where, size, *said, moved)
+    yield Finding(one.kind, one.view, one.where, size, *said, moved)
 
 
 def _rival(tried: list[_Tried]) -> list[int]:
@@ -422,7 +429,7 @@ def _of_one_image(one: Explanation, other: Explanation) -> bool:
 
 def _part(one: Explanation, seen: Seen) -> float:
     """The part of its image that it moves: of two that explain as much it is the smaller one."""
-    rows = seen.linear.view == one.view
+    rows = (seen.linear.view == one.view) | (one.view < 0)
     return float(one.extra[:, :, rows].any(axis=(0, 1)).sum() / max(rows.sum(), 1))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.explanations import FADE, LOCAL, STRIP, SWING, WANDER
+from barpc.ba.explanations import FADE, LOCAL, SETTLING, STRIP, SWING, WANDER
 from barpc.scene import Tracks
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.splined import Splined
@@ -102,6 +102,28 @@ def test_what_fades_is_named_with_its_length() -> None:
     rows = block.views[1].size[1]
     assert 1.0 / found.findings[0].where[4] == pytest.approx(0.05 * rows, rel=0.25)
     assert np.hypot(*found.findings[0].size) == pytest.approx(4.0, rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [0.0, 1.0], ids=["beginning", "end"])
+def test_all_images_that_settle_are_explained_together(first: float) -> None:
+    """All see the same ground there: their ties agree with each other, as if it moved."""
+    block = simulate_block(4, 1500, seed=2, attitude=10e-6, position=2.0)
+    rows = block.views[0].size[1]
+    away = np.abs(block.tracks.xy[:, 1] / rows - first)
+    angle = np.array([0.3, 1.9, 3.7, 5.2])[block.tracks.view]
+    moved = 8.0 * np.exp(-away / 0.02) * np.array([np.cos(angle), np.sin(angle)])
+    found = adjusted(block, replace(block.tracks, xy=block.tracks.xy + moved.T))
+    assert [one.kind for one in found.findings] == [SETTLING] * 4
+    assert sorted(one.view for one in found.findings) == [0, 1, 2, 3]
+    for one in found.findings:
+        assert one.where is not None
+        rate = 1.0 / (0.02 * rows)
+        assert one.where[4] == pytest.approx(rate if first == 0.0 else -rate, rel=0.1)
+    near = (away < 0.1) & ~found.held_out
+    assert found.inlier[near].mean() > 0.9  # of all that were displaced
+    assert np.median(np.hypot(*found.residuals[near].T)) < 0.12
+    assert not found.moving.any()
 
 
 def swung(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.apart import APART, Apart
-from barpc.ba.explanations import EXPLANATIONS, FADE, MOVING, STRIP, SWING, WANDER
+from barpc.ba.explanations import EXPLANATIONS, FADE, MOVING, SETTLING, STRIP, SWING, WANDER
 from barpc.ba.judge import Finding
 from barpc.ba.moving import Motion
 from barpc.ba.placing import Look
@@ -83,6 +83,18 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
     assert (found.image, found.period, found.first) == ("east", 199.6, None)
     assert found.or_of == (tuple(names[v] for v in or_of) or None)
     assert found.size_px == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("rate", "end"), [(0.01, "beginning"), (-0.01, "end")])
+def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
+    places = (1, -6000.0, 12000.0, 0.0, rate), (1, -3000.0, 6000.0, 0.0, rate)
+    sizes = np.array([3.0, 4.0]), np.array([0.0, 1.0])
+    each = [Finding(SETTLING, v, places[v], sizes[v], 90.0, 40.0, "moving", sizes[v]) for v in (0, 1)]
+    (entry,) = explanations(adjustment(findings=each))
+    assert entry.sentence == (
+        f"rows at the {end} of all images lie off, by up to 5.00 px, which fades within 100 rows"
+    )
+    assert (entry.image, entry.gain, entry.runner_up, entry.size_px) == (None, 90.0, "moving", 5.0)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.apart import APART, Apart
-from barpc.ba.explanations import FADE, MOVING, STRIP, SWING, WANDER
+from barpc.ba.explanations import FADE, MOVING, SETTLING, STRIP, SWING, WANDER
 from barpc.ba.judge import Finding
 from barpc.ba.moving import Motion
 from barpc.ba.places import Place
@@ -21,6 +21,7 @@ AXES = "columns", "rows"
 _WORDS = {
     STRIP: "{axis} {first:.0f}-{last:.0f} of {image} lie {size:.2f} px off the rest of it",
     FADE: "rows of {image} lie {size:.2f} px off at row {origin:.0f}, which fades within {length:.0f} rows",
+    SETTLING: "rows at the {end} of all images lie off, by up to {size:.2f} px, which fades within {length:.0f} rows",
     WANDER: "rows of {image} wander by {size:.2f} px",
     SWING: "rows of {image} swing by {least}{size:.2f} px every {period:.0f} rows",
     MOVING: "{share} % of the tie points{side} move together (a cloud, water or shadows?), by {metres} from {first} to "
@@ -29,6 +30,7 @@ _WORDS = {
 RIVALS = {
     STRIP: "rows or columns of an image lie off",
     FADE: "rows of an image lie off and less and less",
+    SETTLING: "rows at an end of all images lie off and less and less",
     WANDER: "rows of an image wander",
     SWING: "rows of an image swing",
     MOVING: "tie points move together",
@@ -100,9 +102,13 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
         )
         sentence = f"{what.format(image)} not its own: {strangeness(apart)}"
         found.append(ExplanationEntry(APART, sentence, image, apart.gain, apart.gap, other))
+    settling = [one for one in adjustment.findings if one.kind == SETTLING]
     for one in adjustment.findings:
         if one.motion is not None:
             found.append(_moving(one, one.motion, adjustment.names))
+            continue
+        if one.kind == SETTLING:
+            found += [_settling(settling)] if one is settling[0] else []
             continue
         image, size = adjustment.names[one.view], float(np.hypot(*one.size))
         others = tuple(adjustment.names[v] for v in one.or_of)
@@ -137,6 +143,17 @@ def strangeness(apart: Apart) -> str:
     return (
         f"{part} of its tie points contradict those of the other images, wherever it is moved or turned to, and these "
         f"agree without it{where}"
+    )
+
+
+def _settling(findings: Sequence[Finding]) -> ExplanationEntry:
+    one = findings[0]
+    assert one.where is not None
+    rate, size = one.where[4], max(float(np.hypot(*each.size)) for each in findings)
+    end = "beginning" if rate > 0.0 else "end"
+    sentence = _WORDS[SETTLING].format(end=end, size=size, length=1.0 / max(abs(rate), 1e-9))
+    return ExplanationEntry(
+        SETTLING, sentence, None, one.gain, one.gap, one.runner_up or None, AXES[1], size_px=size
     )
 
 
