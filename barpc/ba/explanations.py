@@ -289,8 +289,19 @@ def proposed(
     known = set[tuple[object, ...]]()
     for interval in intervals:
         for kind in [kind for kind in EXPLANATIONS if kind not in known_kinds]:
+            if kind == SETTLING and not _at_one_end(seen, intervals):
+                continue
             place = (interval.axis, interval.start, interval.stop) if kind in LOCAL else ()
             place = () if kind in _OF_BLOCK else (interval.view, *place)
             if (kind, *place) not in known:
                 known.add((kind, *place))
                 yield from EXPLANATIONS[kind](seen, interval)
+
+
+def _at_one_end(seen: Seen, intervals: list[Interval]) -> bool:
+    """Whether all that stands out is where images begin, or all where they end: what wanders is seen all over."""
+    at_end = [
+        (one.start <= 0.0, one.stop >= seen.size[1, one.view]) if one.axis == 1 else (False, False)
+        for one in intervals
+    ]
+    return any(map(all, zip(*at_end, strict=True)))
