@@ -208,7 +208,7 @@ class _Search:
             scale = (1.0, 3.0)[trial % 2]
             for _ in range(2):
                 squared = _evidence(self.offsets, mask[None], scale)[1][0]
-                mask = (squared < _NEAR) & among | (mask & (squared < _NEAR))
+                mask = among & (squared < _NEAR)
             if mask.any():
                 yield mask
 
