@@ -93,6 +93,12 @@ def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]
 
     A mean below `floor` [px] is none.
     """
+    if floor not in outcome.standing_out:
+        outcome.standing_out[floor] = _standing_out(outcome, block, floor)
+    return outcome.standing_out[floor]
+
+
+def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
     rows, off = _whitened(outcome, block)
     wrong = (~outcome.inlier[rows]).astype(np.float64)
     pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
@@ -126,8 +132,7 @@ def swinging(outcome: Outcome, block: Block) -> list[Swing]:
     """Periods with which the rows of images swing more than chance allows, one of each at most."""
     rows, off = _whitened(outcome, block)
     right = outcome.inlier[rows].astype(np.float64)
-    found = swings(block.view[rows], block.xy[1, rows], _sizes(block), right, off)
-    return [one for one in found if one.gain > SURE]
+    return swings(block.view[rows], block.xy[1, rows], _sizes(block), right, off)
 
 
 def _whitened(outcome: Outcome, block: Block) -> tuple[BoolArray, Array]:
@@ -283,7 +288,7 @@ class _Search:
         )
         wrong, off = (1.0 - seen.base.right)[rows], settled(linear, left, seen.base)[:, rows]
         view, place = linear.view[rows], seen.place[:, rows]
-        periods = [one for one in swings(view, place[1], seen.size, 1.0 - wrong, off) if one.gain > SURE]
+        periods = swings(view, place[1], seen.size, 1.0 - wrong, off)
         floor = self.floor / self.sigma / seen.base.noise
         out = scan(view, place, seen.size, wrong, off, floor)
         out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]

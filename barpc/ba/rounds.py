@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from barpc.ba.cameras import Projected
 from barpc.ba.ground import Heights
 from barpc.ba.problem import Problem
 from barpc.ba.resembling import Resemblance
+from barpc.ba.scan import Interval
 from barpc.ba.smooth import TERMS, Fit, Smooth, SmoothTest
 from barpc.ba.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
 from barpc.ba.variances import SAME_PRIOR, STANDS, PriorTest, Variances, same_prior
@@ -53,6 +54,8 @@ class Outcome:
     passes: int  # rounds of cutting
     prior: PriorTest  # how the corrections compare with the priors given, and what the priors became
     smooth: SmoothTest  # what is smooth in the residuals that are left
+    # floor [px] -> intervals of images that stand out there, once they were looked for
+    standing_out: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
 
 
 class Rounds:
