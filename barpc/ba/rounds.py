@@ -94,6 +94,7 @@ class Rounds:
         self.projected = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
         self.misfit: Array | float = 0.0
+        self.scatter: Array | None = None  # residuals without smooth parts, where they are known
         self.weight = self.counted
 
     def run(self, once: bool = False) -> Outcome:
@@ -127,6 +128,7 @@ class Rounds:
         if self.robust and self.passes and many_cut:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = revived(self.problem, self.state, self.residual, self.use, weight)
+            self.scatter = None
         self.problem = self.heights.hold(self.problem, self.state.points)
         self.passes += 1
         self._cut()
@@ -161,7 +163,8 @@ class Rounds:
     def _cut(self) -> None:
         """Choose what is used by the residuals that scatter."""
         if self.robust:
-            s = self.observations.squared(self._scatter(), self.use.astype(np.float64))
+            scatter = self._scatter() if self.scatter is None else self.scatter
+            s = self.observations.squared(scatter, self.use.astype(np.float64))
             near = self.observations.is_near(s, self.options.robust_threshold * self.noise)
             self.use = self.observations.tied(self.everything & near)
 
@@ -185,7 +188,8 @@ class Rounds:
         tested = self.smooth.test(self.residual, self.use, fit)
         if self.robust:
             fitted = 2 * TERMS * len(fit)
-            self.noise = self.observations.noise(self._scatter(fit), self.use, self.problem, fitted)
+            self.scatter = self._scatter(fit)
+            self.noise = self.observations.noise(self.scatter, self.use, self.problem, fitted)
             self.misfit = tested.rms
         else:
             self.noise = self.observations.noise(self.residual, self.use, self.problem)

@@ -32,8 +32,8 @@ _TREND = 0.03  # px: another model is tried
 MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
-_STEPS_BACK = 3  # to the delivered cameras: kilometres away, what is left is below a micrometre
-_STANDS = 0.5  # m: what is left after a step from so near is below a micrometre
+_STEPS_BACK = 3  # to the delivered cameras, at most: kilometres away, what is left is below a micrometre
+_STANDS = 30.0  # m: what is left after a step from so near is below a millimetre
 _BETTER = 0.8  # of the noise
 
 
