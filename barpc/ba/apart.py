@@ -128,7 +128,9 @@ def find_apart(
     left: list[_Left] = []
     for one in _agreeing(views, block, outer, options, solve):
         left.append(one)
-        if one.strange and num > _TELLING:  # those that agree without it contradict it in any block with it
+        if (
+            num > _TELLING
+        ):  # those that agree without it contradict it, as far as it is wrong, in any block with it
             break
     if odd is not None and first is not None:
         return _by_prior(left, float(first.outcome.prior.scale[odd]), block)

@@ -154,8 +154,8 @@ def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
     """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out."""
     if outcome.problem.free.size > UNKNOWNS:
         return Judgement()
-    first = standing_out(outcome, block, floor)
-    found = around(outcome, block) if first or swinging(outcome, block) else None
+    asks = standing_out(outcome, block, floor) or swinging(outcome, block)
+    found = around(outcome, block) if asks else None
     if found is None:
         return Judgement()
     linear, state = found
@@ -163,7 +163,7 @@ def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
     try:
         base, few = fit(linear), linear.thinned(_FEW)
         seen = Seen(linear, few, ground, block.xy, _sizes(block), base, nothing, np.zeros(0))
-        return _Search(seen, first, floor, float(np.median(block.sigma))).run()
+        return _Search(seen, floor, float(np.median(block.sigma))).run()
     except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
         _LOG.warning("what explains the tie points is not judged: %s", error)
         return Judgement()
@@ -239,9 +239,9 @@ class _State:
 class _Search:
     """Taking one explanation after the other, of the best and of its rival."""
 
-    def __init__(self, seen: Seen, first: list[Interval], floor: float, sigma: float) -> None:
-        self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
-        self.seen, self.taken = seen, tuple[_Taken, ...]()
+    def __init__(self, seen: Seen, floor: float, sigma: float) -> None:
+        self.start, self.floor, self.sigma = seen, floor, sigma  # [px]
+        self.seen = seen
         self.group: list[Explanation] = []  # looked for once
 
     def run(self) -> Judgement:
@@ -265,7 +265,7 @@ class _Search:
             if state.ended or (best.ended and not state.may_pass(best)):
                 grown.append(state)
                 continue
-            self.seen, self.taken = state.seen, state.taken
+            self.seen = state.seen
             tried = [row for row in self._tried() if row[2] > SURE]
             if not tried and state is best:  # it explains all
                 return states, True
@@ -291,8 +291,7 @@ class _Search:
         periods = swings(view, place[1], seen.size, 1.0 - wrong, off)
         floor = self.floor / self.sigma / seen.base.noise
         out = scan(view, place, seen.size, wrong, off, floor)
-        out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
-        out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
+        out = _distinct([one for one in out if one.gain > SURE])[:_TRIED]
         offered = self._worth_more(self._proposed(out, periods[:_TRIED]))
         made = self._with([], offered)
         sure = [row for row in made if row[0].group and row[2] > SURE]
