@@ -229,7 +229,7 @@ def _evidence(left: _Left, block: Block) -> float:
     size = np.array([view.size for view in block.views], dtype=np.float64)
     area = float(np.median(size.prod(axis=1)) / np.median(block.sigma) ** 2)
     problem = replace(left.found.outcome.problem, camera_prior=left.found.problem.camera_prior)  # as stated
-    known = around(replace(left.found.outcome, problem=problem), left.block)
+    known = around(replace(left.found.outcome, problem=problem), left.block, np.arange(len(left.block.views)))
     if known is None:
         return -ties * float(np.log(area))
     linear, _ = known

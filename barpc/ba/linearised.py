@@ -80,11 +80,31 @@ class Linear:
     offset: Array  # (N q,) unknowns at the state, less the priors' means
     area: float  # in which a wrong match may lie
     image: float  # of an image
+    choices: int  # views of the block of which these were chosen
 
     @property
     def views(self) -> int:
         """N."""
         return self.shape[0]
+
+    def among(self, views: IntArray) -> Linear:
+        """The same with its own tracks' views (n,) only, counted anew; observations of others are left out."""
+        number, index = np.full(self.views, -1), np.full(len(self.view), -1)
+        number[views] = np.arange(len(views))
+        rows = np.flatnonzero(number[self.view] >= 0)
+        index[rows] = np.arange(len(rows))
+        tracks = tuple(replace(one, rows=index[one.rows], view=number[one.view]) for one in self.tracks)
+        return replace(
+            self,
+            view=number[self.view[rows]],
+            residual=self.residual[:, rows],
+            by_unknown=self.by_unknown[..., rows],
+            sigma=self.sigma[rows],
+            tracks=tracks,
+            shape=(len(views), self.shape[1]),
+            precision=self.precision.reshape(self.shape)[views].ravel(),
+            offset=self.offset.reshape(self.shape)[views].ravel(),
+        )
 
     @cached_property
     def pairs(self) -> Pairs:
@@ -177,6 +197,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         (state.params - prior.mean).ravel(),
         2.0 * far * max(2.0 * far, parallax),
         image,
+        structure.num_views,
     )
 
 

@@ -22,7 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from barpc.ba.linearised import Linear, Tracks
 from barpc.geodesy import Array
-from barpc.scene import IntArray
+from barpc.scene import BoolArray, IntArray
 
 _HOTTEST = 200.0  # times the noise stated, where it is cooled from: 20 px of 0.1
 _COOLED = 0.6  # from one iteration to the next, at most
@@ -34,6 +34,8 @@ WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before
 _EPS = 1e-3, 0.98
 _CHUNK = 8192  # pairs of observations worked on at a time, so that temporaries stay in cache
 _CHANGED = 0.1  # of what an unknown rests on: its curvature is summed anew
+_LOOSE = 1e-6  # of what all observations of a track tell of its place
+_TWO = 1.5  # observations: half of the next
 NEAR_LIMIT = (
     4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
 )
@@ -113,6 +115,30 @@ def settled(linear: Linear, residual: Array, fitted: Fit) -> Array:
         off = found.pull(tracks) / np.sqrt(np.maximum(free, 0.1))[:, None] / fitted.noise
         out[:, tracks.rows] = off.reshape(count, n, 2).transpose(2, 0, 1)
     return out
+
+
+def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array, BoolArray]:
+    """Residuals (2, K) of all observations once the ground points are where the right ones (K,) put them.
+
+    In standard deviations that they would have if all were right; and which (K,) have at least two right others.
+    """
+    out, known = np.zeros_like(residual), np.zeros(residual.shape[1], dtype=bool)
+    for tracks in linear.tracks:
+        count, n = tracks.rows.shape
+        ground = np.swapaxes(tracks.follow[:, :3], 1, 2)  # in units in which all observations know it alike
+        weight = right[tracks.rows]
+        weighted = np.swapaxes(ground * np.repeat(weight, 2, axis=1)[..., None], 1, 2)
+        matrix = weighted @ ground + _LOOSE * np.eye(3)
+        by_row = np.linalg.solve(matrix, np.swapaxes(ground, 1, 2))  # (T, 3, 2n)
+        values = tracks.of(residual)
+        left = values - (np.swapaxes(by_row, 1, 2) @ (weighted @ values[..., None]))[..., 0]
+        spread = 1.0 + (1.0 - 2.0 * np.repeat(weight, 2, axis=1)) * (np.swapaxes(ground, 1, 2) * by_row).sum(
+            axis=1
+        )
+        off = (left / np.sqrt(np.maximum(spread, 0.1))).reshape(count, n, 2)
+        out[:, tracks.rows] = off.transpose(2, 0, 1)
+        known[tracks.rows] = weight.sum(axis=1, keepdims=True) - weight > _TWO
+    return out, known
 
 
 def first_guess(

@@ -55,6 +55,10 @@ class Ground:
             return cls(center, np.nanmin(place, axis=1), np.nanmax(place, axis=1), place, by_ground)
         return cls(center, like.low, like.high, place, by_ground)
 
+    def part(self, rows: IntArray) -> Ground:
+        """Of some observations."""
+        return replace(self, place=self.place[:, rows], by_ground=self.by_ground[..., rows])
+
     @cached_property
     def pixel(self) -> float:
         """A pixel on the ground [m]."""

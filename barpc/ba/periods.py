@@ -51,8 +51,8 @@ def swings(
     Parameters
     ----------
     view, row : (K,), where observations are [px], in images of `size` (2, N)
-    right : (K,), probability that an observation is
-    off : (2, K), residuals in standard deviations; 0 of those that are wrong
+    right : (K,), weights; 0 of those that tell nothing
+    off : (2, K), residuals in standard deviations
     """
     views = size.shape[1]
     found = []
