@@ -258,3 +258,37 @@ def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.Monk
     found = adjusted(*flawed(3, 400, MIDDLE))
     assert not found.findings
     assert {one.view for one in found.left} == {1}  # and what stands out is still said
+
+
+@pytest.mark.slow
+def test_in_a_block_of_many_views_two_flaws_far_from_each_other_are_followed() -> None:
+    """More unknowns than all views may have together, so that explanations are tried on parts of the block."""
+    jump = {"view": 30, "axis": 1, "start": 0.5, "stop": 1.1, "px": 3.0}
+    block, tracks = flawed(60, 5000, jump, seed=2)
+    view, rows = tracks.view == 55, block.views[55].size[1]
+    swung = 0.8 * np.sin(2.0 * np.pi * 7.0 * tracks.xy[:, 1:] / rows) * np.array([0.6, 0.8])
+    given = replace(tracks, xy=tracks.xy + view[:, None] * swung)
+    found = adjusted(block, given)
+    assert {(one.kind in LOCAL, one.kind == SWING, one.view) for one in found.findings} == {
+        (True, False, 30), (False, True, 55),
+    }  # fmt: skip
+    by_kind = {one.kind == SWING: one for one in found.findings}
+    assert by_kind[True].period == pytest.approx(rows / 7.0, rel=0.01)
+    assert np.hypot(*by_kind[True].size) == pytest.approx(0.8, abs=0.05)
+    assert by_kind[False].where is not None
+    ends = np.array(by_kind[False].where[1:3]) / block.views[30].size[1]
+    assert np.abs(ends - 0.5).min() < 0.02
+    assert not found.left
+    assert found.inlier[np.isin(tracks.view, [30, 55]) & ~found.held_out].mean() > 0.95
+
+
+def test_the_crests_of_a_swing_that_were_cut_tell_of_it() -> None:
+    """Survivors of the cut lie where a swing of eight standard deviations is zero."""
+    block, tracks = flawed(5, 700, seed=3)
+    view, rows = tracks.view == 2, block.views[2].size[1]
+    swung = 0.8 * np.sin(2.0 * np.pi * 7.0 * tracks.xy[:, 1:] / rows) * np.array([0.6, 0.8])
+    found = adjusted(block, replace(tracks, xy=tracks.xy + view[:, None] * swung))
+    (one,) = found.findings
+    assert (one.kind, one.view) == (SWING, 2)
+    assert one.period == pytest.approx(rows / 7.0, rel=0.02)
+    assert found.inlier[view & ~found.held_out].mean() > 0.95
