@@ -280,15 +280,3 @@ def test_in_a_block_of_many_views_two_flaws_far_from_each_other_are_followed() -
     assert np.abs(ends - 0.5).min() < 0.02
     assert not found.left
     assert found.inlier[np.isin(tracks.view, [30, 55]) & ~found.held_out].mean() > 0.95
-
-
-def test_the_crests_of_a_swing_that_were_cut_tell_of_it() -> None:
-    """Survivors of the cut lie where a swing of eight standard deviations is zero."""
-    block, tracks = flawed(5, 700, seed=3)
-    view, rows = tracks.view == 2, block.views[2].size[1]
-    swung = 0.8 * np.sin(2.0 * np.pi * 7.0 * tracks.xy[:, 1:] / rows) * np.array([0.6, 0.8])
-    found = adjusted(block, replace(tracks, xy=tracks.xy + view[:, None] * swung))
-    (one,) = found.findings
-    assert (one.kind, one.view) == (SWING, 2)
-    assert one.period == pytest.approx(rows / 7.0, rel=0.02)
-    assert found.inlier[view & ~found.held_out].mean() > 0.95
