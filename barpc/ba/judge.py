@@ -192,10 +192,13 @@ def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray)
     rows, ground = np.flatnonzero(np.isin(block.view, views)), Ground.of(outcome.problem, state)
     linear, ground = linear.among(views), ground.part(rows)
     nothing, place = np.zeros((2, 0, len(rows))), block.xy[:, rows]
+    number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
+    number[views] = np.arange(len(views))
     try:
         base, few = fit(linear), linear.thinned(_FEW)
         seen = Seen(linear, few, ground, place, _sizes(block)[:, views], base, nothing, np.zeros(0))
-        return _Search(seen, floor, float(np.median(block.sigma))).run()
+        first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
+        return _Search(seen, first, floor, float(np.median(block.sigma))).run()
     except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
         _LOG.warning("what explains the tie points is not judged: %s", error)
         return Judgement()
@@ -298,9 +301,9 @@ class _State:
 class _Search:
     """Taking one explanation after the other, of the best and of its rival."""
 
-    def __init__(self, seen: Seen, floor: float, sigma: float) -> None:
-        self.start, self.floor, self.sigma = seen, floor, sigma  # [px]
-        self.seen = seen
+    def __init__(self, seen: Seen, first: list[Interval], floor: float, sigma: float) -> None:
+        self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma  # [px]
+        self.seen, self.taken = seen, tuple[_Taken, ...]()
         self.group: list[Explanation] = []  # looked for once
 
     def run(self) -> Judgement:
@@ -324,7 +327,7 @@ class _Search:
             if state.ended or (best.ended and not state.may_pass(best)):
                 grown.append(state)
                 continue
-            self.seen = state.seen
+            self.seen, self.taken = state.seen, state.taken
             tried = [row for row in self._tried() if row[2] > SURE]
             if not tried and state is best:  # it explains all
                 return states, True
@@ -353,7 +356,9 @@ class _Search:
         periods = swings(view, place[1], seen.size, told[rows].astype(np.float64), swung)
         floor = self.floor / self.sigma / seen.base.noise
         out = scan(view, place, seen.size, wrong, off, floor)
-        out = _distinct([one for one in out if one.gain > SURE])[:_TRIED]
+        # in a pair more wrong matches at an end explain what was cut there as well, and nothing stands out beside them
+        out = [one for one in out if one.gain > SURE] or ([] if self.taken else self.first)
+        out = _distinct(out)[:_TRIED]
         offered = self._worth_more(self._proposed(out, periods[:_TRIED]))
         made = self._with([], offered)
         sure = [row for row in made if row[0].group and row[2] > SURE]
