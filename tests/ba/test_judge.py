@@ -47,7 +47,7 @@ def adjusted(block: Block, tracks: Tracks, **options: Any) -> Adjustment:
 @cache
 def in_the_middle() -> tuple[Block, Tracks, Adjustment]:
     """A block of which rows in the middle of an image lie off, and its adjustment."""
-    block, tracks = flawed(3, 1500, MIDDLE)
+    block, tracks = flawed(3, 300, MIDDLE)
     return block, tracks, adjusted(block, tracks)
 
 
@@ -58,8 +58,11 @@ DETECTOR = {"view": 2, "axis": 0, "start": 0.25, "stop": 0.375, "px": 1.0}
 
 @pytest.mark.parametrize("where", rest_slow([MIDDLE, ROWS, DETECTOR]), ids=["middle", "end", "detector"])
 def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) -> None:
-    block, tracks = flawed(3, 1500, where)
-    found = in_the_middle()[2] if where is MIDDLE else adjusted(block, tracks)
+    if where is MIDDLE:
+        block, tracks, found = in_the_middle()
+    else:
+        block, tracks = flawed(3, 1500, where)
+        found = adjusted(block, tracks)
     one = found.findings[0]
     assert (one.kind, one.view) == (STRIP, where["view"])
     assert len(found.findings) == 1
@@ -200,7 +203,7 @@ def test_the_smaller_part_is_said_to_lie_off() -> None:
 
 
 @pytest.mark.parametrize("seed", rest_slow(range(8)))
-@pytest.mark.parametrize("outliers", [0.0, 0.1, 0.3])
+@pytest.mark.parametrize("outliers", rest_slow([0.1, 0.0, 0.3]))
 def test_nothing_is_found_where_nothing_is(seed: int, outliers: float) -> None:
     block, tracks = flawed(2 + seed % 3, 800, seed=100 + seed, outliers=outliers)
     found = adjusted(block, tracks)
