@@ -18,6 +18,7 @@ The excess is the baseline's cost over barpc's, less one.
     python benchmarks/ba.py --large 1000 200000           # views, tracks: seconds and peak memory
     python benchmarks/ba.py --blocks 1000 3000 10000      # growth with views, by stage, and how far from the optimum
     python benchmarks/ba.py --fill 1000 10000             # what other orders of elimination would cost
+    python benchmarks/ba.py --against 26f82d8             # with defaults beside another commit (here 0.2.0), in turns
 """
 
 from __future__ import annotations
@@ -27,8 +28,10 @@ import resource
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 import warnings
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -319,6 +322,48 @@ def _fill_of(views: int, made: Block) -> None:
             print(f"    SuperLU {name}: {error}", flush=True)
 
 
+SIZES = (3, 1500), (10, 5000), (30, 10000), (100, 15000), (300, 30000)
+"""Views and tracks of the blocks that are compared with another commit's."""
+ONE_RUN = """
+import sys, time, warnings
+warnings.simplefilter("ignore")
+from barpc.ba import adjust_tracks
+from barpc.simulate import simulate_block
+views, tracks, seed = map(int, sys.argv[1:])
+block = simulate_block(views, tracks, seed=seed)
+adjust_tracks(block.views, block.tracks)
+best = 1e9
+for _ in range(3):
+    start = time.process_time()
+    adjust_tracks(block.views, block.tracks)
+    best = min(best, time.process_time() - start)
+print(best)
+"""
+
+
+def against(commit: str, repeat: int) -> None:
+    """CPU seconds of an adjustment with defaults by this tree and by a commit, in turns, a scene each."""
+    root = Path(__file__).resolve().parents[1]
+    with tempfile.TemporaryDirectory() as folder:
+        other = Path(folder) / "other"
+        git = ["git", "-C", str(root), "worktree"]
+        subprocess.run([*git, "add", "--detach", str(other), commit], check=True, capture_output=True)
+        try:
+            print(f"views  tracks |  this [s]  {commit} [s]  ratio")
+            for views, tracks in SIZES:
+                found: dict[Path, list[float]] = {root: [], other: []}
+                for seed in range(repeat):
+                    for tree, seconds in found.items():
+                        command = [sys.executable, "-c", ONE_RUN, str(views), str(tracks), str(seed)]
+                        ran = subprocess.run(command, cwd=tree, check=True, capture_output=True, text=True)
+                        seconds.append(float(ran.stdout.split()[-1]))
+                this, that = (statistics.median(seconds) for seconds in found.values())
+                ratio = statistics.median(np.array(found[root]) / np.array(found[other]))
+                print(f"{views:5d} {tracks:7d} | {this:9.3f} {that:12.3f} {ratio:6.2f}", flush=True)
+        finally:
+            subprocess.run([*git, "remove", "--force", str(other)], check=True, capture_output=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -331,6 +376,9 @@ def main() -> None:
     parser.add_argument("--a-view", type=int, default=50, help="tracks a view of these blocks")
     parser.add_argument("--one-block", nargs=2, type=int, help=argparse.SUPPRESS)
     parser.add_argument("--fill", nargs="+", type=int, metavar="VIEWS", help="other orders of elimination")
+    parser.add_argument(
+        "--against", metavar="COMMIT", help="adjustments with defaults beside another commit's"
+    )
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     if arguments.growth:
@@ -341,6 +389,8 @@ def main() -> None:
         one_block(*arguments.one_block)
     elif arguments.blocks:
         blocks(arguments.blocks, arguments.a_view)
+    elif arguments.against:
+        against(arguments.against, arguments.repeat)
     elif arguments.fill:
         fill(arguments.fill)
     else:
