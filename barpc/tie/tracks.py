@@ -25,6 +25,7 @@ from barpc.tie.matching import STRUCTURE, THIN, PairReport, enough, match, match
 from barpc.tie.ortho import Terrain
 from barpc.tie.pairs import Area, Pair, possible_pairs, require_connected
 from barpc.tie.register import refine
+from barpc.tie.resolution import Looks
 from barpc.tie.store import Store, store_of
 from barpc.tie.tasks import Progress, ordered
 
@@ -95,21 +96,30 @@ def find_tracks(
         pool = possible_pairs(views, options, only=only, area=area, given=given)
         trials.run(pool, all_of_them=bool(only))
     tried = sorted(trials.tried.items())
-    pairs, found = [pair for _, (pair, _, _) in tried], [matches for _, (_, matches, _) in tried]
-    reports = tuple(report for _, (_, _, report) in tried)
+    pairs, reports = [pair for _, (pair, _, _) in tried], tuple(report for _, (_, _, report) in tried)
     require_matches(views, pairs, reports)
-    sizes, most = [view.size for view in views], options.points_per_image
-    linked = inside(views, link([pair.views for pair in pairs], found), area)
-    spreads = {p.views: r.spread for p, r in zip(pairs, reports, strict=True) if r.status == "ok"}
-    linked = thin(linked, sizes, int(_SPARE * most))
-    structural = [p.views for p, r in zip(pairs, reports, strict=True) if r.matcher == STRUCTURE]
-    verified = {p.views: m for p, m in zip(pairs, found, strict=True) if p.views in given and len(m)}
-    structural += _unlike(views, verified, options, work)
-    tracks = refine(views, linked, spreads, options, structural=structural, **work)
-    tracks = _with_unregistered(views, tracks, verified, options)
-    tracks = thin(inside(views, tracks, area), sizes, most)
+    tracks = _registered(trials, area, given, options, work)
     require_tracks(views, tracks, pairs, reports, options)
-    return TieResult(tracks, reports, tuple(len(k) for k in trials.keypoints))
+    return TieResult(tracks, reports, trials.keypoints)
+
+
+def _registered(
+    trials: _Trials, area: Area | None, given: GivenMatches, options: TieOptions, work: dict[str, Any]
+) -> Tracks:
+    """What the pairs that were tried have in common, evenly thinned and registered."""
+    looks, most = trials.looks, options.points_per_image
+    tried = [(looks.ends[views], *trials.tried[views][1:]) for views in sorted(trials.tried)]
+    linked = inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
+    spreads = {ends: report.spread for ends, _, report in tried if report.status == "ok"}
+    sizes = [view.size for view in looks.views]
+    linked = thin(linked, sizes, int(_SPARE * most))
+    structural = [ends for ends, _, report in tried if report.matcher == STRUCTURE]
+    theirs = {looks.ends[views] for views in given}
+    verified = {ends: found for ends, found, _ in tried if ends in theirs and len(found)}
+    structural += _unlike(looks.views, verified, options, work)
+    tracks = refine(looks.views, linked, spreads, options, structural=structural, **work)
+    tracks = _with_unregistered(looks.views, tracks, verified, options)
+    return looks.tracks(thin(inside(looks.views, tracks, area), sizes, most))
 
 
 class _Trials:
@@ -128,12 +138,15 @@ class _Trials:
         self._views, self._options, self._store, self._area = views, options, store, area
         self._given, self._terrain, self._work = given, terrain, work
         self._compares = options.matcher == _DEFAULTS.matcher  # by keypoints
-        self.keypoints = [KeypointFiles(store)] * len(views)
+        self.looks = Looks.at(views, [])
+        self._keypoints: list[KeypointFiles] = []
         self.tried: dict[tuple[int, int], tuple[Pair, Matches, PairReport]] = {}
         self._scores: dict[tuple[int, int], int] = {}
 
     def run(self, pool: Sequence[Pair], all_of_them: bool) -> None:
         """Try the best pairs of a pool, or all, and others in place of those that fail."""
+        self.looks = Looks.at(self._views, pool)
+        self._keypoints = [KeypointFiles(self._store)] * len(self.looks.views)
         num, most = len(self._views), self._options.neighbours
         twice = self._compares and several_dates(self._views)
         chosen = pool if all_of_them else best_pairs(pool, num, most)
@@ -153,10 +166,16 @@ class _Trials:
 
     def _locate(self, pairs: Sequence[Pair]) -> None:
         """Find the keypoints that pairs need."""
-        others = [pair for pair in pairs if pair.views not in self._given]
+        others = [self.looks.pair(pair) for pair in pairs if pair.views not in self._given]
         if others and matcher_named(self._options.matcher).detects:
-            views, options = self._views, self._options
-            self.keypoints = locate(views, options, self._store, pairs=others, area=self._area, **self._work)
+            views, options = self.looks.views, self._options
+            self._keypoints = locate(views, options, self._store, pairs=others, area=self._area, **self._work)
+
+    @property
+    def keypoints(self) -> tuple[int, ...]:
+        """How many were found in each view."""
+        count = np.bincount(self.looks.of, weights=[len(k) for k in self._keypoints])
+        return tuple(count.astype(int).tolist())
 
     def _judged(self, pairs: Sequence[Pair]) -> list[Pair]:
         """Pairs with their quick scores, where keypoints can tell."""
@@ -170,19 +189,26 @@ class _Trials:
         return [judged(self._views, p, known[p.views]) if p.views in known else p for p in pairs]
 
     def _ends(self, pair: Pair) -> tuple[tuple[View, View], tuple[KeypointFiles, KeypointFiles]]:
-        i, j = pair.views
-        return (self._views[i], self._views[j]), (self.keypoints[i], self.keypoints[j])
+        i, j = self.looks.ends[pair.views]
+        return (self.looks.views[i], self.looks.views[j]), (self._keypoints[i], self._keypoints[j])
 
     def _try(self, pairs: Sequence[Pair]) -> None:
         known, others = ([p for p in pairs if (p.views in self._given) is there] for there in (True, False))
         before = [
             (self._ends(pair)[0], found) for pair, found, report in self.tried.values() if enough(report)
         ]
-        views, options = self._views, self._options
+        looks, options = self.looks, self._options
         own = match(
-            views, self.keypoints, others, options, terrain=self._terrain, before=before, **self._work
+            looks.views,
+            self._keypoints,
+            [looks.pair(pair) for pair in others],
+            options,
+            terrain=self._terrain,
+            before=before,
+            **self._work,
         )
-        theirs = verify(views, self._given, known, options, **self._work)
+        given = {looks.ends[pair.views]: looks.matches(pair.views, self._given[pair.views]) for pair in known}
+        theirs = verify(looks.views, given, [looks.pair(pair) for pair in known], options, **self._work)
         for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
             self.tried[pair.views] = pair, found, report
 
