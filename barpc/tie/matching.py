@@ -87,11 +87,12 @@ class PairReport:
     reason: str = ""  # why the pair was tried
     beaten: tuple[str, ...] = ()
     """Attempts that found fewer: matcher, whether loosened, verified matches of those wanted, as "guided 12 of 100"."""
+    unregistered: int = 0  # of its tracks stand where keypoints were found: their patches could not be registered
 
     @property
     def means(self) -> str:
-        """What found the matches, and whether with loosened thresholds."""
-        return self.matcher + ", loosened" * self.loosened
+        """What found the matches, whether with loosened thresholds, and whether keypoints tie the pair themselves."""
+        return self.matcher + ", loosened" * self.loosened + ", by keypoints" * bool(self.unregistered)
 
 
 def match_pair(

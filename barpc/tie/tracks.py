@@ -31,6 +31,8 @@ from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 
+NEEDED = 4
+"""Tracks of a pair: across the epipolar lines they are a shift and three that could contradict it."""
 _DEFAULTS = TieOptions()
 _NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
@@ -98,15 +100,18 @@ def find_tracks(
     tried = sorted(trials.tried.items())
     pairs, reports = [pair for _, (pair, _, _) in tried], tuple(report for _, (_, _, report) in tried)
     require_matches(views, pairs, reports)
-    tracks = _registered(trials, area, given, options, work)
-    require_tracks(views, tracks, pairs, reports, options)
+    tracks, bare = _registered(trials, area, given, options, work)
+    reports = tuple(
+        replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True)
+    )
+    require_tracks(views, tracks, pairs, reports)
     return TieResult(tracks, reports, trials.keypoints)
 
 
 def _registered(
     trials: _Trials, area: Area | None, given: GivenMatches, options: TieOptions, work: dict[str, Any]
-) -> Tracks:
-    """What the pairs that were tried have in common, evenly thinned and registered."""
+) -> tuple[Tracks, dict[tuple[int, int], int]]:
+    """What the pairs that were tried have in common, evenly thinned and registered, and how much of it is not."""
     looks, most = trials.looks, options.points_per_image
     tried = [(looks.ends[views], *trials.tried[views][1:]) for views in sorted(trials.tried)]
     linked = inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
@@ -115,11 +120,24 @@ def _registered(
     linked = thin(linked, sizes, int(_SPARE * most))
     structural = [ends for ends, _, report in tried if report.matcher == STRUCTURE]
     theirs = {looks.ends[views] for views in given}
-    verified = {ends: found for ends, found, _ in tried if ends in theirs and len(found)}
-    structural += _unlike(looks.views, verified, options, work)
+    verified = {ends: found for ends, found, _ in tried if len(found)}
+    structural += _unlike(looks.views, {p: verified[p] for p in theirs & set(verified)}, options, work)
     tracks = refine(looks.views, linked, spreads, options, structural=structural, **work)
-    tracks = _with_unregistered(looks.views, tracks, verified, options)
-    return looks.tracks(thin(inside(looks.views, tracks, area), sizes, most))
+    needed = theirs | _needed(looks, tracks, list(verified), options)
+    exact = tracks.num_points
+    tracks = _with_unregistered(looks.views, tracks, {p: m for p, m in verified.items() if p in needed}, options)
+    bare = pair_counts(looks.tracks(tracks.select(tracks.point >= exact)))
+    return looks.tracks(thin(inside(looks.views, tracks, area), sizes, most)), bare
+
+
+def _needed(
+    looks: Looks, tracks: Tracks, pairs: Sequence[tuple[int, int]], options: TieOptions
+) -> set[tuple[int, int]]:
+    """The pairs of looks between views that no pair with enough registered tracks connects."""
+    counts = pair_counts(tracks)
+    firm = [(int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches]
+    part = connected_labels(int(looks.of.max()) + 1, firm)[looks.of]
+    return {(i, j) for i, j in pairs if part[i] != part[j]}
 
 
 class _Trials:
@@ -229,14 +247,14 @@ def _unlike(
 def _with_unregistered(
     views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions
 ) -> Tracks:
-    """Tracks, and the verified matches of those given pairs of which too few could be registered."""
+    """Tracks, and the verified matches of those of some pairs of which too few could be registered."""
     counts = pair_counts(tracks)
     lost = [pair for pair in given if counts.get(pair, 0) < options.min_matches]
     if not lost:
         return tracks
     for i, j in lost:
         words = (
-            "%s - %s: %d of %d given matches could be registered: they are used as they are, good to %.2f px"
+            "%s - %s: %d of %d matches could be registered: the others are used as found, good to %.2f px"
         )
         count, known = counts.get((i, j), 0), given[i, j]
         logger.warning(words, views[i].name, views[j].name, count, len(known), known.sigma)
@@ -295,13 +313,12 @@ def require_tracks(
     tracks: Tracks,
     pairs: Sequence[Pair],
     reports: Sequence[PairReport],
-    options: TieOptions,
 ) -> None:
-    """As `require_matches`, for the pairs that `min_matches` tracks or more are left of."""
+    """As `require_matches`, for the pairs that `NEEDED` tracks or more are left of."""
     left, counts = [], pair_counts(tracks)
     for pair, report in zip(pairs, reports, strict=True):
         common = counts.get(pair.views, 0)
-        status = "ok" if common >= options.min_matches else f"only {common} tracks after registration"
+        status = "ok" if common >= NEEDED else f"only {common} tracks after registration"
         left.append(replace(report, status=status if report.status == "ok" else report.status))
     require_matches(views, pairs, left)
 
