@@ -239,7 +239,9 @@ class TieOptions(Options):
     false_share: float = option(
         0.01, "Share of false matches that is accepted, as control bands estimate it.", above=0, most=1
     )
-    min_matches: int = option(12, "Verified matches that a pair needs to count.", least=4)
+    min_matches: int = option(
+        12, "Verified matches that a pair needs to count; two thirds where thresholds are loosened.", least=4
+    )
     points_per_image: int = option(5000, "Observations kept in an image, at most, evenly spread.", least=1)
 
     def __post_init__(self) -> None:

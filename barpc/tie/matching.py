@@ -57,8 +57,11 @@ _SIGNIFICANT = 6.0  # standard deviations
 _CLEAR = 0.4  # share of the matches that makes wider passes needless
 _FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
-_LOOSE = 0.95, 0.05  # ratio and false share of the second attempt
-_LEAST = 8  # matches of it
+_LOOSE = (
+    0.95,
+    0.05,
+    2 / 3,
+)  # ratio and false share of the second attempt; its part of the matches that a pair needs
 _QUICK = 500  # keypoints of a view that tell what a pair promises
 _LEAST_REACH = 5.0  # px of half a segment, below which matches say nothing of altitudes
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
@@ -87,7 +90,9 @@ class PairReport:
     reason: str = ""  # why the pair was tried
     beaten: tuple[str, ...] = ()
     """Attempts that found fewer: matcher, whether loosened, verified matches of those wanted, as "guided 12 of 100"."""
-    unregistered: int = 0  # of its tracks stand where keypoints were found: their patches could not be registered
+    unregistered: int = (
+        0  # of its tracks stand where keypoints were found: their patches could not be registered
+    )
 
     @property
     def means(self) -> str:
@@ -108,14 +113,14 @@ def match_pair(
     first = _attempt(views, keypoints, pair, options)
     if enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
         return first
-    if options.matcher == STRUCTURE and first[1].matches < _LEAST:  # thresholds do not say where it looks
-        return first
     loose = replace(
         options,
         ratio=max(options.ratio, _LOOSE[0]),
         false_share=max(options.false_share, _LOOSE[1]),
-        min_matches=min(options.min_matches, _LEAST),
+        min_matches=max(4, math.ceil(options.min_matches * _LOOSE[2])),
     )
+    if options.matcher == STRUCTURE and first[1].matches < loose.min_matches:
+        return first  # thresholds do not say where it looks
     found, report = _attempt(views, keypoints, pair, loose)
     return _better(first, (found, replace(report, loosened=True)))
 

@@ -214,9 +214,7 @@ class Survey:
     pixel: tuple[int, int] = (1, 1)  # columns and rows of the file that a pixel holds
 
 
-def survey(
-    path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None
-) -> Survey | None:
+def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Survey | None:
     """The stretch of a raster, or its picture of a size, and how it is stored; None where nothing varies."""
     stretch = sample_stretch(path, band, size)
     with open_raster(path) as dataset:

@@ -76,14 +76,14 @@ class Looks:
         """The looks that pairs need."""
         scale, whole = [_scale(view) for view in views], (1, 1)
         most = [tuple(map(math.isqrt, view.size)) for view in views]  # a look is not smaller than its pixel
-        wanted = {(i, j): _pixels((scale[i], scale[j]), (most[i], most[j])) for i, j in (p.views for p in pairs)}
+        wanted = {
+            (i, j): _pixels((scale[i], scale[j]), (most[i], most[j])) for i, j in (p.views for p in pairs)
+        }
         each = {(i, whole) for i in range(len(views))}
         each |= {end for pair, pixels in wanted.items() for end in zip(pair, pixels, strict=True)}
         looks = sorted(each)
         number = {look: k for k, look in enumerate(looks)}
-        ends = {
-            (i, j): (number[i, pixels[0]], number[j, pixels[1]]) for (i, j), pixels in wanted.items()
-        }
+        ends = {(i, j): (number[i, pixels[0]], number[j, pixels[1]]) for (i, j), pixels in wanted.items()}
         seen = tuple(views[i] if pixel == whole else _look(views[i], pixel) for i, pixel in looks)
         pixel, of = np.array([pixel for _, pixel in looks]), np.array([i for i, _ in looks])
         return cls(seen, pixel.astype(np.float64).reshape(-1, 2), of, ends)

@@ -125,7 +125,9 @@ def _registered(
     tracks = refine(looks.views, linked, spreads, options, structural=structural, **work)
     needed = theirs | _needed(looks, tracks, list(verified), options)
     exact = tracks.num_points
-    tracks = _with_unregistered(looks.views, tracks, {p: m for p, m in verified.items() if p in needed}, options)
+    tracks = _with_unregistered(
+        looks.views, tracks, {p: m for p, m in verified.items() if p in needed}, options
+    )
     bare = pair_counts(looks.tracks(tracks.select(tracks.point >= exact)))
     return looks.tracks(thin(inside(looks.views, tracks, area), sizes, most)), bare
 
@@ -135,7 +137,9 @@ def _needed(
 ) -> set[tuple[int, int]]:
     """The pairs of looks between views that no pair with enough registered tracks connects."""
     counts = pair_counts(tracks)
-    firm = [(int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches]
+    firm = [
+        (int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches
+    ]
     part = connected_labels(int(looks.of.max()) + 1, firm)[looks.of]
     return {(i, j) for i, j in pairs if part[i] != part[j]}
 
@@ -253,9 +257,7 @@ def _with_unregistered(
     if not lost:
         return tracks
     for i, j in lost:
-        words = (
-            "%s - %s: %d of %d matches could be registered: the others are used as found, good to %.2f px"
-        )
+        words = "%s - %s: %d of %d matches could be registered: the others are used as found, good to %.2f px"
         count, known = counts.get((i, j), 0), given[i, j]
         logger.warning(words, views[i].name, views[j].name, count, len(known), known.sigma)
     sizes, most = [view.size for view in views], options.points_per_image

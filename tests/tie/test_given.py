@@ -107,7 +107,7 @@ def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
     views = [first, replace(second, path=str(path)), third]
     with caplog.at_level(logging.WARNING):
         tracks = find_tracks(views, given=true_matches(scene, *PAIRS, noise=0.4, false=0.2)).tracks
-    assert "used as they are" not in caplog.text
+    assert "used as found" not in caplog.text
     for pair in PAIRS:
         assert pair_counts(tracks)[pair] >= 150
         across = np.abs(scene.errors(*pair, *common_tracks(tracks, *pair))).min(axis=1)
@@ -129,7 +129,7 @@ def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, c
         result = find_tracks(
             [first, replace(second, path=str(path))], TieOptions(min_matches=100), given=given
         )
-    assert "used as they are, good to 0." in caplog.text
+    assert "used as found, good to 0." in caplog.text
     assert 0.7 * 400 <= result.tracks.num_points <= 450
     errors = np.abs(scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))).max(axis=1)
     assert 0.2 < np.median(errors) < 0.6
