@@ -15,7 +15,7 @@ import numpy as np
 
 from barpc.frozen import Frozen
 from barpc.geodesy import Array, metres_per_unit
-from barpc.scene import Tracks, View
+from barpc.scene import IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.tie.matcher import Matches
 from barpc.tie.pairs import Pair
@@ -67,7 +67,7 @@ class Looks:
     views: tuple[View, ...]
     """All looks, those of a view together, itself first."""
     pixel: Array  # (L, 2) columns and rows of the file that a look's pixel holds
-    of: Array  # (L,) the view that each is of
+    of: IntArray  # (L,) the view that each is of
     ends: Mapping[Link, Link]
     """Pairs of views, ascending -> the looks, ascending, at which they are compared."""
 
@@ -75,7 +75,7 @@ class Looks:
     def at(cls, views: Sequence[View], pairs: Sequence[Pair]) -> Looks:
         """The looks that pairs need."""
         scale, whole = [_scale(view) for view in views], (1, 1)
-        most = [tuple(map(math.isqrt, view.size)) for view in views]  # a look is not smaller than its pixel
+        most = [(math.isqrt(v.size[0]), math.isqrt(v.size[1])) for v in views]  # a look is not smaller than its pixel
         wanted = {
             (i, j): _pixels((scale[i], scale[j]), (most[i], most[j])) for i, j in (p.views for p in pairs)
         }
@@ -113,7 +113,7 @@ def _pixels(scales: tuple[Array, Array], most: tuple[Link, Link]) -> tuple[Link,
     """Columns and rows of two images, of scales (2, 2), that a pixel of their looks holds, `most` of them each.
 
     The whole number nearest to the other's pixel over its own, along either axis: below a ratio of 1.5 images are
-    compared as they are, and above it by pixels that differ by a third at most, which registration takes for distortion.
+    compared as they are, above it by pixels that differ by a third at most. Registration takes that for distortion.
     """
     if not all(np.isfinite(scale).all() and np.linalg.det(scale) for scale in scales):
         return (1, 1), (1, 1)

@@ -18,6 +18,7 @@ from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
+from barpc.tie.epipolar import grouped, linear_map
 from barpc.tie.features import KeypointFiles, locate
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
@@ -124,11 +125,12 @@ def _registered(
     structural += _unlike(looks.views, {p: verified[p] for p in theirs & set(verified)}, options, work)
     tracks = refine(looks.views, linked, spreads, options, structural=structural, **work)
     needed = theirs | _needed(looks, tracks, list(verified), options)
-    exact = tracks.num_points
-    tracks = _with_unregistered(
-        looks.views, tracks, {p: m for p, m in verified.items() if p in needed}, options
-    )
-    bare = pair_counts(looks.tracks(tracks.select(tracks.point >= exact)))
+    known = {ends: found for ends, found in verified.items() if ends in needed}
+    exact, tracks = pair_counts(tracks), _with_unregistered(looks.views, tracks, known, options)
+    bare = {
+        (int(looks.of[i]), int(looks.of[j])): count - exact.get((i, j), 0)
+        for (i, j), count in pair_counts(tracks).items()
+    }
     return looks.tracks(thin(inside(looks.views, tracks, area), sizes, most)), bare
 
 
@@ -262,20 +264,33 @@ def _with_unregistered(
         logger.warning(words, views[i].name, views[j].name, count, len(known), known.sigma)
     sizes, most = [view.size for view in views], options.points_per_image
     more = thin(link(lost, [given[pair] for pair in lost]), sizes, most)
-    more = more.select(~_twice(tracks, more)[more.point])
-    return Tracks(
-        np.concatenate([tracks.view, more.view]),
-        np.concatenate([tracks.point, tracks.num_points + more.point]),
-        np.concatenate([tracks.xy, more.xy]),
-        np.concatenate([tracks.sigma, more.sigma]),
-    )
+    return _joined(views, tracks, more)
 
 
-def _twice(tracks: Tracks, others: Tracks) -> BoolArray:
-    """Which of other tracks, two of whose observations stand beside registered ones, show a ground point again."""
+def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
+    """Registered tracks and others: one that stands beside a registered one is the same point, seen by more views."""
     known, asked = (np.array([_APART * part.view, *part.xy.T]).T for part in (tracks, others))
-    near = np.isfinite(cKDTree(known).query(asked, distance_upper_bound=_SAME)[0])
-    return np.asarray(np.bincount(others.point[near], minlength=others.num_points) >= 2)
+    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=_SAME))
+    same = np.flatnonzero(np.isfinite(near))
+    point, which = np.unique(others.point[same], return_index=True)
+    anchor = np.full(others.num_points, -1)  # the row of each track that says where it stands, if one does
+    anchor[point] = same[which]
+    number, xy = tracks.num_points + others.point, others.xy.copy()
+    found = np.flatnonzero(anchor[others.point] >= 0)
+    start = anchor[others.point[found]]
+    number[found] = tracks.point[row[start]]
+    moved = (
+        tracks.xy[row[start]] - others.xy[start]
+    )  # registration moves a point, and all views of it with it
+    for group in grouped(others.view[start], others.view[found]):
+        first, second = (views[others.view[end[group[0]]]] for end in (start, found))
+        linear = linear_map(first, second, others.xy[start[group]])
+        xy[found[group]] += (linear @ moved[group, :, None])[..., 0]
+    view, number = np.concatenate([tracks.view, others.view]), np.concatenate([tracks.point, number])
+    once = np.unique(np.stack([number, view]), axis=1, return_index=True)[1]  # in the order that tracks have
+    point = np.unique(number[once], return_inverse=True)[1].reshape(-1)
+    xy, sigma = np.concatenate([tracks.xy, xy]), np.concatenate([tracks.sigma, others.sigma])
+    return Tracks(view[once], point, xy[once], sigma[once])
 
 
 def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -82,6 +83,34 @@ def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) 
     said = f"m.csv: 9 of 18 points lie outside .* in view_01, {width} x {height} pixels"
     with pytest.raises(InputError, match=said):
         read([tmp_path / "m.csv"], views)
+
+
+@pytest.mark.parametrize("read", [given_matches, given_tracks])
+@pytest.mark.parametrize(("astray", "fails"), [(1, False), (10, False), (11, True)])
+def test_a_few_points_beyond_their_image_are_left_out_and_counted(
+    tmp_path, caplog, read, astray, fails
+) -> None:
+    """One in twenty of 200 points; the other end of a match that is left out is no tie point either."""
+    views = load_views(IMAGES).views
+    (width, height), names = views[1].size, [view.name for view in views]
+    rows = [
+        f"{names[0]},{t + 5},7,{t}\n{names[1]},{width + 40 if t < astray else t + 6},9,{t}\n"
+        for t in range(100)
+    ]
+    (tmp_path / "m.csv").write_text("image,col,row,track\n" + "".join(rows))
+    said = (
+        f"m.csv: {astray} of 200 points lie outside their images, as .* in view_01, {width} x {height} pixels"
+    )
+    if fails:
+        with pytest.raises(InputError, match=said):
+            read([tmp_path / "m.csv"], views)
+        return
+    found = read([tmp_path / "m.csv"], views)
+    assert re.search(f"{said}: they are left out", caplog.text)
+    xy = found[0, 1].xy if read is given_matches else found.xy.reshape(-1, 2, 2)
+    assert len(xy) == 100 - astray
+    assert sorted(xy[:, 0, 0].tolist()) == [t + 5 for t in range(astray, 100)]
+    np.testing.assert_array_equal(xy[:, 1, 0], xy[:, 0, 0] + 1)  # each with its own
 
 
 @pytest.mark.slow
