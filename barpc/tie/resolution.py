@@ -75,7 +75,9 @@ class Looks:
     def at(cls, views: Sequence[View], pairs: Sequence[Pair]) -> Looks:
         """The looks that pairs need."""
         scale, whole = [_scale(view) for view in views], (1, 1)
-        most = [(math.isqrt(v.size[0]), math.isqrt(v.size[1])) for v in views]  # a look is not smaller than its pixel
+        most = [
+            (math.isqrt(v.size[0]), math.isqrt(v.size[1])) for v in views
+        ]  # a look is not smaller than its pixel
         wanted = {
             (i, j): _pixels((scale[i], scale[j]), (most[i], most[j])) for i, j in (p.views for p in pairs)
         }
