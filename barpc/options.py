@@ -229,7 +229,12 @@ class TieOptions(Options):
         (0.0, 60.0), "Smallest and largest convergence angle of a pair.", unit="deg", least=0, most=180
     )
     neighbours: int = option(8, "Best partners tried for a view, on top of what connects all views.", least=1)
-    search: float = option(700.0, "How far a camera may be wrong, in any direction.", unit="px", above=0)
+    search: float | None = option(
+        None,
+        "How far a camera may be wrong, in any direction. Without: 700 m on the ground, 20 px at least and 700 at most.",
+        unit="px",
+        above=0,
+    )
     ratio: float = option(
         0.85,
         "Largest descriptor distance of the best candidate over that of the second best.",

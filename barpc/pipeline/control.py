@@ -9,10 +9,11 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground
-from barpc.options import RunOptions
+from barpc.options import RunOptions, TieOptions
 from barpc.pointio.ground import read_gcps
 from barpc.scene import BoolArray, GroundPoints, View
 from barpc.sensor.geometry import ground_sample_distance
+from barpc.tie.pairs import reach_of
 
 _REACH = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
 _ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred
@@ -58,7 +59,7 @@ def _load(path: str, views: Sequence[View], options: RunOptions) -> GroundPoints
             raise
         return replace(GroundPoints.none(), left_out=(f"{error}; the file is left out",))
     out, keep = [], np.ones(len(points.names), dtype=bool)
-    for wrong, what in _implausible(points, views, options.tie.search):
+    for wrong, what in _implausible(points, views, options.tie):
         names = [points.names[g] for g in np.flatnonzero(wrong & keep)]
         if names:
             many = f"{len(names)} of {len(keep)} points ({_listed(names)})"
@@ -77,12 +78,13 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _implausible(
-    points: GroundPoints, views: Sequence[View], search: float
+    points: GroundPoints, views: Sequence[View], options: TieOptions
 ) -> Iterator[tuple[BoolArray, str]]:
     """Points (G,) that cannot be meant, and why; the first reason is the one that counts."""
     low, high = np.array([view.alt_range for view in views])[points.view].T
     alt = points.lonlatalt[points.point, 2]
     shown, pixel = _shown(points, views, np.clip(alt, low, high))
+    search = np.array([reach_of(view, options) for view in views])[points.view]
     reach = np.maximum(_REACH, search * pixel)
     away = _distance(points, shown, (0, 1), (1, 1))
     yield _any(points, ~np.isfinite(away)), "no ground is seen at the position in the image"

@@ -27,7 +27,7 @@ from barpc.tie.guided import Guided
 from barpc.tie.hook import Hook, hooked
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
 from barpc.tie.ortho import Terrain
-from barpc.tie.pairs import Pair, shared_tiles
+from barpc.tie.pairs import Pair, reach_of, shared_tiles
 from barpc.tie.structure import Structure
 from barpc.tie.tasks import Progress, ordered
 
@@ -174,7 +174,7 @@ def _attempt(
     search = _Search(views, loaded, options)
     coarse = search.offset()
     if coarse is None:
-        return NO_MATCHES, replace(report, status=f"no common offset within {options.search:g} px")
+        return NO_MATCHES, replace(report, status=f"no common offset within {search.reach:.4g} px")
     tight, _ = search.trusted(coarse, _FALSE_SHARE_TIGHT)
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
@@ -338,6 +338,7 @@ class _Search:
         self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions
     ) -> None:
         self._views, self._options = views, options
+        self.reach = reach_of(views[1], options)
         self._matcher = matcher_named(options.matcher)(options, keypoints)
         points = keypoints[0].xy
         self._windows = cache(lambda: shared_tiles(views, [Pair((0, 1), 1.0, 0.0)], options)[0])
@@ -382,8 +383,9 @@ class _Search:
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
         best: _Peak | None = None
-        for width, probes in _PASSES:
-            found = self._blind(min(width, self._options.search), probes)
+        passes = {min(width, self.reach): probes for width, probes in _PASSES}  # of one width the last
+        for width, probes in passes.items():
+            found = self._blind(width, probes)
             if found is not None and (best is None or found.significance > best.significance):
                 best = found
             if best is not None and best.share >= _CLEAR:
