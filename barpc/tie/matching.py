@@ -23,7 +23,7 @@ from barpc.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.epipolar import Frame, agreeing, common_range, frame, robust_affine, robust_spread
 from barpc.tie.features import KeypointFiles, Keypoints, join
-from barpc.tie.guided import Guided
+from barpc.tie.guided import CLEAR_RATIO, Guided
 from barpc.tie.hook import Hook, hooked
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
 from barpc.tie.ortho import Terrain
@@ -54,6 +54,7 @@ _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 _PEAK = 4.0  # px, width of the window in which true matches of a blind pass fall
 _LEAST_PEAK = 8  # matches
 _SIGNIFICANT = 6.0  # standard deviations
+_NOWHERE = "no common offset"
 _CLEAR = 0.4  # share of the matches that makes wider passes needless
 _FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
@@ -121,6 +122,8 @@ def match_pair(
     )
     if options.matcher == STRUCTURE and first[1].matches < loose.min_matches:
         return first  # thresholds do not say where it looks
+    if first[1].status.startswith(_NOWHERE) and options.ratio >= CLEAR_RATIO:
+        return first  # nor do looser ones let more through where only clear matches count
     found, report = _attempt(views, keypoints, pair, loose)
     return _better(first, (found, replace(report, loosened=True)))
 
@@ -174,7 +177,7 @@ def _attempt(
     search = _Search(views, loaded, options)
     coarse = search.offset()
     if coarse is None:
-        return NO_MATCHES, replace(report, status=f"no common offset within {search.reach:.4g} px")
+        return NO_MATCHES, replace(report, status=f"{_NOWHERE} within {search.reach:.4g} px")
     tight, _ = search.trusted(coarse, _FALSE_SHARE_TIGHT)
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
