@@ -51,13 +51,13 @@ class Coarser(Frozen):
 
 
 def coarser(xy: Array, pixel: Array) -> Array:
-    """Places (..., 2) [px] counted in pixels that hold several (2,)."""
-    return np.asarray((xy + 0.5) / pixel - 0.5)
+    """Places (..., 2) [px] counted in pixels that hold several (2,); of one to the bit."""
+    return np.asarray((xy - 0.5 * (pixel - 1.0)) / pixel)
 
 
 def finer(xy: Array, pixel: Array) -> Array:
     """The way back of `coarser`."""
-    return np.asarray((xy + 0.5) * pixel - 0.5)
+    return np.asarray(xy * pixel + 0.5 * (pixel - 1.0))
 
 
 @dataclass(frozen=True, eq=False)
