@@ -231,7 +231,7 @@ class TieOptions(Options):
     neighbours: int = option(8, "Best partners tried for a view, on top of what connects all views.", least=1)
     search: float | None = option(
         None,
-        "How far a camera may be wrong, in any direction. Without: 700 m on the ground, 20 px at least and 700 at most.",
+        "How far a camera may be wrong, in any direction. Without: 700 m on the ground, 20 px at least, 700 at most.",
         unit="px",
         above=0,
     )
