@@ -9,7 +9,7 @@ import numpy as np
 
 from barpc.errors import InputError
 from barpc.geodesy import Array, ecef_from_ground
-from barpc.options import RunOptions, TieOptions
+from barpc.options import RunOptions
 from barpc.pointio.ground import read_gcps
 from barpc.scene import BoolArray, GroundPoints, View
 from barpc.sensor.geometry import ground_sample_distance
@@ -59,7 +59,8 @@ def _load(path: str, views: Sequence[View], options: RunOptions) -> GroundPoints
             raise
         return replace(GroundPoints.none(), left_out=(f"{error}; the file is left out",))
     out, keep = [], np.ones(len(points.names), dtype=bool)
-    for wrong, what in _implausible(points, views, options.tie):
+    search = np.array([reach_of(view, options.tie) for view in views])[points.view]
+    for wrong, what in _implausible(points, views, search):
         names = [points.names[g] for g in np.flatnonzero(wrong & keep)]
         if names:
             many = f"{len(names)} of {len(keep)} points ({_listed(names)})"
@@ -78,13 +79,12 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _implausible(
-    points: GroundPoints, views: Sequence[View], options: TieOptions
+    points: GroundPoints, views: Sequence[View], search: Array
 ) -> Iterator[tuple[BoolArray, str]]:
-    """Points (G,) that cannot be meant, and why; the first reason is the one that counts."""
+    """Points (G,) that cannot be meant, and why; the first reason counts. `search` (M,) [px] as of `reach_of`."""
     low, high = np.array([view.alt_range for view in views])[points.view].T
     alt = points.lonlatalt[points.point, 2]
     shown, pixel = _shown(points, views, np.clip(alt, low, high))
-    search = np.array([reach_of(view, options) for view in views])[points.view]
     reach = np.maximum(_REACH, search * pixel)
     away = _distance(points, shown, (0, 1), (1, 1))
     yield _any(points, ~np.isfinite(away)), "no ground is seen at the position in the image"

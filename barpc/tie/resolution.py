@@ -72,14 +72,15 @@ class Looks:
     """Pairs of views, ascending -> the looks, ascending, at which they are compared."""
 
     @classmethod
-    def at(cls, views: Sequence[View], pairs: Sequence[Pair]) -> Looks:
-        """The looks that pairs need."""
+    def at(cls, views: Sequence[View], pairs: Sequence[Pair], apart: bool = True) -> Looks:
+        """The looks that pairs need; without those of other resolutions (`apart`) the views as they are."""
         scale, whole = [_scale(view) for view in views], (1, 1)
         most = [
             (math.isqrt(v.size[0]), math.isqrt(v.size[1])) for v in views
         ]  # a look is not smaller than its pixel
         wanted = {
-            (i, j): _pixels((scale[i], scale[j]), (most[i], most[j])) for i, j in (p.views for p in pairs)
+            (i, j): _pixels((scale[i], scale[j]), (most[i], most[j])) if apart else (whole, whole)
+            for i, j in (p.views for p in pairs)
         }
         each = {(i, whole) for i in range(len(views))}
         each |= {end for pair, pixels in wanted.items() for end in zip(pair, pixels, strict=True)}

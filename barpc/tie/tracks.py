@@ -22,7 +22,16 @@ from barpc.tie.epipolar import grouped, linear_map
 from barpc.tie.features import KeypointFiles, locate
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
-from barpc.tie.matching import STRUCTURE, THIN, PairReport, enough, match, matcher_named, quick_score
+from barpc.tie.matching import (
+    MATCHERS,
+    STRUCTURE,
+    THIN,
+    PairReport,
+    enough,
+    match,
+    matcher_named,
+    quick_score,
+)
 from barpc.tie.ortho import Terrain
 from barpc.tie.pairs import Area, Pair, possible_pairs, require_connected
 from barpc.tie.register import refine
@@ -169,7 +178,8 @@ class _Trials:
 
     def run(self, pool: Sequence[Pair], all_of_them: bool) -> None:
         """Try the best pairs of a pool, or all, and others in place of those that fail."""
-        self.looks = Looks.at(self._views, pool)
+        own = self._options.matcher in MATCHERS  # another one reads the files itself
+        self.looks = Looks.at(self._views, pool, apart=own)
         self._keypoints = [KeypointFiles(self._store)] * len(self.looks.views)
         num, most = len(self._views), self._options.neighbours
         twice = self._compares and several_dates(self._views)
