@@ -190,6 +190,31 @@ def test_rendered_pairs_are_tied_within_a_part_of_the_coarser_pixel(
         assert sigma[0] / sigma[1] == pytest.approx(max(second), rel=0.05)
 
 
+@pytest.mark.slow
+def test_matches_of_others_between_two_resolutions_become_as_exact_as_our_own(
+    scene: Rendered, tmp_path
+) -> None:
+    """Given in the pixels of the files: 0.5 px of the coarser one, and 1.5 of the finer, of noise; a fifth is false."""
+    fine, coarse = scene.views[0], averaged(scene.views[1], tmp_path, 3, 3)
+    rng = np.random.default_rng(8)
+    first = rng.uniform(20, 279, (900, 2))
+    other = (scene.place(0, 1, first) + 0.5) / 3 - 0.5
+    rows = np.flatnonzero(((other > 7) & (other < 92)).all(axis=1))[:400]
+    xy = np.stack(
+        [first[rows] + rng.normal(0, 1.5, (len(rows), 2)), other[rows] + rng.normal(0, 0.5, (len(rows), 2))],
+        1,
+    )
+    wrong = rng.random(len(rows)) < 0.2
+    xy[wrong, 1] = rng.uniform(7, 92, (wrong.sum(), 2))
+    index = -1 - np.stack([np.arange(len(rows))] * 2, axis=1)
+    result = find_tracks([fine, coarse], given={(0, 1): Matches(xy, np.zeros(len(xy)), index)})
+    assert result.tracks.num_points > 100
+    one, two = common_tracks(result.tracks, 0, 1)
+    errors = scene.errors(0, 1, one, 3 * two + 1.0) / 3
+    assert np.abs(np.median(errors, axis=0)).max() < 0.05
+    assert 1.4826 * np.median(np.abs(errors)) < 0.15
+
+
 def test_pairs_that_registered_ones_leave_apart_keep_their_matches_and_no_others() -> None:
     three = [View(f"v{k}", "", (400, 400), camera(k * METRE), (0.0, 500.0)) for k in range(4)]
     looks = Looks.at(three, [Pair(ends, 1.0, 0.0) for ends in ((0, 1), (0, 2), (1, 2), (2, 3))])
