@@ -229,7 +229,12 @@ class TieOptions(Options):
         (0.0, 60.0), "Smallest and largest convergence angle of a pair.", unit="deg", least=0, most=180
     )
     neighbours: int = option(8, "Best partners tried for a view, on top of what connects all views.", least=1)
-    search: float = option(700.0, "How far a camera may be wrong, in any direction.", unit="px", above=0)
+    search: float | None = option(
+        None,
+        "How far a camera may be wrong, in any direction. Without: 700 m on the ground, 20 px at least, 700 at most.",
+        unit="px",
+        above=0,
+    )
     ratio: float = option(
         0.85,
         "Largest descriptor distance of the best candidate over that of the second best.",
@@ -239,7 +244,9 @@ class TieOptions(Options):
     false_share: float = option(
         0.01, "Share of false matches that is accepted, as control bands estimate it.", above=0, most=1
     )
-    min_matches: int = option(12, "Verified matches that a pair needs to count.", least=4)
+    min_matches: int = option(
+        12, "Verified matches that a pair needs to count; two thirds where thresholds are loosened.", least=4
+    )
     points_per_image: int = option(5000, "Observations kept in an image, at most, evenly spread.", least=1)
 
     def __post_init__(self) -> None:

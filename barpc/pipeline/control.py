@@ -13,6 +13,7 @@ from barpc.options import RunOptions
 from barpc.pointio.ground import read_gcps
 from barpc.scene import BoolArray, GroundPoints, View
 from barpc.sensor.geometry import ground_sample_distance
+from barpc.tie.pairs import reach_of
 
 _REACH = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
 _ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred
@@ -58,7 +59,8 @@ def _load(path: str, views: Sequence[View], options: RunOptions) -> GroundPoints
             raise
         return replace(GroundPoints.none(), left_out=(f"{error}; the file is left out",))
     out, keep = [], np.ones(len(points.names), dtype=bool)
-    for wrong, what in _implausible(points, views, options.tie.search):
+    search = np.array([reach_of(view, options.tie) for view in views])[points.view]
+    for wrong, what in _implausible(points, views, search):
         names = [points.names[g] for g in np.flatnonzero(wrong & keep)]
         if names:
             many = f"{len(names)} of {len(keep)} points ({_listed(names)})"
@@ -77,9 +79,9 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _implausible(
-    points: GroundPoints, views: Sequence[View], search: float
+    points: GroundPoints, views: Sequence[View], search: Array
 ) -> Iterator[tuple[BoolArray, str]]:
-    """Points (G,) that cannot be meant, and why; the first reason is the one that counts."""
+    """Points (G,) that cannot be meant, and why; the first reason counts. `search` (M,) [px] as of `reach_of`."""
     low, high = np.array([view.alt_range for view in views])[points.view].T
     alt = points.lonlatalt[points.point, 2]
     shown, pixel = _shown(points, views, np.clip(alt, low, high))

@@ -9,16 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from barpc.errors import InputError
-from barpc.geodesy import Array
 from barpc.pointio.links import Links
 from barpc.pointio.matches import read_links, tracks_of
-from barpc.scene import IntArray, Tracks, View
+from barpc.scene import Tracks, View
 from barpc.tie import Matches
 from barpc.tie.epipolar import grouped
 
 logger = logging.getLogger(__name__)
 
 _MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
+_ASTRAY = (
+    0.05  # of the points may lie farther off, where a matcher looks over borders; of other crops more do
+)
 
 
 def given_tracks(paths: Sequence[str | Path], views: Sequence[View]) -> Tracks:
@@ -55,17 +57,25 @@ def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = F
                 raise
             logger.warning("%s", error)
             continue
-        _require_inside(path, views, parts[-1].view, parts[-1].xy)
+        parts[-1] = _inside(path, views, parts[-1])
     return Links.joined(parts[1:] or parts)
 
 
-def _require_inside(path: str | Path, views: Sequence[View], view: IntArray, xy: Array) -> None:
-    """Raise unless the points (K, 2) [px] lie in their images."""
-    beyond = np.array([view.size for view in views])[view] + (_MARGIN - 1.0)
-    wrong = np.flatnonzero(~((xy >= -_MARGIN) & (xy <= beyond)).all(axis=1))
-    if len(wrong):
-        of, (col, row) = views[view[wrong[0]]], xy[wrong[0]].tolist()
-        raise InputError(
-            f"{path}: {len(wrong)} of {len(xy)} points lie outside their images, as ({col:g}, {row:g}) in {of.name},"
-            f" {of.size[0]} x {of.size[1]} pixels; were they found in other crops, or in reduced images?"
-        )
+def _inside(path: str | Path, views: Sequence[View], links: Links) -> Links:
+    """Without points that lie outside their images; InputError where they are more than a few."""
+    beyond = np.array([view.size for view in views])[links.view] + (_MARGIN - 1.0)
+    inside = np.asarray(((links.xy >= -_MARGIN) & (links.xy <= beyond)).all(axis=1))
+    wrong = np.flatnonzero(~inside)
+    if not len(wrong):
+        return links
+    of, (col, row) = views[links.view[wrong[0]]], links.xy[wrong[0]].tolist()
+    said = (
+        f"{path}: {len(wrong)} of {len(inside)} points lie outside their images, as ({col:g}, {row:g}) in {of.name},"
+        f" {of.size[0]} x {of.size[1]} pixels"
+    )
+    if len(wrong) > _ASTRAY * len(inside):
+        raise InputError(f"{said}; were they found in other crops, or in reduced images?")
+    logger.warning("%s: they are left out", said)
+    number = np.cumsum(inside) - 1
+    ends = links.ends[inside[links.ends].all(axis=1)]
+    return Links(links.view[inside], links.xy[inside], links.sigma[inside], number[ends])

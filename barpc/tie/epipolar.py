@@ -77,7 +77,7 @@ def frame(first: View, second: View, xy: Array, axis: Array | None = None) -> Fr
     middle = np.median(xy[usable], axis=0) if usable.any() else np.zeros(2)
     (u0, w0), (u1, w1) = (low @ _rotation(axis)).T, (high @ _rotation(axis)).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.where(np.abs(u1 - u0) > 1e-3, (w1 - w0) / (u1 - u0), 0.0)
+        slope = np.where(np.abs(u1 - u0) > 1e-3, ((w1 - w0) / (u1 - u0)).clip(-1.0, 1.0), 0.0)
     slope[~usable] = np.nan
     along, across, reach = 0.5 * (u0 + u1), 0.5 * (w0 + w1), 0.5 * np.abs(u1 - u0)
     return Frame(axis, along, across, slope, -reach, reach, linear_map(first, second, middle))

@@ -295,7 +295,7 @@ def locate(
 
     With `pairs`, tiles that no partner may see are not read, nor those outside `area`; the rest as for `find_tracks`.
     """
-    found = ordered(executor, survey, [(v.path, options.band) for v in views], "read", progress)
+    found = ordered(executor, survey, [(v.path, options.band, v.size) for v in views], "read", progress)
     shares = [Share.of(view.size, options) for view in views]
     each = zip(views, found, shares, strict=True)
     boxes = [tiles(v.size, options, share.zoom, known) if known else [] for v, known, share in each]

@@ -18,7 +18,8 @@ from barpc.tie.matcher import NO_MATCHES, Matches, Prediction
 
 FloatArray = npt.NDArray[np.float32]
 
-_CLEAR_RATIO = 0.8  # where only clear matches count
+CLEAR_RATIO = 0.8
+"""Largest ratio where only clear matches count."""
 _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
 _MAX_ZOOM = np.log(1.8)  # the same for the scale
 _APART = 2.0  # px; nearer candidates are the same point
@@ -53,7 +54,7 @@ class Guided:
                 a_of, b_of = row[allowed], col[allowed]
                 best.update(a_of, b_of, first.likeness(a_of, second, b_of), du[allowed], dw[allowed])
         index, distance, ambiguity = best.mutual()
-        clear = ambiguity <= (self._ratio if prediction.probes is None else min(self._ratio, _CLEAR_RATIO))
+        clear = ambiguity <= (self._ratio if prediction.probes is None else min(self._ratio, CLEAR_RATIO))
         xy = np.stack([self._a.xy[index[:, 0]], self._b.xy[index[:, 1]]], axis=1)
         return Matches(xy, distance, index).select(clear)
 

@@ -23,11 +23,11 @@ from barpc.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.epipolar import Frame, agreeing, common_range, frame, robust_affine, robust_spread
 from barpc.tie.features import KeypointFiles, Keypoints, join
-from barpc.tie.guided import Guided
+from barpc.tie.guided import CLEAR_RATIO, Guided
 from barpc.tie.hook import Hook, hooked
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
 from barpc.tie.ortho import Terrain
-from barpc.tie.pairs import Pair, shared_tiles
+from barpc.tie.pairs import Pair, reach_of, shared_tiles
 from barpc.tie.structure import Structure
 from barpc.tie.tasks import Progress, ordered
 
@@ -54,11 +54,15 @@ _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 _PEAK = 4.0  # px, width of the window in which true matches of a blind pass fall
 _LEAST_PEAK = 8  # matches
 _SIGNIFICANT = 6.0  # standard deviations
+_NOWHERE = "no common offset"
 _CLEAR = 0.4  # share of the matches that makes wider passes needless
 _FALSE_SHARE_TIGHT = 0.05  # of the tight pass, which only serves the local one
 _NEIGHBOURS = 12
-_LOOSE = 0.95, 0.05  # ratio and false share of the second attempt
-_LEAST = 8  # matches of it
+_LOOSE = (
+    0.95,
+    0.05,
+    2 / 3,
+)  # ratio and false share of the second attempt; its part of the matches that a pair needs
 _QUICK = 500  # keypoints of a view that tell what a pair promises
 _LEAST_REACH = 5.0  # px of half a segment, below which matches say nothing of altitudes
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
@@ -87,11 +91,14 @@ class PairReport:
     reason: str = ""  # why the pair was tried
     beaten: tuple[str, ...] = ()
     """Attempts that found fewer: matcher, whether loosened, verified matches of those wanted, as "guided 12 of 100"."""
+    unregistered: int = (
+        0  # of its tracks stand where keypoints were found: their patches could not be registered
+    )
 
     @property
     def means(self) -> str:
-        """What found the matches, and whether with loosened thresholds."""
-        return self.matcher + ", loosened" * self.loosened
+        """What found the matches, whether with loosened thresholds, and whether keypoints tie the pair themselves."""
+        return self.matcher + ", loosened" * self.loosened + ", by keypoints" * bool(self.unregistered)
 
 
 def match_pair(
@@ -107,14 +114,16 @@ def match_pair(
     first = _attempt(views, keypoints, pair, options)
     if enough(first[1]) or "keypoints" in first[1].status or options.matcher not in MATCHERS:
         return first
-    if options.matcher == STRUCTURE and first[1].matches < _LEAST:  # thresholds do not say where it looks
-        return first
     loose = replace(
         options,
         ratio=max(options.ratio, _LOOSE[0]),
         false_share=max(options.false_share, _LOOSE[1]),
-        min_matches=min(options.min_matches, _LEAST),
+        min_matches=max(4, math.ceil(options.min_matches * _LOOSE[2])),
     )
+    if options.matcher == STRUCTURE and first[1].matches < loose.min_matches:
+        return first  # thresholds do not say where it looks
+    if first[1].status.startswith(_NOWHERE) and options.ratio >= CLEAR_RATIO:
+        return first  # nor do looser ones let more through where only clear matches count
     found, report = _attempt(views, keypoints, pair, loose)
     return _better(first, (found, replace(report, loosened=True)))
 
@@ -168,7 +177,7 @@ def _attempt(
     search = _Search(views, loaded, options)
     coarse = search.offset()
     if coarse is None:
-        return NO_MATCHES, replace(report, status=f"no common offset within {options.search:g} px")
+        return NO_MATCHES, replace(report, status=f"{_NOWHERE} within {search.reach:.4g} px")
     tight, _ = search.trusted(coarse, _FALSE_SHARE_TIGHT)
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
@@ -332,6 +341,7 @@ class _Search:
         self, views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints], options: TieOptions
     ) -> None:
         self._views, self._options = views, options
+        self.reach = reach_of(views[1], options)
         self._matcher = matcher_named(options.matcher)(options, keypoints)
         points = keypoints[0].xy
         self._windows = cache(lambda: shared_tiles(views, [Pair((0, 1), 1.0, 0.0)], options)[0])
@@ -376,8 +386,9 @@ class _Search:
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
         best: _Peak | None = None
-        for width, probes in _PASSES:
-            found = self._blind(min(width, self._options.search), probes)
+        passes = {min(width, self.reach): probes for width, probes in _PASSES}  # of one width the last
+        for width, probes in passes.items():
+            found = self._blind(width, probes)
             if found is not None and (best is None or found.significance > best.significance):
                 best = found
             if best is not None and best.share >= _CLEAR:

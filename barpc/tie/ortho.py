@@ -171,7 +171,7 @@ def picture(
     if min(box[2:]) < thin:
         return nothing
     box = box[0], box[1], box[2] // thin * thin, box[3] // thin * thin
-    picture, valid = _thinned(path, bands, box, thin)
+    picture, valid = _thinned((path, size), bands, box, thin)
     if not (valid > 0).any():
         return nothing
     if (left := apart / thin) > 1.1:
@@ -184,12 +184,14 @@ def picture(
     return np.asarray(found, np.float32), np.asarray(inside > _KNOWN)
 
 
-def _thinned(path: str, bands: Sequence[int], box: Box, thin: int) -> tuple[FloatImage, FloatImage]:
+def _thinned(
+    file: tuple[str, tuple[int, int]], bands: Sequence[int], box: Box, thin: int
+) -> tuple[FloatImage, FloatImage]:
     """The mean of bands of a window, averaged over `thin` x `thin` px, and how much of each of these is known."""
     cv2.setNumThreads(1)
     picture, valid = np.zeros((box[3], box[2]), np.float32), np.ones((box[3], box[2]), dtype=bool)
     for band in bands:
-        pixels, known = read_pixels(path, box, band)
+        pixels, known = read_pixels(file[0], box, band, file[1])
         picture += levelled(pixels, known)
         valid &= known
     picture[~valid] = picture[valid].mean() if valid.any() else 0.0

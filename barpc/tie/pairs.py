@@ -18,7 +18,7 @@ from barpc.errors import DisconnectedError, InputError, TiePointError
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.options import TieOptions
 from barpc.scene import BoolArray, View, connected_groups
-from barpc.sensor.geometry import Several, convergence_angle, footprint
+from barpc.sensor.geometry import Several, convergence_angle, footprint, ground_sample_distance
 from barpc.sidefile import GEOJSON, read_json
 from barpc.tie.epipolar import common_range
 from barpc.tie.raster import Box, tiles
@@ -27,6 +27,9 @@ logger = logging.getLogger(__name__)
 
 _BEST_ANGLE = 15.0  # deg; matches are many and heights still well determined
 _ANGLE_DECAY = 15.0  # deg
+ASTRAY = 700.0
+"""How far two cameras may be wrong about each other [m]: by 350 m each, as SPOT 1 to 4 state it, the worst of all."""
+_REACH = 20.0, 700.0  # px that are searched at least and at most, unless another number is asked for
 GIVEN = "given"
 """Why a pair is tried that others have matched."""
 _MALFORMED = (
@@ -151,11 +154,11 @@ class Pair:
 class Footprints:
     """Outlines of views at one altitude [m], as far as they lie in an area, in a common plane [m east, north].
 
-    They grow, as the area does, by as much as the cameras may be wrong (`reach` [px]); empty where no ground is seen.
+    They grow, as the area does, by as much as each camera may be wrong (`reaches` [px]); empty where no ground is seen.
     """
 
     def __init__(
-        self, views: Sequence[View], alt: float, reach: float = 0.0, area: Area | None = None
+        self, views: Sequence[View], alt: float, reaches: Sequence[float] = (), area: Area | None = None
     ) -> None:
         rings = [footprint(view.sensor, view.size, alt)[:, :2] for view in views]
         usable = [ring[np.isfinite(ring).all(axis=1)] for ring in rings]
@@ -164,7 +167,7 @@ class Footprints:
         self.alt = alt
         wanted = None if area is None else area.plane(self._origin, self._scale)
         self.outlines: list[shapely.Geometry] = []
-        for view, ring in zip(views, usable, strict=True):
+        for view, ring, reach in zip(views, usable, reaches or [0.0] * len(views), strict=True):
             outline = shapely.make_valid(shapely.Polygon(self.plane(ring) if len(ring) > 3 else ring[:0]))
             more = reach * float(np.sqrt(outline.area / (view.size[0] * view.size[1])))
             near = wanted
@@ -182,6 +185,15 @@ class Footprints:
         return np.column_stack([points / self._scale + self._origin, np.full(len(points), self.alt)])
 
 
+def reach_of(view: View, options: TieOptions) -> float:
+    """How far the camera of a view may be wrong, in any direction [px]."""
+    if options.search is not None:
+        return options.search
+    ground = view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.array(view.altitude))
+    pixel = float(ground_sample_distance(view.sensor, ground)[1])
+    return float(np.clip(ASTRAY / pixel, *_REACH)) if pixel > 0.0 else _REACH[1]
+
+
 def _levels(views: Sequence[View]) -> tuple[float, float, float]:
     """Middle, lowest and highest altitude [m] of what the views' ranges have in common."""
     low, high = common_range(*views)
@@ -189,12 +201,12 @@ def _levels(views: Sequence[View]) -> tuple[float, float, float]:
 
 
 def _overlapping(
-    views: Sequence[View], options: TieOptions, reach: float = 0.0, area: Area | None = None
+    views: Sequence[View], options: TieOptions, reaches: Sequence[float] = (), area: Area | None = None
 ) -> list[Pair]:
     """All pairs that overlap enough at some altitude, under an angle that is asked for, ascending."""
     best: dict[tuple[int, int], Pair] = {}
     for alt in _levels(views):
-        for pair in _overlapping_at(Footprints(views, alt, reach, area), views, options):
+        for pair in _overlapping_at(Footprints(views, alt, reaches, area), views, options):
             if pair.views not in best or pair.overlap > best[pair.views].overlap:
                 best[pair.views] = pair
     return [best[pair] for pair in sorted(best)]
@@ -281,7 +293,7 @@ def _candidates(
     lonely |= ~np.isin(np.arange(len(views)), connected_groups(len(views), sorted(known))[0])
     if not (wanted - known if wanted else lonely.any()):
         return pairs
-    grown = _overlapping(views, options, options.search, area)  # a camera may be wrong by more
+    grown = _overlapping(views, options, [reach_of(view, options) for view in views], area)
     for pair in grown:
         worth = pair.views in wanted if wanted else lonely[list(pair.views)].any()
         if worth and pair.views not in known:
@@ -307,7 +319,7 @@ def shared_tiles(
     area: Area | None = None,
     boxes: Sequence[Sequence[Box]] | None = None,
 ) -> list[list[Box]]:
-    """The tiles (or `boxes`) of every view that a partner may see in the area, though cameras be wrong by `search`."""
+    """The tiles (or `boxes`) of every view that a partner may see in the area, though cameras be wrong (`reach_of`)."""
     boxes = boxes or [tiles(view.size, options) for view in views]
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]
@@ -315,8 +327,9 @@ def shared_tiles(
         i, j = pair.views
         partners[i].append(j)
         partners[j].append(i)
+    reaches = [reach_of(view, options) for view in views]
     for alt in _levels(views):
-        prints = Footprints(views, alt, options.search, area)
+        prints = Footprints(views, alt, reaches, area)
         for i, of_view in enumerate(boxes):
             partly = shapely.union_all([prints.outlines[j] for j in partners[i]])
             corners = np.array(

@@ -79,22 +79,31 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
     return np.where(valid, _levelled(pixels, float(low), float(high), _LEVELS), np.float32(0.0))
 
 
-def read_pixels(path: str | os.PathLike[str], box: Box, band: int = 1) -> tuple[Pixels, BoolArray]:
+def read_pixels(
+    path: str | os.PathLike[str], box: Box, band: int = 1, size: tuple[int, int] | None = None
+) -> tuple[Pixels, BoolArray]:
     """Pixels (height, width) of a window as stored, 0 where invalid, and which of them mean something.
 
     Those at nodata, masked, non-finite, saturated or in undeclared zero borders do not. ImageError: the file cannot
     be read, has no such band (from 1), or holds complex numbers.
     """
-    with PixelReader(path, band) as reader:
+    with PixelReader(path, band, size) as reader:
         return reader.read(box)
 
 
 class PixelReader(ExitStack):
-    """`read_pixels` for many windows: a block that two of them share is decoded once."""
+    """`read_pixels` for many windows: a block that two of them share is decoded once.
 
-    def __init__(self, path: str | os.PathLike[str], band: int = 1) -> None:
+    With a `size` (width, height) that the file holds several times, boxes and pixels are those of the picture of that
+    size: means of the file's.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None
+    ) -> None:
         super().__init__()
         self._band, self._dataset = band, self.enter_context(open_raster(path))
+        self._pixel = _pixel(self._dataset, size)
         try:
             _check_band(self._dataset, path, band)
         except ImageError:
@@ -103,7 +112,32 @@ class PixelReader(ExitStack):
 
     def read(self, box: Box) -> tuple[Pixels, BoolArray]:
         """Pixels of a window, and which of them mean something."""
-        return _read(self._dataset, box, self._band)
+        return _averaged(self._dataset, box, self._band, self._pixel)
+
+
+def _pixel(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
+    """Columns and rows of a raster that one pixel of its picture of a size (width, height) holds."""
+    width, height = size or (dataset.width, dataset.height)
+    return max(1, dataset.width // width), max(1, dataset.height // height)
+
+
+def _averaged(
+    dataset: Any, box: Box, band: int, pixel: tuple[int, int], level: int = 1
+) -> tuple[Pixels, BoolArray]:
+    """Pixels of a window whose sides hold so many of the file's, as means; valid where all of these are."""
+    if pixel == (1, 1):
+        return _read(dataset, box, band, level)
+    (col, row, width, height), (wide, high), parts = box, pixel, []
+    step = max(1, _ROWS // high)
+    for top in range(row, row + height, step):
+        rows = min(step, row + height - top)
+        raw, known = _read(dataset, (wide * col, high * top, wide * width, high * rows), band)
+        raw /= wide * high  # before the sum: it might have no number
+        mean = cv2.resize(raw, (width, rows), interpolation=cv2.INTER_AREA) * raw.dtype.type(wide * high)
+        parts.append((mean, known.reshape(rows, high, width, wide).all(axis=(1, 3))))
+    pixels, valid = (np.concatenate(column) for column in zip(*parts, strict=True))
+    pixels[~valid] = 0.0
+    return pixels, valid
 
 
 def _check_band(dataset: Any, path: str | os.PathLike[str], band: int) -> None:
@@ -146,17 +180,21 @@ def _mask(dataset: Any, band: int, raw: npt.NDArray[Any]) -> BoolArray | None:
     return out
 
 
-def sample_stretch(path: str | os.PathLike[str], band: int = 1) -> Stretch | None:
-    """0.5 and 99.5 percentile of blocks spread over a raster; None where nothing varies."""
+def sample_stretch(
+    path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None
+) -> Stretch | None:
+    """0.5 and 99.5 percentile of blocks spread over a raster, or its picture of a size; None where nothing varies."""
     found: list[Array] = []
     with open_raster(path) as dataset:
         _check_band(dataset, path, band)
         kind = np.dtype(dataset.dtypes[band - 1])
-        zoom = _LEVEL if _levels(dataset, band) else 1
-        side_x, side_y = (min(zoom * _SAMPLE_SIDE, n) for n in (dataset.width, dataset.height))
-        for row in np.linspace(0, dataset.height - side_y, _SAMPLES).astype(int):
-            for col in np.linspace(0, dataset.width - side_x, _SAMPLES).astype(int):
-                pixels, valid = _read(dataset, (int(col), int(row), side_x, side_y), band, zoom)
+        pixel, (width, height) = _pixel(dataset, size), size or (dataset.width, dataset.height)
+        zoom = _LEVEL if pixel == (1, 1) and _levels(dataset, band) else 1
+        side_x, side_y = (min(zoom * _SAMPLE_SIDE, n) for n in (width, height))
+        for row in np.linspace(0, height - side_y, _SAMPLES).astype(int):
+            for col in np.linspace(0, width - side_x, _SAMPLES).astype(int):
+                box = int(col), int(row), side_x, side_y
+                pixels, valid = _averaged(dataset, box, band, pixel, zoom)
                 found.append(pixels[valid][::7].astype(np.float64))
     values = np.concatenate(found)
     low, high = np.percentile(values, [0.5, 99.5]) if len(values) else (0.0, 0.0)
@@ -173,15 +211,18 @@ class Survey:
     stretch: Stretch
     block: tuple[int, int]  # width and height of what is decoded at a time [px]
     levels: bool  # decoding is dear, and every second or fourth pixel costs less (JPEG 2000)
+    pixel: tuple[int, int] = (1, 1)  # columns and rows of the file that a pixel holds
 
 
-def survey(path: str | os.PathLike[str], band: int = 1) -> Survey | None:
-    """The stretch of a raster, and how it is stored; None where nothing varies."""
-    stretch = sample_stretch(path, band)
+def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Survey | None:
+    """The stretch of a raster, or its picture of a size, and how it is stored; None where nothing varies."""
+    stretch = sample_stretch(path, band, size)
     with open_raster(path) as dataset:
         height, width = dataset.block_shapes[band - 1]
-        levels = _levels(dataset, band)
-    return None if stretch is None else Survey(stretch, (width, height), levels)
+        wide, high = pixel = _pixel(dataset, size)
+        levels = pixel == (1, 1) and _levels(dataset, band)
+    block = max(1, width // wide), max(1, height // high)
+    return None if stretch is None else Survey(stretch, block, levels, pixel)
 
 
 def _levels(dataset: Any, band: int) -> bool:
@@ -206,7 +247,7 @@ def read_picture(
         top = row
         while top < row + height:
             stop = min(row + height, (top // step + 1) * step)
-            pixels, known = _read(dataset, (col, top, width, stop - top), band, level)
+            pixels, known = _averaged(dataset, (col, top, width, stop - top), band, found.pixel, level)
             part = slice((top - row) // zoom, (stop - row) // zoom)
             picture[part], valid[part] = _reduced(found.stretch.apply(pixels, known), known, zoom // level)
             top = stop

@@ -87,17 +87,21 @@ def register_places(
     patch: int,
     tile: int = 1024,
 ) -> Registration:
-    """Read what is needed of two images, each a path and its size, and register as `register` does, tile by tile."""
+    """Read what is needed of two images, each a path and its size, and register as `register` does, tile by tile.
+
+    Where a size is a part of the file's, pixels are means of the file's (`PixelReader`).
+    """
     cv2.setNumThreads(1)
     margin = patch + _TAPS + int(_REACH)
     sparse, every = _sparse(reference, margin), Registration.none(start)
     read, groups = (
         (_mosaics, [np.arange(len(start))]) if sparse else (_window, _by_tile(reference, min(tile, _PIECE)))
     )
-    with PixelReader(files[0][0], band) as first, PixelReader(files[1][0], band) as second:
+    (path, size), (other, beyond) = files
+    with PixelReader(path, band, size) as first, PixelReader(other, band, beyond) as second:
         for rows in groups:
-            a, valid_a, shift_a = read(first, files[0][1], reference[rows], margin)
-            b, valid_b, shift_b = read(second, files[1][1], start[rows], margin)
+            a, valid_a, shift_a = read(first, size, reference[rows], margin)
+            b, valid_b, shift_b = read(second, beyond, start[rows], margin)
             places = reference[rows] - shift_a, start[rows] - shift_b
             found = register((a, b), (valid_a, valid_b), *places, linear[rows], patch)
             every.put(rows, replace(found, xy=found.xy + shift_b))

@@ -34,7 +34,9 @@ SIGMA = 0.1
 _HALF = 16  # px: a template reaches so far to each side
 _PAD = 8  # px around what is compared, where channels do not know what lies beyond
 _TILE = 256  # px: points of a tile share a picture
-_BATCH = 32  # templates that are correlated at a time
+_BATCH = 32  # templates that are correlated at a time, at most,
+_AREA = 1 << 21  # of areas of so many px together: 60 bytes a px
+_SURFACE = 1 << 23  # places at which a tile's points are compared, all together: 30 bytes each
 _PITCH = 8  # px between points, at least
 _POINTS = 200, 500, 1000  # looked for: of the cameras' error, in long bands, in short ones
 _LONG, _LONGER = 48.0, 130.0  # px of half a band
@@ -155,6 +157,11 @@ class _Search:
         turned = np.abs(np.linalg.inv(self._step * linear) @ axes.T)
         whole = np.abs(np.linalg.inv(self._step * linear)) @ self._files[1][1]
         reach = np.ceil(np.minimum(turned @ [longest, wide], whole)).astype(np.int64) + 1
+        if len(rows) > 1 and len(rows) * (2 * reach + 1).prod() > _SURFACE:
+            order = rows[np.argsort(at[:, np.ptp(at, axis=0).argmax()], kind="stable")]
+            halves = [self._tile(where, np.sort(half)) for half in np.array_split(order, 2)]
+            first, second, third = (np.concatenate(column) for column in zip(*halves, strict=True))
+            return first, second, third
         centers = where.place(middle + shift)[rows]
         tile = Tile.of(self._files, self._band, self._step, at, centers, linear, reach, _HALF)
         surface = tile.surfaces()
@@ -289,7 +296,9 @@ class Tile:
         return np.concatenate(parts)
 
     def _batches(self) -> list[slice]:
-        return [slice(i, i + _BATCH) for i in range(0, len(self.at), _BATCH)]
+        area = int((2 * (self.half + self.reach) + 1).prod())
+        batch = max(1, min(_BATCH, _AREA // area))
+        return [slice(i, i + batch) for i in range(0, len(self.at), batch)]
 
     def offsets(self) -> Array:
         """How far in B (y, x, 2) [px] the places of a surface lie from the whole px."""

@@ -18,18 +18,31 @@ from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
+from barpc.tie.epipolar import grouped, linear_map
 from barpc.tie.features import KeypointFiles, locate
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
-from barpc.tie.matching import STRUCTURE, THIN, PairReport, enough, match, matcher_named, quick_score
+from barpc.tie.matching import (
+    MATCHERS,
+    STRUCTURE,
+    THIN,
+    PairReport,
+    enough,
+    match,
+    matcher_named,
+    quick_score,
+)
 from barpc.tie.ortho import Terrain
 from barpc.tie.pairs import Area, Pair, possible_pairs, require_connected
 from barpc.tie.register import refine
+from barpc.tie.resolution import Looks
 from barpc.tie.store import Store, store_of
 from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 
+NEEDED = 4
+"""Tracks of a pair: across the epipolar lines they are a shift and three that could contradict it."""
 _DEFAULTS = TieOptions()
 _NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
@@ -95,21 +108,51 @@ def find_tracks(
         pool = possible_pairs(views, options, only=only, area=area, given=given)
         trials.run(pool, all_of_them=bool(only))
     tried = sorted(trials.tried.items())
-    pairs, found = [pair for _, (pair, _, _) in tried], [matches for _, (_, matches, _) in tried]
-    reports = tuple(report for _, (_, _, report) in tried)
+    pairs, reports = [pair for _, (pair, _, _) in tried], tuple(report for _, (_, _, report) in tried)
     require_matches(views, pairs, reports)
-    sizes, most = [view.size for view in views], options.points_per_image
-    linked = inside(views, link([pair.views for pair in pairs], found), area)
-    spreads = {p.views: r.spread for p, r in zip(pairs, reports, strict=True) if r.status == "ok"}
+    tracks, bare = _registered(trials, area, given, options, work)
+    reports = tuple(
+        replace(r, unregistered=bare.get(p.views, 0)) for p, r in zip(pairs, reports, strict=True)
+    )
+    require_tracks(views, tracks, pairs, reports)
+    return TieResult(tracks, reports, trials.keypoints)
+
+
+def _registered(
+    trials: _Trials, area: Area | None, given: GivenMatches, options: TieOptions, work: dict[str, Any]
+) -> tuple[Tracks, dict[tuple[int, int], int]]:
+    """What the pairs that were tried have in common, evenly thinned and registered, and how much of it is not."""
+    looks, most = trials.looks, options.points_per_image
+    tried = [(looks.ends[views], *trials.tried[views][1:]) for views in sorted(trials.tried)]
+    linked = inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
+    spreads = {ends: report.spread for ends, _, report in tried if report.status == "ok"}
+    sizes = [view.size for view in looks.views]
     linked = thin(linked, sizes, int(_SPARE * most))
-    structural = [p.views for p, r in zip(pairs, reports, strict=True) if r.matcher == STRUCTURE]
-    verified = {p.views: m for p, m in zip(pairs, found, strict=True) if p.views in given and len(m)}
-    structural += _unlike(views, verified, options, work)
-    tracks = refine(views, linked, spreads, options, structural=structural, **work)
-    tracks = _with_unregistered(views, tracks, verified, options)
-    tracks = thin(inside(views, tracks, area), sizes, most)
-    require_tracks(views, tracks, pairs, reports, options)
-    return TieResult(tracks, reports, tuple(len(k) for k in trials.keypoints))
+    structural = [ends for ends, _, report in tried if report.matcher == STRUCTURE]
+    theirs = {looks.ends[views] for views in given}
+    verified = {ends: found for ends, found, _ in tried if len(found)}
+    structural += _unlike(looks.views, {p: verified[p] for p in theirs & set(verified)}, options, work)
+    tracks = refine(looks.views, linked, spreads, options, structural=structural, **work)
+    needed = theirs | _needed(looks, tracks, list(verified), options)
+    known = {ends: found for ends, found in verified.items() if ends in needed}
+    exact, tracks = pair_counts(tracks), _with_unregistered(looks.views, tracks, known, options)
+    bare = {
+        (int(looks.of[i]), int(looks.of[j])): count - exact.get((i, j), 0)
+        for (i, j), count in pair_counts(tracks).items()
+    }
+    return looks.tracks(thin(inside(looks.views, tracks, area), sizes, most)), bare
+
+
+def _needed(
+    looks: Looks, tracks: Tracks, pairs: Sequence[tuple[int, int]], options: TieOptions
+) -> set[tuple[int, int]]:
+    """The pairs of looks between views that no pair with enough registered tracks connects."""
+    counts = pair_counts(tracks)
+    firm = [
+        (int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches
+    ]
+    part = connected_labels(int(looks.of.max()) + 1, firm)[looks.of]
+    return {(i, j) for i, j in pairs if part[i] != part[j]}
 
 
 class _Trials:
@@ -128,12 +171,16 @@ class _Trials:
         self._views, self._options, self._store, self._area = views, options, store, area
         self._given, self._terrain, self._work = given, terrain, work
         self._compares = options.matcher == _DEFAULTS.matcher  # by keypoints
-        self.keypoints = [KeypointFiles(store)] * len(views)
+        self.looks = Looks.at(views, [])
+        self._keypoints: list[KeypointFiles] = []
         self.tried: dict[tuple[int, int], tuple[Pair, Matches, PairReport]] = {}
         self._scores: dict[tuple[int, int], int] = {}
 
     def run(self, pool: Sequence[Pair], all_of_them: bool) -> None:
         """Try the best pairs of a pool, or all, and others in place of those that fail."""
+        own = self._options.matcher in MATCHERS  # another one reads the files itself
+        self.looks = Looks.at(self._views, pool, apart=own)
+        self._keypoints = [KeypointFiles(self._store)] * len(self.looks.views)
         num, most = len(self._views), self._options.neighbours
         twice = self._compares and several_dates(self._views)
         chosen = pool if all_of_them else best_pairs(pool, num, most)
@@ -153,10 +200,16 @@ class _Trials:
 
     def _locate(self, pairs: Sequence[Pair]) -> None:
         """Find the keypoints that pairs need."""
-        others = [pair for pair in pairs if pair.views not in self._given]
+        others = [self.looks.pair(pair) for pair in pairs if pair.views not in self._given]
         if others and matcher_named(self._options.matcher).detects:
-            views, options = self._views, self._options
-            self.keypoints = locate(views, options, self._store, pairs=others, area=self._area, **self._work)
+            views, options = self.looks.views, self._options
+            self._keypoints = locate(views, options, self._store, pairs=others, area=self._area, **self._work)
+
+    @property
+    def keypoints(self) -> tuple[int, ...]:
+        """How many were found in each view."""
+        count = np.bincount(self.looks.of, weights=[len(k) for k in self._keypoints])
+        return tuple(count.astype(int).tolist())
 
     def _judged(self, pairs: Sequence[Pair]) -> list[Pair]:
         """Pairs with their quick scores, where keypoints can tell."""
@@ -170,19 +223,26 @@ class _Trials:
         return [judged(self._views, p, known[p.views]) if p.views in known else p for p in pairs]
 
     def _ends(self, pair: Pair) -> tuple[tuple[View, View], tuple[KeypointFiles, KeypointFiles]]:
-        i, j = pair.views
-        return (self._views[i], self._views[j]), (self.keypoints[i], self.keypoints[j])
+        i, j = self.looks.ends[pair.views]
+        return (self.looks.views[i], self.looks.views[j]), (self._keypoints[i], self._keypoints[j])
 
     def _try(self, pairs: Sequence[Pair]) -> None:
         known, others = ([p for p in pairs if (p.views in self._given) is there] for there in (True, False))
         before = [
             (self._ends(pair)[0], found) for pair, found, report in self.tried.values() if enough(report)
         ]
-        views, options = self._views, self._options
+        looks, options = self.looks, self._options
         own = match(
-            views, self.keypoints, others, options, terrain=self._terrain, before=before, **self._work
+            looks.views,
+            self._keypoints,
+            [looks.pair(pair) for pair in others],
+            options,
+            terrain=self._terrain,
+            before=before,
+            **self._work,
         )
-        theirs = verify(views, self._given, known, options, **self._work)
+        given = {looks.ends[pair.views]: looks.matches(pair.views, self._given[pair.views]) for pair in known}
+        theirs = verify(looks.views, given, [looks.pair(pair) for pair in known], options, **self._work)
         for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
             self.tried[pair.views] = pair, found, report
 
@@ -203,33 +263,44 @@ def _unlike(
 def _with_unregistered(
     views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions
 ) -> Tracks:
-    """Tracks, and the verified matches of those given pairs of which too few could be registered."""
+    """Tracks, and the verified matches of those of some pairs of which too few could be registered."""
     counts = pair_counts(tracks)
     lost = [pair for pair in given if counts.get(pair, 0) < options.min_matches]
     if not lost:
         return tracks
     for i, j in lost:
-        words = (
-            "%s - %s: %d of %d given matches could be registered: they are used as they are, good to %.2f px"
-        )
+        words = "%s - %s: %d of %d matches could be registered: the others are used as found, good to %.2f px"
         count, known = counts.get((i, j), 0), given[i, j]
         logger.warning(words, views[i].name, views[j].name, count, len(known), known.sigma)
     sizes, most = [view.size for view in views], options.points_per_image
     more = thin(link(lost, [given[pair] for pair in lost]), sizes, most)
-    more = more.select(~_twice(tracks, more)[more.point])
-    return Tracks(
-        np.concatenate([tracks.view, more.view]),
-        np.concatenate([tracks.point, tracks.num_points + more.point]),
-        np.concatenate([tracks.xy, more.xy]),
-        np.concatenate([tracks.sigma, more.sigma]),
-    )
+    return _joined(views, tracks, more)
 
 
-def _twice(tracks: Tracks, others: Tracks) -> BoolArray:
-    """Which of other tracks, two of whose observations stand beside registered ones, show a ground point again."""
+def _joined(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
+    """Registered tracks and others: one that stands beside a registered one is the same point, seen by more views."""
     known, asked = (np.array([_APART * part.view, *part.xy.T]).T for part in (tracks, others))
-    near = np.isfinite(cKDTree(known).query(asked, distance_upper_bound=_SAME)[0])
-    return np.asarray(np.bincount(others.point[near], minlength=others.num_points) >= 2)
+    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=_SAME))
+    same = np.flatnonzero(np.isfinite(near))
+    point, which = np.unique(others.point[same], return_index=True)
+    anchor = np.full(others.num_points, -1)  # the row of each track that says where it stands, if one does
+    anchor[point] = same[which]
+    number, xy = tracks.num_points + others.point, others.xy.copy()
+    found = np.flatnonzero(anchor[others.point] >= 0)
+    start = anchor[others.point[found]]
+    number[found] = tracks.point[row[start]]
+    moved = (
+        tracks.xy[row[start]] - others.xy[start]
+    )  # registration moves a point, and all views of it with it
+    for group in grouped(others.view[start], others.view[found]):
+        first, second = (views[others.view[end[group[0]]]] for end in (start, found))
+        linear = linear_map(first, second, others.xy[start[group]])
+        xy[found[group]] += (linear @ moved[group, :, None])[..., 0]
+    view, number = np.concatenate([tracks.view, others.view]), np.concatenate([tracks.point, number])
+    once = np.unique(np.stack([number, view]), axis=1, return_index=True)[1]  # in the order that tracks have
+    point = np.unique(number[once], return_inverse=True)[1].reshape(-1)
+    xy, sigma = np.concatenate([tracks.xy, xy]), np.concatenate([tracks.sigma, others.sigma])
+    return Tracks(view[once], point, xy[once], sigma[once])
 
 
 def inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
@@ -269,13 +340,12 @@ def require_tracks(
     tracks: Tracks,
     pairs: Sequence[Pair],
     reports: Sequence[PairReport],
-    options: TieOptions,
 ) -> None:
-    """As `require_matches`, for the pairs that `min_matches` tracks or more are left of."""
+    """As `require_matches`, for the pairs that `NEEDED` tracks or more are left of."""
     left, counts = [], pair_counts(tracks)
     for pair, report in zip(pairs, reports, strict=True):
         common = counts.get(pair.views, 0)
-        status = "ok" if common >= options.min_matches else f"only {common} tracks after registration"
+        status = "ok" if common >= NEEDED else f"only {common} tracks after registration"
         left.append(replace(report, status=status if report.status == "ok" else report.status))
     require_matches(views, pairs, left)
 

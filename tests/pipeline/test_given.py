@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -82,6 +83,40 @@ def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) 
     said = f"m.csv: 9 of 18 points lie outside .* in view_01, {width} x {height} pixels"
     with pytest.raises(InputError, match=said):
         read([tmp_path / "m.csv"], views)
+
+
+@pytest.mark.parametrize("read", [given_matches, given_tracks])
+@pytest.mark.parametrize(("astray", "fails"), [(1, False), (15, False), (16, True)])
+def test_a_few_points_beyond_their_image_are_left_out_and_counted(
+    tmp_path, caplog, read, astray, fails
+) -> None:
+    """One in twenty of 300 points; what else sees them keeps its own partners."""
+    views = load_views(IMAGES).views
+    (width, height), names = views[0].size, [view.name for view in views]
+    rows = [
+        f"{names[i]},{width + 40 if t < astray and i == 0 else t + 5 + i},{7 + i},{t}\n"
+        for t in range(100)
+        for i in range(3)
+    ]
+    (tmp_path / "m.csv").write_text("image,col,row,track\n" + "".join(rows))
+    said = (
+        f"m.csv: {astray} of 300 points lie outside their images, as .* in view_00, {width} x {height} pixels"
+    )
+    if fails:
+        with pytest.raises(InputError, match=said):
+            read([tmp_path / "m.csv"], views)
+        return
+    found = read([tmp_path / "m.csv"], views)
+    assert re.search(f"{said}: they are left out", caplog.text)
+    if read is given_tracks:
+        assert np.bincount(np.bincount(found.point)).tolist() == [0, 0, astray, 100 - astray]
+        first = (found.xy[:, 0] - found.view)[np.searchsorted(found.point, np.arange(100))]
+        np.testing.assert_array_equal(found.xy[:, 0] - found.view, first[found.point])
+        return
+    for pair, lost in (((0, 1), astray), ((0, 2), astray), ((1, 2), 0)):
+        xy = found[pair].xy
+        assert sorted(xy[:, 0, 0] - pair[0] - 5) == [*range(lost, 100)]
+        np.testing.assert_array_equal(xy[:, 1, 0] - xy[:, 0, 0], pair[1] - pair[0])
 
 
 @pytest.mark.slow

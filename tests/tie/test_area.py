@@ -213,8 +213,8 @@ def test_outlines_and_the_area_grow_by_as_much_as_the_cameras_may_be_wrong(tmp_p
     area = read_area(written(tmp_path / "a.json", box(west, south, east, north)))
     plain = Footprints(two, 100.0)
     for reach, metres in ((0.0, 0.0), (40.0, 20.0)):
-        grown = Footprints(two, 100.0, reach)
-        inside = Footprints(two, 100.0, reach, area)
+        grown = Footprints(two, 100.0, [reach] * 2)
+        inside = Footprints(two, 100.0, [reach] * 2, area)
         for outline, grew, part in zip(plain.outlines, grown.outlines, inside.outlines, strict=True):
             edge = np.array(outline.bounds) + metres * np.array([-1, -1, 1, 1])
             np.testing.assert_allclose(grew.bounds, edge, atol=0.1)
@@ -231,7 +231,7 @@ def test_outlines_and_the_area_grow_by_as_much_as_the_cameras_may_be_wrong(tmp_p
 def test_outlines_of_an_oblong_image_grow_by_whole_pixels_too() -> None:
     (square,) = views_of(camera(0.0, lean=0.0))
     oblong = replace(square, size=(1000, 250))
-    plain, grown = (Footprints([oblong], 100.0, reach).outlines[0] for reach in (0.0, 40.0))
+    plain, grown = (Footprints([oblong], 100.0, [reach]).outlines[0] for reach in (0.0, 40.0))
     np.testing.assert_allclose(np.subtract(grown.bounds, plain.bounds), [-20, -20, 20, 20], atol=0.1)
 
 

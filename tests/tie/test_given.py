@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from barpc.errors import DisconnectedError
 from barpc.raster import open_raster
 from barpc.scene import Tracks
-from barpc.tie import Matches, TieOptions, common_tracks, find_tracks
+from barpc.tie import Matches, TieOptions, common_tracks, find_tracks, raster
 from barpc.tie.tracks import pair_counts
 from tests.lanes import rest_slow
 
@@ -108,7 +108,7 @@ def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
     views = [first, replace(second, path=str(path)), third]
     with caplog.at_level(logging.WARNING):
         tracks = find_tracks(views, given=true_matches(scene, *PAIRS, noise=0.4, false=0.2)).tracks
-    assert "used as they are" not in caplog.text
+    assert "used as found" not in caplog.text
     for pair in PAIRS:
         assert pair_counts(tracks)[pair] >= 150
         across = np.abs(scene.errors(*pair, *common_tracks(tracks, *pair))).min(axis=1)
@@ -130,7 +130,7 @@ def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, c
         result = find_tracks(
             [first, replace(second, path=str(path))], TieOptions(min_matches=100), given=given
         )
-    assert "used as they are, good to 0." in caplog.text
+    assert "used as found, good to 0." in caplog.text
     assert 0.7 * 400 <= result.tracks.num_points <= 450
     errors = np.abs(scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))).max(axis=1)
     assert 0.2 < np.median(errors) < 0.6
@@ -140,6 +140,47 @@ def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, c
     places = np.hstack(common_tracks(result.tracks, 0, 1))
     known = exact[result.tracks.view == 0]
     assert cKDTree(places[~known]).query(places[known])[0].min() > 2.0
+
+
+@pytest.mark.slow
+def test_a_view_that_cannot_be_registered_joins_the_points_that_the_others_are_registered_by(
+    render, tmp_path
+) -> None:
+    """Each point is one track: that of the two views that register, and the third where it was matched."""
+    scene = render(views=3, size=(300, 300))
+    blank = np.full((300, 300), 900, np.uint16)
+    third = replace(scene.views[2], path=str(write_image(tmp_path / "blank.tif", blank)))
+    given = true_matches(scene, *PAIRS, noise=0.3)
+    result = find_tracks([*scene.views[:2], third], TieOptions(min_matches=100), given=given)
+    tracks = result.tracks
+    assert [report.unregistered > 100 for report in result.pairs] == [False, True, True]
+    assert "by keypoints" in result.pairs[1].means
+    assert (np.bincount(tracks.point) == 3).sum() > 100
+    places = tracks.xy[tracks.view == 0]
+    assert (cKDTree(places).query(places, k=2)[0][:, 1] < 1.0).mean() < 0.03  # two points of one pixel
+    errors = np.abs(scene.errors(0, 2, *common_tracks(tracks, 0, 2)))
+    assert 0.1 < np.median(errors) < 0.5
+    assert (errors > 3.0).mean() <= 0.02
+
+
+def test_no_more_is_read_for_matches_of_others_than_patches_about_them(render, tmp_path, monkeypatch) -> None:
+    """Of nine million pixels an image the corner that the points stand in, once to see how and once to register."""
+    scene = render(views=2, size=(300, 300))
+    large = []
+    for view in scene.views:
+        with open_raster(view.path) as image:
+            path = write_image(tmp_path / f"{view.name}.tif", np.tile(image.read(1), (10, 10)), tiled=True)
+        large.append(replace(view, path=str(path), size=(3000, 3000)))
+    read, pixels = raster._read, []
+
+    def watched(dataset, box, *more):
+        pixels.append(box[2] * box[3])
+        return read(dataset, box, *more)
+
+    monkeypatch.setattr(raster, "_read", watched)
+    given = true_matches(scene, (0, 1), count=200)
+    assert find_tracks(large, given=given).tracks.num_points > 100
+    assert sum(pixels) <= 2 * 2 * 356**2  # 300 and a margin of 28 px
 
 
 def test_given_pairs_connect_what_the_cameras_say_is_apart(render) -> None:

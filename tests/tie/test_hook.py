@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import types
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,7 @@ from barpc.tie.hook import Hook, hook_files, hooked
 from barpc.tie.matcher import Prediction
 from barpc.tie.matching import MATCHERS, matcher_named
 from tests.lanes import rest_slow
+from tests.tie.test_pairs import METRE, camera, views
 
 ROOT = Path(__file__).parents[2]
 TEXT = '''
@@ -154,6 +156,23 @@ def everywhere(xy: np.ndarray) -> Frame:
     x, y = xy.T
     zero, ten = np.zeros(len(xy)), np.full(len(xy), 10.0)
     return Frame(np.array([1.0, 0.0]), x, y, zero, -ten, ten, np.eye(2))
+
+
+def test_a_matcher_of_ones_own_sees_the_images_as_their_files_are(monkeypatch) -> None:
+    """It opens them: half the resolution is for those that read through barpc."""
+    seen: list[tuple[tuple[int, int], tuple[int, int]]] = []
+    users = types.ModuleType("users_of_two_sizes")
+
+    def match(a: View, b: View, prediction: Prediction) -> np.ndarray:
+        seen.append((a.size, b.size))
+        return np.empty((0, 2, 2))
+
+    users.match = match  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "users_of_two_sizes", users)
+    fine, coarse = views(camera(0.0), camera(METRE).window(0, 0, 2, 2))
+    with pytest.raises(TiePointError, match="no common offset"):
+        find_tracks([fine, replace(coarse, size=(500, 500))], TieOptions(matcher="users_of_two_sizes:match"))
+    assert set(seen) == {((1000, 1000), (500, 500))}
 
 
 def test_what_a_function_finds_counts_in_the_band_and_on_the_images() -> None:

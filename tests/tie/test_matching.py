@@ -217,11 +217,11 @@ def test_passes_grow_wider_until_one_is_clear(search) -> None:
     assert clear.asked == [(20.0, 1500)]
     unclear = Listed(spread_out(80, 50))
     found = search(unclear).offset()
-    assert [width for width, _ in unclear.asked] == [20.0, 80.0, TieOptions().search]
+    assert [width for width, _ in unclear.asked] == [20.0, 80.0, 700.0]
     assert [probes for _, probes in unclear.asked] == [1500, 2000, 3000]
     assert found is not None
     assert found.half_width == 3.0
-    none = Listed(spread_out(300, 5, width=TieOptions().search))
+    none = Listed(spread_out(300, 5, width=700.0))
     assert search(none).offset() is None
     assert len(none.asked) == 3
 

@@ -15,7 +15,7 @@ from barpc.tie.features import join
 from barpc.tie.matcher import NO_MATCHES
 from barpc.tie.matching import PairReport, _altitudes, match, match_pair
 from barpc.tie.pairs import Pair
-from barpc.tie.tracks import _twice, _unlike, _with_unregistered
+from barpc.tie.tracks import _joined, _unlike, _with_unregistered
 
 from .test_pairs import camera, views
 
@@ -60,8 +60,8 @@ def test_a_pair_with_enough_is_tried_once(attempts) -> None:
     ("given", "loosened"),
     [
         ({}, (0.95, 0.05, 8)),
-        ({"ratio": 0.97, "min_matches": 5}, (0.97, 0.05, 5)),
-        ({"min_matches": 9}, (0.95, 0.05, 8)),
+        ({"ratio": 0.97, "min_matches": 5}, (0.97, 0.05, 4)),
+        ({"min_matches": 100}, (0.95, 0.05, 67)),
     ],
 )
 def test_a_pair_with_fewer_is_tried_again_with_looser_thresholds(attempts, given, loosened) -> None:
@@ -155,15 +155,23 @@ def of(*rows: tuple[int, int, float, float]) -> Tracks:
     return Tracks(view.astype(int), point.astype(int), np.column_stack([x, y]), np.full(len(rows), 0.1))
 
 
-def test_a_track_is_there_twice_where_two_of_its_places_lie_beside_registered_ones() -> None:
+def test_a_point_that_is_registered_is_one_track_and_what_else_sees_it_goes_with_it() -> None:
+    """Views a tenth of a pixel apart, the third with pixels half as large: what moves a pixel moves two there."""
+    three = views(camera(0.0), camera(0.0), camera(0.0).window(0, 0, 0.5, 0.5))
     known = of((0, 0, 100.0, 100.0), (1, 0, 50.0, 50.0), (0, 1, 300.0, 300.0), (1, 1, 350.0, 300.0))
     other = of(
-        (0, 0, 102.1, 100.0), (1, 0, 50.0, 47.9),  # both within two pixels and a bit
-        (0, 1, 102.3, 100.0), (1, 1, 50.0, 50.0),  # one of them
-        (0, 2, 50.0, 50.0), (1, 2, 100.0, 100.0),  # of the other view
-        (0, 3, 301.0, 301.0), (1, 3, 351.0, 299.0),
+        (0, 0, 102.1, 100.0), (1, 0, 50.0, 47.9),  # both within two pixels and a bit: known
+        (0, 1, 301.0, 299.5), (2, 1, 600.0, 600.0),  # seen by one more
+        (0, 2, 50.0, 50.0), (2, 2, 100.0, 100.0),  # beside another view's
+        (0, 3, 302.3, 300.0), (1, 3, 351.0, 299.0), (2, 3, 700.0, 700.0),  # known; the third has its place already
     )  # fmt: skip
-    assert _twice(known, other).tolist() == [True, False, False, True]
+    found = _joined(three, known, other)
+    assert found.point.tolist() == [0, 0, 1, 1, 1, 2, 2]
+    assert found.view.tolist() == [0, 1, 0, 1, 2, 0, 2]
+    expected = [[100, 100], [50, 50], [300, 300], [350, 300], [598, 601], [50, 50], [100, 100]]
+    np.testing.assert_allclose(found.xy, expected, atol=1e-6)
+    none = Tracks(*(np.empty(0, np.int64),) * 2, np.empty((0, 2)), np.empty(0))
+    assert _joined(three, none, other).num_points == 4
 
 
 def given_matches(count: int) -> Matches:
@@ -207,8 +215,7 @@ def test_given_matches_are_added_where_fewer_than_are_wanted_could_be_registered
         more = _with_unregistered(two, registered, given, TieOptions(min_matches=21))
     assert more.num_points == 40  # those that are registered once
     assert (
-        "20 of 40 given matches could be registered: they are used as they are, good to 0.30 px"
-        in caplog.text
+        "20 of 40 matches could be registered: the others are used as found, good to 0.30 px" in caplog.text
     )
     assert (np.diff(more.point) >= 0).all()
     assert np.unique(more.sigma).tolist() == [0.1, 0.3]

@@ -226,10 +226,14 @@ def test_the_search_reaches_as_far_as_asked_for(scene: Rendered) -> None:
 
 
 def test_a_pair_needs_as_many_matches_as_asked_for(scene: Rendered) -> None:
-    kept = len(scene.tied.tracks) // 2
+    kept, verified = len(scene.tied.tracks) // 2, scene.tied.pairs[0].verified
+    assert kept < verified
     assert len(find_tracks(scene.views, TieOptions(min_matches=kept)).tracks) == 2 * kept
-    with pytest.raises(Exception, match=f"only {kept} tracks after registration"):
-        find_tracks(scene.views, TieOptions(min_matches=kept + 1))
+    more = find_tracks(scene.views, TieOptions(min_matches=kept + 1))  # those that are not registered stay
+    assert kept < more.tracks.num_points <= verified
+    assert more.pairs[0].unregistered == more.tracks.num_points - kept
+    with pytest.raises(Exception, match="too few matches"):
+        find_tracks(scene.views, TieOptions(min_matches=2 * verified))
 
 
 @pytest.mark.parametrize(

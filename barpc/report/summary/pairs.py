@@ -75,7 +75,7 @@ class PairEntry(Record):
         "What became of it in matching; null for tie points taken as given (matches_only)"
     )
     tied_by: str | None = said(
-        "Matcher that tied it, and whether with loosened thresholds; null as there",
+        "Matcher that tied it, whether with loosened thresholds, and by keypoints not registered; null as there",
         head="tied by",
         default=None,
     )

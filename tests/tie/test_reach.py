@@ -1,0 +1,228 @@
+"""How far a pair is searched: as far as its cameras may be wrong in metres, at a bounded cost."""
+
+from __future__ import annotations
+
+import re
+import resource
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import rowcol
+from rasterio.warp import transform
+
+from barpc.geodesy import Array
+from barpc.pipeline.views import load_views
+from barpc.scene import View
+from barpc.tie import PairReport, TieOptions, common_tracks, find_tracks, matching, structure
+from barpc.tie.epipolar import frame
+from barpc.tie.features import join
+from barpc.tie.matcher import NO_MATCHES, Prediction
+from barpc.tie.matching import _Search, match_pair
+from barpc.tie.pairs import Pair, reach_of
+from barpc.tie.structure import Tile
+
+from .conftest import write_image
+from .test_pairs import METRE, camera, views
+
+GEOID = 28.2
+"""Above the ellipsoid there [m], by EGM96."""
+
+
+@pytest.mark.parametrize(
+    ("pixel", "asked", "reach"),
+    [
+        (0.3, None, 700.0), (1.0, None, 700.0), (2.0, None, 350.0), (10.0, None, 70.0), (60.0, None, 20.0),
+        (10.0, 700.0, 700.0), (0.5, 12.0, 12.0),
+    ],
+)  # fmt: skip
+def test_a_camera_may_be_wrong_by_so_many_metres_whatever_its_pixel(pixel, asked, reach) -> None:
+    (view,) = views(camera(0.0, lean=0.0).window(0, 0, 2 * pixel, 2 * pixel))
+    assert reach_of(view, TieOptions(search=asked)) == pytest.approx(reach, rel=0.01)
+
+
+def test_a_camera_that_sees_no_ground_is_searched_as_far_as_any() -> None:
+    (view,) = views(camera(0.0).crop(1e12, 0.0))
+    assert reach_of(view, TieOptions()) == 700.0
+
+
+@pytest.mark.parametrize(
+    ("asked", "passes"),
+    [
+        (700.0, [(20.0, 1500), (80.0, 2000), (700.0, 3000)]),
+        (54.0, [(20.0, 1500), (54.0, 3000)]),
+        (20.0, [(20.0, 3000)]),
+    ],
+)
+def test_no_width_is_searched_twice(monkeypatch, asked, passes) -> None:
+    made = []
+
+    class Nothing:
+        detects = True
+
+        def __init__(self, options, keypoints) -> None: ...
+
+        def match(self, a: View, b: View, prediction: Prediction):
+            made.append((prediction.half_width, prediction.probes))
+            return NO_MATCHES
+
+    monkeypatch.setitem(matching.MATCHERS, "nothing", Nothing)
+    two = (*views(camera(0.0), camera(METRE)),)
+    search = _Search(two, (join([]), join([])), TieOptions(matcher="nothing", search=asked))  # type: ignore[arg-type]
+    assert search.offset() is None
+    assert made == passes
+
+
+@pytest.mark.parametrize(
+    ("status", "ratio", "times"),
+    [
+        ("no common offset within 7 px", 0.85, 1),
+        ("no common offset within 7 px", 0.7, 2),
+        ("too few matches", 0.85, 2),
+    ],
+)
+def test_where_clear_matches_show_no_offset_looser_thresholds_are_not_tried(
+    monkeypatch, status, ratio, times
+) -> None:
+    """A stricter ratio than that of clear matches is loosened for these, too."""
+    made = []
+
+    def attempt(*given):
+        made.append(given)
+        return NO_MATCHES, PairReport(("a", "b"), status, (900, 900), overlap=1.0)
+
+    monkeypatch.setattr(matching, "_attempt", attempt)
+    match_pair((None, None), (join([]),) * 2, Pair((0, 1), 1.0, 5.0), TieOptions(ratio=ratio))  # type: ignore[arg-type]
+    assert len(made) == times
+
+
+class Pinhole:
+    """A frame camera 3 km above a point, looking down, half a metre a pixel."""
+
+    def project(self, ground: Array) -> Array:
+        return 499.5 + ground[..., :2] / METRE * [6000.0, -6000.0] / (3000.0 - ground[..., 2:])
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        lonlat = (image - 499.5) * [METRE, -METRE] / 6000.0 * (3000.0 - alt[..., None])
+        return np.concatenate([lonlat, alt[..., None]], axis=-1)
+
+    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
+        steps = [
+            (self.project(ground + step) - self.project(ground - step))
+            for step in np.diag([METRE, METRE, 1.0])
+        ]
+        return self.project(ground), np.stack(steps, axis=-1) / (2 * np.array([METRE, METRE, 1.0]))
+
+
+def test_segments_around_an_epipole_stay_near_their_points() -> None:
+    """A frame camera above what a satellite sees straight below: points move away from the middle as they grow."""
+    below, above = views(camera(0.0, lean=0.0)), replace(*views(camera(0.0)), sensor=Pinhole())
+    xy = np.random.default_rng(1).uniform(0, 999, (500, 2))
+    where = frame(above, below[0], xy)
+    assert (np.abs(where.slope) <= 1.0).all()
+    ends = np.stack([where.place(where.before - 700.0), where.place(where.after + 700.0)])
+    assert np.abs(ends - xy).max() < 1.5 * 750.0  # 1000 times that without a bound
+    along = np.abs(np.degrees(np.arctan2(*(xy - 499.5).T[::-1])) % 180.0)
+    axis = np.degrees(np.arctan2(where.axis[1], where.axis[0])) % 180.0
+    near = np.abs((along - axis + 90.0) % 180.0 - 90.0) < 40.0
+    assert near.sum() > 100
+    top = below[0].sensor.project(above.sensor.localize(xy[near], np.full(near.sum(), 200.0)))
+    assert (
+        np.abs(
+            replace(
+                where,
+                **{
+                    name: getattr(where, name)[near]
+                    for name in ("along", "across", "slope", "before", "after")
+                },
+            ).errors(top)[:, 1]
+        ).max()
+        < 1e-6
+    )  # where they lie along the axis they are as they were
+
+
+@pytest.mark.slow
+def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) -> None:
+    """Bands without votes: every point is looked for alone; how many are correlated together changes nothing."""
+    options = TieOptions(matcher="structure", search=20.0)
+    search = _Search(tuple(scene.views), (join([]), join([])), options)
+    coarse = search.offset()
+    assert coarse is not None
+    whole = structure._Search(*scene.views, 1, coarse).matches()
+    sizes, of = [], Tile.surfaces
+
+    def watched(self):
+        found = of(self)
+        sizes.append(found.size)
+        return found
+
+    monkeypatch.setattr(Tile, "surfaces", watched)
+    monkeypatch.setattr(structure, "_SURFACE", 60_000)
+    monkeypatch.setattr(structure, "_AREA", 20_000)
+    parts = structure._Search(*scene.views, 1, coarse).matches()
+    assert len(sizes) >= 8
+    assert max(sizes) <= 60_000
+    assert len(parts) == len(whole) > 100
+    order = [np.lexsort(found.xy[:, 0].T) for found in (whole, parts)]
+    apart = np.abs(whole.xy[order[0]] - parts.xy[order[1]]).max(axis=(1, 2))
+    assert np.median(apart) < 0.05  # pictures begin elsewhere
+
+
+# --- real images --------------------------------------------------------------------------------------------
+
+
+def frames(shared_data: Path) -> tuple[str, list[str]]:
+    """A satellite's image of 2003, and four of an aerial camera of 2015."""
+    aerial = sorted((shared_data / "cross_sensor/ngi_2015").glob("ngi*.tif"))
+    return str(shared_data / "optical/qb2_single/qb2_basic1b.tif"), [str(path) for path in aerial]
+
+
+def heights(shared_data: Path, lonlat: Array) -> Array:
+    """Of the terrain [m above the ellipsoid] at places (n, 2) [deg]."""
+    with rasterio.open(shared_data / "cross_sensor/ngi_2015/dem.tif") as dem:
+        x, y = transform("EPSG:4326", dem.crs, *lonlat.T)
+        row, col = (
+            np.clip(n, 0, size - 1) for n, size in zip(rowcol(dem.transform, x, y), dem.shape, strict=True)
+        )
+        return dem.read(1)[row, col].astype(float) + GEOID
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(4))
+def test_a_satellite_and_an_aerial_camera_are_tied_over_twelve_years(shared_data, number) -> None:
+    """Without a DEM. The frames' cameras are exact; the satellite's is 3.0, 2.1 px off, as surveyed points say."""
+    satellite, aerial = frames(shared_data)
+    both = load_views([satellite, aerial[number]]).views
+    tracks = find_tracks(both).tracks
+    assert [view.name[:3] for view in both] == ["ngi", "qb2"]
+    assert tracks.num_points >= 12
+    xy, other = common_tracks(tracks, 0, 1)
+    ground = both[0].sensor.localize(xy, np.full(len(xy), 300.0))
+    for _ in range(8):
+        ground = both[0].sensor.localize(xy, heights(shared_data, ground[:, :2]))
+    off = other - both[1].sensor.project(ground)
+    np.testing.assert_allclose(np.median(off, axis=0), [-3.0, -2.1], atol=0.35)
+    assert (np.hypot(*(off - np.median(off, axis=0)).T) > 3.0).mean() <= 0.05
+
+
+@pytest.mark.slow
+def test_a_refusal_ends_within_five_seconds_a_megapixel_and_six_hundred_megabytes(
+    shared_data, tmp_path
+) -> None:
+    """The satellite's image upside down under the same RPC: nothing is where it should be."""
+    satellite, aerial = frames(shared_data)
+    with rasterio.open(satellite) as image:
+        pixels, rpc = image.read(1), image.rpcs
+    path = write_image(tmp_path / "turned.tif", np.ascontiguousarray(pixels[::-1, ::-1]), rpcs=rpc)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-m", "barpc", "match", str(path), aerial[0], "-o", str(tmp_path / "run")]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert run.returncode == 1
+    assert re.search(r"too few tie points: .* no common offset within 1\d\d", run.stderr)
+    assert after.ru_utime - before.ru_utime <= 5.0 * (pixels.size / 1e6 + 0.74)
+    assert after.ru_maxrss <= 600 * 1024
