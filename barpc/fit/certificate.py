@@ -13,6 +13,7 @@ from math import comb
 import numpy as np
 import numpy.typing as npt
 
+from barpc.errors import FitError
 from barpc.geodesy import Array, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.rational import MONOMIALS, monomials
@@ -78,6 +79,8 @@ class Sample:
         seed: int = 0,
     ) -> Sample:
         """One point a cell of `cells` along each side of the image, at random in it, and those along the edges."""
+        if min(size) < 1:
+            raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
         rng = np.random.default_rng(seed)
         cell = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
         inside = np.column_stack([cell, rng.permutation(len(cell))]) + rng.random((len(cell), 3))
@@ -101,6 +104,14 @@ class Sample:
             points=np.concatenate([self.points, points[known]]),
             ground=np.concatenate([self.ground, ground[known]]),
         )
+
+    def contradiction(self) -> float:
+        """Largest distance [px] of the points from where the model projects their ground; infinite where it fails.
+
+        At the altitudes that were asked for, whatever altitudes it gave back.
+        """
+        asked = np.column_stack([self.ground[:, :2], self.points[:, 2]])
+        return float(_size(self.model.project(asked) - self.points[:, :2]).max(initial=0.0))
 
     def errors(self, rpc: RPC) -> tuple[Errors, Array]:
         """What an RPC makes of the points all over the image, and its largest errors (2,) [px], found by looking on.

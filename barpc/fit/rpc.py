@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit.certificate import Errors, Sample, coverage, roundtrip, smallest_denominator
-from barpc.fit.localisation import Localisation, Seen, inverse, off, with_localisation
+from barpc.fit.localisation import Seen, inverse, off, with_localisation
 from barpc.fit.points import control_points, extent, numbers, screened, widened
+from barpc.fit.result import EXACT, RpcFit
 from barpc.fit.solve import COMMON, Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
+from barpc.sensor.geometry import Radar
 from barpc.sensor.rpc import RPC
 from barpc.sensor.splined import Splined
 
@@ -27,100 +28,6 @@ _LOOPS = 4096  # round trips that a table of points is tried on, about
 _ABOUT = 1.1  # times the error
 _MISSING = 0.1  # part of the image without a ground point, at most
 _CELLS = 72  # of ``gauss-newton``, along each side of the image
-_HOPE = 3.0  # times the tolerance: what ``minimax`` may bring below it
-_EXACT = 1e-6  # px: what no other method is tried on
-
-
-@dataclass(frozen=True, eq=False)
-class RpcFit:
-    """A fitted RPC and its certificate.
-
-    Parameters
-    ----------
-    rpc : RPC
-        The result.
-    rmse_cnp, max_cnp : (2,)
-        Root mean square and largest error of col, row on the control points [px].
-    rmse_ckp, max_ckp : (2,)
-        The same on check points all over image and altitudes, which the fit has not seen [px]; the largest error was
-        also looked for around the worst of them.
-    beyond : float
-        Part of the image and the altitudes that may miss by more than `max_ckp`: no more, with 95 % confidence. 1 for
-        given points, which may lie anywhere and say nothing of the rest.
-    min_denominator : float
-        Lower bound of the denominators over the ground box and 25 % around it, over what they are at its centre; above
-        0 there is no pole.
-    roundtrip : float
-        Largest distance of a check point from where its projection is localised [px]; infinite where that fails.
-    coverage : float
-        Share of the image inside the convex hull of the control points.
-    h : (2,)
-        Regularisation used for col, row.
-    iterations : int
-        Passes over the points.
-    num_cnp, num_ckp : int
-        Number of points.
-    method : str
-        The solver whose result this is.
-    localisation : Localisation or None
-        The certificate of `rpc.direct`, where it was asked for.
-    """
-
-    rpc: RPC
-    rmse_cnp: Array
-    max_cnp: Array
-    rmse_ckp: Array
-    max_ckp: Array
-    beyond: float
-    min_denominator: float
-    roundtrip: float
-    coverage: float
-    h: Array
-    iterations: int
-    num_cnp: int
-    num_ckp: int
-    method: str
-    localisation: Localisation | None = None
-
-    def __repr__(self) -> str:
-        return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"
-
-    def summary(self) -> dict[str, Any]:
-        """The certificate as plain numbers and lists, col before row, lengths in px."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
-        if self.localisation is None:
-            del values["localisation"]
-        else:
-            values["localisation"] = asdict(self.localisation)
-        return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
-
-    def as_written(self, rpc: RPC) -> RpcFit:
-        """The fit with the RPC that a file of it holds: what that lost over its box is added to the errors."""
-        lost = self.rpc.off(rpc)
-        return replace(
-            self,
-            rpc=rpc,
-            rmse_ckp=self.rmse_ckp + np.sqrt((lost**2).mean(axis=0)),
-            max_ckp=self.max_ckp + lost.max(axis=0),
-            localisation=None if rpc.direct is None else self.localisation,
-        )
-
-    def verdict(self, tolerance: float) -> str:
-        """What is wrong with this fit at a tolerance [px], in words; empty if nothing is."""
-        worst = float(self.max_ckp.max())
-        if not worst <= tolerance:
-            return (
-                f"the RPC misses its check points by up to {worst:.3g} px (RMSE col {self.rmse_ckp[0]:.3g}, "
-                f"row {self.rmse_ckp[1]:.3g}), wanted {tolerance:g}: fit a smaller altitude range or a "
-                "smaller image, or raise the tolerance"
-                + ", or fit by the method minimax"
-                * (self.method == "gauss-newton" and worst < _HOPE * tolerance)
-            )
-        if not self.min_denominator > 0:
-            return "the RPC has a pole near the scene: use more control points or a stronger regularisation"
-        if not self.roundtrip <= max(tolerance, 1e-6):
-            return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
-        return "" if self.localisation is None else self.localisation.verdict(tolerance)
 
 
 def fit_rpc(
@@ -147,7 +54,8 @@ def fit_rpc(
     Raises
     ------
     FitError
-        The model cannot be localised over the image, or the RPC does not reach the tolerance.
+        The model cannot be localised over the image, its two directions contradict each other, it shows the ground
+        mirrored (and is neither a radar nor built on an RPC), or the RPC does not reach the tolerance.
 
     Warns
     -----
@@ -165,13 +73,17 @@ def fit_rpc(
         message = f"{sample.missing:.1%} of the image has no ground point and is left out: the RPC extrapolates there"
         warnings.warn(message, BarpcWarning, stacklevel=2)
     vendor = underlying_rpc(model)
+    mirrored = options.allow_mirrored or vendor is not None or isinstance(innermost(model), Radar)
+    screened(sample.ground, sample.points[:, :2], mirrored)
+    contradiction = sample.contradiction()
 
     given = partial(_given, model, size, alt_range, options)
 
     def attempt(method: str, source: SensorModel = model) -> RpcFit:
         solution = solve(*_given(source, size, alt_range, options, method), options, method, vendor=vendor)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
-        return _certified(solution, *sample.errors(solution.rpc), loop, size, beyond)
+        fit = _certified(solution, *sample.errors(solution.rpc), loop, size, beyond)
+        return replace(fit, contradiction=contradiction)
 
     try:
         fit = _best(attempt, options, vendor, strict and not isinstance(model, Splined), exact=True)
@@ -319,8 +231,13 @@ def _localised(
 
 def underlying_rpc(model: object) -> RPC | None:
     """The RPC that a model is built on: itself, or what its corrections stand in front of."""
-    while model is not None and not isinstance(model, RPC):
-        model = getattr(model, "sensor", None)
+    return inner if isinstance(inner := innermost(model), RPC) else None
+
+
+def innermost(model: object) -> object:
+    """The camera that a model's corrections stand in front of, or itself."""
+    while (inner := getattr(model, "sensor", None)) is not None:
+        model = inner
     return model
 
 
@@ -382,7 +299,7 @@ def _best(
     """
     several = options.method in ("auto", COMMON)
     fits = [attempt("ridge" if several else str(options.method))]
-    if several and exact and not float(fits[0].max_ckp.max()) <= _EXACT:
+    if several and exact and not float(fits[0].max_ckp.max()) <= EXACT:
         fits.append(attempt("gauss-newton"))
     if options.method == "auto":
         others = ["lcurve"] + (["vendor-denominators"] if vendor is not None else [])

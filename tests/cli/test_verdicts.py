@@ -27,6 +27,7 @@ def a_fit(**changes: Any) -> Any:
         "method": "lcurve", "iterations": 4, "h": (1e-6, 0.25), "num_cnp": 1000, "num_ckp": 500, "coverage": 0.985,
         "rmse_cnp": (1e-3, 2e-3), "max_cnp": (3e-3, 4e-3), "rmse_ckp": (5e-3, 6e-3), "max_ckp": (7e-3, 8e-3),
         "beyond": 0.0123, "min_denominator": 0.9, "roundtrip": 1e-9, "localisation": None,
+        "contradiction": 3e-9,
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **changes})
 
@@ -42,7 +43,7 @@ def test_a_certificate_has_a_figure_in_every_line() -> None:
         "check max     0.007        0.008",
         "beyond        1.23% of the image may miss by more, at most (95 % confidence)",
         "denominators  at least 0.9 over the box and 25 % around it",
-        "round trip    1e-09 px",
+        "round trip    1e-09 px; the camera's own 3e-09",
         "verdict       within tolerance",
     ]
     given = _certificate(a_fit(beyond=1.0), "it misses").split("\n")
