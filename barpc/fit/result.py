@@ -15,6 +15,35 @@ _HOPE = 3.0  # times the tolerance: what ``minimax`` may bring below it
 EXACT = 1e-6  # px: what no other method is tried on, and no round trip is held to
 
 
+@dataclass(frozen=True)
+class Free:
+    """What an RPC reaches whose denominators are kept up over the image's own ground only.
+
+    Parameters
+    ----------
+    rmse_px, max_px : float
+        Of its check points, the larger of col and row.
+    pole : (lon, lat, alt)
+        Where a denominator is 0 nearest to the middle of that ground; NaN where none was found.
+    far : float
+        How far, 1 being the end of the ground.
+    """
+
+    rmse_px: float
+    max_px: float
+    pole: tuple[float, ...]
+    far: float
+
+    def __str__(self) -> str:
+        lon, lat, alt = self.pole
+        pole = f"a pole at lon {lon:.4f}, lat {lat:.4f}, {alt:.0f} m, {self.far:.3g} times as far from the middle as"
+        return f"without a margin around the image (pole_margin 0) up to {self.max_px:.3g} px, with " + (
+            f"{pole} the image's end"
+            if np.isfinite(self.far)
+            else "small denominators around it, but no pole"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class RpcFit:
     """A fitted RPC and its certificate.
@@ -32,8 +61,8 @@ class RpcFit:
         Part of the image and the altitudes that may miss by more than `max_ckp`: no more, with 95 % confidence. 1 for
         given points, which may lie anywhere and say nothing of the rest.
     min_denominator : float
-        Lower bound of the denominators over the ground box and 25 % around it, over what they are at its centre; above
-        0 there is no pole.
+        Lower bound of the denominators over the hull of the image's own ground and a margin (`FitOptions.pole_margin`)
+        around it, over what they are at its centre; above 0 there is no pole.
     roundtrip : float
         Largest distance of a check point from where its projection is localised [px]; infinite where that fails.
     coverage : float
@@ -51,6 +80,8 @@ class RpcFit:
     contradiction : float
         Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
         there [px]; 0 for given points. What else projects with the model may be off by as much more.
+    free : Free or None
+        What denominators without a margin would reach, where that is less than half the RMSE.
     """
 
     rpc: RPC
@@ -69,6 +100,7 @@ class RpcFit:
     method: str
     localisation: Localisation | None = None
     contradiction: float = 0.0
+    free: Free | None = None
 
     def __repr__(self) -> str:
         return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"
@@ -76,10 +108,9 @@ class RpcFit:
     def summary(self) -> dict[str, Any]:
         """The certificate as plain numbers and lists, col before row, lengths in px."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
-        if self.localisation is None:
-            del values["localisation"]
-        else:
-            values["localisation"] = asdict(self.localisation)
+        for name in ("localisation", "free"):
+            part = values.pop(name)
+            values |= {} if part is None else {name: asdict(part)}
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:
@@ -109,6 +140,7 @@ class RpcFit:
                 "smaller image, or raise the tolerance"
                 + ", or fit by the method minimax"
                 * (self.method == "gauss-newton" and worst < _HOPE * tolerance)
+                + (f"; {self.free}" if self.free else "")
             )
         if not self.min_denominator > 0:
             return "the RPC has a pole near the scene: use more control points or a stronger regularisation"

@@ -11,11 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
-from barpc.fit.certificate import Errors, Sample, coverage, roundtrip, smallest_denominator
+from barpc.fit.certificate import Errors, Sample, coverage, roundtrip
 from barpc.fit.localisation import Seen, inverse, off, with_localisation
 from barpc.fit.points import control_points, extent, numbers, screened, widened
-from barpc.fit.result import EXACT, RpcFit
-from barpc.fit.solve import COMMON, Solution, solve
+from barpc.fit.poles import Region
+from barpc.fit.result import EXACT, Free, RpcFit
+from barpc.fit.solve import BOUNDED, COMMON, Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
@@ -27,6 +28,7 @@ _CHUNK = 8192
 _LOOPS = 4096  # round trips that a table of points is tried on, about
 _ABOUT = 1.1  # times the error
 _MISSING = 0.1  # part of the image without a ground point, at most
+_WORTH = 2.0  # times the RMSE: where a bound on the denominators costs as much, it is said
 _CELLS = 72  # of ``gauss-newton``, along each side of the image
 
 
@@ -79,11 +81,15 @@ def fit_rpc(
 
     given = partial(_given, model, size, alt_range, options)
 
-    def attempt(method: str, source: SensorModel = model) -> RpcFit:
+    def attempt(method: str, source: SensorModel = model, options: FitOptions = options) -> RpcFit:
         solution = solve(*_given(source, size, alt_range, options, method), options, method, vendor=vendor)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
         fit = _certified(solution, *sample.errors(solution.rpc), loop, size, beyond)
-        return replace(fit, contradiction=contradiction)
+        fit = replace(fit, contradiction=contradiction)
+        if not (options.pole_margin and solution.held):
+            return fit
+        free = attempt(method, source, replace(options, pole_margin=0.0))
+        return _compared(fit, free, solution.region, options.pole_margin)
 
     try:
         fit = _best(attempt, options, vendor, strict and not isinstance(model, Splined), exact=True)
@@ -93,6 +99,16 @@ def fit_rpc(
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
+
+
+def _compared(fit: RpcFit, free: RpcFit, region: Region, margin: float) -> RpcFit:
+    """A fit that knows what `free`, whose denominators are kept up over the image's own ground only, makes better."""
+    if not np.linalg.norm(fit.rmse_ckp) > _WORTH * np.linalg.norm(free.rmse_ckp):
+        return fit
+    place, far = region.nearest_pole(free.rpc.coeffs[1::2], margin)
+    pole = free.rpc.ground_offset + place * free.rpc.ground_scale
+    found = Free(float(free.rmse_ckp.max()), float(free.max_ckp.max()), tuple(pole.tolist()), far)
+    return replace(fit, free=found)
 
 
 def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
@@ -112,10 +128,7 @@ def _given(
     method: str,
 ) -> tuple[Array, Array]:
     """Ground (N, 3) and image points (N, 2) for a method."""
-    if method in (
-        "gauss-newton",
-        "minimax",
-    ):  # what an RPC cannot follow has any frequency: scattered points alias none
+    if method in BOUNDED:  # what an RPC cannot follow has any frequency: scattered points alias none
         scattered = Sample.of(model, size, alt_range, _CELLS, seed=1)
         ground, image = scattered.ground, scattered.points[:, :2]
     else:
@@ -269,7 +282,7 @@ def _certified(
     for start in range(0, len(ground), _CHUNK):
         part = slice(start, start + _CHUNK)
         used.add(rpc.project(ground[part]) - image[part])
-    (low, high), (left, right) = extent(ground), extent(image)
+    left, right = extent(image)
     if size is not None:
         left, right = np.full(2, -0.5), np.asarray(size) - 0.5
     return RpcFit(
@@ -279,7 +292,7 @@ def _certified(
         rmse_ckp=seen.rmse,
         max_ckp=largest,
         beyond=beyond,
-        min_denominator=smallest_denominator(rpc, low, high),
+        min_denominator=solution.region.smallest(rpc.coeffs[1::2]),
         roundtrip=loop,
         coverage=coverage(image, left, right),
         h=solution.h,

@@ -6,7 +6,7 @@ noise, hence no penalty; noisy points cannot drive a denominator to zero. sigma 
 
 ``gauss-newton``: the least squares of y - a / b itself, not of b y - a, from the ridge on: the same rows with what the
 coefficients now give in place of y, and damped towards them. No penalty: for models without noise, whose misfit a ridge
-takes for noise. Steps that bring a denominator near zero over the points are not taken.
+takes for noise. Denominators stay above a tenth over the hull of the points and a margin (`barpc.fit.poles`).
 
 ``minimax``: from there on the least largest error, by least squares whose weights grow with the errors (Lawson,
 "Contributions to the theory of linear least maximum approximation", 1961).
@@ -25,8 +25,8 @@ from functools import cached_property, partial
 import numpy as np
 
 from barpc.errors import FitError
-from barpc.fit.certificate import BEYOND, least_value
 from barpc.fit.points import extent
+from barpc.fit.poles import FLOOR, Region, bounded
 from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
 from barpc.fit.system import (
     EPS,
@@ -54,9 +54,8 @@ TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _SAMPLES = 200  # of the L-curve
 _LEAST_DAMPED, _FIRST_DAMPED, _MOST_DAMPED = 1e-12, 1e-6, 1e3  # of the size of a column
-_AROUND = np.full((3, 2), [-BEYOND, BEYOND])
-_MARGIN = 0.1  # of what a denominator is at the centre
 _REWEIGHTED = 7  # times, of ``minimax``
+_SLACK = 1e-8  # of the least denominator: rounding
 _GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
@@ -162,6 +161,17 @@ class Solution:
         norm = self.problem.norm
         return RPC(self.coeffs, norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
 
+    @cached_property
+    def region(self) -> Region:
+        """Where its denominators are looked at."""
+        return region_of(self.problem)
+
+    @property
+    def held(self) -> bool:
+        """Whether a denominator is as small as it may be: without the bound it were smaller."""
+        least = min(self.region.least(cubic) for cubic in self.coeffs[1::2])
+        return self.method in BOUNDED and least <= FLOOR + 2 * _SLACK
+
     def leave_one_out(self) -> Iterator[Array]:
         """Residuals (n, 2) that points would have if they had not been used, some hundred at a time.
 
@@ -189,6 +199,13 @@ class Solution:
             return inverses
         (both,), m = inverses, len(self.problem.active)
         return [np.delete(both, slice(m, 2 * m), axis=0), both[m:] * self.problem.aspect]
+
+
+def region_of(problem: Problem) -> Region:
+    """The hull of a problem's own points and its margin."""
+    norm = problem.norm
+    ground = (problem.ground - norm.ground_offset) / norm.ground_scale
+    return Region.around(ground, (problem.image - norm.image_offset) / norm.image_scale, problem.margin)
 
 
 def tidy(values: Array) -> Array:
@@ -235,7 +252,9 @@ def solve(
     if keeps:  # its offset may lie a whole turn away
         ground = np.column_stack([wrap_longitude(ground[:, 0], norm.ground_offset[0]), ground[:, 1:]])
     common = options.method == COMMON
-    problem = Problem(ground, image, norm, weight=weight, common=common).screened()
+    problem = Problem(
+        ground, image, norm, weight=weight, common=common, margin=options.pole_margin
+    ).screened()
     unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)
     if len(ground) <= unknowns:
         raise FitError(
@@ -269,34 +288,34 @@ def _ridge(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> F
 
 def _gauss_newton(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     start, _, _, passes = _ridge(problem, None, vendor)
-    parts, solved = [], []
+    parts, solved, region = [], [], region_of(problem)
     for axes in problem.parts:
         numerators, denominator = start[[2 * axis for axis in axes]], start[2 * axes[0] + 1]
-        if not least_value(denominator, _AROUND) > _MARGIN:  # from a polynomial, then
+        if not region.least(denominator) > FLOOR:  # from a polynomial, then
             denominator = np.eye(20)[0]
             systems = [problem.compressed(axis, denominator, free=False) for axis in axes]
             numerators = np.stack([problem.expanded(solution(one), denominator)[0] for one in systems])
-        x, system, steps = _minimised(problem, axes, problem.packed(np.vstack([numerators, denominator])))
-        parts.append(problem.expanded(x if quantize is None else solution(system, quantize)))
+        x, system, steps = _minimised(
+            problem, axes, problem.packed(np.vstack([numerators, denominator])), region
+        )
+        parts.append(problem.expanded(x if quantize is None else solution(system.solved_by(x), quantize)))
         solved.append(system)
         passes = max(passes, steps)
     return _quotients(parts), solved, np.zeros(2), passes
 
 
-def _minimised(problem: Problem, axes: Sequence[int], x: Array) -> tuple[Array, Compressed, int]:
+def _minimised(
+    problem: Problem, axes: Sequence[int], x: Array, region: Region
+) -> tuple[Array, Compressed, int]:
     """Least squares of y - a / b from unknowns x (k,), the system there, and the passes over the points."""
     *numerators, denominator = problem.expanded(x)
     system, damping, passes = problem.system(axes, denominator, numerators), 0.0, 1
     size = np.linalg.norm(system.matrix, axis=0)
     while passes < MAX_PASSES and damping < _MOST_DAMPED:
-        penalty = max(damping, _LEAST_DAMPED) * size
-        ahead = solution(system.penalized(penalty, penalty * x))
+        ahead = _ahead(problem, system, x, damping * size, size, region)
         *numerators, denominator = problem.expanded(ahead)
-        before, after = system.squares(x), np.inf
-        if least_value(denominator, _AROUND) > _MARGIN:
-            passes += 1
-            following = problem.system(axes, denominator, numerators)
-            after = following.squares(ahead)
+        following, passes = problem.system(axes, denominator, numerators), passes + 1
+        before, after = system.squares(x), following.squares(ahead)
         if after < before:
             x, system, damping = ahead, following, 0.1 * damping if damping > _FIRST_DAMPED else 0.0
             if before - after < _GAIN * before:
@@ -306,9 +325,27 @@ def _minimised(problem: Problem, axes: Sequence[int], x: Array) -> tuple[Array, 
     return x, system, passes
 
 
+def _ahead(
+    problem: Problem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region
+) -> Array:
+    """The solution of a system damped towards x, its denominator kept up over a region; x where there is none."""
+    for least, solver in (
+        (_LEAST_DAMPED, solution),
+        (
+            _FIRST_DAMPED,
+            partial(bounded, region=region, active=problem.active),
+        ),  # which wants it well conditioned
+    ):
+        damped = np.maximum(penalty, least * size)
+        ahead = solver(system.penalized(damped, damped * x))
+        if ahead is not None and region.least(problem.expanded(ahead)[-1]) >= FLOOR - _SLACK:
+            return ahead
+    return x
+
+
 def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     coeffs, solved, h, passes = _gauss_newton(problem, None, vendor)
-    given, parts = 1.0 if problem.weight is None else problem.weight, []
+    given, parts, region = 1.0 if problem.weight is None else problem.weight, [], region_of(problem)
     for axis in range(2):
         x, least, weight = (
             problem.packed(coeffs[2 * axis : 2 * axis + 2]),
@@ -322,9 +359,11 @@ def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) ->
             weight *= errors  # Lawson's
             weight /= weight.mean()
             heavy = replace(problem, weight=given * np.sqrt(weight), first=None)
-            x, solved[axis], steps = _minimised(heavy, (axis,), x)
+            x, solved[axis], steps = _minimised(heavy, (axis,), x, region)
             passes += steps
-        parts.append(problem.expanded(best if quantize is None else solution(solved[axis], quantize)))
+        parts.append(
+            problem.expanded(best if quantize is None else solution(solved[axis].solved_by(best), quantize))
+        )
     return _quotients(parts), solved, h, passes
 
 
@@ -359,3 +398,5 @@ METHODS: dict[str, Callable[[Problem, Rounding | None, RPC | None], Found]] = {
     "vendor-denominators": _vendor_denominators,
 }
 """Name -> solver of a problem; ``vendor-denominators`` keeps those of the vendor's RPC."""
+BOUNDED = ("gauss-newton", "minimax")
+"""Methods that keep denominators up, and take scattered points."""

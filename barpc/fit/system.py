@@ -75,6 +75,12 @@ class Compressed:
         rest = self.matrix @ solution - self.target
         return float(rest @ rest + self.triangle[-1, -1] ** 2)
 
+    def solved_by(self, solution: Array) -> Compressed:
+        """The system of the same rows that a given solution (k,) leaves nothing of but what it never reaches."""
+        triangle = self.triangle.copy()
+        triangle[:-1, -1] = self.matrix @ solution
+        return Compressed(triangle, self.num_points)
+
     def penalized(self, penalty: Array, toward: Array | float = 0.0) -> Compressed:
         """The system with the rows diag(`penalty`) x = `toward` below."""
         rows = np.column_stack([np.diag(penalty), np.broadcast_to(toward, penalty.shape)])
@@ -98,6 +104,9 @@ class Problem:
     active: IntArray = field(default_factory=lambda: ALL)  # monomials in use, the constant one first
     weight: Array | None = None  # (N,)
     common: bool = False  # one denominator of both coordinates
+    margin: float = (
+        0.25  # share of the half width of the points, around them, over which denominators are kept up
+    )
     first: Compressed | None = None  # of col without a denominator, where it is known already
 
     def screened(self) -> Problem:

@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 
 from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
-from barpc.fit.certificate import CELLS, Sample, least_value, smallest_denominator
+from barpc.fit.certificate import CELLS, Sample
+from barpc.fit.poles import least_value, smallest_denominator
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import synthetic

@@ -15,9 +15,10 @@ from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import rpc as fit_module
 from barpc.fit import solve as solve_module
-from barpc.fit.certificate import CELLS, Errors, Sample, least_value, smallest_value
+from barpc.fit.certificate import CELLS, Errors, Sample
 from barpc.fit.localisation import Localisation, inverse, off
 from barpc.fit.points import control_points
+from barpc.fit.poles import Region, least_value, smallest_value
 from barpc.fit.precision import PRECISIONS
 from barpc.fit.rpc import _plainer, underlying_rpc
 from barpc.fit.solve import COMMON, normalization, solve, tidy
@@ -106,20 +107,22 @@ def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypa
     problem, starts = Problem(ground, image, norm), []
     whole = solve_module._minimised
 
-    def seen(problem: Problem, axes: Any, x: Array) -> Any:
+    def seen(problem: Problem, axes: Any, x: Array, region: Region) -> Any:
         starts.append(x)
-        return whole(problem, axes, x)
+        return whole(problem, axes, x, region)
 
     monkeypatch.setattr(solve_module, "_minimised", seen)
     plain, *_ = solve_module._gauss_newton(problem, None, None)
     ridge = solve_module._ridge(problem, None, None)
     np.testing.assert_array_equal(starts[0], np.concatenate([ridge[0][0], ridge[0][1, 1:]]))
     basis = monomials(((ground - norm.ground_offset) / norm.ground_scale).T)
-    for slope, kept in ((0.70, True), (0.74, False)):  # 1 - 1.25 slope: above a tenth, and below
+    reach = -solve_module.region_of(problem).least(-np.eye(20)[1])  # of L: the image, and a quarter around it
+    assert 1.2 < reach < 1.4
+    for slope, kept in ((0.89 / reach, True), (0.91 / reach, False)):  # 1 - slope L: above a tenth, and below
         starts.clear()
         poles = ridge[0].copy()
         poles[1::2] = 0.0
-        poles[1::2, 0], poles[1::2, 1] = 1.0, slope
+        poles[1::2, 0], poles[1::2, 1] = 1.0, -slope
         monkeypatch.setattr(solve_module, "_ridge", lambda *_, poles=poles: (poles, *ridge[1:]))
         found, *_ = solve_module._gauss_newton(problem, None, None)
         for axis in range(2):
@@ -135,15 +138,15 @@ def test_a_step_that_makes_things_worse_is_not_taken(camera: Camera) -> None:
     """From a start far off: the sum of squares never rises, and no denominator comes near zero."""
     ground, image, norm = wavy(camera, 120, 20.0)
     problem = Problem(ground, image, norm)
-    rng = np.random.default_rng(0)
+    rng, around = np.random.default_rng(0), np.full((3, 2), [-1.25, 1.25])
     for axis in range(2):
         start = np.concatenate([rng.normal(0, 1, 20), rng.normal(0, 0.02, 19)])
         before = problem.system((axis,), problem.expanded(start)[1], problem.expanded(start)[:1]).squares(
             start
         )
-        x, system, passes = solve_module._minimised(problem, (axis,), start)
+        x, system, passes = solve_module._minimised(problem, (axis,), start, Region.box(around))
         assert system.squares(x) < 0.1 * before
-        assert least_value(problem.expanded(x)[1], np.full((3, 2), [-1.25, 1.25])) > 0.1
+        assert least_value(problem.expanded(x)[1], around) > 0.1 - 1e-8
         assert passes <= 20
         error = problem.errors(axis, x)
         assert (error**2).sum() == pytest.approx(system.squares(x), rel=1e-9)
