@@ -21,7 +21,7 @@ from barpc.sensor.rational import MONOMIALS, monomials
 from barpc.sensor.rpc import RPC
 
 FLOOR = 0.1
-"""Least value of a denominator that is 1 at the centre."""
+"""Least value of a denominator over what it is at the centre."""
 BOX = 0.25  # share of the half width, around a box: of an RPC whose image is not known
 _PIECES = 8  # of a side
 _NODES = 3 * _PIECES + 1  # of its control net
@@ -118,6 +118,10 @@ class Region:
         """A lower bound, near the least value, of a cubic (20,)."""
         return float(self.bernstein(cubic).min())
 
+    def above(self, cubic: Array) -> bool:
+        """Whether a denominator (20,) is above `FLOOR` of what it is at the centre."""
+        return self.least(cubic) > FLOOR * float(self.there[0] @ cubic)
+
     def smallest(self, cubics: Array) -> float:
         """A lower bound of cubics (k, 20) over what they are at the centre; NaN where one is 0 there."""
         with np.errstate(all="ignore"):
@@ -180,21 +184,22 @@ def bounded(system: Compressed, region: Region, active: IntArray) -> Array | Non
     """
     from scipy.optimize import nnls  # a tenth of a second, which smooth cameras do not need
 
+    floor = FLOOR + 10.0 * _SLACK
     x, used, cubic, m = solution(system), np.empty(0, dtype=np.int64), np.eye(20)[0], len(active) - 1
     for _ in range(_ROUNDS):
         cubic[active[1:]] = x[-m:]
-        short = region.bernstein(cubic) - FLOOR
+        short = region.bernstein(cubic) - floor * (region.there[0] @ cubic)
         short[used] = 0.0
         broken = np.argsort(short, kind="stable")[:_CUTS]
         broken = broken[short[broken] < -_SLACK]
         if not len(broken):
             return x
         used = np.append(used, broken)
-        rows = region.rows(used)
+        rows = region.rows(used) - floor * region.there[0]
         normal = solve_triangular(
             system.matrix, np.pad(rows[:, active[1:]], ((0, 0), (len(x) - m, 0))).T, trans="T"
         )
-        below = FLOOR - rows[:, 0] - system.target @ normal
+        below = -rows[:, 0] - system.target @ normal
         size, last = np.linalg.norm(normal, axis=0), np.eye(len(x) + 1)[-1]
         columns = np.vstack([normal, below]) / size
         try:

@@ -55,7 +55,7 @@ TOLERANCE = 1e-10
 _SAMPLES = 200  # of the L-curve
 _LEAST_DAMPED, _FIRST_DAMPED, _MOST_DAMPED = 1e-12, 1e-6, 1e3  # of the size of a column
 _REWEIGHTED = 7  # times, of ``minimax``
-_SLACK = 1e-8  # of the least denominator: rounding
+_SLACK = 1e-6  # of the least denominator: rounding
 _GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
@@ -169,8 +169,7 @@ class Solution:
     @property
     def held(self) -> bool:
         """Whether a denominator is as small as it may be: without the bound it were smaller."""
-        least = min(self.region.least(cubic) for cubic in self.coeffs[1::2])
-        return self.method in BOUNDED and least <= FLOOR + 2 * _SLACK
+        return self.method in BOUNDED and self.region.smallest(self.coeffs[1::2]) < FLOOR + _SLACK
 
     def leave_one_out(self) -> Iterator[Array]:
         """Residuals (n, 2) that points would have if they had not been used, some hundred at a time.
@@ -291,7 +290,7 @@ def _gauss_newton(problem: Problem, quantize: Rounding | None, vendor: RPC | Non
     parts, solved, region = [], [], region_of(problem)
     for axes in problem.parts:
         numerators, denominator = start[[2 * axis for axis in axes]], start[2 * axes[0] + 1]
-        if not region.least(denominator) > FLOOR:  # from a polynomial, then
+        if not region.above(denominator):  # from a polynomial, then
             denominator = np.eye(20)[0]
             systems = [problem.compressed(axis, denominator, free=False) for axis in axes]
             numerators = np.stack([problem.expanded(solution(one), denominator)[0] for one in systems])
@@ -338,7 +337,7 @@ def _ahead(
     ):
         damped = np.maximum(penalty, least * size)
         ahead = solver(system.penalized(damped, damped * x))
-        if ahead is not None and region.least(problem.expanded(ahead)[-1]) >= FLOOR - _SLACK:
+        if ahead is not None and region.above(problem.expanded(ahead)[-1]):
             return ahead
     return x
 

@@ -149,7 +149,10 @@ def test_a_bounded_least_squares_is_that_of_another_solver():
     def cost(x):
         return float(((rows @ (x - want)) ** 2).sum())
 
-    bound = {"type": "ineq", "fun": lambda x: (lines @ np.append(1.0, x[20:]))[::7] - FLOOR}
+    bound = {
+        "type": "ineq",
+        "fun": lambda x: ((lines - FLOOR * region.there[0]) @ np.append(1.0, x[20:]))[::7],
+    }
     other = minimize(
         cost,
         np.zeros(39),
