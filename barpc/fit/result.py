@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from barpc.fit.localisation import Localisation
+from barpc.fit.reasons import Reason
 from barpc.geodesy import Array
 from barpc.sensor.rpc import RPC
 
@@ -82,6 +83,8 @@ class RpcFit:
         there [px]; 0 for given points. What else projects with the model may be off by as much more.
     free : Free or None
         What denominators without a margin would reach, where that is less than half the RMSE.
+    reason : Reason or None
+        Why it misses its tolerance, of a model that it misses.
     """
 
     rpc: RPC
@@ -101,6 +104,7 @@ class RpcFit:
     localisation: Localisation | None = None
     contradiction: float = 0.0
     free: Free | None = None
+    reason: Reason | None = None
 
     def __repr__(self) -> str:
         return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"
@@ -108,7 +112,7 @@ class RpcFit:
     def summary(self) -> dict[str, Any]:
         """The certificate as plain numbers and lists, col before row, lengths in px."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
-        for name in ("localisation", "free"):
+        for name in ("localisation", "free", "reason"):
             part = values.pop(name)
             values |= {} if part is None else {name: asdict(part)}
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
@@ -136,14 +140,15 @@ class RpcFit:
         if not worst <= tolerance:
             return (
                 f"the RPC misses its check points by up to {worst:.3g} px (RMSE col {self.rmse_ckp[0]:.3g}, "
-                f"row {self.rmse_ckp[1]:.3g}), wanted {tolerance:g}: fit a smaller altitude range or a "
-                "smaller image, or raise the tolerance"
+                f"row {self.rmse_ckp[1]:.3g}), wanted {tolerance:g}: "
+                + (f"{self.reason}" if self.reason else "fit a smaller altitude range or a smaller image")
+                + ", or raise the tolerance"
                 + ", or fit by the method minimax"
                 * (self.method == "gauss-newton" and worst < _HOPE * tolerance)
                 + (f"; {self.free}" if self.free else "")
             )
         if not self.min_denominator > 0:
-            return "the RPC has a pole near the scene: use more control points or a stronger regularisation"
+            return "the RPC has a pole near the scene: use more control points, or a smaller pole_margin"
         if not self.roundtrip <= max(tolerance, EXACT):
             return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
         return "" if self.localisation is None else self.localisation.verdict(tolerance)

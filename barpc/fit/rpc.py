@@ -15,6 +15,7 @@ from barpc.fit.certificate import Errors, Sample, coverage, roundtrip
 from barpc.fit.localisation import Seen, inverse, off, with_localisation
 from barpc.fit.points import control_points, extent, numbers, screened, widened
 from barpc.fit.poles import Region
+from barpc.fit.reasons import reason
 from barpc.fit.result import EXACT, Free, RpcFit
 from barpc.fit.solve import BOUNDED, COMMON, Solution, solve
 from barpc.geodesy import Array, wrap_longitude
@@ -92,9 +93,12 @@ def fit_rpc(
         return _compared(fit, free, solution.region, options.pole_margin)
 
     try:
-        fit = _best(attempt, options, vendor, strict and not isinstance(model, Splined), exact=True)
+        fit = _best(attempt, options, vendor, False, exact=True)
         if isinstance(model, Splined):
             fit = _plainer(fit, attempt("ridge", model.sensor))
+        if not float(fit.max_ckp.max()) <= options.tolerance:
+            fit = replace(fit, reason=reason(fit.rpc, sample))
+        _accepted(fit, options, strict and not isinstance(model, Splined))
         return _localised(fit, given, partial(_missed, sample), options, strict)
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
@@ -303,6 +307,13 @@ def _certified(
     )
 
 
+def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
+    """The fit; FitError where `strict` and something is wrong with it."""
+    if strict and (wrong := fit.verdict(options.tolerance)):
+        raise FitError(wrong)
+    return fit
+
+
 def _best(
     attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool, exact: bool
 ) -> RpcFit:
@@ -323,7 +334,4 @@ def _best(
         (bool(said), not fit.min_denominator > 0, float(np.linalg.norm(fit.rmse_ckp)))
         for said, fit in zip(wrong, fits, strict=True)
     ]
-    best = rank.index(min(rank))
-    if strict and wrong[best]:
-        raise FitError(wrong[best])
-    return fits[best]
+    return _accepted(fits[rank.index(min(rank))], options, strict)

@@ -115,7 +115,7 @@ def solve_lcurve(problem: Problem, axes: Sequence[int]) -> tuple[Array, list[Com
             rmse, following = _reweighted(problem, axes, coeffs, penalty, corrected)
             if rmse < least:
                 least, best = rmse, (coeffs, solved)
-            if abs(last - rmse) < TOLERANCE:
+            if not abs(last - rmse) >= TOLERANCE:  # nor a number, where a denominator is 0 at a point
                 break
             coeffs, solved, last = _coefficients(problem, following), following, rmse
     return *best, h, passes
