@@ -54,7 +54,10 @@ TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _SAMPLES = 200  # of the L-curve
 _LEAST_DAMPED, _FIRST_DAMPED, _MOST_DAMPED = 1e-12, 1e-6, 1e3  # of the size of a column
-_REWEIGHTED = 7  # times, of ``minimax``
+_POWER = (
+    1.5  # of the errors that weights grow with, and 20 rounds: 0.94 px for 1.21 at 89.9 N, 60 rounds 0.89
+)
+_REWEIGHTED = 20  # times, of ``minimax``
 _SLACK = 1e-6  # of the least denominator: rounding
 _GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
@@ -355,7 +358,7 @@ def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) ->
             errors = problem.errors(axis, x)
             if errors.max() < least:
                 least, best = float(errors.max()), x
-            weight *= errors  # Lawson's
+            weight *= errors**_POWER  # Lawson's
             weight /= weight.mean()
             heavy = replace(problem, weight=given * np.sqrt(weight), first=None)
             x, solved[axis], steps = _minimised(heavy, (axis,), x, region)
