@@ -17,7 +17,7 @@ from barpc.fit.points import control_points, extent, numbers, screened, widened
 from barpc.fit.poles import Region
 from barpc.fit.reasons import reason
 from barpc.fit.result import EXACT, Free, RpcFit
-from barpc.fit.solve import BOUNDED, COMMON, Solution, solve
+from barpc.fit.solve import BOUNDED, Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
@@ -303,7 +303,7 @@ def _certified(
         iterations=solution.iterations,
         num_cnp=used.count,
         num_ckp=seen.count,
-        method=COMMON if problem.common else solution.method,
+        method=solution.method,
     )
 
 
@@ -321,14 +321,14 @@ def _best(
 
     Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
     """
-    several = options.method in ("auto", COMMON)
-    fits = [attempt("ridge" if several else str(options.method))]
-    if several and exact and not float(fits[0].max_ckp.max()) <= EXACT:
+    if options.method != "auto":
+        return _accepted(attempt(str(options.method)), options, strict)
+    fits = [attempt("ridge")]
+    if exact and not float(fits[0].max_ckp.max()) <= EXACT:
         fits.append(attempt("gauss-newton"))
-    if options.method == "auto":
-        others = ["lcurve"] + (["vendor-denominators"] if vendor is not None else [])
-        while others and all(fit.verdict(options.tolerance) for fit in fits):
-            fits.append(attempt(others.pop(0)))
+    others = ["lcurve"] + (["vendor-denominators"] if vendor is not None else [])
+    while others and all(fit.verdict(options.tolerance) for fit in fits):
+        fits.append(attempt(others.pop(0)))
     wrong = [fit.verdict(options.tolerance) for fit in fits]
     rank = [
         (bool(said), not fit.min_denominator > 0, float(np.linalg.norm(fit.rmse_ckp)))

@@ -45,8 +45,6 @@ from barpc.sensor.rpc import RPC
 Found = tuple[Array, list["Compressed"], Array, int]
 """Coefficients (4, 20); final systems of col and row, penalties included; their regularisation h (2,); passes."""
 
-COMMON = "common-denominator"
-"""The method that solves col and row together, first by a ridge and then, of a model, by Gauss-Newton."""
 WEIGHTED = 1
 """Further passes of ``ridge`` with the residuals weighted by 1 / denominator, where that varies."""
 MAX_PASSES = 20
@@ -129,8 +127,8 @@ def _coefficients(problem: Problem, systems: list[Compressed], quantize: Roundin
 
 
 def _quotients(parts: Sequence[Array]) -> Array:
-    """Coefficients (4, 20) of parts, each its numerators and their denominator last."""
-    return np.stack([row for part in parts for above in part[:-1] for row in (above, part[-1])])
+    """Coefficients (4, 20) of col and row, each its numerator and its denominator."""
+    return np.concatenate(parts)
 
 
 def _reweighted(
@@ -196,11 +194,7 @@ class Solution:
 
     def _inverses(self) -> list[Array]:
         """For col and row, what takes its row of (M | y) to the unknowns' standard deviations (k, n)."""
-        inverses = [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
-        if len(inverses) == 2:
-            return inverses
-        (both,), m = inverses, len(self.problem.active)
-        return [np.delete(both, slice(m, 2 * m), axis=0), both[m:] * self.problem.aspect]
+        return [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
 
 
 def region_of(problem: Problem) -> Region:
@@ -253,10 +247,7 @@ def solve(
     norm = normalization(ground, image, options, vendor if keeps else None)
     if keeps:  # its offset may lie a whole turn away
         ground = np.column_stack([wrap_longitude(ground[:, 0], norm.ground_offset[0]), ground[:, 1:]])
-    common = options.method == COMMON
-    problem = Problem(
-        ground, image, norm, weight=weight, common=common, margin=options.pole_margin
-    ).screened()
+    problem = Problem(ground, image, norm, weight=weight, margin=options.pole_margin).screened()
     unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)
     if len(ground) <= unknowns:
         raise FitError(
@@ -275,48 +266,47 @@ def solve_problem(problem: Problem, options: FitOptions, method: str, vendor: RP
 
 def _ridge(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     solved, h, passes = [], np.zeros(2), 1
-    for axes in problem.parts:
-        expected, denominator = expected_size(problem.active, len(axes)), None
+    expected = expected_size(problem.active)
+    for axis in range(2):
+        denominator = None
         for done in range(1 + WEIGHTED):
-            system, sigma = noise_scaled(problem.system(axes, denominator), expected)
+            system, sigma = noise_scaled(problem.compressed(axis, denominator), expected)
             denominator = problem.expanded(solution(system))[-1]
             passes = max(passes, 1 + done)
             if np.abs(denominator[1:]).sum() < _EVEN:
                 break
         solved.append(system)
-        h[list(axes)] = sigma / TAU
+        h[axis] = sigma / TAU
     return _coefficients(problem, solved, quantize), solved, h, passes
 
 
 def _gauss_newton(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     start, _, _, passes = _ridge(problem, None, vendor)
     parts, solved, region = [], [], region_of(problem)
-    for axes in problem.parts:
-        numerators, denominator = start[[2 * axis for axis in axes]], start[2 * axes[0] + 1]
-        if not region.above(denominator):  # from a polynomial, then
+    for axis in range(2):
+        part = start[2 * axis : 2 * axis + 2]
+        if not region.above(part[1]):  # from a polynomial, then
             denominator = np.eye(20)[0]
-            systems = [problem.compressed(axis, denominator, free=False) for axis in axes]
-            numerators = np.stack([problem.expanded(solution(one), denominator)[0] for one in systems])
-        x, system, steps = _minimised(
-            problem, axes, problem.packed(np.vstack([numerators, denominator])), region
-        )
+            part = problem.expanded(solution(problem.compressed(axis, denominator, free=False)), denominator)
+        x, system, steps = _minimised(problem, axis, problem.packed(part), region)
         parts.append(problem.expanded(x if quantize is None else solution(system.solved_by(x), quantize)))
         solved.append(system)
         passes = max(passes, steps)
     return _quotients(parts), solved, np.zeros(2), passes
 
 
-def _minimised(
-    problem: Problem, axes: Sequence[int], x: Array, region: Region
-) -> tuple[Array, Compressed, int]:
+def _minimised(problem: Problem, axis: int, x: Array, region: Region) -> tuple[Array, Compressed, int]:
     """Least squares of y - a / b from unknowns x (k,), the system there, and the passes over the points."""
-    *numerators, denominator = problem.expanded(x)
-    system, damping, passes = problem.system(axes, denominator, numerators), 0.0, 1
+
+    def linearised(x: Array) -> Compressed:
+        numerator, denominator = problem.expanded(x)
+        return problem.compressed(axis, denominator, numerator=numerator)
+
+    system, damping, passes = linearised(x), 0.0, 1
     size = np.linalg.norm(system.matrix, axis=0)
     while passes < MAX_PASSES and damping < _MOST_DAMPED:
         ahead = _ahead(problem, system, x, damping * size, size, region)
-        *numerators, denominator = problem.expanded(ahead)
-        following, passes = problem.system(axes, denominator, numerators), passes + 1
+        following, passes = linearised(ahead), passes + 1
         before, after = system.squares(x), following.squares(ahead)
         if after < before:
             x, system, damping = ahead, following, 0.1 * damping if damping > _FIRST_DAMPED else 0.0
@@ -361,7 +351,7 @@ def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) ->
             weight *= errors**_POWER  # Lawson's
             weight /= weight.mean()
             heavy = replace(problem, weight=given * np.sqrt(weight), first=None)
-            x, solved[axis], steps = _minimised(heavy, (axis,), x, region)
+            x, solved[axis], steps = _minimised(heavy, axis, x, region)
             passes += steps
         parts.append(
             problem.expanded(best if quantize is None else solution(solved[axis].solved_by(best), quantize))
