@@ -137,7 +137,10 @@ def _reweighted(
     """RMSE [px] of coefficients, and the systems that their denominators weight."""
     squares, following = 0.0, []
     for i, axis in enumerate(axes):
-        system = problem.compressed(axis, coeffs[2 * i + 1])
+        with np.errstate(
+            all="ignore"
+        ):  # a denominator that is 0 at a point: no number comes of it, and the passes end
+            system = problem.compressed(axis, coeffs[2 * i + 1])
         x = problem.packed(coeffs[2 * i : 2 * i + 2])
         squares += system.squares(x) * float(problem.norm.image_scale[axis]) ** 2
         # corrected: |M x - y|^2 + |x - x_previous|^2

@@ -158,3 +158,11 @@ def test_radars_and_what_is_built_on_an_rpc_may_show_the_ground_mirrored():
 def test_given_points_have_no_other_direction():
     image = np.random.default_rng(0).uniform(0, 1, (300, 2)) * SIZE
     assert fit_rpc_points(HONEST.localize(image, np.linspace(*ALTS, 300)), image).contradiction == 0.0
+
+
+def test_a_lens_beyond_its_fold_is_refused_in_one_line():
+    """Its distances from the middle shrink again: the way back ends anywhere, and no solver is at home there."""
+    size = (14000, 10000)
+    folded = Frame(5.4, 43.2, 5000.0, 9000.0, size, -0.3)
+    with pytest.raises(FitError, match="the model contradicts itself"):
+        fit_rpc(folded, size, (0.0, 600.0))
