@@ -409,7 +409,7 @@ class FitOptions(Options):
         0.01, "A fit whose check points miss by more in one coordinate is refused.", unit="px", above=0
     )
     pole_margin: float = option(
-        0.25,
+        0.1,
         """How far around the image's own ground, as a share of its half width, denominators stay above a tenth of what
         they are in its middle: room for those who leave the image. With 0 a camera that cubics follow badly is often
         followed better.""",

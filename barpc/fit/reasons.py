@@ -151,9 +151,7 @@ def _step(smooth: Array, cols: Array) -> tuple[float, float]:
             mean[n:] - mean[:-n], axis=1
         )  # at i: between points i .. i + n - 1 and the n after
         heights.append(np.pad(change, (n - 1, n)))  # at i: between points i and i + 1
-    at = int(heights[1].argmax())
-    near = heights[0][max(at - _FEW, 0) : at + _FEW + 1]
-    if near.max() < np.sqrt(_FEW / _MANY) * heights[1][at]:  # halfway between no step and nothing else
+    at = _MANY - 1 + int(heights[0][_MANY - 1 : len(heights[1]) - _MANY].argmax())  # as far as both reach
+    if heights[0][at] < np.sqrt(_FEW / _MANY) * heights[1][at]:  # halfway between no step and nothing else
         return 0.0, float("nan")
-    at += int(near.argmax()) - min(_FEW, at)
     return float(heights[0][at]), float(np.sort(cols)[at : at + 2].mean())

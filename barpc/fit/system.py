@@ -103,9 +103,8 @@ class Problem:
     norm: Normalization
     active: IntArray = field(default_factory=lambda: ALL)  # monomials in use, the constant one first
     weight: Array | None = None  # (N,)
-    margin: float = (
-        0.25  # share of the half width of the points, around them, over which denominators are kept up
-    )
+    # share of the half width of the points, around them, over which denominators are kept up
+    margin: float = 0.1
     first: Compressed | None = None  # of col without a denominator, where it is known already
 
     def screened(self) -> Problem:

@@ -94,7 +94,7 @@ CASES = {
     "a detector like a pole": (
         lambda: bent(along(0, lambda u: 20.0 * np.exp(6.0 * (u - 1.0)))),
         "pole",
-        (0.02, 0.1),
+        (0.005, 0.03),
         None,
     ),
 }
