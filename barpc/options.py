@@ -393,17 +393,15 @@ class FitOptions(Options):
         "ridge",
         "gauss-newton",
         "minimax",
-        "common-denominator",
         "lcurve",
         "lcurve-joint",
         "vendor-denominators",
     ] = option(
         "auto",
-        """`ridge`: QR compression and a noise-scaled ridge. `lcurve`: the paper's solver; `lcurve-joint` with one h
-        for col and row (78 unknowns) instead of one each (39 + 39). `gauss-newton`: the least squares of the error
+        """`ridge`: QR compression and a noise-scaled ridge. `lcurve-joint`: the paper's solver, one h for col and row
+        (78 unknowns); `lcurve`: with one each (39 + 39). `gauss-newton`: the least squares of the error
         itself, for models without noise; `minimax`: the least largest error instead. `vendor-denominators`: numerators
-        only. `auto`: `ridge`, and another one where the certificate says that it is better. `common-denominator`: one
-        for col and row, by `ridge` and `gauss-newton` as `auto` goes.""",
+        only. `auto`: `ridge`, and another one where the certificate says that it is better.""",
     )
     grid: tuple[int, int, int] = option(
         (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4
@@ -416,6 +414,13 @@ class FitOptions(Options):
     )
     tolerance: float = option(
         0.01, "A fit whose check points miss by more in one coordinate is refused.", unit="px", above=0
+    )
+    pole_margin: float = option(
+        0.1,
+        """How far around the image's own ground, as a share of its half width, denominators stay above a tenth of what
+        they are in its middle: room for those who leave the image. With 0 a camera that cubics follow badly is often
+        followed better.""",
+        least=0,
     )
     precision: Literal["nitf", "rpcm"] | None = option(
         None, "Fit numbers that a format with few digits can hold."

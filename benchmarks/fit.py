@@ -27,8 +27,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
-from barpc.fit.certificate import smallest_denominator
 from barpc.fit.points import control_points
+from barpc.fit.poles import smallest_denominator
 from barpc.geodesy import Array
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor.rpc import RPC

@@ -40,6 +40,7 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 )
 @click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
 @flag("fit.tolerance")
+@flag("fit.pole_margin")
 @flag("fit.localisation")
 @click.option("--options", "options_file", metavar="FILE", help="TOML file; its table [fit] counts here.")
 @click.option("--keep-going", is_flag=True, help="Write the RPC although it misses the tolerance; exit 3.")
@@ -164,8 +165,10 @@ def _certificate(fit: RpcFit, verdict: str) -> str:
         "              col [px]     row [px]",
         *(f"{name:14s}{col:<13.3g}{row:.3g}" for name, (col, row) in rows.items()),
         *([more] if fit.beyond < 1 else []),  # given points say nothing of the rest
-        f"denominators  at least {fit.min_denominator:.3g} over the box and 25 % around it",
-        f"round trip    {fit.roundtrip:.1g} px",
+        f"denominators  at least {fit.min_denominator:.3g} over the image's ground and around it",
+        *([] if fit.free is None else [f"              {fit.free}"]),
+        f"round trip    {fit.roundtrip:.1g} px"
+        + f"; the camera's own {fit.contradiction:.1g}" * (fit.beyond < 1),
         *([] if fit.localisation is None else [_localisation(fit.localisation)]),
         f"verdict       {verdict or 'within tolerance'}",
     ]

@@ -22,7 +22,7 @@ from barpc.cli.terminal import as_json, echo
 from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, ground_at, opened_dem
 from barpc.dem import Dem
 from barpc.errors import InputError, RpcError
-from barpc.fit.certificate import smallest_denominator
+from barpc.fit.poles import smallest_denominator
 from barpc.geojson import collection, feature, polygon
 from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC

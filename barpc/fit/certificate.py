@@ -1,34 +1,30 @@
 """What an RPC is worth over a whole image: points that the fit has not seen, poles, round trips.
 
 The points are drawn one a cell of the image and at an altitude of its own each, with more along its edges; where the
-error is largest more are drawn around the worst, closer and closer. Poles are excluded by a bound and not by samples.
+error is largest more are drawn around the worst, closer and closer.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import comb
 
 import numpy as np
 import numpy.typing as npt
 
+from barpc.errors import FitError
 from barpc.geodesy import Array, wrap_longitude
 from barpc.sensor import SensorModel
-from barpc.sensor.rational import MONOMIALS, monomials
 from barpc.sensor.rpc import RPC
 
 BoolArray = npt.NDArray[np.bool_]
 
 CELLS = 45
 """Along each side of the image: 2025 points of the whole."""
-BEYOND = 1.25  # the box and 25 %: where denominators are looked at
 _EDGE = 12  # points along each edge of the image, at either end of the altitudes
 _WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, how often
 _NEARER = 0.5  # each time
-_PIECES = 8  # of a side of the box in the bound of a denominator
 _CHUNK = 8192
-_BERNSTEIN = np.array([[comb(i, k) / comb(3, k) for k in range(4)] for i in range(4)])
 
 
 @dataclass
@@ -78,6 +74,8 @@ class Sample:
         seed: int = 0,
     ) -> Sample:
         """One point a cell of `cells` along each side of the image, at random in it, and those along the edges."""
+        if min(size) < 1:
+            raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
         rng = np.random.default_rng(seed)
         cell = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
         inside = np.column_stack([cell, rng.permutation(len(cell))]) + rng.random((len(cell), 3))
@@ -101,6 +99,14 @@ class Sample:
             points=np.concatenate([self.points, points[known]]),
             ground=np.concatenate([self.ground, ground[known]]),
         )
+
+    def contradiction(self) -> float:
+        """Largest distance [px] of the points from where the model projects their ground; infinite where it fails.
+
+        At the altitudes that were asked for, whatever altitudes it gave back.
+        """
+        asked = np.column_stack([self.ground[:, :2], self.points[:, 2]])
+        return float(_size(self.model.project(asked) - self.points[:, :2]).max(initial=0.0))
 
     def errors(self, rpc: RPC) -> tuple[Errors, Array]:
         """What an RPC makes of the points all over the image, and its largest errors (2,) [px], found by looking on.
@@ -151,45 +157,6 @@ def _scaled(unit: Array, size: tuple[int, int], alt_range: tuple[float, float]) 
     """col, row, altitude (..., 3) of places in 0 .. 1."""
     low, high = alt_range
     return np.asarray(unit * [*size, high - low] + [-0.5, -0.5, low])
-
-
-def least_value(cubic: Array, box: Array) -> float:
-    """A lower bound, near the least value, of a cubic (20,) over a `box` (3, 2).
-
-    Over every piece of the box it lies above the least of its Bernstein coefficients (Farouki 2012, "The Bernstein
-    polynomial basis: a centennial retrospective").
-    """
-    powers = np.zeros((4, 4, 4))
-    for coefficient, monomial in zip(cubic, MONOMIALS, strict=True):
-        powers[tuple(monomial.count(letter) for letter in "LPH")] = coefficient
-    edges = np.linspace(box[:, 0], box[:, 1], _PIECES + 1)
-    width = (box[:, 1] - box[:, 0]) / _PIECES
-    for axis in range(3):
-        shifted = np.zeros((_PIECES, 4, 4))  # x^p as a polynomial of the place in the piece
-        for p in range(4):
-            for k in range(p + 1):
-                shifted[:, k, p] = comb(p, k) * edges[:-1, axis] ** (p - k) * width[axis] ** k
-        powers = np.tensordot(_BERNSTEIN @ shifted, powers, axes=(2, 2 * axis))
-        powers = np.moveaxis(powers, (0, 1), (2 * axis, 2 * axis + 1))
-    return float(powers.min())
-
-
-def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
-    """A lower bound of the denominators over a box `low`, `high` (3,) [deg, deg, m] and 25 % around it.
-
-    Over what they are at its centre.
-    """
-    return smallest_value(rpc.coeffs[1::2], rpc.normalize(np.stack([low, high])))
-
-
-def smallest_value(cubics: Array, box: Array) -> float:
-    """A lower bound of cubics (k, 20) over a box (3, 2) and 25 % around it, over what they are at its centre."""
-    middle, half = box.mean(axis=1), 0.5 * np.abs(box[:, 1] - box[:, 0])
-    around = middle[:, None] + half[:, None] * np.array([-BEYOND, BEYOND])
-    center = (cubics @ monomials(middle[:, None]))[:, 0]
-    least = np.array([least_value(cubic, around) for cubic in cubics])
-    with np.errstate(all="ignore"):  # NaN where a pole is at the centre
-        return float((least / center).min())
 
 
 def roundtrip(rpc: RPC, ground: Array) -> float:

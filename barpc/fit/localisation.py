@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.fit.certificate import Errors, smallest_value
-from barpc.fit.points import extent
+from barpc.fit.certificate import Errors
 from barpc.fit.precision import Normalization
 from barpc.fit.solve import Solution, solve_problem
 from barpc.fit.system import Problem
@@ -87,12 +86,9 @@ def with_localisation(
     found: list[tuple[RPC, Localisation]] = []
     for method in ("ridge", "gauss-newton") if exact else ("ridge",):
         solution = solve_problem(problem(method), options, method)
-        norm, direct = solution.problem.norm, replace(rpc, direct=solution.coeffs)
+        direct = replace(rpc, direct=solution.coeffs)
         errors, largest = seen(direct, solution)
-        box = (np.stack(extent(solution.problem.ground), axis=1) - norm.ground_offset[:, None]) / (
-            norm.ground_scale[:, None]
-        )
-        least = smallest_value(solution.coeffs[1::2], box)
+        least = solution.region.smallest(solution.coeffs[1::2])
         (rmse_m, rmse_px), (max_m, max_px) = errors.rmse.tolist(), largest.tolist()
         found.append((direct, Localisation(rmse_m, max_m, rmse_px, max_px, least, method)))
         if max_px <= _EXACT:

@@ -69,8 +69,6 @@ def control_points(
     It spans the outer edges of the image and `alt_range` [m]; longitudes run on across the antimeridian. NaN where
     the model fails.
     """
-    if min(size) < 1:
-        raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
     if options.space == "ground":
         x, y = _ground_box(model, size, alt_range)
     else:

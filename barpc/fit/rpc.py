@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from barpc.errors import BarpcWarning, FitError
-from barpc.fit.certificate import Errors, Sample, coverage, roundtrip, smallest_denominator
-from barpc.fit.localisation import Localisation, Seen, inverse, off, with_localisation
+from barpc.fit.certificate import Errors, Sample, coverage, roundtrip
+from barpc.fit.localisation import Seen, inverse, off, with_localisation
 from barpc.fit.points import control_points, extent, numbers, screened, widened
-from barpc.fit.solve import COMMON, Solution, solve
+from barpc.fit.poles import Region
+from barpc.fit.reasons import reason
+from barpc.fit.result import EXACT, Free, RpcFit
+from barpc.fit.solve import BOUNDED, Solution, solve
 from barpc.geodesy import Array, wrap_longitude
 from barpc.options import FitOptions
 from barpc.sensor import SensorModel
+from barpc.sensor.geometry import Radar
 from barpc.sensor.rpc import RPC
 from barpc.sensor.splined import Splined
 
@@ -26,101 +29,8 @@ _CHUNK = 8192
 _LOOPS = 4096  # round trips that a table of points is tried on, about
 _ABOUT = 1.1  # times the error
 _MISSING = 0.1  # part of the image without a ground point, at most
+_WORTH = 2.0  # times the RMSE: where a bound on the denominators costs as much, it is said
 _CELLS = 72  # of ``gauss-newton``, along each side of the image
-_HOPE = 3.0  # times the tolerance: what ``minimax`` may bring below it
-_EXACT = 1e-6  # px: what no other method is tried on
-
-
-@dataclass(frozen=True, eq=False)
-class RpcFit:
-    """A fitted RPC and its certificate.
-
-    Parameters
-    ----------
-    rpc : RPC
-        The result.
-    rmse_cnp, max_cnp : (2,)
-        Root mean square and largest error of col, row on the control points [px].
-    rmse_ckp, max_ckp : (2,)
-        The same on check points all over image and altitudes, which the fit has not seen [px]; the largest error was
-        also looked for around the worst of them.
-    beyond : float
-        Part of the image and the altitudes that may miss by more than `max_ckp`: no more, with 95 % confidence. 1 for
-        given points, which may lie anywhere and say nothing of the rest.
-    min_denominator : float
-        Lower bound of the denominators over the ground box and 25 % around it, over what they are at its centre; above
-        0 there is no pole.
-    roundtrip : float
-        Largest distance of a check point from where its projection is localised [px]; infinite where that fails.
-    coverage : float
-        Share of the image inside the convex hull of the control points.
-    h : (2,)
-        Regularisation used for col, row.
-    iterations : int
-        Passes over the points.
-    num_cnp, num_ckp : int
-        Number of points.
-    method : str
-        The solver whose result this is.
-    localisation : Localisation or None
-        The certificate of `rpc.direct`, where it was asked for.
-    """
-
-    rpc: RPC
-    rmse_cnp: Array
-    max_cnp: Array
-    rmse_ckp: Array
-    max_ckp: Array
-    beyond: float
-    min_denominator: float
-    roundtrip: float
-    coverage: float
-    h: Array
-    iterations: int
-    num_cnp: int
-    num_ckp: int
-    method: str
-    localisation: Localisation | None = None
-
-    def __repr__(self) -> str:
-        return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"
-
-    def summary(self) -> dict[str, Any]:
-        """The certificate as plain numbers and lists, col before row, lengths in px."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
-        if self.localisation is None:
-            del values["localisation"]
-        else:
-            values["localisation"] = asdict(self.localisation)
-        return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
-
-    def as_written(self, rpc: RPC) -> RpcFit:
-        """The fit with the RPC that a file of it holds: what that lost over its box is added to the errors."""
-        lost = self.rpc.off(rpc)
-        return replace(
-            self,
-            rpc=rpc,
-            rmse_ckp=self.rmse_ckp + np.sqrt((lost**2).mean(axis=0)),
-            max_ckp=self.max_ckp + lost.max(axis=0),
-            localisation=None if rpc.direct is None else self.localisation,
-        )
-
-    def verdict(self, tolerance: float) -> str:
-        """What is wrong with this fit at a tolerance [px], in words; empty if nothing is."""
-        worst = float(self.max_ckp.max())
-        if not worst <= tolerance:
-            return (
-                f"the RPC misses its check points by up to {worst:.3g} px (RMSE col {self.rmse_ckp[0]:.3g}, "
-                f"row {self.rmse_ckp[1]:.3g}), wanted {tolerance:g}: fit a smaller altitude range or a "
-                "smaller image, or raise the tolerance"
-                + ", or fit by the method minimax"
-                * (self.method == "gauss-newton" and worst < _HOPE * tolerance)
-            )
-        if not self.min_denominator > 0:
-            return "the RPC has a pole near the scene: use more control points or a stronger regularisation"
-        if not self.roundtrip <= max(tolerance, 1e-6):
-            return f"the RPC cannot be inverted over the scene (round trip {self.roundtrip:.3g} px)"
-        return "" if self.localisation is None else self.localisation.verdict(tolerance)
 
 
 def fit_rpc(
@@ -147,7 +57,8 @@ def fit_rpc(
     Raises
     ------
     FitError
-        The model cannot be localised over the image, or the RPC does not reach the tolerance.
+        The model cannot be localised over the image, its two directions contradict each other, it shows the ground
+        mirrored (and is neither a radar nor built on an RPC), or the RPC does not reach the tolerance.
 
     Warns
     -----
@@ -165,22 +76,43 @@ def fit_rpc(
         message = f"{sample.missing:.1%} of the image has no ground point and is left out: the RPC extrapolates there"
         warnings.warn(message, BarpcWarning, stacklevel=2)
     vendor = underlying_rpc(model)
+    mirrored = options.allow_mirrored or vendor is not None or isinstance(innermost(model), Radar)
+    screened(sample.ground, sample.points[:, :2], mirrored)
+    contradiction = sample.contradiction()
 
     given = partial(_given, model, size, alt_range, options)
 
-    def attempt(method: str, source: SensorModel = model) -> RpcFit:
+    def attempt(method: str, source: SensorModel = model, options: FitOptions = options) -> RpcFit:
         solution = solve(*_given(source, size, alt_range, options, method), options, method, vendor=vendor)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
-        return _certified(solution, *sample.errors(solution.rpc), loop, size, beyond)
+        fit = _certified(solution, *sample.errors(solution.rpc), loop, size, beyond)
+        fit = replace(fit, contradiction=contradiction)
+        if not (options.pole_margin and solution.held):
+            return fit
+        free = attempt(method, source, replace(options, pole_margin=0.0))
+        return _compared(fit, free, solution.region, options.pole_margin)
 
     try:
-        fit = _best(attempt, options, vendor, strict and not isinstance(model, Splined), exact=True)
+        fit = _best(attempt, options, vendor, False, exact=True)
         if isinstance(model, Splined):
             fit = _plainer(fit, attempt("ridge", model.sensor))
+        if not float(fit.max_ckp.max()) <= options.tolerance:
+            fit = replace(fit, reason=reason(fit.rpc, sample))
+        _accepted(fit, options, strict and not isinstance(model, Splined))
         return _localised(fit, given, partial(_missed, sample), options, strict)
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
+
+
+def _compared(fit: RpcFit, free: RpcFit, region: Region, margin: float) -> RpcFit:
+    """A fit that knows what `free`, whose denominators are kept up over the image's own ground only, makes better."""
+    if not np.linalg.norm(fit.rmse_ckp) > _WORTH * np.linalg.norm(free.rmse_ckp):
+        return fit
+    place, far = region.nearest_pole(free.rpc.coeffs[1::2], margin)
+    pole = free.rpc.ground_offset + place * free.rpc.ground_scale
+    found = Free(float(free.rmse_ckp.max()), float(free.max_ckp.max()), tuple(pole.tolist()), far)
+    return replace(fit, free=found)
 
 
 def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
@@ -200,10 +132,7 @@ def _given(
     method: str,
 ) -> tuple[Array, Array]:
     """Ground (N, 3) and image points (N, 2) for a method."""
-    if method in (
-        "gauss-newton",
-        "minimax",
-    ):  # what an RPC cannot follow has any frequency: scattered points alias none
+    if method in BOUNDED:  # what an RPC cannot follow has any frequency: scattered points alias none
         scattered = Sample.of(model, size, alt_range, _CELLS, seed=1)
         ground, image = scattered.ground, scattered.points[:, :2]
     else:
@@ -319,8 +248,13 @@ def _localised(
 
 def underlying_rpc(model: object) -> RPC | None:
     """The RPC that a model is built on: itself, or what its corrections stand in front of."""
-    while model is not None and not isinstance(model, RPC):
-        model = getattr(model, "sensor", None)
+    return inner if isinstance(inner := innermost(model), RPC) else None
+
+
+def innermost(model: object) -> object:
+    """The camera that a model's corrections stand in front of, or itself."""
+    while (inner := getattr(model, "sensor", None)) is not None:
+        model = inner
     return model
 
 
@@ -352,7 +286,7 @@ def _certified(
     for start in range(0, len(ground), _CHUNK):
         part = slice(start, start + _CHUNK)
         used.add(rpc.project(ground[part]) - image[part])
-    (low, high), (left, right) = extent(ground), extent(image)
+    left, right = extent(image)
     if size is not None:
         left, right = np.full(2, -0.5), np.asarray(size) - 0.5
     return RpcFit(
@@ -362,15 +296,22 @@ def _certified(
         rmse_ckp=seen.rmse,
         max_ckp=largest,
         beyond=beyond,
-        min_denominator=smallest_denominator(rpc, low, high),
+        min_denominator=solution.region.smallest(rpc.coeffs[1::2]),
         roundtrip=loop,
         coverage=coverage(image, left, right),
         h=solution.h,
         iterations=solution.iterations,
         num_cnp=used.count,
         num_ckp=seen.count,
-        method=COMMON if problem.common else solution.method,
+        method=solution.method,
     )
+
+
+def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
+    """The fit; FitError where `strict` and something is wrong with it."""
+    if strict and (wrong := fit.verdict(options.tolerance)):
+        raise FitError(wrong)
+    return fit
 
 
 def _best(
@@ -380,20 +321,17 @@ def _best(
 
     Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
     """
-    several = options.method in ("auto", COMMON)
-    fits = [attempt("ridge" if several else str(options.method))]
-    if several and exact and not float(fits[0].max_ckp.max()) <= _EXACT:
+    if options.method != "auto":
+        return _accepted(attempt(str(options.method)), options, strict)
+    fits = [attempt("ridge")]
+    if exact and not float(fits[0].max_ckp.max()) <= EXACT:
         fits.append(attempt("gauss-newton"))
-    if options.method == "auto":
-        others = ["lcurve"] + (["vendor-denominators"] if vendor is not None else [])
-        while others and all(fit.verdict(options.tolerance) for fit in fits):
-            fits.append(attempt(others.pop(0)))
+    others = ["lcurve"] + (["vendor-denominators"] if vendor is not None else [])
+    while others and all(fit.verdict(options.tolerance) for fit in fits):
+        fits.append(attempt(others.pop(0)))
     wrong = [fit.verdict(options.tolerance) for fit in fits]
     rank = [
         (bool(said), not fit.min_denominator > 0, float(np.linalg.norm(fit.rmse_ckp)))
         for said, fit in zip(wrong, fits, strict=True)
     ]
-    best = rank.index(min(rank))
-    if strict and wrong[best]:
-        raise FitError(wrong[best])
-    return fits[best]
+    return _accepted(fits[rank.index(min(rank))], options, strict)

@@ -6,7 +6,7 @@ noise, hence no penalty; noisy points cannot drive a denominator to zero. sigma 
 
 ``gauss-newton``: the least squares of y - a / b itself, not of b y - a, from the ridge on: the same rows with what the
 coefficients now give in place of y, and damped towards them. No penalty: for models without noise, whose misfit a ridge
-takes for noise. Steps that bring a denominator near zero over the points are not taken.
+takes for noise. Denominators stay above a tenth over the hull of the points and a margin (`barpc.fit.poles`).
 
 ``minimax``: from there on the least largest error, by least squares whose weights grow with the errors (Lawson,
 "Contributions to the theory of linear least maximum approximation", 1961).
@@ -25,8 +25,8 @@ from functools import cached_property, partial
 import numpy as np
 
 from barpc.errors import FitError
-from barpc.fit.certificate import BEYOND, least_value
 from barpc.fit.points import extent
+from barpc.fit.poles import FLOOR, Region, bounded
 from barpc.fit.precision import ALTITUDE_FLOOR, PRECISIONS, Normalization
 from barpc.fit.system import (
     EPS,
@@ -45,8 +45,6 @@ from barpc.sensor.rpc import RPC
 Found = tuple[Array, list["Compressed"], Array, int]
 """Coefficients (4, 20); final systems of col and row, penalties included; their regularisation h (2,); passes."""
 
-COMMON = "common-denominator"
-"""The method that solves col and row together, first by a ridge and then, of a model, by Gauss-Newton."""
 WEIGHTED = 1
 """Further passes of ``ridge`` with the residuals weighted by 1 / denominator, where that varies."""
 MAX_PASSES = 20
@@ -54,9 +52,11 @@ TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _SAMPLES = 200  # of the L-curve
 _LEAST_DAMPED, _FIRST_DAMPED, _MOST_DAMPED = 1e-12, 1e-6, 1e3  # of the size of a column
-_AROUND = np.full((3, 2), [-BEYOND, BEYOND])
-_MARGIN = 0.1  # of what a denominator is at the centre
-_REWEIGHTED = 7  # times, of ``minimax``
+_POWER = (
+    1.5  # of the errors that weights grow with, and 20 rounds: 0.94 px for 1.21 at 89.9 N, 60 rounds 0.89
+)
+_REWEIGHTED = 20  # times, of ``minimax``
+_SLACK = 1e-6  # of the least denominator: rounding
 _GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _EVEN = 0.05  # a denominator within 1 -/+ this weights nothing
 
@@ -116,7 +116,7 @@ def solve_lcurve(problem: Problem, axes: Sequence[int]) -> tuple[Array, list[Com
             rmse, following = _reweighted(problem, axes, coeffs, penalty, corrected)
             if rmse < least:
                 least, best = rmse, (coeffs, solved)
-            if abs(last - rmse) < TOLERANCE:
+            if not abs(last - rmse) >= TOLERANCE:  # nor a number, where a denominator is 0 at a point
                 break
             coeffs, solved, last = _coefficients(problem, following), following, rmse
     return *best, h, passes
@@ -127,8 +127,8 @@ def _coefficients(problem: Problem, systems: list[Compressed], quantize: Roundin
 
 
 def _quotients(parts: Sequence[Array]) -> Array:
-    """Coefficients (4, 20) of parts, each its numerators and their denominator last."""
-    return np.stack([row for part in parts for above in part[:-1] for row in (above, part[-1])])
+    """Coefficients (4, 20) of col and row, each its numerator and its denominator."""
+    return np.concatenate(parts)
 
 
 def _reweighted(
@@ -137,7 +137,10 @@ def _reweighted(
     """RMSE [px] of coefficients, and the systems that their denominators weight."""
     squares, following = 0.0, []
     for i, axis in enumerate(axes):
-        system = problem.compressed(axis, coeffs[2 * i + 1])
+        with np.errstate(
+            all="ignore"
+        ):  # a denominator that is 0 at a point: no number comes of it, and the passes end
+            system = problem.compressed(axis, coeffs[2 * i + 1])
         x = problem.packed(coeffs[2 * i : 2 * i + 2])
         squares += system.squares(x) * float(problem.norm.image_scale[axis]) ** 2
         # corrected: |M x - y|^2 + |x - x_previous|^2
@@ -162,6 +165,16 @@ class Solution:
         norm = self.problem.norm
         return RPC(self.coeffs, norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
 
+    @cached_property
+    def region(self) -> Region:
+        """Where its denominators are looked at."""
+        return region_of(self.problem)
+
+    @property
+    def held(self) -> bool:
+        """Whether a denominator is as small as it may be: without the bound it were smaller."""
+        return self.method in BOUNDED and self.region.smallest(self.coeffs[1::2]) < FLOOR + _SLACK
+
     def leave_one_out(self) -> Iterator[Array]:
         """Residuals (n, 2) that points would have if they had not been used, some hundred at a time.
 
@@ -184,11 +197,14 @@ class Solution:
 
     def _inverses(self) -> list[Array]:
         """For col and row, what takes its row of (M | y) to the unknowns' standard deviations (k, n)."""
-        inverses = [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
-        if len(inverses) == 2:
-            return inverses
-        (both,), m = inverses, len(self.problem.active)
-        return [np.delete(both, slice(m, 2 * m), axis=0), both[m:] * self.problem.aspect]
+        return [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
+
+
+def region_of(problem: Problem) -> Region:
+    """The hull of a problem's own points and its margin."""
+    norm = problem.norm
+    ground = (problem.ground - norm.ground_offset) / norm.ground_scale
+    return Region.around(ground, (problem.image - norm.image_offset) / norm.image_scale, problem.margin)
 
 
 def tidy(values: Array) -> Array:
@@ -234,8 +250,7 @@ def solve(
     norm = normalization(ground, image, options, vendor if keeps else None)
     if keeps:  # its offset may lie a whole turn away
         ground = np.column_stack([wrap_longitude(ground[:, 0], norm.ground_offset[0]), ground[:, 1:]])
-    common = options.method == COMMON
-    problem = Problem(ground, image, norm, weight=weight, common=common).screened()
+    problem = Problem(ground, image, norm, weight=weight, margin=options.pole_margin).screened()
     unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)
     if len(ground) <= unknowns:
         raise FitError(
@@ -254,49 +269,48 @@ def solve_problem(problem: Problem, options: FitOptions, method: str, vendor: RP
 
 def _ridge(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     solved, h, passes = [], np.zeros(2), 1
-    for axes in problem.parts:
-        expected, denominator = expected_size(problem.active, len(axes)), None
+    expected = expected_size(problem.active)
+    for axis in range(2):
+        denominator = None
         for done in range(1 + WEIGHTED):
-            system, sigma = noise_scaled(problem.system(axes, denominator), expected)
+            system, sigma = noise_scaled(problem.compressed(axis, denominator), expected)
             denominator = problem.expanded(solution(system))[-1]
             passes = max(passes, 1 + done)
             if np.abs(denominator[1:]).sum() < _EVEN:
                 break
         solved.append(system)
-        h[list(axes)] = sigma / TAU
+        h[axis] = sigma / TAU
     return _coefficients(problem, solved, quantize), solved, h, passes
 
 
 def _gauss_newton(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     start, _, _, passes = _ridge(problem, None, vendor)
-    parts, solved = [], []
-    for axes in problem.parts:
-        numerators, denominator = start[[2 * axis for axis in axes]], start[2 * axes[0] + 1]
-        if not least_value(denominator, _AROUND) > _MARGIN:  # from a polynomial, then
+    parts, solved, region = [], [], region_of(problem)
+    for axis in range(2):
+        part = start[2 * axis : 2 * axis + 2]
+        if not region.above(part[1]):  # from a polynomial, then
             denominator = np.eye(20)[0]
-            systems = [problem.compressed(axis, denominator, free=False) for axis in axes]
-            numerators = np.stack([problem.expanded(solution(one), denominator)[0] for one in systems])
-        x, system, steps = _minimised(problem, axes, problem.packed(np.vstack([numerators, denominator])))
-        parts.append(problem.expanded(x if quantize is None else solution(system, quantize)))
+            part = problem.expanded(solution(problem.compressed(axis, denominator, free=False)), denominator)
+        x, system, steps = _minimised(problem, axis, problem.packed(part), region)
+        parts.append(problem.expanded(x if quantize is None else solution(system.solved_by(x), quantize)))
         solved.append(system)
         passes = max(passes, steps)
     return _quotients(parts), solved, np.zeros(2), passes
 
 
-def _minimised(problem: Problem, axes: Sequence[int], x: Array) -> tuple[Array, Compressed, int]:
+def _minimised(problem: Problem, axis: int, x: Array, region: Region) -> tuple[Array, Compressed, int]:
     """Least squares of y - a / b from unknowns x (k,), the system there, and the passes over the points."""
-    *numerators, denominator = problem.expanded(x)
-    system, damping, passes = problem.system(axes, denominator, numerators), 0.0, 1
+
+    def linearised(x: Array) -> Compressed:
+        numerator, denominator = problem.expanded(x)
+        return problem.compressed(axis, denominator, numerator=numerator)
+
+    system, damping, passes = linearised(x), 0.0, 1
     size = np.linalg.norm(system.matrix, axis=0)
     while passes < MAX_PASSES and damping < _MOST_DAMPED:
-        penalty = max(damping, _LEAST_DAMPED) * size
-        ahead = solution(system.penalized(penalty, penalty * x))
-        *numerators, denominator = problem.expanded(ahead)
-        before, after = system.squares(x), np.inf
-        if least_value(denominator, _AROUND) > _MARGIN:
-            passes += 1
-            following = problem.system(axes, denominator, numerators)
-            after = following.squares(ahead)
+        ahead = _ahead(problem, system, x, damping * size, size, region)
+        following, passes = linearised(ahead), passes + 1
+        before, after = system.squares(x), following.squares(ahead)
         if after < before:
             x, system, damping = ahead, following, 0.1 * damping if damping > _FIRST_DAMPED else 0.0
             if before - after < _GAIN * before:
@@ -306,9 +320,27 @@ def _minimised(problem: Problem, axes: Sequence[int], x: Array) -> tuple[Array, 
     return x, system, passes
 
 
+def _ahead(
+    problem: Problem, system: Compressed, x: Array, penalty: Array, size: Array, region: Region
+) -> Array:
+    """The solution of a system damped towards x, its denominator kept up over a region; x where there is none."""
+    for least, solver in (
+        (_LEAST_DAMPED, solution),
+        (
+            _FIRST_DAMPED,
+            partial(bounded, region=region, active=problem.active),
+        ),  # which wants it well conditioned
+    ):
+        damped = np.maximum(penalty, least * size)
+        ahead = solver(system.penalized(damped, damped * x))
+        if ahead is not None and region.above(problem.expanded(ahead)[-1]):
+            return ahead
+    return x
+
+
 def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) -> Found:
     coeffs, solved, h, passes = _gauss_newton(problem, None, vendor)
-    given, parts = 1.0 if problem.weight is None else problem.weight, []
+    given, parts, region = 1.0 if problem.weight is None else problem.weight, [], region_of(problem)
     for axis in range(2):
         x, least, weight = (
             problem.packed(coeffs[2 * axis : 2 * axis + 2]),
@@ -319,12 +351,14 @@ def _minimax(problem: Problem, quantize: Rounding | None, vendor: RPC | None) ->
             errors = problem.errors(axis, x)
             if errors.max() < least:
                 least, best = float(errors.max()), x
-            weight *= errors  # Lawson's
+            weight *= errors**_POWER  # Lawson's
             weight /= weight.mean()
             heavy = replace(problem, weight=given * np.sqrt(weight), first=None)
-            x, solved[axis], steps = _minimised(heavy, (axis,), x)
+            x, solved[axis], steps = _minimised(heavy, axis, x, region)
             passes += steps
-        parts.append(problem.expanded(best if quantize is None else solution(solved[axis], quantize)))
+        parts.append(
+            problem.expanded(best if quantize is None else solution(solved[axis].solved_by(best), quantize))
+        )
     return _quotients(parts), solved, h, passes
 
 
@@ -359,3 +393,5 @@ METHODS: dict[str, Callable[[Problem, Rounding | None, RPC | None], Found]] = {
     "vendor-denominators": _vendor_denominators,
 }
 """Name -> solver of a problem; ``vendor-denominators`` keeps those of the vendor's RPC."""
+BOUNDED = ("gauss-newton", "minimax")
+"""Methods that keep denominators up, and take scattered points."""

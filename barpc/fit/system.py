@@ -10,7 +10,7 @@ chunk by chunk: no condition number is squared, whatever the number of points.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -75,6 +75,12 @@ class Compressed:
         rest = self.matrix @ solution - self.target
         return float(rest @ rest + self.triangle[-1, -1] ** 2)
 
+    def solved_by(self, solution: Array) -> Compressed:
+        """The system of the same rows that a given solution (k,) leaves nothing of but what it never reaches."""
+        triangle = self.triangle.copy()
+        triangle[:-1, -1] = self.matrix @ solution
+        return Compressed(triangle, self.num_points)
+
     def penalized(self, penalty: Array, toward: Array | float = 0.0) -> Compressed:
         """The system with the rows diag(`penalty`) x = `toward` below."""
         rows = np.column_stack([np.diag(penalty), np.broadcast_to(toward, penalty.shape)])
@@ -97,7 +103,8 @@ class Problem:
     norm: Normalization
     active: IntArray = field(default_factory=lambda: ALL)  # monomials in use, the constant one first
     weight: Array | None = None  # (N,)
-    common: bool = False  # one denominator of both coordinates
+    # share of the half width of the points, around them, over which denominators are kept up
+    margin: float = 0.1
     first: Compressed | None = None  # of col without a denominator, where it is known already
 
     def screened(self) -> Problem:
@@ -162,42 +169,14 @@ class Problem:
             triangle = _take_in(triangle, rows)
         return Compressed(np.triu(triangle), len(self.image))
 
-    @property
-    def parts(self) -> tuple[tuple[int, ...], ...]:
-        """The coordinates that have unknowns in common."""
-        return ((0, 1),) if self.common else ((0,), (1,))
-
-    def system(
-        self, axes: Sequence[int], denominator: Array | None = None, numerators: Sequence[Array] = ()
-    ) -> Compressed:
-        """The system of a part: `compressed` of one coordinate, or both above each other with one denominator."""
-        above = numerators if len(numerators) else [None] * len(axes)
-        each = [self.compressed(i, denominator, numerator=a) for i, a in zip(axes, above, strict=True)]
-        if len(each) == 1:
-            return each[0]
-        m, (col, row) = len(self.active), (system.triangle for system in each)
-        row = row * self.aspect
-        nothing = np.zeros((len(col), m))
-        both = np.vstack([np.hstack([col[:, :m], nothing, col[:, m:]]), np.hstack([nothing, row])])
-        size = both.shape[1]
-        triangle = _take_in(np.zeros((size, size), order="F"), both)
-        return Compressed(np.triu(triangle), 2 * len(self.image))
-
-    @property
-    def aspect(self) -> float:
-        """What a row counts for beside a column where they are solved together: both in pixels."""
-        return float(self.norm.image_scale[1] / self.norm.image_scale[0])
-
     def expanded(self, solution: Array, denominator: Array | None = None) -> Array:
-        """Numerators, one or two, and denominator (n + 1, 20) of a solution; monomials not in use are zero."""
-        m = len(self.active)
-        count = max(len(solution) // m, 1)
-        out = np.zeros((count + 1, 20))
-        out[:count, self.active] = solution[: count * m].reshape(count, m)
+        """Numerator and denominator (2, 20) of a solution; monomials not in use are zero."""
+        m, out = len(self.active), np.zeros((2, 20))
+        out[0, self.active] = solution[:m]
         if denominator is not None:
-            out[-1] = denominator
+            out[1] = denominator
         else:
-            out[-1, 0], out[-1, self.active[1:]] = 1.0, solution[count * m :]
+            out[1, 0], out[1, self.active[1:]] = 1.0, solution[m:]
         return out
 
     def errors(self, axis: int, x: Array) -> Array:
@@ -207,17 +186,17 @@ class Problem:
 
     def packed(self, expanded: Array) -> Array:
         """The solution (k,) that `expanded` makes numerators and denominator of."""
-        return np.concatenate([*expanded[:-1, self.active], expanded[-1, self.active[1:]]])
+        return np.concatenate([expanded[0, self.active], expanded[1, self.active[1:]]])
 
 
-def expected_size(active: IntArray, numerators: int = 1) -> Array:
+def expected_size(active: IntArray) -> Array:
     """Size (k,) expected of each unknown, those of the denominator last; infinite where nothing is expected.
 
     Numerator: 0.1 of degree two, 0.03 of degree three. Denominator: `TAU` of degree one, a tenth of it
     of degree two, a hundredth of degree three: what vendors' RPCs show, with room.
     """
     degree = _DEGREE[active]
-    return np.concatenate([*[_NUMERATOR[degree]] * numerators, TAU * _DENOMINATOR[degree[1:]]])
+    return np.concatenate([_NUMERATOR[degree], TAU * _DENOMINATOR[degree[1:]]])
 
 
 def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float]:

@@ -23,6 +23,7 @@ MIN_VECTORS = 4
 MIN_DEGREE, MAX_DEGREE = 5, 11
 
 _TOLERANCE = 1.0  # m: state vectors that scatter more are not one orbit
+_UNSEEN = 1e-4  # m/s: at 900 km 1.6 us, the rounding of times and a thousandth of a line
 _FLOOR = 2e-5  # m: a residual across the track that no pixel sees
 _DIGITS = np.array([1e-5, 1e-5, 1e-6])  # m, m, m/s: no standard deviation is smaller
 _ROUNDS = 5  # of estimating them: they settle in three
@@ -142,13 +143,18 @@ def attitude_through(times: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Orbit(Curve):
-    """The polynomial through state vectors."""
+    """The polynomial through state vectors, and the velocity that they state where it is not its derivative."""
 
     sigma: Array  # (3,): standard deviations of positions along and across the track [m], of velocities [m/s]
+    stated: Array  # (K, 3): stated velocity less derivative [m/s], as a polynomial of the time from the first knot
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._array("sigma", (3,), RpcError)
+        more, table = self._array("stated", (None, 3), RpcError), self._table.copy()
+        table[3:6, : len(more), 0] += more.T
+        table[6:, : len(more) - 1, 0] += (more[1:] * np.arange(1, len(more))[:, None]).T
+        self._keep("_table", table)
 
 
 def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float, float]) -> Orbit:
@@ -161,6 +167,11 @@ def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float
     estimated along with the orbit, from the residuals. The degree is the lowest that no higher one (`MIN_DEGREE`
     to `MAX_DEGREE`) betters by more than half in the residual ACROSS the track: about 5 for downlinked vectors, 6
     for auxiliary ones, more for a long span. Along the track a high degree would follow the rounding of the times.
+
+    Velocities are those that are stated: of downlinked vectors not the derivatives of their positions, by 4 to 17 mm/s
+    that change smoothly. The processor's zero Doppler goes by them (as SNAP's does): by the derivatives rows are 0.01
+    to 0.23 lines off the product's own grid, up to 2 m; by a quadratic for the difference, where that explains it, 1e-4
+    (1e-3 in stripmap).
 
     Parameters
     ----------
@@ -228,7 +239,13 @@ def _fit_orbit(time: Array, position: Array, velocity: Array, degree: int) -> Or
         chebyshev.chebval(-1.0, chebyshev.chebder(series, k)) / (half**k * math.factorial(k))
         for k in range(degree + 1)
     ]
-    return Orbit(time[[0, -1]], np.array(taylor)[None], sigma)
+    lacking = velocity - chebyshev.chebval(x, chebyshev.chebder(series)).T / half
+    quadratic = (time - time[0])[:, None] ** np.arange(3)
+    stated = np.linalg.lstsq(quadratic, lacking, rcond=None)[0]
+    left, free = lacking - quadratic @ stated, max(len(time) - 3, 1) / len(time)
+    if not np.sqrt((lacking**2).mean()) > _GAIN * max(_UNSEEN, np.sqrt((left**2).mean() / free)):
+        stated = np.zeros((1, 3))
+    return Orbit(time[[0, -1]], np.array(taylor)[None], sigma, stated)
 
 
 class Turn:

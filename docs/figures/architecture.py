@@ -41,7 +41,7 @@ JOURNEYS = {
         ("fit/points.py", "control_points", "-> a grid of ground and image points"),
         ("fit/solve.py", "solve", "-> coefficients, ridge first"),
         ("fit/system.py", "Problem", "-> the linearised system, its triangle"),
-        ("fit/certificate.py", "smallest_denominator", "-> no pole, by a bound"),
+        ("fit/solve.py", "region_of", "-> where no pole may be"),
         ("fit/certificate.py", "roundtrip", "-> the certificate, on points that the fit has not seen"),
     ),
 }

@@ -14,6 +14,7 @@ from barpc.cli import adjust as adjusting
 from barpc.cli import fit as fitting
 from barpc.cli.adjust import _tell
 from barpc.cli.fit import _certificate
+from barpc.fit.result import Free
 from barpc.rpcio import write_rpc
 from tests.cli.test_main import run
 from tests.report.made import a_summary
@@ -27,6 +28,7 @@ def a_fit(**changes: Any) -> Any:
         "method": "lcurve", "iterations": 4, "h": (1e-6, 0.25), "num_cnp": 1000, "num_ckp": 500, "coverage": 0.985,
         "rmse_cnp": (1e-3, 2e-3), "max_cnp": (3e-3, 4e-3), "rmse_ckp": (5e-3, 6e-3), "max_ckp": (7e-3, 8e-3),
         "beyond": 0.0123, "min_denominator": 0.9, "roundtrip": 1e-9, "localisation": None,
+        "contradiction": 3e-9, "free": None,
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **changes})
 
@@ -41,10 +43,15 @@ def test_a_certificate_has_a_figure_in_every_line() -> None:
         "check rmse    0.005        0.006",
         "check max     0.007        0.008",
         "beyond        1.23% of the image may miss by more, at most (95 % confidence)",
-        "denominators  at least 0.9 over the box and 25 % around it",
-        "round trip    1e-09 px",
+        "denominators  at least 0.9 over the image's ground and around it",
+        "round trip    1e-09 px; the camera's own 3e-09",
         "verdict       within tolerance",
     ]
+    free = Free(0.01, 0.02, (5.4, 43.2, 900.0), 1.7)
+    assert _certificate(a_fit(free=free), "").split("\n")[9] == (
+        "              without a margin around the image (pole_margin 0) up to 0.02 px, with a pole at lon 5.4000, "
+        "lat 43.2000, 900 m, 1.7 times as far from the middle as the image's end"
+    )
     given = _certificate(a_fit(beyond=1.0), "it misses").split("\n")
     assert not any(line.startswith("beyond") for line in given)
     assert given[-1] == "verdict       it misses"

@@ -7,14 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 from barpc.errors import FitError, RpcFormatError
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
-from barpc.fit.solve import COMMON, solve
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.rpcio import read_rpc, write_rpc
-from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic
 from tests.fit.models import hard
@@ -124,53 +121,6 @@ def test_given_points_have_one_too_across_the_antimeridian_and_with_noise(lon: f
     fresh, at = random_points(camera, 500, rng)
     found = left_out.rpc.localize_direct(at, fresh[:, 2])
     assert np.linalg.norm(ecef_from_ground(found) - ecef_from_ground(fresh), axis=1).max() < 0.5
-
-
-# --- one denominator of col and row -------------------------------------------------------------------------
-
-
-def test_a_common_denominator_is_the_best_of_its_kind() -> None:
-    fit = fit_rpc(*hard()[FRAME], options=FitOptions(method=COMMON, tolerance=1.0))
-    assert fit.method == COMMON
-    assert (fit.rpc.coeffs[1] == fit.rpc.coeffs[3]).all()
-    ground, image = places(FRAME, 4000)
-    basis, scale = monomials(fit.rpc.normalize(ground)), fit.rpc.image_scale[:, None]
-    y = ((image - fit.rpc.image_offset) / fit.rpc.image_scale).T
-
-    def residual(x: Array) -> Array:
-        below = np.append(1.0, x[40:]) @ basis
-        return (scale * (np.stack([x[:20] @ basis, x[20:40] @ basis]) / below - y)).ravel()
-
-    plain = np.append(np.linalg.lstsq(basis.T, y.T, rcond=None)[0].T.ravel(), np.zeros(19))
-    best = np.sqrt((least_squares(residual, plain, method="lm", xtol=1e-12, ftol=1e-10).fun ** 2).mean())
-    error = fit.rpc.project(ground) - image
-    assert 0.99 * best <= np.sqrt((error**2).mean()) <= 1.05 * best
-
-
-def test_two_coordinates_of_one_denominator_are_found_and_their_leverages_are_those_of_the_whole_system() -> (
-    None
-):
-    rng = np.random.default_rng(0)
-    coeffs = 1e-3 * rng.normal(size=(4, 20))
-    coeffs[0, 1], coeffs[2, 2], coeffs[1, 0] = 1.0, -1.0, 1.0
-    coeffs[3] = coeffs[1]
-    truth = RPC(coeffs, [5.0, 43.0, 500.0], [0.1, 0.1, 500.0], [9e3, 5e3], [9e3, 3e3])
-    ground = truth.ground_offset + truth.ground_scale * rng.uniform(-1, 1, (150, 3))
-    image = truth.project(ground)
-    exact = fit_rpc_points(ground, image, options=FitOptions(method=COMMON))
-    assert np.abs(exact.rpc.project(ground) - image).max() < 1e-7
-    noisy = image + rng.normal(0, 0.3, image.shape)
-    solution = solve(ground, noisy, FitOptions(method=COMMON), "ridge")
-    found = np.concatenate(list(solution.leave_one_out()))
-    problem = solution.problem
-    col, row = (next(iter(problem.rows(axis, solution.coeffs[1])))[1][:, :-1] for axis in range(2))
-    none = np.zeros((150, 20))
-    whole = np.vstack([np.hstack([col[:, :20], none, col[:, 20:]]), problem.aspect * np.hstack([none, row])])
-    penalty = solution.solved[0].matrix.T @ solution.solved[0].matrix - whole.T @ whole
-    inverse = np.linalg.inv(whole.T @ whole + np.diag(np.maximum(np.diag(penalty), 0.0)))
-    leverage = np.einsum("ij,jk,ik->i", whole, inverse, whole).reshape(2, 150).T
-    residual = solution.rpc.project(ground) - noisy
-    np.testing.assert_allclose(found, residual / (1.0 - leverage), rtol=0.02, atol=1e-4)
 
 
 # --- the least largest error --------------------------------------------------------------------------------

@@ -15,13 +15,14 @@ from barpc.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import rpc as fit_module
 from barpc.fit import solve as solve_module
-from barpc.fit.certificate import CELLS, Errors, Sample, least_value, smallest_value
+from barpc.fit.certificate import CELLS, Errors, Sample
 from barpc.fit.localisation import Localisation, inverse, off
 from barpc.fit.points import control_points
+from barpc.fit.poles import Region, least_value, smallest_value
 from barpc.fit.precision import PRECISIONS
 from barpc.fit.rpc import _plainer, underlying_rpc
-from barpc.fit.solve import COMMON, normalization, solve, tidy
-from barpc.fit.system import Problem, expected_size, solution
+from barpc.fit.solve import normalization, solve, tidy
+from barpc.fit.system import Problem, solution
 from barpc.geodesy import Array, ecef_from_ground
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
@@ -106,20 +107,22 @@ def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypa
     problem, starts = Problem(ground, image, norm), []
     whole = solve_module._minimised
 
-    def seen(problem: Problem, axes: Any, x: Array) -> Any:
+    def seen(problem: Problem, axis: int, x: Array, region: Region) -> Any:
         starts.append(x)
-        return whole(problem, axes, x)
+        return whole(problem, axis, x, region)
 
     monkeypatch.setattr(solve_module, "_minimised", seen)
     plain, *_ = solve_module._gauss_newton(problem, None, None)
     ridge = solve_module._ridge(problem, None, None)
     np.testing.assert_array_equal(starts[0], np.concatenate([ridge[0][0], ridge[0][1, 1:]]))
     basis = monomials(((ground - norm.ground_offset) / norm.ground_scale).T)
-    for slope, kept in ((0.70, True), (0.74, False)):  # 1 - 1.25 slope: above a tenth, and below
+    reach = -solve_module.region_of(problem).least(-np.eye(20)[1])  # of L: the image, and a tenth around it
+    assert 1.05 < reach < 1.25
+    for slope, kept in ((0.89 / reach, True), (0.91 / reach, False)):  # 1 - slope L: above a tenth, and below
         starts.clear()
         poles = ridge[0].copy()
         poles[1::2] = 0.0
-        poles[1::2, 0], poles[1::2, 1] = 1.0, slope
+        poles[1::2, 0], poles[1::2, 1] = 1.0, -slope
         monkeypatch.setattr(solve_module, "_ridge", lambda *_, poles=poles: (poles, *ridge[1:]))
         found, *_ = solve_module._gauss_newton(problem, None, None)
         for axis in range(2):
@@ -135,15 +138,14 @@ def test_a_step_that_makes_things_worse_is_not_taken(camera: Camera) -> None:
     """From a start far off: the sum of squares never rises, and no denominator comes near zero."""
     ground, image, norm = wavy(camera, 120, 20.0)
     problem = Problem(ground, image, norm)
-    rng = np.random.default_rng(0)
+    rng, around = np.random.default_rng(0), np.full((3, 2), [-1.25, 1.25])
     for axis in range(2):
         start = np.concatenate([rng.normal(0, 1, 20), rng.normal(0, 0.02, 19)])
-        before = problem.system((axis,), problem.expanded(start)[1], problem.expanded(start)[:1]).squares(
-            start
-        )
-        x, system, passes = solve_module._minimised(problem, (axis,), start)
+        above, below = problem.expanded(start)
+        before = problem.compressed(axis, below, numerator=above).squares(start)
+        x, system, passes = solve_module._minimised(problem, axis, start, Region.box(around))
         assert system.squares(x) < 0.1 * before
-        assert least_value(problem.expanded(x)[1], np.full((3, 2), [-1.25, 1.25])) > 0.1
+        assert least_value(problem.expanded(x)[1], around) > 0.1 - 1e-8
         assert passes <= 20
         error = problem.errors(axis, x)
         assert (error**2).sum() == pytest.approx(system.squares(x), rel=1e-9)
@@ -161,23 +163,6 @@ def test_minimax_keeps_the_round_with_the_least_largest_error(camera: Camera) ->
     assert passes > few + 7
     near = np.sort(np.abs(left(problem, even)), axis=0)[::-1] / largest[1]
     assert (near[10] > 0.85).all()  # many points are about as bad as the worst
-
-
-def test_one_denominator_is_that_of_both(camera: Camera) -> None:
-    ground, image, norm = wavy(camera)
-    problem = Problem(ground, image, norm, common=True)
-    assert problem.parts == ((0, 1),)
-    assert problem.aspect == pytest.approx(9800.0 / 10100.0)
-    for found in (solve_module._ridge(problem, None, None), solve_module._gauss_newton(problem, None, None)):
-        np.testing.assert_array_equal(found[0][1], found[0][3])
-        assert (found[0][0] != found[0][2]).any()
-    both, *_ = solve_module._gauss_newton(problem, None, None)
-    each, *_ = solve_module._gauss_newton(replace(problem, common=False), None, None)
-    squares = [(left(problem, coeffs) ** 2).sum() for coeffs in (each, both)]
-    assert squares[0] < squares[1]
-    expected = expected_size(problem.active, 2)
-    assert len(expected) == 59
-    np.testing.assert_array_equal(expected[:20], expected[20:40])
 
 
 def test_coefficients_rounded_for_a_format_are_what_the_format_holds(camera: Camera) -> None:
@@ -249,10 +234,8 @@ def test_the_least_squares_are_looked_for_where_a_ridge_leaves_a_millionth_of_a_
         tried.append(method)
         return made(method=method, max_ckp=np.array([largest, 1e-9]), rmse_ckp=np.full(2, 1e-7))
 
-    for option in ("auto", COMMON):
-        tried.clear()
-        fit_module._best(attempt, FitOptions(method=option), None, True, exact=True)
-        assert tried == methods
+    fit_module._best(attempt, FitOptions(), None, True, exact=True)
+    assert tried == methods
     tried.clear()
     fit_module._best(attempt, FitOptions(), None, True, exact=False)
     assert tried == ["ridge"]

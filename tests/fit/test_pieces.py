@@ -14,7 +14,7 @@ import pytest
 from barpc.errors import FitError, InputError, RpcError
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import rpc as fit_module
-from barpc.fit.certificate import Errors, coverage, roundtrip, smallest_denominator
+from barpc.fit.certificate import Errors, coverage, roundtrip
 from barpc.fit.points import (
     _check_order,
     control_points,
@@ -23,6 +23,7 @@ from barpc.fit.points import (
     terrain_range,
     widened,
 )
+from barpc.fit.poles import smallest_denominator
 from barpc.fit.rpc import relative_weight, underlying_rpc
 from barpc.fit.solve import _curvature, solve_lcurve
 from barpc.fit.system import ALL, Problem, expected_size, noise_scaled, solution
@@ -66,6 +67,7 @@ ELSEWHERE = {
     "nodes": "test_nodes_are_where_they_are_asked_for",
     "localisation": "test_a_localisation_rpc_comes_only_where_it_is_asked_for",
     "tolerance": "test_the_tolerance_decides_whether_a_fit_is_accepted",
+    "pole_margin": "test_a_wider_margin_keeps_denominators_up_farther_out",
     "allow_mirrored": "test_mirrored_points_are_taken_where_allowed",
 }
 
@@ -174,6 +176,21 @@ def test_nodes_are_where_they_are_asked_for() -> None:
     np.testing.assert_allclose(spaced(2.0, 10.0, 5, "uniform"), [2, 4, 6, 8, 10])
     expected = 6.0 - 4.0 * np.cos(np.pi * np.arange(5) / 4)
     np.testing.assert_allclose(spaced(2.0, 10.0, 5, "chebyshev"), expected)
+
+
+def test_a_wider_margin_keeps_denominators_up_farther_out(camera: Camera) -> None:
+    """The same misfit under two margins: the narrower, the better, and the smaller what is a step outside."""
+    bent = Bent(
+        camera.model, lambda at: np.stack([20.0 * np.exp(6e-4 * (at[..., 0] - 2e4)), 0.0 * at[..., 0]], -1)
+    )
+    narrow, wide = (
+        fit_rpc(bent, camera.size, camera.alt_range, options=FitOptions(pole_margin=margin), strict=False)
+        for margin in (0.0, 0.5)
+    )
+    assert np.linalg.norm(narrow.rmse_ckp) < 0.5 * np.linalg.norm(wide.rmse_ckp)
+    middle, half = camera.rpc.ground_offset, camera.rpc.ground_scale
+    outside = [smallest_denominator(fit.rpc, middle - half, middle + half) for fit in (narrow, wide)]
+    assert outside[0] < outside[1]
 
 
 def test_the_tolerance_decides_whether_a_fit_is_accepted(camera: Camera) -> None:

@@ -583,11 +583,50 @@ def test_an_auxiliary_orbit_meets_the_grid_of_the_product(shared_data: Path, sta
     assert abs(azimuth.mean()) <= 7e-4
 
 
-def test_a_downlinked_orbit_meets_the_grid_but_for_a_constant(shared_data: Path) -> None:
-    annotation = read_annotation(annotation_path(shared_data, "20210401t052624"))
-    range_, azimuth = grid_residuals(annotation, RangeDoppler.from_annotation(annotation)).T
-    assert np.abs(azimuth - np.median(azimuth)).max() <= 0.01
-    assert np.abs(range_).max() <= 2e-4
+def _of_three(shared_data: Path) -> list[Path]:
+    return sorted((shared_data / "radar" / "s1_three_swaths").glob("*_iw[13].xml"))
+
+
+@pytest.mark.parametrize("number", rest_slow(range(-1, 10), keep=2))
+def test_a_downlinked_orbit_meets_the_grid_by_the_velocities_it_states(
+    shared_data: Path, number: int
+) -> None:
+    """They are not the derivatives of its positions, by which rows are 0.005 to 0.12 lines off."""
+    path = annotation_path(shared_data, "20210401t052624") if number < 0 else _of_three(shared_data)[number]
+    annotation = read_annotation(path)
+    model = RangeDoppler.from_annotation(annotation)
+    assert annotation.states.source == "Downlink"
+    range_, azimuth = grid_residuals(annotation, model).T
+    assert np.abs(azimuth).max() <= 1.2e-3
+    assert azimuth.std() <= 2.5e-4
+    assert np.abs(range_).max() <= 3e-4
+    derived = replace(model, orbit=replace(model.orbit, stated=np.zeros((1, 3))))
+    assert np.abs(grid_residuals(annotation, derived)[:, 1]).max() > 0.012
+
+
+def test_velocities_that_only_scatter_are_not_followed(shared_data: Path) -> None:
+    """A smooth difference of 10 mm/s is; the same as noise is not, nor one of a tenth of a millimetre."""
+    annotation = read_annotation(annotation_path(shared_data, AUXILIARY[0]))
+    states, noise = (
+        annotation.states,
+        np.random.default_rng(5).normal(0, 6e-3, (len(annotation.states.time), 3)),
+    )
+    smooth = np.array([6e-3, -6e-3, 6e-3]) * np.linspace(0.5, 1.5, len(noise))[:, None] ** 2
+    for wrong, followed in (
+        (smooth, True),
+        (noise, False),
+        (5e-3 * smooth, False),
+        (smooth + 0.1 * noise, True),
+    ):
+        moved = replace(annotation, states=replace(states, velocity=states.velocity + wrong))
+        model = RangeDoppler.from_annotation(moved)
+        assert bool(model.orbit.stated.any()) == followed
+        if followed:
+            at = np.array([12.0])  # s
+            times = (states.time - model.epoch) / np.timedelta64(1, "s")
+            given = [np.interp(at, times, axis) for axis in smooth.T]
+            found = model.orbit.states(at)[1] - replace(model.orbit, stated=np.zeros((1, 3))).states(at)[1]
+            np.testing.assert_allclose(found, given, atol=1e-3)
 
 
 def test_a_product_of_2016_meets_its_grid(shared_data: Path) -> None:
@@ -619,9 +658,13 @@ def test_incidence_angles_are_those_of_the_grid(shared_data: Path, stamp: str) -
 
 @pytest.mark.parametrize("stamp", rest_slow([*SLC[:1], "20211223t051122", *SLC[1:]], keep=2))
 def test_an_independent_tool_finds_the_same_image_points(shared_data: Path, stamp: str) -> None:
-    """Another tool's points; its orbit is of degree 11, and its times are UNIX seconds in a float."""
+    """Another tool's points; its orbit is of degree 11, and its times are UNIX seconds in a float.
+
+    Its velocities are the derivatives of positions, by which downlinked vectors do not meet their product's grid.
+    """
     path = annotation_path(shared_data, stamp)
     built, annotation = quiet_model(path), read_annotation(path)
+    built = replace(built, orbit=replace(built.orbit, stated=np.zeros((1, 3))))
     with (shared_data / "truth" / "sar" / f"{path.name}.csv").open() as file:
         rows = list(csv.DictReader(file))
     table = {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
