@@ -18,10 +18,21 @@ from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
-from barpc.tie.features import KeypointFiles, locate
+from barpc.tie.features import KeypointFiles, Share, locate
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
-from barpc.tie.matching import STRUCTURE, THIN, PairReport, enough, match, matcher_named, quick_score
+from barpc.tie.matching import (
+    STRUCTURE,
+    THIN,
+    PairReport,
+    ample,
+    coarsely,
+    enough,
+    match,
+    matcher_named,
+    quick_score,
+    wanted_of_a_pair,
+)
 from barpc.tie.ortho import Terrain
 from barpc.tie.pairs import Area, Pair, possible_pairs, require_connected
 from barpc.tie.register import refine
@@ -33,6 +44,7 @@ logger = logging.getLogger(__name__)
 _DEFAULTS = TieOptions()
 _NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
+_HELD = 4.0  # keypoints that an image is to hold for each match wanted, of less detail: of the triplet 2.2 are
 _SAME = 2.2  # px that registration may move a point by, rounding included
 _APART = 1e7  # px, more than an image measures
 _QUOTAS = (4, 8, 16)
@@ -128,6 +140,8 @@ class _Trials:
         self._views, self._options, self._store, self._area = views, options, store, area
         self._given, self._terrain, self._work = given, terrain, work
         self._compares = options.matcher == _DEFAULTS.matcher  # by keypoints
+        self._coarse = self._compares and not several_dates(views) and _worth_a_first_look(views, options)
+        self._looks = 0
         self.keypoints = [KeypointFiles(store)] * len(views)
         self.tried: dict[tuple[int, int], tuple[Pair, Matches, PairReport]] = {}
         self._scores: dict[tuple[int, int], int] = {}
@@ -156,7 +170,8 @@ class _Trials:
         others = [pair for pair in pairs if pair.views not in self._given]
         if others and matcher_named(self._options.matcher).detects:
             views, options = self._views, self._options
-            self.keypoints = locate(views, options, self._store, pairs=others, area=self._area, **self._work)
+            where: dict[str, Any] = {"pairs": others, "area": self._area, "coarse": self._coarse}
+            self.keypoints = locate(views, options, self._store, **where, **self._work)
 
     def _judged(self, pairs: Sequence[Pair]) -> list[Pair]:
         """Pairs with their quick scores, where keypoints can tell."""
@@ -179,12 +194,35 @@ class _Trials:
             (self._ends(pair)[0], found) for pair, found, report in self.tried.values() if enough(report)
         ]
         views, options = self._views, self._options
-        own = match(
-            views, self.keypoints, others, options, terrain=self._terrain, before=before, **self._work
-        )
+        own = self._matched(others, before)
         theirs = verify(views, self._given, known, options, **self._work)
         for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
             self.tried[pair.views] = pair, found, report
+
+    def _matched(
+        self, pairs: Sequence[Pair], before: Sequence[tuple[tuple[View, View], Matches]]
+    ) -> list[tuple[Matches, PairReport]]:
+        """Matches of pairs by a first look, and by a closer one at those of which that shows too little."""
+        views, options, keypoints = self._views, self._options, self.keypoints
+        first = coarsely(views, keypoints, pairs, options, **self._work) if self._coarse else []
+        found = {p.views: one for p, one in zip(pairs, first, strict=False) if ample(one[1], options)}
+        lacking = [pair for pair in pairs if pair.views not in found]
+        if self._coarse and lacking:
+            closer = locate(views, options, self._store, pairs=lacking, area=self._area, **self._work)
+            self._looks += 1  # each numbers its keypoints, below 0, where no place is
+            keypoints = [replace(files, start=-self._looks << 32) for files in closer]
+        known = [(self._ends(pair)[0], found[pair.views][0]) for pair in pairs if pair.views in found]
+        again = match(
+            views, keypoints, lacking, options, terrain=self._terrain, before=[*before, *known], **self._work
+        )
+        found |= {pair.views: one for pair, one in zip(lacking, again, strict=True)}
+        return [found[pair.views] for pair in pairs]
+
+
+def _worth_a_first_look(views: Sequence[View], options: TieOptions) -> bool:
+    """Whether images hold so much detail that looking at less of it may be enough."""
+    needed = _HELD * wanted_of_a_pair(options)
+    return all(Share.of(view.size, options, coarse=True).expected(view.size) >= needed for view in views)
 
 
 def _unlike(
