@@ -315,14 +315,14 @@ class _Template:
         normal = (jacobian @ jacobian.transpose(0, 2, 1)).astype(np.float64)
         normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
-        xy, step = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
-        sampled = self._normalized(self._sample(fine, *xy))[0]
-        correlation = ((sampled * values) @ self._weight).astype(np.float64)
+        xy, step, correlation = self._iterate(
+            fine, (jacobian, inverse), start.copy(), linear.copy(), settled
+        )
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_LEAST_SIGMA)
-        moved = np.hypot(*(xy[0] - start).T)
+        moved = np.hypot(*(xy - start).T)
         ok = (step <= 10 * settled) & (moved <= _REACH) & np.isfinite(sigma)
-        return Registration(xy[0], correlation, sigma, ok)
+        return Registration(xy, correlation, sigma, ok)
 
     def _iterate(
         self,
@@ -331,9 +331,12 @@ class _Template:
         centre: Array,
         linear: Array,
         settled: float,
-    ) -> tuple[tuple[Array, Array], Array]:
-        """Centres and distortions after the iterations, and the length of each one's last step [px]."""
-        length = np.full(len(centre), np.inf)
+    ) -> tuple[Array, Array, Array]:
+        """Centres after the iterations, the length of each one's last step [px], and the correlation there.
+
+        The gain between patches of variance 1, where nothing else is left to fit, is their correlation.
+        """
+        length, gain = np.full(len(centre), np.inf), np.zeros(len(centre))
         active = np.arange(len(centre))
         jacobian, inverse = solver
         for _ in range(_STEPS):
@@ -341,7 +344,8 @@ class _Template:
             patches = self._normalized(self._sample(fine, sampled, linear[active]))[0]
             right = (jacobian @ (self._root * patches)[:, :, None]).astype(np.float64)
             solution = (inverse @ right)[:, :, 0]
-            change = solution[:, :6] / np.maximum(solution[:, 6:7], 0.2)  # gain: how like the patches are
+            gain[active] = solution[:, 6]
+            change = solution[:, :6] / np.maximum(solution[:, 6:7], 0.2)
             shift = np.clip(change[:, :2], -1.0, 1.0)
             distortion = np.clip(change[:, 2:].reshape(-1, 2, 2) / self._half, -0.2, 0.2)
             linear[active] = linear[active] @ np.linalg.inv(np.eye(2) + distortion)
@@ -353,7 +357,7 @@ class _Template:
                 break
             if not going.all():
                 active, jacobian, inverse = active[going], jacobian[going], inverse[going]
-        return (centre, linear), length
+        return centre, length, gain
 
     def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatImage:
         """Patches (N, P) of the other image about centres (N, 2) under distortions (N, 2, 2)."""
