@@ -241,20 +241,21 @@ def _upsampled(image: FloatImage) -> FloatImage:
 
     Between these a linear sample moves no phase; OpenCV's bicubic one would, by up to a twentieth of the step.
     """
-    wide = np.empty((image.shape[0], _FINE * image.shape[1]), np.float32)
-    out = np.empty((_FINE * image.shape[0], wide.shape[1]), np.float32)
     one, border = np.ones(1, np.float32), cv2.BORDER_REFLECT_101
-    for phase, kernel in enumerate(_kernels()):
-        wide[:, phase::_FINE] = cv2.sepFilter2D(image, -1, kernel, one, None, (_TAPS - 1, 0), 0.0, border)
-    for phase, kernel in enumerate(_kernels()):
-        out[phase::_FINE] = cv2.sepFilter2D(wide, -1, one, kernel, None, (0, _TAPS - 1), 0.0, border)
+    across, down = (_TAPS - 1, 0), (0, _TAPS - 1)
+    columns = [cv2.sepFilter2D(image, -1, kernel, one, None, across, 0.0, border) for kernel in _kernels()]
+    wide = cv2.merge([image, *columns]).reshape(len(image), -1)
+    out = np.empty((_FINE * len(image), wide.shape[1]), np.float32)
+    out[::_FINE] = wide
+    for phase, kernel in enumerate(_kernels(), start=1):
+        cv2.sepFilter2D(wide, -1, one, kernel, out[phase::_FINE], down, 0.0, border)
     return out
 
 
 def _kernels() -> list[FloatImage]:
-    """Weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel."""
+    """Weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel but 0."""
     kernels = []
-    for phase in range(_FINE):
+    for phase in range(1, _FINE):
         offset = np.arange(1 - _TAPS, _TAPS + 1) - phase / _FINE
         kernel = np.sinc(offset) * np.cos(0.5 * np.pi * offset / (_TAPS + 1)) ** 2
         kernels.append((kernel / kernel.sum()).astype(np.float32))
