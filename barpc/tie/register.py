@@ -316,9 +316,7 @@ class _Template:
         normal = (jacobian @ jacobian.transpose(0, 2, 1)).astype(np.float64)
         normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
-        xy, step, correlation = self._iterate(
-            fine, (jacobian, inverse), start.copy(), linear.copy(), settled
-        )
+        xy, step, correlation = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_LEAST_SIGMA)
         moved = np.hypot(*(xy - start).T)

@@ -44,7 +44,9 @@ logger = logging.getLogger(__name__)
 _DEFAULTS = TieOptions()
 _NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
-_HELD = 4.0  # keypoints that an image is to hold for each match wanted, of less detail: of the triplet 2.2 are
+_HELD = (
+    4.0  # keypoints that an image is to hold for each match wanted, of less detail: of the triplet 2.2 are
+)
 _SAME = 2.2  # px that registration may move a point by, rounding included
 _APART = 1e7  # px, more than an image measures
 _QUOTAS = (4, 8, 16)
