@@ -2,8 +2,8 @@
 
     python benchmarks/whole.py IMG IMG [IMG...] [--against FOLDER] [--turns 7] [-- OPTION...]
 
-Each turn is a process of its own with an output folder of its own, so that nothing is kept from one to the next; user and
-system time, one thread, the median of the turns after a first one that compiles the sources, as installing does.
+Each turn is a process of its own with an output folder of its own, so that nothing is kept from one to the next; user
+and system time, one thread, the median of the turns after a first one that compiles the sources, as installing does.
 "start" is what no stage counts: the interpreter, imports, the end.
 """
 
