@@ -32,6 +32,10 @@ _AMPLE = 5  # keypoints for each tie point wanted
 _ZOOMS = ((1.25e-4, 4), (2e-3, 2))
 """Keypoints wanted a px, below which so many pixels a side are looked at as one: real images hold 1200e-6, 4500e-6."""
 _HOLDS = {2: 4.5e-3, 4: 1.2e-3}  # keypoints a px that real images hold, looked at so
+_PART, _LEAST = 0.1, 100
+"""Verified matches of a pair that make a closer look needless, as a part of the points wanted of an image, and at
+least: with 250 tracks in place of 3664 three real pairs meet check points alike, to 0.139, 0.154, 0.129 px."""
+_HELD = 4.0  # keypoints that images are to hold for each of these, or nothing is gained; the triplet has 2.1 to 2.5
 _SPARE = 1.2  # of a tile's share: what poor tiles leave goes to the others
 
 
@@ -134,6 +138,17 @@ class Share:
     def cell(self) -> int:
         """Side of the cells that take their strongest in turns [px]."""
         return CELL * max(1, round(float(np.sqrt(_FEW / self.density)) / CELL))
+
+
+def ample_matches(options: TieOptions) -> int:
+    """So many verified matches of a pair at a first look make a closer one needless."""
+    return max(_LEAST, int(np.ceil(_PART * options.points_per_image)))
+
+
+def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) -> bool:
+    """Whether images of `sizes` (width, height) hold so much that looking at less of it may be enough."""
+    needed = _HELD * ample_matches(options)
+    return all(Share.of(size, options, coarse=True).expected(size) >= needed for size in sizes)
 
 
 def detect_tile(

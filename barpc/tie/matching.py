@@ -22,7 +22,7 @@ from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.epipolar import Frame, agreeing, common_range, frame, robust_affine, robust_spread
-from barpc.tie.features import KeypointFiles, Keypoints, join
+from barpc.tie.features import KeypointFiles, Keypoints, ample_matches, join
 from barpc.tie.guided import Guided
 from barpc.tie.hook import Hook, hooked
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
@@ -46,9 +46,6 @@ THIN = 100
 """Verified matches of a pair below which it is tried again,"""
 SHARE, FEW = 0.3, 30
 """unless they are this share of the keypoints in its common area, and so many: small images have no more to give."""
-_PART = 0.1
-"""Verified matches of a pair by a first look, as a part of the points wanted of an image: with 250 tracks in place of
-3664 three real pairs meet independent check points to 0.139, 0.154, 0.129 px RMS in place of 0.139, 0.154, 0.129."""
 TOLERANCE = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
 _DEFAULTS = TieOptions()
@@ -122,32 +119,9 @@ def match_pair(
     return _better(first, (found, replace(report, loosened=True)))
 
 
-def coarsely(
-    views: Sequence[View],
-    keypoints: Sequence[KeypointFiles],
-    pairs: Sequence[Pair],
-    options: TieOptions,
-    *,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
-) -> list[tuple[Matches, PairReport]]:
-    """One attempt at every pair with the keypoints of a first look; `ample` says of which that is all they need."""
-    tasks = [
-        ((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options)
-        for pair, (i, j) in ((pair, pair.views) for pair in pairs)
-    ]
-    found: list[tuple[Matches, PairReport]] = ordered(executor, _attempt, tasks, "match", progress)
-    return found
-
-
-def wanted_of_a_pair(options: TieOptions) -> int:
-    """So many verified matches of a first look make a closer one needless."""
-    return max(THIN, math.ceil(_PART * options.points_per_image))
-
-
 def ample(report: PairReport, options: TieOptions) -> bool:
     """Whether a first look found so much that a closer one is needless."""
-    return report.status == "ok" and report.verified >= wanted_of_a_pair(options)
+    return report.status == "ok" and report.verified >= ample_matches(options)
 
 
 def enough(report: PairReport) -> bool:
@@ -257,16 +231,21 @@ def match(
     *,
     terrain: Terrain | None = None,
     before: Sequence[tuple[tuple[View, View], Matches]] = (),
+    once: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
     """Matches of every pair, each with its report: `match_pair` over all pairs, and `STRUCTURE` where it finds few.
 
     `terrain`, or else the matches of other pairs, some of them found `before`, tell the altitudes at which that looks.
+    With `once` a first look's keypoints are tried once: `ample` says of which pairs that is all that they need.
     """
     ends = [(pair, *pair.views) for pair in pairs]
     tasks = [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
-    found: list[tuple[Matches, PairReport]] = ordered(executor, match_pair, tasks, "match", progress)
+    work = _attempt if once else match_pair
+    found: list[tuple[Matches, PairReport]] = ordered(executor, work, tasks, "match", progress)
+    if once:
+        return found
     thin = [k for k, (_, report) in enumerate(found) if not enough(report)]
     named = options.matcher != _DEFAULTS.matcher
     if not thin or (named and (options.matcher != STRUCTURE or terrain is None)):  # a name is what is wanted

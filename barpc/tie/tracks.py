@@ -18,7 +18,7 @@ from barpc.options import TieOptions
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
-from barpc.tie.features import KeypointFiles, Share, locate
+from barpc.tie.features import KeypointFiles, locate, worth_a_first_look
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
 from barpc.tie.matching import (
@@ -26,12 +26,10 @@ from barpc.tie.matching import (
     THIN,
     PairReport,
     ample,
-    coarsely,
     enough,
     match,
     matcher_named,
     quick_score,
-    wanted_of_a_pair,
 )
 from barpc.tie.ortho import Terrain
 from barpc.tie.pairs import Area, Pair, possible_pairs, require_connected
@@ -44,9 +42,6 @@ logger = logging.getLogger(__name__)
 _DEFAULTS = TieOptions()
 _NOTHING: GivenMatches = MappingProxyType({})
 _SPARE = 1.3  # tracks registered for each one kept
-_HELD = (
-    4.0  # keypoints that an image is to hold for each match wanted, of less detail: of the triplet 2.2 are
-)
 _SAME = 2.2  # px that registration may move a point by, rounding included
 _APART = 1e7  # px, more than an image measures
 _QUOTAS = (4, 8, 16)
@@ -142,7 +137,8 @@ class _Trials:
         self._views, self._options, self._store, self._area = views, options, store, area
         self._given, self._terrain, self._work = given, terrain, work
         self._compares = options.matcher == _DEFAULTS.matcher  # by keypoints
-        self._coarse = self._compares and not several_dates(views) and _worth_a_first_look(views, options)
+        sizes = [view.size for view in views]
+        self._coarse = self._compares and not several_dates(views) and worth_a_first_look(sizes, options)
         self._looks = 0
         self.keypoints = [KeypointFiles(store)] * len(views)
         self.tried: dict[tuple[int, int], tuple[Pair, Matches, PairReport]] = {}
@@ -206,7 +202,7 @@ class _Trials:
     ) -> list[tuple[Matches, PairReport]]:
         """Matches of pairs by a first look, and by a closer one at those of which that shows too little."""
         views, options, keypoints = self._views, self._options, self.keypoints
-        first = coarsely(views, keypoints, pairs, options, **self._work) if self._coarse else []
+        first = match(views, keypoints, pairs, options, once=True, **self._work) if self._coarse else []
         found = {p.views: one for p, one in zip(pairs, first, strict=False) if ample(one[1], options)}
         lacking = [pair for pair in pairs if pair.views not in found]
         if self._coarse and lacking:
@@ -219,12 +215,6 @@ class _Trials:
         )
         found |= {pair.views: one for pair, one in zip(lacking, again, strict=True)}
         return [found[pair.views] for pair in pairs]
-
-
-def _worth_a_first_look(views: Sequence[View], options: TieOptions) -> bool:
-    """Whether images hold so much detail that looking at less of it may be enough."""
-    needed = _HELD * wanted_of_a_pair(options)
-    return all(Share.of(view.size, options, coarse=True).expected(view.size) >= needed for view in views)
 
 
 def _unlike(

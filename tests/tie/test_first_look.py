@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions, TieResult, common_tracks, find_tracks, tracks
-from barpc.tie.features import Share
+from barpc.tie.features import Share, worth_a_first_look
 from barpc.tie.matching import PairReport, ample
 
 FEW = TieOptions(points_per_image=500)  # of which 300 px hold enough to look twice
@@ -41,7 +41,7 @@ def without(monkeypatch):
 
     def found(views) -> TieResult:
         with monkeypatch.context() as patch:
-            patch.setattr(tracks, "_worth_a_first_look", lambda *_: False)
+            patch.setattr(tracks, "worth_a_first_look", lambda *_: False)
             return find_tracks(views, FEW)
 
     return found
@@ -62,8 +62,8 @@ def test_a_first_look_takes_half_the_detail_and_what_is_wanted_alone(side, point
     share = Share.of((side, side), options, coarse=True)
     assert share.zoom == zoom
     assert share.density == pytest.approx(min(5 * points, options.keypoints_per_image) / side**2)
-    view = type("View", (), {"size": (side, side)})
-    assert tracks._worth_a_first_look([view], options) == worth
+    assert worth_a_first_look([(side, side)], options) == worth
+    assert not worth_a_first_look([(side, side), (100, 100)], options)
 
 
 @pytest.mark.parametrize(
