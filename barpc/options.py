@@ -240,7 +240,11 @@ class TieOptions(Options):
         0.01, "Share of false matches that is accepted, as control bands estimate it.", above=0, most=1
     )
     min_matches: int = option(12, "Verified matches that a pair needs to count.", least=4)
-    points_per_image: int = option(5000, "Observations kept in an image, at most, evenly spread.", least=1)
+    points_per_image: int = option(
+        5000,
+        "Observations kept in an image, at most, evenly spread; with more, images are looked at more closely.",
+        least=1,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
