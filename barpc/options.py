@@ -247,7 +247,11 @@ class TieOptions(Options):
     min_matches: int = option(
         12, "Verified matches that a pair needs to count; two thirds where thresholds are loosened.", least=4
     )
-    points_per_image: int = option(5000, "Observations kept in an image, at most, evenly spread.", least=1)
+    points_per_image: int = option(
+        5000,
+        "Observations kept in an image, at most, evenly spread; with more, images are looked at more closely.",
+        least=1,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -25,7 +25,6 @@ from rasterio.coords import BoundingBox
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
-from rasterio.io import MemoryFile
 from rasterio.transform import array_bounds
 from rasterio.windows import Window
 
@@ -197,18 +196,6 @@ Pixels = npt.NDArray[Any]
 _BLOCK = 512  # px
 _MOST_OPEN = 64
 _WIDE = ("int32", "uint32", "int64", "uint64", "float64")  # GDAL scales them as float64, others as float32
-
-
-def jpeg(pixels: npt.NDArray[np.uint8]) -> bytes:
-    """Grey values (H, W) as a JPEG file."""
-    height, width = pixels.shape
-    with rasterio.Env(**GDAL_OPTIONS, **_ALONE), MemoryFile() as memory:
-        with _WARNINGS, warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            shape = {"width": width, "height": height, "count": 1, "dtype": "uint8"}
-            with memory.open(driver="JPEG", **shape, QUALITY=70) as out:
-                out.write(pixels, 1)
-        return bytes(memory.read())
 
 
 class Mosaic:

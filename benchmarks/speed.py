@@ -58,6 +58,7 @@ def benchmarks(data: Path | None, peers: str | None, rpcfit: str | None, cars: s
         chosen[1:1] = [
             Benchmark("fit.py", "Fitting an RPC", fit, "fit.md"),
             Benchmark("ties.py", "Tie points", (*images, *given("--cars", cars)), "tie_points.md"),
+            Benchmark("whole.py", "The whole of an adjustment", tuple(images), "tie_points.md"),
         ]
     return chosen
 

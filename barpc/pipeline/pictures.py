@@ -16,11 +16,12 @@ from rasterio.windows import Window
 
 from barpc.errors import ImageError
 from barpc.geodesy import Array
-from barpc.raster import jpeg, open_raster
+from barpc.raster import open_raster
 from barpc.remote import Remote
 from barpc.report import Run
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import epipolar_offset
+from barpc.tie.raster import jpeg
 
 logger = logging.getLogger(__name__)
 

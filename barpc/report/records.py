@@ -95,8 +95,14 @@ class Record:
 
 
 @cache
+def _hints(record: Any) -> dict[str, Any]:
+    """Types of a record's fields; Python evaluates their texts anew whenever it is asked."""
+    return get_type_hints(record)
+
+
+@cache
 def _readers(record: Any) -> dict[str, Callable[[Any], Any] | None]:
-    hints = get_type_hints(record)
+    hints = _hints(record)
     return {field.name: _reader(hints[field.name]) for field in fields(record)}
 
 
@@ -261,7 +267,7 @@ def column_of(kind: Any, path: str) -> Column:
     if path in kind.OWN:
         return kind.OWN[path]  # type: ignore[no-any-return]
     for name in path.split("."):
-        hint, declared = get_type_hints(kind)[name], kind.__dataclass_fields__[name]
+        hint, declared = _hints(kind)[name], kind.__dataclass_fields__[name]
         parts = (hint, *get_args(hint))
         kind = next((part for part in parts if isinstance(part, type) and issubclass(part, Record)), kind)
     heads, form, adjusted = declared.metadata["column"]

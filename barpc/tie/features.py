@@ -31,6 +31,11 @@ _FEW = 8  # keypoints of a cell, about, where an image's are few: its cells are 
 _AMPLE = 5  # keypoints for each tie point wanted
 _ZOOMS = ((1.25e-4, 4), (2e-3, 2))
 """Keypoints wanted a px, below which so many pixels a side are looked at as one: real images hold 1200e-6, 4500e-6."""
+_HOLDS = {2: 4.5e-3, 4: 1.2e-3}  # keypoints a px that real images hold, looked at so
+_PART, _LEAST = 0.1, 100
+"""Verified matches of a pair that make a closer look needless, as a part of the points wanted of an image, and at
+least: with 250 tracks in place of 3664 three real pairs meet check points alike, to 0.139, 0.154, 0.129 px."""
+_HELD = 4.0  # keypoints that images are to hold for each of these, or nothing is gained; the triplet has 2.1 to 2.5
 _SPARE = 1.2  # of a tile's share: what poor tiles leave goes to the others
 
 
@@ -105,12 +110,19 @@ class Share:
     zoom: int = 1  # px of the image a side of a pixel that is looked at
 
     @staticmethod
-    def of(size: tuple[int, int], options: TieOptions) -> Share:
-        """That of a whole image of `size` (width, height)."""
+    def of(size: tuple[int, int], options: TieOptions, coarse: bool = False) -> Share:
+        """That of a whole image of `size` (width, height); `coarse`: of a first look, for what is wanted alone."""
         area = size[0] * size[1]
         wanted = min(options.keypoints_per_image, _AMPLE * options.points_per_image) / area
         zooms = (zoom for below, zoom in _ZOOMS if wanted < below and min(size) > zoom * options.tile)
-        return Share(options.keypoints_per_image / area, next(zooms, 1))
+        zoom = next(zooms, 1)
+        if coarse:
+            return Share(wanted, min(2 * zoom, max(_HOLDS)))
+        return Share(options.keypoints_per_image / area, zoom)
+
+    def expected(self, size: tuple[int, int]) -> float:
+        """How many keypoints an image of `size` (width, height) with detail all over may have, looked at so."""
+        return min(self.density, _HOLDS.get(self.zoom, np.inf)) * size[0] * size[1]
 
     def within(self, used: float) -> Share:
         """The same where only a part of the image is used: by powers of two, not to be another one each time."""
@@ -126,6 +138,17 @@ class Share:
     def cell(self) -> int:
         """Side of the cells that take their strongest in turns [px]."""
         return CELL * max(1, round(float(np.sqrt(_FEW / self.density)) / CELL))
+
+
+def ample_matches(options: TieOptions) -> int:
+    """So many verified matches of a pair at a first look make a closer one needless."""
+    return max(_LEAST, int(np.ceil(_PART * options.points_per_image)))
+
+
+def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) -> bool:
+    """Whether images of `sizes` (width, height) hold so much that looking at less of it may be enough."""
+    needed = _HELD * ample_matches(options)
+    return all(Share.of(size, options, coarse=True).expected(size) >= needed for size in sizes)
 
 
 def detect_tile(
@@ -211,6 +234,7 @@ class KeypointFiles:
     boxes: tuple[Box, ...] = ()
     names: tuple[str, ...] = ()
     counts: tuple[int, ...] = ()
+    start: int = 0  # the number of the first
 
     def __len__(self) -> int:
         """Number of keypoints."""
@@ -223,7 +247,7 @@ class KeypointFiles:
 
     def load(self, wanted: Sequence[Box] | None = None) -> tuple[Keypoints, IntArray]:
         """Keypoints of some tiles (None: of all), by row and column in a tile, and their numbers within the view."""
-        parts, numbers, first = [], [np.empty(0, dtype=np.int64)], 0
+        parts, numbers, first = [], [np.empty(0, dtype=np.int64)], self.start
         chosen = set(self.boxes if wanted is None else wanted)
         for box, name, count in zip(self.boxes, self.names, self.counts, strict=True):
             if count and box in chosen:
@@ -288,15 +312,17 @@ def locate(
     *,
     pairs: Sequence[Pair] | None = None,
     area: Area | None = None,
+    coarse: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[KeypointFiles]:
     """Keypoints of every view, in files of a store; none in an image in which nothing varies.
 
-    With `pairs`, tiles that no partner may see are not read, nor those outside `area`; the rest as for `find_tracks`.
+    With `pairs`, tiles that no partner may see are not read, nor those outside `area`; with `coarse` images are looked
+    at in less detail, and for fewer keypoints; the rest as for `find_tracks`.
     """
     found = ordered(executor, survey, [(v.path, options.band, v.size) for v in views], "read", progress)
-    shares = [Share.of(view.size, options) for view in views]
+    shares = [Share.of(view.size, options, coarse) for view in views]
     each = zip(views, found, shares, strict=True)
     boxes = [tiles(v.size, options, share.zoom, known) if known else [] for v, known, share in each]
     if pairs is not None:
@@ -310,7 +336,7 @@ def locate(
         for view, known, share, of_view in zip(views, found, shares, boxes, strict=True)
         for box in of_view
     ]
-    names = names_of(executor, detect_tile, tasks)
+    names = [f"{name}{'-coarse' * coarse}" for name in names_of(executor, detect_tile, tasks)]
     keeping = [(store, name, *task) for name, task in zip(names, tasks, strict=True)]
     counts = np.array(ordered(executor, keep_tile, keeping, "detect", progress), dtype=np.int64)
     files, first = [], 0

@@ -22,7 +22,7 @@ from barpc.geodesy import Array
 from barpc.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.epipolar import Frame, agreeing, common_range, frame, robust_affine, robust_spread
-from barpc.tie.features import KeypointFiles, Keypoints, join
+from barpc.tie.features import KeypointFiles, Keypoints, ample_matches, join
 from barpc.tie.guided import CLEAR_RATIO, Guided
 from barpc.tie.hook import Hook, hooked
 from barpc.tie.matcher import NO_MATCHES, Matcher, Matches, Prediction
@@ -126,6 +126,11 @@ def match_pair(
         return first  # nor do looser ones let more through where only clear matches count
     found, report = _attempt(views, keypoints, pair, loose)
     return _better(first, (found, replace(report, loosened=True)))
+
+
+def ample(report: PairReport, options: TieOptions) -> bool:
+    """Whether a first look found so much that a closer one is needless."""
+    return report.status == "ok" and report.verified >= ample_matches(options)
 
 
 def enough(report: PairReport) -> bool:
@@ -235,16 +240,21 @@ def match(
     *,
     terrain: Terrain | None = None,
     before: Sequence[tuple[tuple[View, View], Matches]] = (),
+    once: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Matches, PairReport]]:
     """Matches of every pair, each with its report: `match_pair` over all pairs, and `STRUCTURE` where it finds few.
 
     `terrain`, or else the matches of other pairs, some of them found `before`, tell the altitudes at which that looks.
+    With `once` a first look's keypoints are tried once: `ample` says of which pairs that is all that they need.
     """
     ends = [(pair, *pair.views) for pair in pairs]
     tasks = [((views[i], views[j]), (keypoints[i], keypoints[j]), pair, options) for pair, i, j in ends]
-    found: list[tuple[Matches, PairReport]] = ordered(executor, match_pair, tasks, "match", progress)
+    work = _attempt if once else match_pair
+    found: list[tuple[Matches, PairReport]] = ordered(executor, work, tasks, "match", progress)
+    if once:
+        return found
     thin = [k for k, (_, report) in enumerate(found) if not enough(report)]
     named = options.matcher != _DEFAULTS.matcher
     if not thin or (named and (options.matcher != STRUCTURE or terrain is None)):  # a name is what is wanted

@@ -245,20 +245,21 @@ def _upsampled(image: FloatImage) -> FloatImage:
 
     Between these a linear sample moves no phase; OpenCV's bicubic one would, by up to a twentieth of the step.
     """
-    wide = np.empty((image.shape[0], _FINE * image.shape[1]), np.float32)
-    out = np.empty((_FINE * image.shape[0], wide.shape[1]), np.float32)
     one, border = np.ones(1, np.float32), cv2.BORDER_REFLECT_101
-    for phase, kernel in enumerate(_kernels()):
-        wide[:, phase::_FINE] = cv2.sepFilter2D(image, -1, kernel, one, None, (_TAPS - 1, 0), 0.0, border)
-    for phase, kernel in enumerate(_kernels()):
-        out[phase::_FINE] = cv2.sepFilter2D(wide, -1, one, kernel, None, (0, _TAPS - 1), 0.0, border)
+    across, down = (_TAPS - 1, 0), (0, _TAPS - 1)
+    columns = [cv2.sepFilter2D(image, -1, kernel, one, None, across, 0.0, border) for kernel in _kernels()]
+    wide = cv2.merge([image, *columns]).reshape(len(image), -1)
+    out = np.empty((_FINE * len(image), wide.shape[1]), np.float32)
+    out[::_FINE] = wide
+    for phase, kernel in enumerate(_kernels(), start=1):
+        cv2.sepFilter2D(wide, -1, one, kernel, out[phase::_FINE], down, 0.0, border)
     return out
 
 
 def _kernels() -> list[FloatImage]:
-    """Weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel."""
+    """Weights (2 `_TAPS`,) of the pixels about a point, for every fraction of a pixel but 0."""
     kernels = []
-    for phase in range(_FINE):
+    for phase in range(1, _FINE):
         offset = np.arange(1 - _TAPS, _TAPS + 1) - phase / _FINE
         kernel = np.sinc(offset) * np.cos(0.5 * np.pi * offset / (_TAPS + 1)) ** 2
         kernels.append((kernel / kernel.sum()).astype(np.float32))
@@ -319,14 +320,12 @@ class _Template:
         normal = (jacobian @ jacobian.transpose(0, 2, 1)).astype(np.float64)
         normal += _RIDGE * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
-        xy, step = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
-        sampled = self._normalized(self._sample(fine, *xy))[0]
-        correlation = ((sampled * values) @ self._weight).astype(np.float64)
+        xy, step, correlation = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_LEAST_SIGMA)
-        moved = np.hypot(*(xy[0] - start).T)
+        moved = np.hypot(*(xy - start).T)
         ok = (step <= 10 * settled) & (moved <= _REACH) & np.isfinite(sigma)
-        return Registration(xy[0], correlation, sigma, ok)
+        return Registration(xy, correlation, sigma, ok)
 
     def _iterate(
         self,
@@ -335,9 +334,12 @@ class _Template:
         centre: Array,
         linear: Array,
         settled: float,
-    ) -> tuple[tuple[Array, Array], Array]:
-        """Centres and distortions after the iterations, and the length of each one's last step [px]."""
-        length = np.full(len(centre), np.inf)
+    ) -> tuple[Array, Array, Array]:
+        """Centres after the iterations, the length of each one's last step [px], and the correlation there.
+
+        The gain between patches of variance 1, where nothing else is left to fit, is their correlation.
+        """
+        length, gain = np.full(len(centre), np.inf), np.zeros(len(centre))
         active = np.arange(len(centre))
         jacobian, inverse = solver
         for _ in range(_STEPS):
@@ -345,7 +347,8 @@ class _Template:
             patches = self._normalized(self._sample(fine, sampled, linear[active]))[0]
             right = (jacobian @ (self._root * patches)[:, :, None]).astype(np.float64)
             solution = (inverse @ right)[:, :, 0]
-            change = solution[:, :6] / np.maximum(solution[:, 6:7], 0.2)  # gain: how like the patches are
+            gain[active] = solution[:, 6]
+            change = solution[:, :6] / np.maximum(solution[:, 6:7], 0.2)
             shift = np.clip(change[:, :2], -1.0, 1.0)
             distortion = np.clip(change[:, 2:].reshape(-1, 2, 2) / self._half, -0.2, 0.2)
             linear[active] = linear[active] @ np.linalg.inv(np.eye(2) + distortion)
@@ -357,7 +360,7 @@ class _Template:
                 break
             if not going.all():
                 active, jacobian, inverse = active[going], jacobian[going], inverse[going]
-        return (centre, linear), length
+        return centre, length, gain
 
     def _sample(self, fine: FloatImage, centre: Array, linear: Array) -> FloatImage:
         """Patches (N, P) of the other image about centres (N, 2) under distortions (N, 2, 2)."""

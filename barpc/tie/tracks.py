@@ -19,7 +19,7 @@ from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, mid
 from barpc.sensor.geometry import triangulate
 from barpc.tie.choice import COMPARED, TRIES, best_pairs, further_pairs, judged, several_dates
 from barpc.tie.epipolar import grouped, linear_map
-from barpc.tie.features import KeypointFiles, locate
+from barpc.tie.features import KeypointFiles, locate, worth_a_first_look
 from barpc.tie.given import GivenMatches, verify
 from barpc.tie.matcher import Matches
 from barpc.tie.matching import (
@@ -27,6 +27,7 @@ from barpc.tie.matching import (
     STRUCTURE,
     THIN,
     PairReport,
+    ample,
     enough,
     match,
     matcher_named,
@@ -172,6 +173,7 @@ class _Trials:
         self._given, self._terrain, self._work = given, terrain, work
         self._compares = options.matcher == _DEFAULTS.matcher  # by keypoints
         self.looks = Looks.at(views, [])
+        self._coarse, self._closer = False, 0
         self._keypoints: list[KeypointFiles] = []
         self.tried: dict[tuple[int, int], tuple[Pair, Matches, PairReport]] = {}
         self._scores: dict[tuple[int, int], int] = {}
@@ -181,8 +183,11 @@ class _Trials:
         own = self._options.matcher in MATCHERS  # another one reads the files itself
         self.looks = Looks.at(self._views, pool, apart=own)
         self._keypoints = [KeypointFiles(self._store)] * len(self.looks.views)
+        sizes = [view.size for view in self.looks.views]
+        dates = several_dates(self._views)
+        self._coarse = self._compares and not dates and worth_a_first_look(sizes, self._options)
         num, most = len(self._views), self._options.neighbours
-        twice = self._compares and several_dates(self._views)
+        twice = self._compares and dates
         chosen = pool if all_of_them else best_pairs(pool, num, most)
         if twice and len(chosen) < len(pool):
             self._locate(pool)
@@ -203,7 +208,8 @@ class _Trials:
         others = [self.looks.pair(pair) for pair in pairs if pair.views not in self._given]
         if others and matcher_named(self._options.matcher).detects:
             views, options = self.looks.views, self._options
-            self._keypoints = locate(views, options, self._store, pairs=others, area=self._area, **self._work)
+            where: dict[str, Any] = {"pairs": others, "area": self._area, "coarse": self._coarse}
+            self._keypoints = locate(views, options, self._store, **where, **self._work)
 
     @property
     def keypoints(self) -> tuple[int, ...]:
@@ -232,19 +238,32 @@ class _Trials:
             (self._ends(pair)[0], found) for pair, found, report in self.tried.values() if enough(report)
         ]
         looks, options = self.looks, self._options
-        own = match(
-            looks.views,
-            self._keypoints,
-            [looks.pair(pair) for pair in others],
-            options,
-            terrain=self._terrain,
-            before=before,
-            **self._work,
-        )
+        own = self._matched([looks.pair(pair) for pair in others], before)
         given = {looks.ends[pair.views]: looks.matches(pair.views, self._given[pair.views]) for pair in known}
         theirs = verify(looks.views, given, [looks.pair(pair) for pair in known], options, **self._work)
         for pair, (found, report) in zip([*others, *known], [*own, *theirs], strict=True):
             self.tried[pair.views] = pair, found, report
+
+    def _matched(
+        self, pairs: Sequence[Pair], before: Sequence[tuple[tuple[View, View], Matches]]
+    ) -> list[tuple[Matches, PairReport]]:
+        """Matches of pairs of looks by a first look, and by a closer one at those of which that shows too little."""
+        views, options, keypoints = self.looks.views, self._options, self._keypoints
+        first = match(views, keypoints, pairs, options, once=True, **self._work) if self._coarse else []
+        found = {p.views: one for p, one in zip(pairs, first, strict=False) if ample(one[1], options)}
+        lacking = [pair for pair in pairs if pair.views not in found]
+        if self._coarse and lacking:
+            closer = locate(views, options, self._store, pairs=lacking, area=self._area, **self._work)
+            self._closer += 1  # each numbers its keypoints, below 0, where no place is
+            keypoints = [replace(files, start=-self._closer << 32) for files in closer]
+        known = [
+            ((views[p.views[0]], views[p.views[1]]), found[p.views][0]) for p in pairs if p.views in found
+        ]
+        again = match(
+            views, keypoints, lacking, options, terrain=self._terrain, before=[*before, *known], **self._work
+        )
+        found |= {pair.views: one for pair, one in zip(lacking, again, strict=True)}
+        return [found[pair.views] for pair in pairs]
 
 
 def _unlike(

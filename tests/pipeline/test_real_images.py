@@ -110,7 +110,7 @@ def test_an_image_that_was_turned_or_resampled_is_met_all_the_same(shared_data, 
     assert found.findings == ()  # nothing but the image as a whole
     assert not found.moving.any()
     if name == "as delivered":
-        assert np.abs(found.scene_shift).max() < 0.1
+        assert np.abs(found.scene_shift).max() < 0.2  # of 7 m, 7 m and 67 m that are not known
 
 
 @pytest.mark.slow

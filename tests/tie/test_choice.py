@@ -177,9 +177,10 @@ class Looks:
     def _ties(self, names) -> bool:
         return self.alike(*(int(name[1:]) for name in names))
 
-    def _match(self, views, keypoints, pairs, *args, **rest):
+    def _match(self, views, keypoints, pairs, *args, once: bool = False, **rest):
         ends = [tuple(views[i].name for i in pair.views) for pair in pairs]
-        self.tried.append([pair.views for pair in pairs])
+        if not once:  # of which each may have had a first look
+            self.tried.append([pair.views for pair in pairs])
         return [
             (NO_MATCHES, PairReport(names, "ok" if self._ties(names) else "unlike", (9, 9))) for names in ends
         ]

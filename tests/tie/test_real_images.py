@@ -38,6 +38,12 @@ def raw_spread(views: list[View]) -> dict[tuple[int, int], float]:
 
 
 @pytest.fixture(scope="module")
+def every_tie(triplet) -> TieResult:
+    """All that the triplet has, for who wants more than a first look shows."""
+    return find_tracks(triplet, TieOptions(points_per_image=20_000))
+
+
+@pytest.fixture(scope="module")
 def triplet_spread(triplet) -> dict[tuple[int, int], float]:
     return raw_spread(triplet)
 
@@ -67,13 +73,14 @@ def test_registration_more_than_halves_the_spread_of_keypoints_on_steep_ground(v
 
 
 @pytest.mark.slow
-def test_matches_are_many_and_hardly_any_is_false(triplet, triplet_ties: TieResult) -> None:
+def test_matches_are_many_and_hardly_any_is_false(triplet, triplet_ties: TieResult, every_tie) -> None:
     areas = [w * h / 1e6 for w, h in (view.size for view in triplet)]
-    for (i, j), report in zip(PAIRS, triplet_ties.pairs, strict=True):
-        assert report.status == "ok"
-        assert report.verified / min(areas[i], areas[j]) >= 4000
-        assert report.inlier_share >= 0.95
-        assert report.control_share <= 0.01
+    for ties, least, share in ((every_tie, 4000, 0.95), (triplet_ties, 1600, 0.93)):
+        for (i, j), report in zip(PAIRS, ties.pairs, strict=True):
+            assert report.status == "ok"
+            assert report.verified / min(areas[i], areas[j]) >= least
+            assert report.inlier_share >= share
+            assert report.control_share <= 0.01
 
 
 @pytest.mark.slow
@@ -91,14 +98,16 @@ def test_independent_check_points_lie_where_the_tie_points_say(
 
 
 @pytest.mark.slow
-def test_tracks_prefer_three_views_and_state_a_sigma_that_fits_their_errors(triplet, triplet_ties) -> None:
-    tracks = triplet_ties.tracks
-    assert (np.bincount(tracks.point) == 3).sum() >= 1300
-    for i, j in PAIRS:
-        a, b = tracks.view == i, tracks.view == j
-        _, rows, others = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
-        stated = np.hypot(tracks.sigma[a][rows], tracks.sigma[b][others])
-        assert 0.6 < robust_spread(fit(triplet, tracks, i, j)[1] / stated) < 1.5
+def test_tracks_prefer_three_views_and_state_a_sigma_that_fits_their_errors(
+    triplet, triplet_ties, every_tie
+) -> None:
+    for tracks, least in ((every_tie.tracks, 1300), (triplet_ties.tracks, 600)):
+        assert (np.bincount(tracks.point) == 3).sum() >= least
+        for i, j in PAIRS:
+            a, b = tracks.view == i, tracks.view == j
+            _, rows, others = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
+            stated = np.hypot(tracks.sigma[a][rows], tracks.sigma[b][others])
+            assert 0.6 < robust_spread(fit(triplet, tracks, i, j)[1] / stated) < 1.5
 
 
 @pytest.mark.slow

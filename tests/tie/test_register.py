@@ -65,6 +65,26 @@ def test_a_known_affine_map_is_found_to_a_hundredth_of_a_pixel(texture, referenc
     assert np.abs(error.mean(axis=0)).max() < 0.001
 
 
+def test_the_correlation_told_is_that_of_the_patches(texture, reference) -> None:
+    """Of an image moved by whole pixels, noisy and of another contrast, whose patches need no interpolation."""
+    noise = np.random.default_rng(6).normal(0, 0.35 * texture.std(), texture.shape)
+    other = (500 + 0.6 * np.roll(texture + noise, (2, 3), axis=(0, 1))).astype(np.float32)
+    found = run(texture, other, reference, reference + (3.2, 2.1), np.eye(2))
+    y, x = np.mgrid[-10:11, -10:11]
+    weight = np.exp(-0.5 * (x**2 + y**2) / 7.0**2)
+    weight /= weight.sum()
+    told = []
+    for col, row in reference[found.ok].astype(int):
+        a, b = texture[row + y, col + x].astype(float), other[row + 2 + y, col + 3 + x].astype(float)
+        a, b = a - (weight * a).sum(), b - (weight * b).sum()
+        told.append((weight * a * b).sum() / np.sqrt((weight * a * a).sum() * (weight * b * b).sum()))
+    assert found.ok.mean() > 0.9
+    assert found.correlation[found.ok].max() < 1.0
+    off = found.correlation[found.ok] - told  # six unknowns fit a little of the noise, too
+    assert 0.0 <= np.median(off) < 0.01
+    assert np.abs(off).max() < 0.05
+
+
 @pytest.mark.parametrize("zoom", [1.0, 1.3])
 def test_enough_is_read_about_a_place_for_the_patch_and_its_interpolation(texture, tmp_path, zoom) -> None:
     """One place at a time, from files, is registered as in the whole images."""

@@ -1,0 +1,69 @@
+"""The whole of `barpc adjust`, from nothing: CPU seconds of every stage, in turns against other checkouts.
+
+    python benchmarks/whole.py IMG IMG [IMG...] [--against FOLDER] [--turns 7] [-- OPTION...]
+
+Each turn is a process of its own with an output folder of its own, so that nothing is kept from one to the next; user
+and system time, one thread, the median of the turns after a first one that compiles the sources, as installing does.
+"start" is what no stage counts: the interpreter, imports, the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+def turn(checkout: Path, compiled: str, arguments: list[str]) -> dict[str, float]:
+    """CPU seconds of one run by stage, "start" and "whole"."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "barpc", "-q", "adjust", *arguments, "-o", f"{folder}/out"]
+        places = {"PYTHONPATH": str(checkout), "PYTHONPYCACHEPREFIX": compiled, "PYTHONDONTWRITEBYTECODE": ""}
+        environment = os.environ | THREADS | places
+        subprocess.run(command, check=True, env=environment, cwd=folder)
+        summary = json.loads(Path(folder, "out", "summary.json").read_text())
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    whole = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    stages = {entry["stage"]: entry["cpu_seconds"] for entry in summary["stages"]}
+    return {"start": whole - sum(stages.values()), **stages, "whole": whole}
+
+
+def main() -> int:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("arguments", nargs="+", metavar="IMG", help="images and options of `barpc adjust`")
+    parser.add_argument("--against", type=Path, action="append", default=[], metavar="FOLDER")
+    parser.add_argument("--turns", type=int, default=7)
+    given = parser.parse_args()
+    checkouts = [*(folder.resolve() for folder in given.against), ROOT]
+    arguments = [str(Path(text).resolve()) if Path(text).exists() else text for text in given.arguments]
+    found: dict[Path, list[dict[str, float]]] = {checkout: [] for checkout in checkouts}
+    with tempfile.TemporaryDirectory() as compiled:
+        for number in range(given.turns + 1):
+            for checkout in checkouts:
+                one = turn(checkout, compiled, arguments)
+                if number:
+                    found[checkout].append(one)
+    stages = dict.fromkeys(stage for turns in found.values() for one in turns for stage in one)
+    print(f"CPU s, median of {given.turns} turns" + ", the last column this checkout" * (len(checkouts) > 1))
+    for stage in sorted(stages, key=lambda stage: stage == "whole"):
+        medians = [statistics.median(one.get(stage, 0.0) for one in found[c]) for c in checkouts]
+        ratio = f"   x {medians[-1] / medians[0]:.2f}" if len(medians) > 1 and medians[0] > 0 else ""
+        print(f"  {stage:14s}" + "".join(f"{seconds:8.3f}" for seconds in medians) + ratio)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,137 @@
+"""Images are looked at in less detail first: what that shows too little of is matched as if it had not been."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barpc.tie import TieOptions, TieResult, common_tracks, find_tracks, tracks
+from barpc.tie.features import Share, worth_a_first_look
+from barpc.tie.matching import PairReport, ample
+
+FEW = TieOptions(points_per_image=500)  # of which 300 px hold enough to look twice
+
+
+def same(a: TieResult, b: TieResult) -> bool:
+    return all(
+        getattr(a.tracks, name).tobytes() == getattr(b.tracks, name).tobytes()
+        for name in ("view", "point", "xy", "sigma")
+    )
+
+
+@pytest.fixture
+def looks(monkeypatch) -> list[bool]:
+    """Whether each look at images was a first one."""
+    seen: list[bool] = []
+    known = tracks.locate
+
+    def watched(*args, coarse: bool = False, **rest):
+        seen.append(coarse)
+        return known(*args, coarse=coarse, **rest)
+
+    monkeypatch.setattr(tracks, "locate", watched)
+    return seen
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """Tie points found without a first look."""
+
+    def found(views) -> TieResult:
+        with monkeypatch.context() as patch:
+            patch.setattr(tracks, "worth_a_first_look", lambda *_: False)
+            return find_tracks(views, FEW)
+
+    return found
+
+
+@pytest.mark.parametrize(
+    ("side", "points", "zoom", "worth"),
+    [
+        (600, 5000, 2, False), (700, 5000, 2, True),  # 2000 keypoints of 4500 a Mpx
+        (3500, 5000, 2, True), (3600, 5000, 4, True),  # twice as coarse as a closer look
+        (20_000, 5000, 4, True),
+        (700, 20_000, 2, False),  # whoever wants more points gets all that there are
+        (700, 80, 2, True),
+    ],
+)  # fmt: skip
+def test_a_first_look_takes_half_the_detail_and_what_is_wanted_alone(side, points, zoom, worth) -> None:
+    options = TieOptions(points_per_image=points)
+    share = Share.of((side, side), options, coarse=True)
+    assert share.zoom == zoom
+    assert share.density == pytest.approx(min(5 * points, options.keypoints_per_image) / side**2)
+    assert worth_a_first_look([(side, side)], options) == worth
+    assert not worth_a_first_look([(side, side), (100, 100)], options)
+
+
+@pytest.mark.parametrize(
+    ("points", "verified", "status", "is_ample"),
+    [
+        (5000, 500, "ok", True), (5000, 499, "ok", False), (9001, 900, "ok", False), (80, 100, "ok", True),
+        (80, 99, "ok", False), (5000, 600, "too few matches", False),
+    ],
+)  # fmt: skip
+def test_a_tenth_of_the_points_wanted_is_ample(points, verified, status, is_ample) -> None:
+    report = PairReport(("a", "b"), status, (0, 0), verified=verified)
+    assert ample(report, TieOptions(points_per_image=points)) == is_ample
+
+
+def test_what_a_first_look_shows_enough_of_is_looked_at_once(scene, looks, without) -> None:
+    found = find_tracks(scene.views, FEW)
+    assert looks == [True]
+    assert 100 <= found.tracks.num_points < without(scene.views).tracks.num_points
+    errors = scene.errors(0, 1, *common_tracks(found.tracks, 0, 1))
+    assert (1.4826 * np.median(np.abs(errors), axis=0)).max() <= 0.06
+    assert np.abs(np.median(errors, axis=0)).max() <= 0.01
+
+
+def test_what_it_shows_too_little_of_is_matched_as_if_it_had_not_been(
+    scene, looks, without, monkeypatch
+) -> None:
+    monkeypatch.setattr(tracks, "ample", lambda *_: False)
+    found = find_tracks(scene.views, FEW)
+    assert looks == [True, False]
+    expected = without(scene.views)
+    assert same(found, expected)
+    assert found.pairs == expected.pairs
+
+
+def test_points_of_two_looks_are_not_taken_for_each_other(render, looks, monkeypatch) -> None:
+    """One pair of three is looked at closely: a number stands for one place of a view, and tracks are true."""
+    scene = render(views=3, size=(300, 300))
+    names = tuple(view.name for view in (scene.views[0], scene.views[2]))
+    monkeypatch.setattr(tracks, "ample", lambda report, _: report.names != names)
+    linked, link = [], tracks.link
+    monkeypatch.setattr(tracks, "link", lambda *given: linked.append(given) or link(*given))
+    found = find_tracks(scene.views, FEW)
+    assert looks == [True, False]
+    pairs, matches = max(linked, key=lambda given: sum(map(len, given[1])))
+    assert len(pairs) == 3
+    places: dict[tuple[int, int], tuple[float, ...]] = {}
+    for pair, of_pair in zip(pairs, matches, strict=True):
+        for end, view in enumerate(pair):
+            for number, xy in zip(of_pair.index[:, end].tolist(), of_pair.xy[:, end].tolist(), strict=True):
+                assert places.setdefault((view, number), tuple(xy)) == tuple(xy)
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        errors = scene.errors(i, j, *common_tracks(found.tracks, i, j))
+        assert len(errors) > 100
+        assert np.sqrt((errors**2).mean(axis=0)).max() <= 0.1
+
+
+def test_images_of_several_dates_are_looked_at_closely_at_once(scene, looks) -> None:
+    """What two dates have in common may be fine, and little."""
+    dated = [replace(v, date=f"2020-0{k + 1}-01") for k, v in enumerate(scene.views)]
+    find_tracks(dated, FEW)
+    assert looks == [False]
+
+
+@pytest.mark.slow
+def test_check_points_of_real_images_are_met_as_with_all_their_detail(triplet, triplet_ties) -> None:
+    every = find_tracks(triplet, TieOptions(points_per_image=20_000))
+    assert triplet_ties.tracks.num_points < 0.6 * every.tracks.num_points
+    assert all(report.verified >= 500 for report in triplet_ties.pairs)
+    for one, other in zip(triplet_ties.pairs, every.pairs, strict=True):
+        assert np.hypot(*np.subtract(one.offset, other.offset)) < 1.0  # the parallax of other ground
+        assert abs(one.offset[1] - other.offset[1]) < 0.03
