@@ -84,13 +84,17 @@ class Rounds:
         self.smooth = Smooth(problem.structure, problem.xy, unknowns, Resemblance.of(block, TERMS))
         given, control = problem.camera_prior, heights.has_control
         self.variances = Variances.of(given, unknowns, options, control, block.views)
+        if known is not None and known.problem.cameras.unknowns is unknowns:
+            self.problem = replace(self.problem, camera_prior=known.problem.camera_prior)
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
-        self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
+        if known is not None:
+            self.use = self.observations.tied(self.use & known.inlier)
+        self.counted = self.use.astype(np.float64)
         self.is_known = known is not None
         self.projected = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
-        self.misfit: Array | float = 0.0
+        self.misfit: Array | float = 0.0 if known is None or not self.robust else known.smooth.rms
         self.weight = self.counted
 
     def run(self, once: bool = False) -> Outcome:
@@ -132,7 +136,8 @@ class Rounds:
         smooth = self._estimate_noise()
         numbers = self.passes, self.use.sum(), len(self.use), self.noise
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
-        same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
+        again = self.passes > 1 or self.is_known
+        same = again and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
         # what is known of the place goes with what is shared, and nothing else learns of it
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
@@ -164,8 +169,9 @@ class Rounds:
 
     def _solve(self) -> Minimum:
         """Least squares of what is used; a second pass follows the first robust one always, and is exact."""
+        again = self.passes > 1 or self.is_known
         solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
-        tolerance = TOLERANCE if self.passes > 1 or not self.robust else _FIRST_TOLERANCE
+        tolerance = TOLERANCE if again or not self.robust else _FIRST_TOLERANCE
         noise = self.noise if self.options.estimate_noise else 1.0
         self.weight = weight = self.observations.weight(self.use, noise, self.misfit)
         found = minimise(self.problem, self.state, weight, solver, tolerance, self.projected)
