@@ -26,6 +26,7 @@ _LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that 
 _LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
 _SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
 _SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
+FAINT = 100.0  # times their noise have observations of control points that hold nothing, in images with tie points
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
 _BACKFITTING = 6
 _MANY_CUT = 0.01  # of the observations: more are looked at again
@@ -80,8 +81,11 @@ class Rounds:
         self.robust = options.loss != "linear"
         is_tie = block.point < block.num_tracks
         of_reference = block.point >= block.num_known
-        self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie, of_reference)
-        self.smooth = Smooth(problem.structure, problem.xy, unknowns, Resemblance.of(block, TERMS))
+        faint = faintness(block, heights)[block.point]
+        sigma = block.sigma * faint
+        self.observations = Observations(self.problem, sigma, options.noise_floor, is_tie, of_reference)
+        alike = Resemblance.of(block, TERMS)
+        self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
         given, control = problem.camera_prior, heights.has_control
         self.variances = Variances.of(given, unknowns, options, control, block.views)
         if known is not None and known.problem.cameras.unknowns is unknowns:
@@ -211,6 +215,21 @@ class Rounds:
         for _ in range(_BACKFITTING):
             part += self.smooth.part(settled(residual - part), counted)
         return settled(residual - part)
+
+
+def faintness(block: Block, heights: Heights) -> Array:
+    """Times (P,) by which observations of a point count as noisier: a control point that holds nothing ties nothing.
+
+    Those of many points marked a pixel off in one image would pull it away from its tie points, which together count
+    for so much only. Points that are seen in an image without tie points are what ties that.
+    """
+    alone = np.bincount(block.view[block.point < block.num_tracks], minlength=len(block.views)) == 0
+    faint = np.zeros(block.num_points, dtype=bool)
+    faint[block.num_tracks : block.num_known] = True
+    faint[block.point[alone[block.view]]] = False
+    if heights.has_control:
+        faint[heights.control[0].index] = False
+    return np.where(faint, FAINT, 1.0)
 
 
 def _robust(

@@ -231,6 +231,8 @@ def _control(gcps: Sequence[GcpEntry]) -> list[str]:
     words = f"{len(seen) - len(rejected) - undecided} of {len(seen)} GCPs that are seen hold the block"
     if undecided:
         return [f"{words}: they fall into sets that contradict each other, and none outweighs the others."]
+    if len(rejected) == len(seen):
+        return [f"{words}: the images contradict them."]
     return [f"{words}; the rest contradicts {listed(rejected, _NAMED)}." if rejected else f"{words}."]
 
 

@@ -359,7 +359,7 @@ def _control_reasons(run: Run) -> list[str]:
         out.append(f"The altimetry holds nothing: {heights.why_not} ({counts}).")
     tested = None if run.adjustment is None else run.adjustment.control
     if run.gcps is not None and tested is not None:
-        for status, words in _CONTROL_WORDS.items():
+        for status, words in () if tested.torn else _CONTROL_WORDS.items():
             names = [
                 f"{name} ({_enu(tested.residual[g])}, w = {tested.w[g]:.1f})"
                 if np.isfinite(tested.w[g])
@@ -371,7 +371,7 @@ def _control_reasons(run: Run) -> list[str]:
                 alike = status == "rejected" and tested.agreed is not None and tested.agreed.alike
                 datum = " They agree with each other: is their datum, or their height, another one?" * alike
                 out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.{datum}")
-        out += _undecided(run.gcps.names, tested)
+        out += _undecided(run.gcps.names, tested) + _torn(tested)
         if not tested.fits and not any(tested.status(g) == "contradicts" for g in range(len(tested.used))):
             out.append(
                 f"{_count(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
@@ -408,6 +408,17 @@ def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
     return [
         f"GCPs contradict each other, and no set of them outweighs the others: {one} against {other}{apart}. None of "
         "them was used: check coordinates, axes, datum and image positions, or add a point."
+    ]
+
+
+def _torn(tested: ControlTest) -> list[str]:
+    """Control that agrees with itself and not with the images."""
+    if not tested.torn:
+        return []
+    without, held = tested.torn
+    return [
+        f"Held by the GCPs the images would agree less with each other: {without:.3f} px became {held:.3f} px at tie "
+        "points that took no part. None of the GCPs was used: check coordinates, image positions and stated accuracies."
     ]
 
 
