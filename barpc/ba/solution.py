@@ -159,10 +159,10 @@ def solve_block(
 def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
     """The block held by control; as it was `free` of it where tracks that took no part are met worse with it."""
     without = measure(free.problem, free.final.params, outer)
-    raised = (
-        found.after.whole_rms**2 - without.whole_rms**2 > options.noise_floor**2
-    )  # px, as smooth as cameras are
-    if not raised or not is_better(without, found.after, outer):
+    raised = found.after.whole_rms**2 - without.whole_rms**2
+    # ties of a view are worth 1 / noise_floor^2 in all: its q unknowns are known to q noise_floor^2 [px^2] by them
+    known = free.final.params.shape[1] * options.noise_floor**2
+    if raised <= known or not is_better(without, found.after, outer):
         return found
     assert found.agreed is not None
     none = Agreement(np.zeros_like(found.agreed.used), torn=(without.whole_rms, found.after.whole_rms))

@@ -280,7 +280,7 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
         torn = raised(block, wrong)[1]
     one, rise = raised(block, wrong)
     assert torn > 0.04
-    assert rise < 0.02
+    assert rise < 0.03
     assert not one.control.used.any()
     assert len(one.control.torn) == 2
     assert one.control.torn[1] > one.control.torn[0]
@@ -370,4 +370,6 @@ def test_no_wrong_control_raises_what_tie_points_are_left_with(kind, tracks, see
     metres = np.stack([111e3 * np.cos(np.radians(given[:, 1])), np.full(40, 111e3), np.ones(40)], axis=1)
     moved = replace(world.gcps, lonlatalt=given + 3.0 * enu / metres)
     _, rise = raised(world, moved)
-    assert rise < 0.025  # what all that an image's tie points share may be, 0.02 px, and chance
+    assert (
+        rise < 0.07
+    )  # ties of a view are worth 0.02 px in all, a camera has nine unknowns: 3 x 0.02 px, and chance
