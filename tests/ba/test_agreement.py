@@ -292,10 +292,7 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
     assert any("the images would agree less with each other" in reason for reason in summary.reasons)
     assert any(line.startswith("Without ground control that agrees") for line in summary.verdict)
     assert [point.status for point in summary.gcps] == ["rejected"] * 6
-    assert any(
-        line == "0 of 6 GCPs that are seen hold the block: the images contradict them."
-        for line in decisions(summary)
-    )
+    assert any("; the images contradict gcp_000, " in line for line in decisions(summary))
 
 
 @pytest.mark.parametrize("pixels", [1.0, 10.0])
