@@ -355,9 +355,9 @@ class _Work:
         report = replace(report, tried=len(point), passed=int(passed.sum()))
         middle = np.append(places[point].mean(axis=0), view.altitude)
         local = (places[point] - middle[:2]) * metres_per_unit(middle)[:2]
-        *sight, up = sight_enu(view.sensor, middle)
-        aside = max(float(np.hypot(*sight)), 1e-9)
-        sight = np.array(sight) / aside
+        sight, up = np.split(sight_enu(view.sensor, middle), [2])
+        aside = max(float(np.linalg.norm(sight)), 1e-9)
+        sight = sight / aside
         turned = np.stack(
             [[sight[1], -sight[0]], sight]
         )  # across it; along it, where the terrain's errors move points
@@ -369,7 +369,7 @@ class _Work:
         east, north = ((fitted @ turned)[keep].mean(axis=0) + report.offset).tolist()
         report = replace(report, offset=(east, north), points=int(keep.sum()), scatter=scatter)
         gsd = float(ground_sample_distance(view.sensor, middle)[1])
-        report = replace(report, along=along, slope=aside / abs(float(up)), gsd=gsd)
+        report = replace(report, along=along, slope=aside / abs(float(up[0])), gsd=gsd)
         return report, (point[keep], xy[keep], np.full(int(keep.sum()), scatter / gsd))
 
 
