@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.block import Block
-from barpc.ba.judge import UNKNOWNS, around
+from barpc.ba.judge import LARGEST, UNKNOWNS, around
 from barpc.ba.mixture import fit
 from barpc.ba.placing import Look, Placed, look, place
 from barpc.ba.scan import SURE
@@ -34,6 +34,7 @@ APART = "apart"
 _MOST = 0.5  # of a view's tie points
 _TELLING = 3  # views: without one a pair is left, which agrees about much; so each of three is left out
 _TRIED = 6  # views of a block, those that lost most
+_TRIED_OF_MANY = 2  # where solving it takes long, of those that are gone
 _UNKNOWNS_A_VIEW = 9  # with a drift
 
 Solver = Callable[[Block, Block], Solution]
@@ -114,7 +115,7 @@ def find_apart(
     """
     num, odd = len(block.views), None
     asked_for_less = options.first_model != GEOMETRIC or options.drift == 0 or options.loss == "linear"
-    if num < 3 or num * _UNKNOWNS_A_VIEW > UNKNOWNS or asked_for_less:
+    if num < 3 or num * _UNKNOWNS_A_VIEW > LARGEST or asked_for_less:
         return None, None
     lost = np.ones(num) if first is None else _lost(first, block)
     gone = 1.0 - lost <= _MOST * (1.0 - np.median(lost))
@@ -124,11 +125,15 @@ def find_apart(
         if agrees(first):
             odd = _odd(first, block) if num > _TELLING else None
             asked = asked[gone[asked]] if odd is None else np.array([odd])
+        if num * _UNKNOWNS_A_VIEW > UNKNOWNS:
+            asked = asked[gone[asked]][:_TRIED_OF_MANY]
     views = [v for v in asked.tolist() if block.names[v] not in options.fixed]
     left: list[_Left] = []
     for one in _agreeing(views, block, outer, options, solve):
         left.append(one)
-        if one.strange and num > _TELLING:  # those that agree without it contradict it in any block with it
+        if (
+            num > _TELLING
+        ):  # those that agree without it contradict it, as far as it is wrong, in any block with it
             break
     if odd is not None and first is not None:
         return _by_prior(left, float(first.outcome.prior.scale[odd]), block)
@@ -227,7 +232,7 @@ def _evidence(left: _Left, block: Block) -> float:
     size = np.array([view.size for view in block.views], dtype=np.float64)
     area = float(np.median(size.prod(axis=1)) / np.median(block.sigma) ** 2)
     problem = replace(left.found.outcome.problem, camera_prior=left.found.problem.camera_prior)  # as stated
-    known = around(replace(left.found.outcome, problem=problem), left.block)
+    known = around(replace(left.found.outcome, problem=problem), left.block, np.arange(len(left.block.views)))
     if known is None:
         return -ties * float(np.log(area))
     linear, _ = known

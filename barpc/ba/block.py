@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -74,6 +75,10 @@ class Block:
 
     def first_points(self) -> Array:
         """Where each point's first observing view puts it at its middle altitude (P, 3), ECEF [m]."""
+        return self._first_points.copy()
+
+    @cached_property
+    def _first_points(self) -> Array:
         first = np.sort(np.unique(self.point, return_index=True)[1])
         points = np.full((self.num_points, 3), np.nan)
         bounds = np.searchsorted(self.view[first], np.arange(len(self.views) + 1))

@@ -106,8 +106,13 @@ class Covariance:
     @cached_property
     def full(self) -> Array:
         """Covariance (N q, N q) of all unknowns: N^2 numbers, meant for some hundred views."""
+        out = np.zeros((len(self.free), len(self.free)))
+        if self.factor.whole_inverse is not None:
+            out[np.ix_(self.free, self.free)] = self.factor.whole_inverse()
+            return out
         every = np.arange(len(self.free))
-        out = np.hstack([self._columns(every[part], False) for part in parts(len(every), _COLUMNS)])
+        for part in parts(len(every), _COLUMNS):
+            out[:, part] = self._columns(every[part], False)
         return 0.5 * (out + out.T)
 
     def points(self, index: IntArray) -> Array:

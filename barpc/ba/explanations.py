@@ -110,7 +110,7 @@ def _local(kind: str, seen: Seen, view: int, where: Where, sigma: float) -> Expl
     part = np.where(seen.linear.view == view, profile(seen.place[axis], *map(np.asarray, shape)), 0.0)
     extra = np.zeros((2, 2, len(part)))
     extra[0, 0] = extra[1, 1] = part
-    cost = price(seen.linear.views) + SCALE * (2.0 if kind == FADE else 1.0)
+    cost = price(seen.linear.choices) + SCALE * (2.0 if kind == FADE else 1.0)
     return Explanation(kind, view, extra, np.full(2, sigma), cost, where)
 
 
@@ -225,7 +225,7 @@ def swing(seen: Seen, found: Swing) -> Explanation:
     rows = np.flatnonzero(seen.linear.view == found.view)
     basis = waves_of(seen.place[1, rows], np.array(found.period))
     one = _on_both(seen, SWING, found.view, rows, basis, _WANDER)
-    costs = price_of_period(float(seen.size[1, found.view]), seen.linear.views) + SCALE
+    costs = price_of_period(float(seen.size[1, found.view]), seen.linear.choices) + SCALE
     return replace(one, price=costs, period=found.period)
 
 
@@ -255,7 +255,7 @@ def alike(seen: Seen, one: Explanation, found: Fit) -> list[Explanation]:
 def _on_both(seen: Seen, kind: str, view: int, rows: IntArray, basis: Array, sigma: float) -> Explanation:
     extra = np.zeros((2, 2 * len(basis), len(seen.linear.view)))
     extra[0, : len(basis), rows] = extra[1, len(basis) :, rows] = basis.T
-    return Explanation(kind, view, extra, np.full(2 * len(basis), sigma), float(np.log(seen.linear.views)))
+    return Explanation(kind, view, extra, np.full(2 * len(basis), sigma), float(np.log(seen.linear.choices)))
 
 
 def group(seen: Seen, _interval: Interval) -> list[Explanation]:

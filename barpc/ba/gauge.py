@@ -35,7 +35,7 @@ place of the scene. A rotation that changes with the row does the last: rows fol
 SIMILAR = MOTIONS.index("twist")
 """The first of these that bend the scene: those before keep its shape."""
 
-_SAMPLE = 5000  # points that stand for the scene's shape
+_SAMPLE = 2000  # points that stand for the scene's shape
 
 
 @dataclass(frozen=True)

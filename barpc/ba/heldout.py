@@ -107,6 +107,9 @@ def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Arr
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     """The observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
     views, index = len(block.views), np.unique(block.point)
+    if not len(index):
+        unknown = np.full(views, np.nan)
+        return HeldOut(np.zeros((2, 0)), index, np.zeros((0, 3)), unknown, unknown)
     part, first = seen_in(problem, params, block)
     observations = Observations(part, block.sigma, 0.0, np.ones(len(block.view), dtype=bool))
     counted = np.ones(len(block.view))

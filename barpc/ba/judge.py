@@ -27,7 +27,7 @@ from barpc.ba.explanations import (
     sharpened,
 )
 from barpc.ba.linearised import Linear, linearise, numbers
-from barpc.ba.mixture import Fit, fit, settled
+from barpc.ba.mixture import Fit, fit, off_from_right, settled
 from barpc.ba.moving import Found, Ground, Motion, group_of
 from barpc.ba.periods import Swing, swings
 from barpc.ba.rounds import Outcome, revived
@@ -35,7 +35,7 @@ from barpc.ba.scan import SURE, Interval, scan
 from barpc.ba.solve import State
 from barpc.ba.weights import Observations
 from barpc.geodesy import Array
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, IntArray
 
 _LOG = logging.getLogger(__name__)
 
@@ -51,7 +51,12 @@ _SEEN = (
 )
 _WORTH = 0.1 * SURE  # nats: less decides nothing
 _HELD_IN = 4  # images of which a part may hold what moves
-UNKNOWNS = 400  # of all views, up to which explanations are tried
+UNKNOWNS = 400  # of all views, up to which explanations are tried on all together
+LARGEST, OBSERVATIONS = (
+    12_000,
+    1_000_000,
+)  # unknowns and observations of a block, up to which they are on parts of it
+_NEAREST = 12  # views of a part
 _NUMBERS = 3e7  # of a mixture, at most: 240 MB
 
 
@@ -93,8 +98,15 @@ def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]
 
     A mean below `floor` [px] is none.
     """
+    if floor not in outcome.standing_out:
+        outcome.standing_out[floor] = _standing_out(outcome, block, floor)
+    return outcome.standing_out[floor]
+
+
+def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
     rows, off = _whitened(outcome, block)
     wrong = (~outcome.inlier[rows]).astype(np.float64)
+    off = off * outcome.inlier[rows]
     pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
     found = scan(block.view[rows], block.xy[:, rows], _sizes(block), wrong, off, floor / pixel)
     return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
@@ -125,20 +137,20 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
 def swinging(outcome: Outcome, block: Block) -> list[Swing]:
     """Periods with which the rows of images swing more than chance allows, one of each at most."""
     rows, off = _whitened(outcome, block)
-    right = outcome.inlier[rows].astype(np.float64)
-    found = swings(block.view[rows], block.xy[1, rows], _sizes(block), right, off)
-    return [one for one in found if one.gain > SURE]
+    # what was cut is seen as well as the rest where others tell its point
+    told = np.bincount(block.point[outcome.inlier], minlength=block.num_points)[block.point] >= 2
+    return swings(block.view[rows], block.xy[1, rows], _sizes(block), told[rows].astype(np.float64), off)
 
 
 def _whitened(outcome: Outcome, block: Block) -> tuple[BoolArray, Array]:
-    """Observations of tracks (K,), and residuals (2, k) of these in standard deviations, 0 of those that were cut."""
+    """Observations of tracks (K,), and residuals (2, k) of these in standard deviations."""
     is_tie = (block.point < block.num_tracks) & block.use
     freedom = Observations(outcome.problem, block.sigma, 0.0, is_tie).freedom(
         outcome.inlier.astype(np.float64)
     )
     spread = block.sigma * outcome.noise * np.sqrt(0.5 * freedom)
     rows = is_tie & np.isfinite(outcome.residual).all(axis=0)
-    return rows, np.where(outcome.inlier[rows], outcome.residual[:, rows] / spread[rows], 0.0)
+    return rows, outcome.residual[:, rows] / spread[rows]
 
 
 def _sizes(block: Block) -> Array:
@@ -146,29 +158,84 @@ def _sizes(block: Block) -> Array:
 
 
 def judge(outcome: Outcome, block: Block, floor: float) -> Judgement:
-    """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out."""
-    if outcome.problem.free.size > UNKNOWNS:
+    """What explains the ties of a block beside its cameras, the first taken first; empty where nothing stands out.
+
+    Of more unknowns than `UNKNOWNS` each image that stands out is judged among those that it shares most tracks with:
+    what moves on the ground competes there, but is not followed.
+    """
+    size, views = outcome.problem.free.size, np.arange(len(block.views))
+    if size > LARGEST or len(block.view) > OBSERVATIONS:
         return Judgement()
-    first = standing_out(outcome, block, floor)
-    found = around(outcome, block) if first or swinging(outcome, block) else None
+    asks = [one.view for one in standing_out(outcome, block, floor)]
+    if not asks or size > UNKNOWNS:
+        asks += [one.view for one in swinging(outcome, block)]
+    if size <= UNKNOWNS:
+        return _judged_among(outcome, block, floor, views) if asks else Judgement()
+    found = Judgement((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
+    done: set[int] = set()
+    for view in dict.fromkeys(asks):
+        if view not in done:
+            views = _near(block, view)
+            done.update(views.tolist())
+            one = _judged_among(outcome, block, floor, views)
+            if one.findings and one.findings[-1].moved is None:
+                found = _joined(found, one, views, np.flatnonzero(np.isin(block.view, views)))
+    return found if found.findings else Judgement()
+
+
+def _judged_among(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Judgement:
+    """What explains the ties that some views have among them; views and observations are counted anew."""
+    found = around(outcome, block, views)
     if found is None:
         return Judgement()
     linear, state = found
-    nothing, ground = np.zeros((2, 0, len(block.view))), Ground.of(outcome.problem, state)
+    rows, ground = np.flatnonzero(np.isin(block.view, views)), Ground.of(outcome.problem, state)
+    linear, ground = linear.among(views), ground.part(rows)
+    nothing, place = np.zeros((2, 0, len(rows))), block.xy[:, rows]
+    number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
+    number[views] = np.arange(len(views))
     try:
         base, few = fit(linear), linear.thinned(_FEW)
-        seen = Seen(linear, few, ground, block.xy, _sizes(block), base, nothing, np.zeros(0))
+        seen = Seen(linear, few, ground, place, _sizes(block)[:, views], base, nothing, np.zeros(0))
+        first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
         return _Search(seen, first, floor, float(np.median(block.sigma))).run()
     except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
         _LOG.warning("what explains the tie points is not judged: %s", error)
         return Judgement()
 
 
-def around(outcome: Outcome, block: Block) -> tuple[Linear, State] | None:
-    """All ties of a block, linearised where the rounds ended, and there; None where they are too many to be judged."""
+def _near(block: Block, view: int) -> IntArray:
+    """A view and those that share most tracks with it, in their order."""
+    ties = block.use & (block.point < block.num_tracks)
+    of_view = np.zeros(block.num_points, dtype=bool)
+    of_view[block.point[ties & (block.view == view)]] = True
+    shared = np.bincount(block.view[ties & of_view[block.point]], minlength=len(block.views))
+    shared[view] = len(ties) + 1
+    nearest = np.argsort(-shared, kind="stable")[:_NEAREST]
+    return np.sort(nearest[shared[nearest] > 0])
+
+
+def _joined(all_of: Judgement, one: Judgement, views: IntArray, rows: IntArray) -> Judgement:
+    """With what was found among some views, of observations at `rows`; views that were moved before stay."""
+    step, right = all_of.step.copy(), all_of.right.copy()
+    new = ~step[views].any(axis=1)
+    step[views[new]] = one.step[new]
+    right[rows] = one.right
+    findings = (
+        replace(row, view=int(views[row.view]), or_of=tuple(int(views[v]) for v in row.or_of))
+        for row in one.findings
+    )
+    return Judgement((*all_of.findings, *findings), step, right)
+
+
+def around(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, State] | None:
+    """The ties among some views of a block, linearised where the rounds ended, and there; None where they are too many
+    to be judged.
+    """
     problem = outcome.problem
-    use = block.use & (block.point < block.num_tracks)
-    if problem.free.size > UNKNOWNS or numbers(np.bincount(block.point[use])) > _NUMBERS:
+    use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
+    unknowns = problem.free.size // len(block.views) * len(views)
+    if unknowns > UNKNOWNS or numbers(np.bincount(block.point[use])) > _NUMBERS:
         return None
     state, _ = revived(
         problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
@@ -283,11 +350,15 @@ class _Search:
         )
         wrong, off = (1.0 - seen.base.right)[rows], settled(linear, left, seen.base)[:, rows]
         view, place = linear.view[rows], seen.place[:, rows]
-        periods = [one for one in swings(view, place[1], seen.size, 1.0 - wrong, off) if one.gain > SURE]
+        all_off, told = off_from_right(linear, left, seen.base.right)
+        told[rows] |= wrong < 0.5
+        swung = all_off[:, rows] / seen.base.noise
+        periods = swings(view, place[1], seen.size, told[rows].astype(np.float64), swung)
         floor = self.floor / self.sigma / seen.base.noise
         out = scan(view, place, seen.size, wrong, off, floor)
-        out = [*([] if self.taken else self.first), *(one for one in out if one.gain > SURE)]
-        out = _distinct(sorted(out, key=lambda one: -one.gain))[:_TRIED]
+        # in a pair more wrong matches at an end explain what was cut there as well, and nothing stands out beside them
+        out = [one for one in out if one.gain > SURE] or ([] if self.taken else self.first)
+        out = _distinct(out)[:_TRIED]
         offered = self._worth_more(self._proposed(out, periods[:_TRIED]))
         made = self._with([], offered)
         sure = [row for row in made if row[0].group and row[2] > SURE]

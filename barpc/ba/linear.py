@@ -25,6 +25,8 @@ class Factor:
     inverse: Callable[[], Blocks] | None = (
         None  # the inverse's blocks where the matrix has some, if it has blocks
     )
+    whole_inverse: Callable[[], Array] | None = None  # (n, n), of a dense one
+    log_determinant: float = np.nan  # of the matrix, of a dense one
 
 
 def factorize(matrix: Array, damping: float = 0.0) -> Factor:
@@ -40,10 +42,21 @@ def factorize(matrix: Array, damping: float = 0.0) -> Factor:
     diagonal = matrix.diagonal()
     _check(diagonal)
     if not len(diagonal):
-        return Factor(lambda b: b, "none")
+        return Factor(lambda b: b, "none", whole_inverse=lambda: matrix, log_determinant=0.0)
     damped = matrix + np.diag(damping * diagonal) if damping else matrix
-    cholesky = la.cho_factor(damped, check_finite=False)
-    return Factor(lambda b: la.cho_solve(cholesky, b, check_finite=False), "dense")
+    cholesky = la.cho_factor(damped, lower=True, check_finite=False)
+
+    def inverse() -> Array:
+        lower = np.tril(la.lapack.dpotri(cholesky[0], lower=True)[0])
+        return np.asarray(lower + np.tril(lower, -1).T)
+
+    volume = 2.0 * float(np.log(cholesky[0].diagonal()).sum())
+    return Factor(
+        lambda b: la.cho_solve(cholesky, b, check_finite=False),
+        "dense",
+        whole_inverse=inverse,
+        log_determinant=volume,
+    )
 
 
 def factorize_blocks(

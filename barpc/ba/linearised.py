@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -19,11 +20,21 @@ _TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 @dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of observations i <= j of the same tracks, sorted by what views these are of."""
+
+    order: IntArray  # (M,) of the pairs as they come, track by track
+    first: IntArray  # (M,) observations
+    second: IntArray
+    bounds: IntArray  # where pairs of other views begin, and the end
+    views: IntArray  # (P, 2)
+
+
+@dataclass(frozen=True, eq=False)
 class Tracks:
     """Tracks of n views each."""
 
     rows: IntArray  # (T, n) their observations, sorted by what views they are of
-    sets: IntArray  # where tracks of other views begin
     view: IntArray  # (T, n)
     subsets: BoolArray  # (S, n) which may be right together
     follow: Array  # (T, 3 S, 2n) a basis of what the ground point follows of each subset; zero outside it
@@ -69,11 +80,53 @@ class Linear:
     offset: Array  # (N q,) unknowns at the state, less the priors' means
     area: float  # in which a wrong match may lie
     image: float  # of an image
+    choices: int  # views of the block of which these were chosen
 
     @property
     def views(self) -> int:
         """N."""
         return self.shape[0]
+
+    def among(self, views: IntArray) -> Linear:
+        """The same with its own tracks' views (n,) only, counted anew; observations of others are left out."""
+        number, index = np.full(self.views, -1), np.full(len(self.view), -1)
+        number[views] = np.arange(len(views))
+        rows = np.flatnonzero(number[self.view] >= 0)
+        index[rows] = np.arange(len(rows))
+        tracks = tuple(replace(one, rows=index[one.rows], view=number[one.view]) for one in self.tracks)
+        return replace(
+            self,
+            view=number[self.view[rows]],
+            residual=self.residual[:, rows],
+            by_unknown=self.by_unknown[..., rows],
+            sigma=self.sigma[rows],
+            tracks=tracks,
+            shape=(len(views), self.shape[1]),
+            precision=self.precision.reshape(self.shape)[views].ravel(),
+            offset=self.offset.reshape(self.shape)[views].ravel(),
+        )
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """All pairs of observations of the same track, an observation with itself among them."""
+        rows = np.concatenate(
+            [
+                tracks.rows[:, np.triu_indices(tracks.rows.shape[1])].transpose(1, 0, 2).reshape(2, -1)
+                for tracks in self.tracks
+            ],
+            axis=1,
+        )
+        views = self.view[rows]
+        order = np.lexsort(views[::-1])
+        sorted_views = views[:, order]
+        begin = np.flatnonzero((np.diff(sorted_views, axis=1, prepend=-1) != 0).any(axis=0))
+        bounds = np.append(begin, len(order))
+        return Pairs(order, rows[0, order], rows[1, order], bounds, sorted_views[:, begin].T)
+
+    @cached_property
+    def by_row(self) -> Array:
+        """`by_unknown` observation by observation (K, 2, q)."""
+        return np.ascontiguousarray(self.by_unknown.transpose(2, 0, 1))
 
     @property
     def taking_part(self) -> BoolArray:
@@ -97,7 +150,7 @@ class Linear:
         for tracks in self.tracks:
             view = tracks.view[::every]
             parts = (tracks.follow[::every], tracks.volume[::every], tracks.by_unknown[::every])
-            few.append(Tracks(tracks.rows[::every], _changes(view), view, tracks.subsets, *parts))
+            few.append(Tracks(tracks.rows[::every], view, tracks.subsets, *parts))
         return replace(self, tracks=tuple(few))
 
 
@@ -125,7 +178,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         subsets = _subsets(n)
         follow, room = _followed(ground, subsets, held[:, structure.point[rows[:, 0]]])
         of_cameras = np.ascontiguousarray(by_unknown[:, :, rows].transpose(2, 3, 0, 1))
-        tracks.append(Tracks(rows, _changes(view), view, subsets, follow, room - np.log(volume), of_cameras))
+        tracks.append(Tracks(rows, view, subsets, follow, room - np.log(volume), of_cameras))
         ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
         bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
     far = (
@@ -144,6 +197,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         (state.params - prior.mean).ravel(),
         2.0 * far * max(2.0 * far, parallax),
         image,
+        structure.num_views,
     )
 
 
@@ -151,11 +205,6 @@ def numbers(count: IntArray) -> float:
     """How many numbers there are to tracks of so many views each (T,)."""
     subsets = np.where(count <= _MOST_SUBSETS, 2.0 ** count.astype(np.float64), count + 1.0)
     return float((6.0 * subsets * count).sum())
-
-
-def _changes(view: IntArray) -> IntArray:
-    """Where rows of views (T, n) change."""
-    return np.flatnonzero((np.diff(view, axis=0, prepend=-1) != 0).any(axis=1))
 
 
 def _subsets(n: int) -> BoolArray:

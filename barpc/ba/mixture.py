@@ -22,7 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from barpc.ba.linearised import Linear, Tracks
 from barpc.geodesy import Array
-from barpc.scene import IntArray
+from barpc.scene import BoolArray, IntArray
 
 _HOTTEST = 200.0  # times the noise stated, where it is cooled from: 20 px of 0.1
 _COOLED = 0.6  # from one iteration to the next, at most
@@ -32,7 +32,10 @@ _BEGINNINGS = 6  # reweightings of a first guess
 _STANDS = 2e-3, 0.3  # change of the noise (logarithm) and of the log-likelihood at the end
 WRONG = 1.0, 10.0  # of so many observations of a view so many are wrong, before any is seen
 _EPS = 1e-3, 0.98
+_CHUNK = 8192  # pairs of observations worked on at a time, so that temporaries stay in cache
 _CHANGED = 0.1  # of what an unknown rests on: its curvature is summed anew
+_LOOSE = 1e-6  # of what all observations of a track tell of its place
+_TWO = 1.5  # observations: half of the next
 NEAR_LIMIT = (
     4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
 )
@@ -75,7 +78,7 @@ def fit(
     Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, whose unknowns may be fewer, it
     is cooled again only from where the further ones begin; with a `group` that moves from the top.
     """
-    return _Mixture(linear, extra, sigma, warm, group).run()
+    return Mixture(linear, extra, sigma, warm, group).run()
 
 
 def moving(linear: Linear, extra: Array, group: Group, found: Fit) -> Array:
@@ -112,6 +115,30 @@ def settled(linear: Linear, residual: Array, fitted: Fit) -> Array:
         off = found.pull(tracks) / np.sqrt(np.maximum(free, 0.1))[:, None] / fitted.noise
         out[:, tracks.rows] = off.reshape(count, n, 2).transpose(2, 0, 1)
     return out
+
+
+def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array, BoolArray]:
+    """Residuals (2, K) of all observations once the ground points are where the right ones (K,) put them.
+
+    In standard deviations that they would have if all were right; and which (K,) have at least two right others.
+    """
+    out, known = np.zeros_like(residual), np.zeros(residual.shape[1], dtype=bool)
+    for tracks in linear.tracks:
+        count, n = tracks.rows.shape
+        ground = np.swapaxes(tracks.follow[:, :3], 1, 2)  # in units in which all observations know it alike
+        weight = right[tracks.rows]
+        weighted = np.swapaxes(ground * np.repeat(weight, 2, axis=1)[..., None], 1, 2)
+        matrix = weighted @ ground + _LOOSE * np.eye(3)
+        by_row = np.linalg.solve(matrix, np.swapaxes(ground, 1, 2))  # (T, 3, 2n)
+        values = tracks.of(residual)
+        left = values - (np.swapaxes(by_row, 1, 2) @ (weighted @ values[..., None]))[..., 0]
+        spread = 1.0 + (1.0 - 2.0 * np.repeat(weight, 2, axis=1)) * (np.swapaxes(ground, 1, 2) * by_row).sum(
+            axis=1
+        )
+        off = (left / np.sqrt(np.maximum(spread, 0.1))).reshape(count, n, 2)
+        out[:, tracks.rows] = off.transpose(2, 0, 1)
+        known[tracks.rows] = weight.sum(axis=1, keepdims=True) - weight > _TWO
+    return out, known
 
 
 def first_guess(
@@ -253,7 +280,7 @@ class _Seen:
     kinds: tuple[_Kind, ...]
 
 
-class _Mixture:
+class Mixture:
     """One fit at work: unknowns x = (cameras N q, extra e, those of a group that moves m).
 
     Each step is Newton's for the weights expected now, but for the curvature, which is summed anew only where weights
@@ -296,10 +323,11 @@ class _Mixture:
         self.curvature: list[Array] = []
         self.summed: list[Array] = []
 
-    def run(self) -> Fit:
-        """Expect and maximise until nothing changes."""
+    def run(self, most: int = _ITERATIONS, cooled: float = _COOLED) -> Fit:
+        """Expect and maximise until nothing changes, or so often; from where the last run ended."""
         linear, last, known, ends = self.linear, -np.inf, 0.0, False
-        for left in range(_ITERATIONS, 0, -1):
+        self.cooled = cooled
+        for left in range(most, 0, -1):
             seen = self._expected()
             is_new = self._has_changed(seen) or ends or left == 1
             if is_new:
@@ -330,7 +358,7 @@ class _Mixture:
         still = seen.kinds[0]
         found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), _LEAST_NOISE)
         cold = self.noise <= found
-        noise = found if cold else max(found, _COOLED * self.noise)
+        noise = found if cold else max(found, self.cooled * self.noise)
         wrong = np.bincount(
             self.linear.view[self.part], 1.0 - seen.right[self.part], minlength=self.linear.views
         )
@@ -421,30 +449,48 @@ class _Mixture:
 
     def _curvature(self, weights: Sequence[Array], beside: Array) -> Array:
         """Second derivatives of half the squares by the cameras' unknowns and those beside them."""
-        (views, q), size = self.linear.shape, beside.shape[1]
-        blocks, of_beside = np.zeros((views, q, views, q)), np.zeros((size, size))
-        across = np.zeros((views, q, size))
-        for tracks, of_subset in zip(self.linear.tracks, weights, strict=True):
-            count, n = tracks.rows.shape
-            weight, touched = tracks.weight(of_subset), np.asarray(self.touched[tracks.rows].any(axis=1))
-            for begin, end in pairwise([*tracks.sets.tolist(), count]):
-                parts, seen = tracks.by_unknown[begin:end], tracks.view[begin]
-                rows = np.ascontiguousarray(parts.transpose(1, 0, 2, 3)).reshape(n, -1, q)
-                for j in range(n):
-                    block = weight[begin:end, : 2 * j + 2, 2 * j : 2 * j + 2]
-                    of_one = (block @ parts[:, j]).reshape(-1, j + 1, 2, q)
-                    of_rows = of_one.transpose(1, 0, 2, 3).reshape(j + 1, -1, q)
-                    sums = np.swapaxes(rows[: j + 1], 1, 2) @ of_rows
-                    blocks[seen[: j + 1], :, seen[j]] += sums
-                    blocks[seen[j], :, seen[:j]] += np.swapaxes(sums[:j], 1, 2)
-                some = np.flatnonzero(touched[begin:end])
-                if len(some) and size:
-                    columns = beside[:, :, tracks.rows[begin + some]].transpose(2, 3, 0, 1)
-                    columns = columns.reshape(len(some), 2 * n, size)
-                    weighted = weight[begin + some] @ columns
-                    of_beside += columns.reshape(-1, size).T @ weighted.reshape(-1, size)
-                    turned = weighted.reshape(-1, n, 2, size).transpose(1, 0, 2, 3).reshape(n, -1, size)
-                    of_some = parts[some].transpose(1, 3, 0, 2).reshape(n, q, -1)
-                    across[seen] += of_some @ turned
-        cameras, cross = blocks.reshape(views * q, -1), across.reshape(views * q, size)
+        linear, (views, q), size = self.linear, self.linear.shape, beside.shape[1]
+        of_beside, across = np.zeros((size, size)), np.zeros((views, q, size))
+        of_pairs, seen, turned = list[Array](), list[IntArray](), list[Array]()
+        for tracks, of_subset in zip(linear.tracks, weights, strict=True):
+            n = tracks.rows.shape[1]
+            weight = tracks.weight(of_subset)
+            of_pairs.append(weight.reshape(-1, n, 2, n, 2).transpose(0, 1, 3, 2, 4)[:, *np.triu_indices(n)])
+            some = np.flatnonzero(self.touched[tracks.rows].any(axis=1)) if size else ()
+            if len(some):
+                columns = beside[:, :, tracks.rows[some]].transpose(2, 3, 0, 1).reshape(len(some), -1, size)
+                weighted = weight[some] @ columns
+                of_beside += columns.reshape(-1, size).T @ weighted.reshape(-1, size)
+                seen.append(tracks.rows[some].ravel())
+                turned.append(weighted.reshape(-1, 2, size))
+        if seen:
+            rows = np.concatenate(seen)
+            order = np.argsort(linear.view[rows], kind="stable")
+            left = linear.by_row[rows[order]].reshape(-1, q)
+            right = np.concatenate(turned)[order].reshape(-1, size)
+            for v, (a, b) in enumerate(
+                pairwise(2 * np.searchsorted(linear.view[rows[order]], np.arange(views + 1)))
+            ):
+                across[v] = left[a:b].T @ right[a:b]
+        cameras = self._of_cameras(np.concatenate([one.reshape(-1, 2, 2) for one in of_pairs]))
+        cross = across.reshape(views * q, size)
         return np.block([[cameras, cross], [cross.T, of_beside]])
+
+    def _of_cameras(self, weight: Array) -> Array:
+        """The same by the cameras' unknowns alone (N q, N q), of the weights (M, 2, 2) of pairs of observations."""
+        linear, (views, q), pairs = self.linear, self.linear.shape, self.linear.pairs
+        out, at = np.zeros((views, q, views, q)), pairs.bounds
+        starts = at[np.searchsorted(at, np.arange(0, at[-1] + _CHUNK, _CHUNK), side="right").clip(1) - 1]
+        for start, stop in pairwise(np.unique([*starts.tolist(), at[-1]]).tolist()):
+            part = slice(start, stop)
+            left = linear.by_row[pairs.first[part]].reshape(-1, q).T
+            right = (weight[pairs.order[part]] @ linear.by_row[pairs.second[part]]).reshape(-1, q)
+            kinds = slice(*np.searchsorted(at, [start, stop]).tolist())
+            ends = 2 * (at[kinds.start : kinds.stop + 1] - start)
+            for (one, other), (a, b) in zip(
+                pairs.views[kinds].tolist(), pairwise(ends.tolist()), strict=True
+            ):
+                sums = left[:, a:b] @ right[a:b]
+                out[one, :, other] = sums
+                out[other, :, one] = sums.T
+        return out.reshape(views * q, -1)

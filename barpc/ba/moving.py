@@ -17,16 +17,18 @@ import numpy as np
 from barpc.ba.block import Block
 from barpc.ba.heldout import seen_in
 from barpc.ba.linearised import Linear, linearise
-from barpc.ba.mixture import Fit, Group, fit, moving
+from barpc.ba.mixture import Fit, Group, Mixture, moving
 from barpc.ba.problem import Problem
 from barpc.ba.solve import State
 from barpc.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.scene import BoolArray, IntArray
 
 CELLS = 6  # a side of the ground: the group's share is free in each
-_STARTS = 4  # a side of the ground, of which each moves in turn
+_STARTS = 3  # a side of the ground, of which each moves in turn
 _LIKELY = 0.95  # that a track moves where the group is looked for, and that it stands far from there
 _FEW = 1500  # observations that are looked at from every start
+_LOOK, _QUICK = 8, 0.36  # steps of every start, cooled so much in each; only the best go on
+_KEPT = 3
 _SIGMA = 30.0  # px on the ground: a displacement from view to view, before it is known
 
 
@@ -52,6 +54,10 @@ class Ground:
         if like is None:
             return cls(center, np.nanmin(place, axis=1), np.nanmax(place, axis=1), place, by_ground)
         return cls(center, like.low, like.high, place, by_ground)
+
+    def part(self, rows: IntArray) -> Ground:
+        """Of some observations."""
+        return replace(self, place=self.place[:, rows], by_ground=self.by_ground[..., rows])
 
     @cached_property
     def pixel(self) -> float:
@@ -108,14 +114,12 @@ def proposal(linear: Linear, ground: Ground, base: Fit, extra: Array, sigma: Arr
         rows[tracks.rows] = True
     if not rows.any():
         return None
-    best: tuple[Group, Fit] | None = None
-    for share in _first_shares(ground, rows, base.right):
-        start = replace(group, share=share)
-        found = fit(few, extra, sigma, base, start)
-        if best is None or found.evidence > best[1].evidence:
-            best = start, found
-    assert best is not None
-    start, found = best
+    starts = [replace(group, share=share) for share in _first_shares(ground, rows, base.right)]
+    begun = [Mixture(few, extra, sigma, base, start) for start in starts]
+    looks = [one.run(_LOOK, _QUICK) for one in begun]
+    best = sorted(range(len(looks)), key=lambda n: -looks[n].evidence)[:_KEPT]
+    ended = [(begun[n].run(), starts[n]) for n in best]
+    found, start = max(ended, key=lambda row: row[0].evidence)
     shares = _shares(found.moving, cell, rows)[cell]
     member = moving(linear, extra, replace(start, share=shares), found)
     if np.mean(member[rows] > 0.5) > 0.5:  # of two groups the larger stands

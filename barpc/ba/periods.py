@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barpc.ba.scan import CLIPPED
+from barpc.ba.scan import CLIPPED, SURE
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 from barpc.sensor.splined import swing
@@ -21,7 +21,8 @@ _SHORTEST = 32.0  # rows: of what is shorter a matcher's window shows the mean
 _BIN = _SHORTEST / 8.0  # rows summed: 2 % of the shortest are lost
 _FEWEST_SEEN = 30  # observations of a view
 _FEWEST = 1.5  # waves of an image: fewer are no swing yet
-_FINE = 8  # frequencies a wave more
+_COARSE, _FINE = 2, 8  # frequencies a wave more, to see whether there is a peak and where it is
+_SEEN = 0.8  # of a peak, where it lies amid two coarse ones: sinc^2(1/4)
 _INDEPENDENT = 4  # as many of these count as tests: Baluev 2008's bound, near the levels asked for
 _LOBE = 1.5  # waves: what is nearer to a peak is its own
 _BESIDE = 5.0  # waves at least, and as many as the peak has
@@ -42,23 +43,26 @@ def price(rows: float, views: int) -> float:
     return float(np.log(max(_INDEPENDENT * rows / _SHORTEST, 1.0) * views))
 
 
-def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array) -> list[Swing]:
-    """The period that stands out most in every view, the best first; none that gains nothing.
+def swings(
+    view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE
+) -> list[Swing]:
+    """The period that stands out most in every view, the best first; none that gains less than `least` [nats].
 
     Parameters
     ----------
     view, row : (K,), where observations are [px], in images of `size` (2, N)
-    right : (K,), probability that an observation is
-    off : (2, K), residuals in standard deviations; 0 of those that are wrong
+    right : (K,), weights; 0 of those that tell nothing
+    off : (2, K), residuals in standard deviations
     """
     views = size.shape[1]
     found = []
     for v in range(views):
         mine = (view == v) & (right > 0.0)
-        rows, costs = float(size[1, v]), price(float(size[1, v]), views)
+        rows = float(size[1, v])
+        costs = price(rows, views)
         if mine.sum() >= _FEWEST_SEEN and rows > 2.0 * _FEWEST * _SHORTEST:
             clipped = np.clip(off[:, mine], -CLIPPED, CLIPPED)
-            best = _Rows(row[mine], rows, right[mine], clipped).largest(costs)
+            best = _Rows(row[mine], rows, right[mine], clipped).largest(costs + least)
             if best is not None:
                 found.append(Swing(v, best[0], best[1] - costs))
     return sorted(found, key=lambda one: -one.gain)
@@ -70,11 +74,15 @@ class _Rows:
     def __init__(self, row: Array, rows: float, right: Array, off: Array) -> None:
         self.row, self.off, self.right = row, off, right
         self.bins = int(np.ceil(rows / _BIN))
-        self.waves = np.arange(int(_FINE * rows / _SHORTEST)) / _FINE  # of an image
+        self.last = rows / _SHORTEST
+        self.waves = np.arange(int(_FINE * self.last)) / _FINE  # of an image
         self.first = int(np.ceil(_FINE * _FEWEST))
 
     def largest(self, costs: float) -> tuple[float, float] | None:
         """Period, and minus the logarithm of how probable such a peak is at one frequency; None where it is `costs`."""
+        coarse = self._spectrum(self.off, _COARSE)[int(_COARSE * _FEWEST) :]
+        if not len(coarse) or _worth(coarse.max() / _SEEN) <= costs:
+            return None
         gain = self._spectrum(self.off)
         band = np.floor(2.0 * np.log2(self.waves[self.first :]))
         best = None
@@ -87,22 +95,24 @@ class _Rows:
                     best = float(period), worth
         return best
 
-    def _spectrum(self, off: Array) -> Array:
+    def _spectrum(self, off: Array, fine: int = _FINE) -> Array:
         """Half the chi-square that a cosine and a sine of both coordinates take away, by frequency."""
-        right, last = self.right, len(self.waves)
+        right, last = self.right, int(fine * self.last)
         centred = (off - (off @ right / right.sum())[:, None]) * right
         spread = centred @ centred.T / right.sum()  # what noise leaves of it once points have followed
         spread[np.diag_indices(2)] += 1e-9 * np.trace(spread) + 1e-30
         at = (self.row / _BIN).astype(np.int64).clip(0, self.bins - 1)
         sums = np.array([np.bincount(at, weight, self.bins) for weight in (*centred, right)])
-        col, along, count = np.fft.rfft(sums, _FINE * self.bins, axis=1)
+        col, along, count = np.fft.rfft(sums, fine * self.bins, axis=1)
         half, twice = 0.5 * right.sum(), 0.5 * count[: 2 * last : 2]
-        score = np.stack([[one[:last].real, one[:last].imag] for one in (col, along)])
         cos, sin, both = half + twice.real, half - twice.real, twice.imag
         determinant = np.maximum(cos * sin - both**2, 1e-12 * half**2)
-        weight = np.array([[sin, -both], [-both, cos]]) / determinant
-        inverse = np.linalg.inv(spread)
-        return 0.5 * np.asarray(np.einsum("cd,cak,abk,dbk->k", inverse, score, weight, score, optimize=True))
+        lower = np.linalg.cholesky(np.linalg.inv(spread))
+        gain = np.zeros(last)
+        for weights in lower.T:  # of what noise leaves alike in every direction
+            one = weights[0] * col[:last] + weights[1] * along[:last]
+            gain += sin * one.real**2 - 2.0 * both * one.real * one.imag + cos * one.imag**2
+        return np.asarray(0.5 * gain / determinant)
 
     def _level(self, k: int, period: float) -> float:
         """How much more than noise there is beside a peak once that is taken away: at least 1."""

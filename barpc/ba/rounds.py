@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from barpc.ba.cameras import Projected
 from barpc.ba.ground import Heights
 from barpc.ba.problem import Problem
 from barpc.ba.resembling import Resemblance
+from barpc.ba.scan import Interval
 from barpc.ba.smooth import TERMS, Fit, Smooth, SmoothTest
 from barpc.ba.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
 from barpc.ba.variances import SAME_PRIOR, STANDS, PriorTest, Variances, same_prior
@@ -54,6 +55,8 @@ class Outcome:
     passes: int  # rounds of cutting
     prior: PriorTest  # how the corrections compare with the priors given, and what the priors became
     smooth: SmoothTest  # what is smooth in the residuals that are left
+    # floor [px] -> intervals of images that stand out there, once they were looked for
+    standing_out: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
 
 
 class Rounds:
@@ -99,6 +102,7 @@ class Rounds:
         self.projected = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
         self.misfit: Array | float = 0.0 if known is None or not self.robust else known.smooth.rms
+        self.scatter: Array | None = None  # residuals without smooth parts, where they are known
         self.weight = self.counted
 
     def run(self, once: bool = False) -> Outcome:
@@ -132,6 +136,7 @@ class Rounds:
         if self.robust and self.passes and many_cut:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = revived(self.problem, self.state, self.residual, self.use, weight)
+            self.scatter = None
         self.problem = self.heights.hold(self.problem, self.state.points)
         self.passes += 1
         self._cut()
@@ -167,7 +172,8 @@ class Rounds:
     def _cut(self) -> None:
         """Choose what is used by the residuals that scatter."""
         if self.robust:
-            s = self.observations.squared(self._scatter(), self.use.astype(np.float64))
+            scatter = self._scatter() if self.scatter is None else self.scatter
+            s = self.observations.squared(scatter, self.use.astype(np.float64))
             near = self.observations.is_near(s, self.options.robust_threshold * self.noise)
             self.use = self.observations.tied(self.everything & near)
 
@@ -192,7 +198,8 @@ class Rounds:
         tested = self.smooth.test(self.residual, self.use, fit)
         if self.robust:
             fitted = 2 * TERMS * len(fit)
-            self.noise = self.observations.noise(self._scatter(fit), self.use, self.problem, fitted)
+            self.scatter = self._scatter(fit)
+            self.noise = self.observations.noise(self.scatter, self.use, self.problem, fitted)
             self.misfit = tested.rms
         else:
             self.noise = self.observations.noise(self.residual, self.use, self.problem)

@@ -9,12 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import entr
+from scipy.special import entr, xlogy
 
 from barpc.geodesy import Array
 from barpc.scene import IntArray
 
 BINS = 40  # stretches of an image's rows or columns
+_STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # all intervals of these
+_WHOLE = BINS - 1  # which of them is all of an image, and no interval
 SURE = 5.0  # nats: an explanation that gains less is none
 _LINE = 0.05  # of the larger extent of residuals: a smaller one is none
 CLIPPED = 8.0
@@ -63,24 +65,24 @@ def scan(
         rows = np.array([np.ones(len(view)), wrong, *off])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         sums = np.pad(sums.reshape(-1, views, BINS).cumsum(axis=-1), ((0, 0), (0, 0), (1, 0)))
-        count, bad, col, row = (part[:, None, :] - part[:, :, None] for part in sums[:4])  # (N, start, stop)
-        total, all_bad = sums[:2, :, -1, None, None]
-        both = np.stack([_shares(count, bad, total, all_bad), _means(count - bad, col, row, floor)])
+        count, bad, col, row = sums[:, :, _STOPS] - sums[:, :, _STARTS]  # (N, intervals)
+        total, all_bad = sums[:2, :, -1:]
+        both = _shares(count, bad, total, all_bad), _means(count - bad, col, row, floor)
         for by_share, gain in zip((True, False), both, strict=True):
-            gain[:, ~np.triu(np.ones((BINS + 1, BINS + 1), dtype=bool), 1)] = 0.0
-            gain[:, 0, BINS] = 0.0  # all of an image is no interval
+            gain[:, _WHOLE] = 0.0
             for v in range(views):
-                i, j = divmod(int(gain[v].argmax()), BINS + 1)
+                at = int(gain[v].argmax())
+                worth = float(gain[v, at]) - price(views)
+                i, j = int(_STARTS[at]), int(_STOPS[at])
                 if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
                     i, j = (
                         (0, i) if j == BINS else (j, BINS)
                     )  # means tell of two parts: the smaller one lies off
                 step = size[axis, v] / BINS
-                share = float(bad[v, i, j] / max(count[v, i, j], 1.0))
-                at = float(i * step), float(j * step)
-                common = float(np.hypot(col[v, i, j], row[v, i, j]) / max(count[v, i, j] - bad[v, i, j], 1.0))
-                worth = float(gain[v, i, j]) - price(views)
-                found.append(Interval(v, axis, *at, worth, share, common, bool(by_share)))
+                inside, wrongs, *off_by = (sums[:, v, j] - sums[:, v, i]).tolist()
+                common = float(np.hypot(*off_by) / max(inside - wrongs, 1.0))
+                ends = float(i * step), float(j * step)
+                found.append(Interval(v, axis, *ends, worth, wrongs / max(inside, 1.0), common, by_share))
     return sorted(found, key=lambda one: -one.gain)
 
 
@@ -114,9 +116,9 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
 
 def _means(count: Array, col: Array, row: Array, floor: float) -> Array:
     """Logarithm of the likelihood ratio of a displacement inside, and another outside, over one of all."""
-    whole = np.maximum(count[:, :1, -1:], 1.0)
-    part = count / whole
-    inside = np.hypot(col - col[:, :1, -1:] * part, row - row[:, :1, -1:] * part)
+    all_of = slice(_WHOLE, _WHOLE + 1)
+    part = count / np.maximum(count[:, all_of], 1.0)
+    inside = np.hypot(col - col[:, all_of] * part, row - row[:, all_of] * part)
     spread = np.maximum(count * (1.0 - part), 0.5)
     return np.asarray(0.5 * inside**2 / (spread + (spread * floor) ** 2))
 
@@ -125,9 +127,8 @@ def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:
     """Logarithm of the likelihood ratio of two shares over one, where that inside is the larger."""
 
     def log(k: Array, n: Array) -> Array:
-        p = k / np.maximum(n, 1e-9)
-        with np.errstate(all="ignore"):
-            return np.where(k > 0, k * np.log(p), 0.0) + np.where(n - k > 1e-9, (n - k) * np.log1p(-p), 0.0)
+        good = np.maximum(n - k, 0.0)
+        return np.asarray(xlogy(k, k) + xlogy(good, good) - xlogy(n, n))
 
     outside, bad_outside = total - count, all_bad - bad
     more = bad * np.maximum(outside, 1e-9) > bad_outside * count

@@ -32,7 +32,8 @@ _TREND = 0.03  # px: another model is tried
 MUCH_NOISE = 1.5  # times what is stated
 _MUCH_LOST = 0.85  # of a view's observations are to be left
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
-_STEPS_BACK = 3  # to the delivered cameras: kilometres away, what is left is below a micrometre
+_STEPS_BACK = 3  # to the delivered cameras, at most: kilometres away, what is left is below a micrometre
+_STANDS = 30.0  # m: what is left after a step from so near is below a millimetre
 _BETTER = 0.8  # of the noise
 
 
@@ -72,12 +73,14 @@ class Solution:
         height where the rays of a point tell none.
         """
         problem, points = self.problem, self.final.points
-        shown = problem.residuals(self.final.params, points) + problem.xy
+        shown = self.outcome.residual + problem.xy
         held = staying(points, np.flatnonzero(self.heights.weak))
         mended = replace(problem, xy=shown, point_prior=held)
         for _ in range(_STEPS_BACK):
-            projected = problem.project_points(problem.camera_prior.mean, points)
+            projected, before = problem.project_points(problem.camera_prior.mean, points), points
             points = mended.triangulate(points, projected, block.use / block.sigma)
+            if np.nanmax(np.abs(points - before), initial=0.0) < _STANDS:
+                break
         return points
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -30,17 +31,17 @@ class Parts:
     kept_out: BoolArray  # (K,)
     group: IntArray  # (K,) number of the group that moved from 1 on, 0: of none
 
-    @property
+    @cached_property
     def inner(self) -> Block:
         """What is solved."""
         return self.block.without(self.kept_out | (self.group > 0))
 
-    @property
+    @cached_property
     def outer(self) -> Block:
         """What measures it."""
         return self.block.without(~self.kept_out | (self.group > 0))
 
-    @property
+    @cached_property
     def apart(self) -> Block:
         """What moved."""
         return self.block.without(self.group == 0)
@@ -69,6 +70,8 @@ class Parts:
     def mostly_moving(self, inlier: BoolArray) -> list[Interval]:
         """Rows of images of which more ties move than stand, of those kept (K,) of `inner`: they may be what is off."""
         block, gone = self.block, self.group > 0
+        if not gone.any():
+            return []
         rows = gone.copy()
         rows[~self.kept_out & ~gone] = inlier & (self.inner.point < block.num_tracks)
         size = np.array([view.size for view in block.views], dtype=np.float64).T

@@ -86,14 +86,14 @@ class _Around:
         change = np.where(free, (1.0 / prior.sigma**2 - 1.0 / now.sigma**2).ravel(), 0.0)
         given = reduced.plain(np.ones_like(free))
         matrix = given + np.diag(change)
-        part = matrix[np.ix_(free, free)]
-        covariance = Covariance(replace(reduced, matrix=matrix), factorize(part), free)
+        factor = factorize(matrix[np.ix_(free, free)])
+        covariance = Covariance(replace(reduced, matrix=matrix), factor, free)
         offset = (start - now.mean).ravel()
         step = -covariance.solve(change * offset)
         moved = offset + step
         cost = float(step @ (given @ step) + change @ moved**2)
         held = free & np.isfinite(prior.sigma.ravel())
-        volume = float(np.linalg.slogdet(part)[1]) + 2.0 * float(np.log(prior.sigma.ravel()[held]).sum())
+        volume = factor.log_determinant + 2.0 * float(np.log(prior.sigma.ravel()[held]).sum())
         return -0.5 * (cost + volume), start + step.reshape(start.shape), covariance
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from barpc.ba.apart import APART
-from barpc.ba.judge import UNKNOWNS
+from barpc.ba.judge import LARGEST
 from barpc.ba.scan import SURE
 from barpc.report.records import Table, table
 from barpc.report.summary import (
@@ -102,9 +102,9 @@ def _explained(scene: SceneEntry, summary: Summary) -> list[str]:
         found = [
             "Nothing stood out that the cameras' errors as stated do not explain: nothing else was tried."
         ]
-        if sum(len(view.correction.unknowns) for view in summary.views if view.correction) > UNKNOWNS:
+        if sum(len(view.correction.unknowns) for view in summary.views if view.correction) > LARGEST:
             found = [
-                f"Nothing else was tried: in blocks of more than {UNKNOWNS} unknowns explanations do not compete."
+                f"Nothing else was tried: in blocks of more than {LARGEST:,} unknowns explanations do not compete."
             ]
         elif scene.left:
             found = [f"None of what was tried explains what is left ({', '.join(RIVALS.values())}): refused."]

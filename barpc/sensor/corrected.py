@@ -32,6 +32,7 @@ _ROW_STEPS = 60  # a drift of thousandths of a pixel a row gains three digits a 
 _ROW_SETTLED = 1e-6  # px: what is left is a thousandth of it
 _STEPS = 12
 _SETTLED = 1e-4  # px: what is left after a step from there is below rounding
+_DIGITS = 1e-8  # of derivatives: the solver's steps ask for no more
 _TOLERANCE = 1e-7  # px: a localised point must project this near to where it was asked (plus rounding)
 
 
@@ -70,10 +71,12 @@ class Motion:
 
         By T they are those by X, negative; those by d are those by R where there is no drift.
         """
-        back = by_moved if self._drift is None else self._drift.back(by_moved)
-        by_point = _by_view(self._matrix.swapaxes(1, 2), back, self._bounds)
         by_turn = cross(self._turned, by_moved)
-        before, by_drift = (by_turn, by_turn) if self._drift is None else self._drift.back_and_rate(by_turn)
+        back, before, by_drift = by_moved, by_turn, by_turn
+        if self._drift is not None:
+            back = self._drift.back(by_moved, _DIGITS)
+            before, by_drift = self._drift.back_and_rate(by_turn, _DIGITS)
+        by_point = _by_view(self._matrix.swapaxes(1, 2), back, self._bounds)
         left = rotation_left_jacobian(self._rotation).swapaxes(1, 2)
         by_rotation = _by_view(left, before, self._bounds)
         return by_point, by_rotation, by_rotation if self._drift is None else by_drift

@@ -237,7 +237,8 @@ class Turn:
     def __init__(self, w: Array) -> None:
         x = (w * w).sum(axis=-2, keepdims=True)  # the angles, squared
         self._w = w
-        if x.max(initial=0.0) < 1e-4:  # sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3: to 3e-16
+        self._largest = float(x.max(initial=0.0))
+        if self._largest < 1e-4:  # sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3: to 3e-16
             self._a, self._b, self._c = 1 - x / 6 * (1 - x / 20), 0.5 - x / 24 * (1 - x / 30), 1 / 6 - x / 120
             return
         angle = np.sqrt(x)
@@ -251,14 +252,18 @@ class Turn:
         bent = cross(self._w, v)
         return np.asarray(v + self._a * bent + self._b * cross(self._w, bent))
 
-    def back(self, v: Array) -> Array:
-        """exp(-[w]x) v of vectors (..., 3, N)."""
+    def back(self, v: Array, error: float = 0.0) -> Array:
+        """exp(-[w]x) v of vectors (..., 3, N), to a relative error."""
         bent = cross(self._w, v)
+        if self._largest < error:
+            return np.asarray(v - bent)
         return np.asarray(v - self._a * bent + self._b * cross(self._w, bent))
 
-    def back_and_rate(self, v: Array) -> tuple[Array, Array]:
+    def back_and_rate(self, v: Array, error: float = 0.0) -> tuple[Array, Array]:
         """`back` and `rate` of the same vectors."""
         bent = cross(self._w, v)
+        if self._largest < error:
+            return v - bent, v - 0.5 * bent
         twice = cross(self._w, bent)
         return v - self._a * bent + self._b * twice, v - self._b * bent + self._c * twice
 

@@ -97,9 +97,10 @@ def lines_of_sight(sensor: SensorModel, image: Array, alt_range: tuple[float, fl
     direction : (..., 3), unit vector in ECEF, pointing up, towards the sensor
     """
     image = np.asarray(image, dtype=np.float64)
-    low, high = alt_range[0], max(alt_range[1], alt_range[0] + 100.0)
-    origin = ecef_from_ground(sensor.localize(image, np.full(image.shape[:-1], low)))
-    direction = ecef_from_ground(sensor.localize(image, np.full(image.shape[:-1], high))) - origin
+    alt = np.empty((2, *image.shape[:-1]))
+    alt[0], alt[1] = alt_range[0], max(alt_range[1], alt_range[0] + 100.0)
+    origin, end = ecef_from_ground(sensor.localize(np.broadcast_to(image, (2, *image.shape)), alt))
+    direction = end - origin
     return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import starmap
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from benchmarks import worlds_families as families
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import CONTROL, make
 from tests.ba.conftest import INDEPENDENT, centers_of
+from tests.lanes import rest_slow
 
 SIGMA = 0.3
 
@@ -80,7 +82,13 @@ def test_cameras_farther_off_than_stated_blame_no_point() -> None:
 
 @pytest.mark.parametrize(
     ("count", "wrong", "size", "least"),
-    [(5, 1, 30.0, 19), (6, 3, 30.0, 19), (9, 4, 100.0, 19), (6, 3, 8.0, 14), (5, 1, 3.0, 16)],
+    rest_slow(
+        starmap(
+            pytest.param,
+            [(6, 3, 8.0, 14), (9, 4, 100.0, 19), (5, 1, 3.0, 16), (5, 1, 30.0, 19), (6, 3, 30.0, 19)],
+        ),
+        keep=3,
+    ),
 )
 def test_the_right_points_are_used_and_no_other(count, wrong, size, least) -> None:
     exact = 0
@@ -91,7 +99,9 @@ def test_the_right_points_are_used_and_no_other(count, wrong, size, least) -> No
     assert exact >= (least if count < 9 else 4)
 
 
-@pytest.mark.parametrize(("count", "moved"), [(2, 1), (4, 2), (6, 3), (12, 6)])
+@pytest.mark.parametrize(
+    ("count", "moved"), rest_slow(starmap(pytest.param, [(2, 1), (4, 2), (6, 3), (12, 6)]), keep=3)
+)
 def test_two_sets_of_equal_weight_are_both_said_and_none_is_used(count, moved) -> None:
     for seed in range(10 if count < 12 else 2):
         one = found(count, seed, dict.fromkeys(range(moved), (0.0, 0.0, 60.0)))
@@ -102,7 +112,9 @@ def test_two_sets_of_equal_weight_are_both_said_and_none_is_used(count, moved) -
         assert 2 * min(first.sum(), second.sum()) >= moved
 
 
-@pytest.mark.parametrize(("count", "moved"), [(5, 2), (9, 4), (12, 4), (30, 9)])
+@pytest.mark.parametrize(
+    ("count", "moved"), rest_slow(starmap(pytest.param, [(9, 4), (5, 2), (12, 4), (30, 9)]))
+)
 def test_the_larger_set_is_used_and_the_others_are_told_to_agree(count, moved) -> None:
     alike, times = 0, 10 if count < 12 else 2
     for seed in range(times):

@@ -127,7 +127,7 @@ def test_nothing_is_tried_where_the_block_agrees(monkeypatch) -> None:
 
 
 def test_a_view_of_wrong_matches_is_no_foreign_one() -> None:
-    made, rng = simulate_block(3, 250, seed=3, attitude=10e-6, position=2.0), np.random.default_rng(1)
+    made, rng = simulate_block(3, 150, seed=3, attitude=10e-6, position=2.0), np.random.default_rng(1)
     wrong = (made.tracks.view == 2) & (rng.uniform(size=len(made.tracks)) < 0.7)
     off = rng.uniform(-30.0, 30.0, made.tracks.xy.shape)
     found = adjust_tracks(made.views, replace(made.tracks, xy=made.tracks.xy + wrong[:, None] * off))

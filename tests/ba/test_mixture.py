@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from barpc.ba import linearised, mixture
 from barpc.ba.block import join
 from barpc.ba.linearised import Linear, Tracks, linearise
-from barpc.ba.mixture import Fit, fit, log_likelihoods, settled
+from barpc.ba.mixture import Fit, fit, log_likelihoods, off_from_right, settled
 from barpc.ba.starting import first_state, make_problem
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
@@ -132,3 +132,32 @@ def test_the_same_block_gives_the_same_bits(linear: Linear) -> None:
     assert isinstance(one, Fit)
     assert (one.step == other.step).all()
     assert one.evidence == other.evidence
+
+
+def test_what_is_wrong_is_seen_from_where_the_right_ones_put_the_point(linear: Linear) -> None:
+    """Noise of one standard deviation, of right and wrong ones alike, and an offset that only the others can tell."""
+    rng = np.random.default_rng(3)
+    noise = rng.normal(size=linear.residual.shape)
+    wrong = linear.taking_part & (linear.view == 1)
+    right = (~wrong).astype(np.float64)
+    off, known = off_from_right(linear, noise, right)
+    tracks = {tracks.rows.shape[1]: tracks for tracks in linear.tracks}
+    pairs, triples = tracks[2].rows, tracks[3].rows
+    assert not known[pairs].any()  # one other does not tell a point
+    assert known[triples][tracks[3].view == 1].all()
+    assert not known[triples][tracks[3].view != 1].any()
+    of_wrong = triples[tracks[3].view == 1]
+    assert off[:, of_wrong].std() == pytest.approx(1.0, abs=0.12)
+    moved = noise + 8.0 * wrong
+    seen, _ = off_from_right(linear, moved, right)
+    assert np.median((seen - off)[:, of_wrong]) > 5.0
+    others = triples[tracks[3].view != 1]
+    np.testing.assert_allclose(seen[:, others], off[:, others], atol=1e-3)  # nothing of it is theirs
+    all_alike, _ = off_from_right(linear, moved, np.ones_like(right))
+    assert np.median(np.abs(all_alike - off)[:, others]) > 1.0
+    with_point = linear.tracks[-1]
+    project = projector(with_point)  # with all of them right: what the mixture takes away
+    left = (project @ with_point.of(noise)[..., None])[..., 0]
+    spread = np.sqrt(np.maximum(np.diagonal(project, axis1=1, axis2=2), 0.1))
+    whole, _ = off_from_right(linear, noise, np.ones_like(right))
+    np.testing.assert_allclose(with_point.of(whole), left / spread, atol=1e-4)

@@ -287,7 +287,8 @@ def test_the_scenes_move_is_from_where_the_delivered_cameras_put_what_is_seen_no
     params = np.random.default_rng(1).normal(0, 3, (3, 6))
     final = replace(state, params=params, points=state.points + 5.0)
     inlier = np.arange(len(block.view)) < kept * len(block.view)
-    outcome: Any = SimpleNamespace(inlier=inlier, minimum=SimpleNamespace(state=final))
+    residual = problem.residuals(params, final.points)
+    outcome: Any = SimpleNamespace(inlier=inlier, residual=residual, minimum=SimpleNamespace(state=final))
     found = Solution(problem, state, None, heights, outcome, None, None, None).first_points(block)  # type: ignore[arg-type]
     sensors = problem.cameras.unknowns.corrected(params, given.views)
     ground = ground_from_ecef(final.points)

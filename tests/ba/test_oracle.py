@@ -26,7 +26,7 @@ from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
 from tests.ba.oracle import Plain, ecef_of, enu_of, ground_of
 from tests.constants import chosen
-from tests.lanes import diagonal
+from tests.lanes import diagonal, rest_slow
 
 SIGMAS = {"sigma_attitude": 7.0, "sigma_position": 2.0, "sigma_drift": 3.0}
 EAST, NORTH = 0.3, -0.2  # slopes of the terrain
@@ -120,7 +120,7 @@ def make_case(drift: int = 0, fixed: tuple[str, ...] = ()) -> Case:
     return Case(problem, plain, params, points, 1.0 / block.sigma)
 
 
-@pytest.fixture(scope="module", params=[0, 2])
+@pytest.fixture(scope="module", params=rest_slow([2, 0]))
 def case(request) -> Case:
     return make_case(request.param)
 

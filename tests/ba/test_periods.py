@@ -39,7 +39,7 @@ def test_chance_swings_nowhere() -> None:
     for seed in range(60):
         view, row, size, off = ties(seed, 3000.0)
         off[1] = 0.3 * off[0] if seed % 2 else off[1]  # of a pair: one direction alone is seen
-        found = swings(view, row, size, np.ones(len(view)), off)
+        found = swings(view, row, size, np.ones(len(view)), off, 0.0)
         gains.append(found[0].gain if found else 0.0)
     assert np.mean(np.array(gains) > SURE) < 0.04
     assert np.mean(np.array(gains) > 0.0) > 0.1  # and is not far too high

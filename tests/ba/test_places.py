@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.places import CHANCE, Place, Unused, met_worse
+from tests.lanes import diagonal
 
 SIZE = np.array([[20_000.0, 9_000.0], [15_000.0, 12_000.0]])
 NOISE = 0.1
@@ -27,8 +28,7 @@ def worst(unused: Unused) -> list[Place]:
     return met_worse(unused, SIZE[:, : unused.view.max() + 1], *LIMITS)
 
 
-@pytest.mark.parametrize("wrong", [0.0, 0.03, 0.3, 0.5])
-@pytest.mark.parametrize("each", [25, 60, 200])
+@pytest.mark.parametrize(("each", "wrong"), diagonal([60, 200, 25], [0.03, 0.3, 0.0, 0.5]))
 def test_where_all_places_are_alike_none_is_named(each: int, wrong: float) -> None:
     found = [worst(observed(seed, each, wrong, 2)[0]) for seed in range(12)]
     assert not any(found)

@@ -19,6 +19,7 @@ from barpc.scene import GroundPoints, Tracks
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of
+from tests.lanes import rest_slow
 
 
 def seen(given: Tracks | GroundPoints, ground: np.ndarray, sensors: list, seed: int, noise: float = 0.05):
@@ -67,7 +68,7 @@ def test_gcps_that_hold_the_scene_move_it_as_far_as_its_rays_meet_elsewhere() ->
 
 
 @pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
-@pytest.mark.parametrize("wrong", [0.0, 0.1])
+@pytest.mark.parametrize("wrong", rest_slow([0.1, 0.0]))
 def test_two_images_with_one_rpc_have_no_height_to_move(wrong: float) -> None:
     """Their rays meet nowhere: what the cameras do to heights of hundreds of metres a pixel is no move."""
     block = simulate_block(2, 100, seed=1, per_site=2)
@@ -137,7 +138,7 @@ def stating(block: Block, sensors: list, accuracy: float) -> tuple:
     )
 
 
-@pytest.mark.parametrize("count", [2, 4, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", rest_slow([2, 4, 8]))
 def test_adjusting_what_was_adjusted_makes_its_place_no_better_known(count: int) -> None:
     """Its errors are shared: n views that state what the place is known to are not n witnesses (36.6 -> 13.0 m)."""
     block = simulate_block(count, 100, seed=8, per_site=count)

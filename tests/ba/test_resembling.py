@@ -18,6 +18,7 @@ from barpc.geodesy import metres_per_unit
 from barpc.options import AdjustOptions
 from barpc.scene import GroundPoints, Reference, Tracks
 from barpc.simulate import simulate_block
+from tests.lanes import rest_slow
 
 STEP = 20.0  # m: of the reference
 TEMPLATE = 33  # px of it
@@ -80,7 +81,7 @@ def without(smooth: Smooth) -> Smooth:
     return bare
 
 
-@pytest.mark.parametrize("apart", [8, 11, 23])
+@pytest.mark.parametrize("apart", rest_slow([11, 23, 8], keep=2))
 def test_noise_that_templates_share_is_no_jitter(view, apart):
     cried, before = [], []
     for seed in range(10):

@@ -13,6 +13,7 @@ from barpc.geodesy import enu_basis, ground_from_ecef
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import solve
+from tests.lanes import rest_slow
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,7 @@ def measured(block: Block, found: Adjustment, pair: tuple[int, int]) -> tuple[fl
     return rms(by_camera), rms(by_camera - by_camera.mean(axis=0)), n
 
 
-@pytest.mark.parametrize("pair", [(0, 1), (2, 1), pytest.param((0, 2), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("pair", rest_slow([(2, 1), (0, 1), (0, 2)]))
 def test_heights_of_a_pair_move_as_its_cameras_do(made, found, pair) -> None:
     absolute, relative, count = measured(made, found, pair)
     heights = pair_heights(found, *pair)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.scan import BINS, SURE, neighbours_alike, price, scan
+from tests.lanes import rest_slow
 
 SIZE = np.array([[8000.0, 4000.0], [12000.0, 6000.0]])  # of two images, columns and rows
 
@@ -101,10 +102,11 @@ def test_one_residual_that_is_far_off_is_one_residual() -> None:
     assert np.isfinite([one.gain for one in scan(view, place, SIZE, wrong, off)]).all()
 
 
-def test_wrong_matches_lie_in_any_direction() -> None:
+@pytest.mark.parametrize("counts", rest_slow([(2, 20), (2, 20, 200, 2000)]), ids=str)
+def test_wrong_matches_lie_in_any_direction(counts: tuple[int, ...]) -> None:
     """In none of 100 images of each of two shapes is a direction common, however few or many are wrong."""
     rng = np.random.default_rng(4)
-    for count in (2, 20, 200, 2000):
+    for count in counts:
         view, place = np.repeat([0, 1], [count, count]), rng.uniform(0.0, 9000.0, (2, 2 * count))
         for _ in range(50):
             off = rng.uniform(-30.0, 30.0, (2, 2 * count))

@@ -30,6 +30,7 @@ def test_adjusted_cameras_bring_a_pair_onto_its_epipolar_lines(ventoux):
     assert after.far == 0
 
 
+@pytest.mark.slow
 def test_semi_global_matching_finds_a_surface_where_it_found_none(ventoux):
     images, out = ventoux
     before = stereo.measure(images, images, out)

@@ -110,6 +110,7 @@ def test_satnerf_files_hold_what_its_loader_reads(run_dir, tmp_path):
         assert len(rings) == (2 if abs(one["geojson"]["center"][0]) > 100 else 1)
 
 
+@pytest.mark.parametrize("run_dir", rest_slow(["on_date_line", "southern"]), indirect=True)
 def test_nerfstudio_s_pinholes_are_as_near_as_they_say(run_dir, tmp_path):
     out = exported(run_dir, "nerfstudio", tmp_path)
     found, alts = read(out / "transforms.json"), read(out / "transforms.json")["alt_range"]

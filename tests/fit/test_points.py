@@ -36,7 +36,7 @@ def test_exact_points_give_an_exact_rpc(camera: Camera, points: tuple[Array, Arr
 
 @pytest.mark.parametrize(
     ("count", "factor"),
-    [(60, 2.5), (300, 1.5), pytest.param(4000, 1.2, marks=pytest.mark.slow)],
+    [(60, 2.5), *(pytest.param(*row, marks=pytest.mark.slow) for row in ((300, 1.5), (4000, 1.2)))],
 )
 def test_noise_neither_makes_poles_nor_costs_more_than_the_unknowns_do(
     vendors: list[Camera], count: int, factor: float

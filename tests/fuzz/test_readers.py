@@ -23,7 +23,12 @@ def test_a_sample_is_accepted_as_it_is(kind, tmp_path):
 # GDAL's words of a damaged file may be no text, which rasterio then says of itself
 @pytest.mark.filterwarnings("ignore:.*rasterio._env.log_error:pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
-    "runs", [30, pytest.param(120, marks=pytest.mark.nightly), pytest.param(1200, marks=pytest.mark.nightly)]
+    "runs",
+    [
+        10,
+        pytest.param(20, marks=pytest.mark.slow),
+        *(pytest.param(runs, marks=pytest.mark.nightly) for runs in (120, 1200)),
+    ],
 )
 @pytest.mark.parametrize("kind", SAMPLES)
 def test_damage_is_a_value_or_one_error(kind, runs):

@@ -85,8 +85,16 @@ def test_grids_are_written_where_the_rpc_misses_the_camera_and_nowhere_else(
     assert list(run_of(tmp_path / "far", (view, far, camera))[0]) == ["a" + GRID, "a" + CORRECTION]
 
 
-def test_what_is_told_of_a_grid_is_its_error(tmp_path, view, camera, fit):
-    (written,) = run_of(tmp_path, (view, fit, camera))
+@pytest.fixture(scope="module")
+def once(tmp_path_factory, view, camera, fit) -> tuple[Path, dict[str, dict[str, float | str]]]:
+    """A folder with the grids of the view, and what is told of them; nothing is written there."""
+    folder = tmp_path_factory.mktemp("once")
+    (written,) = run_of(folder, (view, fit, camera))
+    return folder, written
+
+
+def test_what_is_told_of_a_grid_is_its_error(once, camera):
+    tmp_path, written = once
     ground, image = seen_by(camera)
     for name in (GRID, CORRECTION):
         off = np.linalg.norm(open_camera(tmp_path / f"a{name}").model.project(ground) - image, axis=1).max()
@@ -96,10 +104,9 @@ def test_what_is_told_of_a_grid_is_its_error(tmp_path, view, camera, fit):
     assert LINEAR / 10 < written["a" + GRID]["linear"] < LINEAR
 
 
-def test_no_altitude_changes_what_is_added_to_the_rpc_of_a_correction(tmp_path, view, camera, fit):
+def test_no_altitude_changes_what_is_added_to_the_rpc_of_a_correction(once, camera, fit):
     """The run's own RPC is not the one to add to: what it lacks is another at other altitudes."""
-    run_of(tmp_path, (view, fit, camera))
-    rpc, lacking = read_correction(tmp_path / f"a{CORRECTION}")
+    rpc, lacking = read_correction(once[0] / f"a{CORRECTION}")
     at = seen_by(camera)[1]
     for alt in ALTS:
         ground = rpc.localize(at, np.full(len(at), alt))
@@ -654,9 +661,8 @@ def test_a_grid_is_the_camera_of_an_image_and_no_image(block, tmp_path):
             check([str(tmp_path / "a" / (images[0].stem + end)), images[1]])
 
 
-def test_a_grid_that_no_rpc_holds_is_not_converted(tmp_path, view, camera, fit):
-    run_of(tmp_path / "out", (view, fit, camera))
-    path = tmp_path / "out" / f"a{GRID}"
+def test_a_grid_that_no_rpc_holds_is_not_converted(tmp_path, once):
+    path = once[0] / f"a{GRID}"
     found = CliRunner().invoke(
         cli, ["convert", str(path), str(tmp_path / "a_RPC.TXT")], standalone_mode=False
     )

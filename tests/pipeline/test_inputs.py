@@ -26,7 +26,9 @@ def test_tie_points_from_a_file_give_the_same_answer(known, matched, tmp_path):
     result, out = matched
     runs = []
     for name in ("matches.csv", "matches.npz"):
-        given = RunOptions(matches_only=True, matches=str(out / name), stop_after="adjustment")
+        given = RunOptions(
+            matches_only=True, matches=str(out / name), stop_after="adjustment", pictures=False
+        )
         again = adjust(known.images, tmp_path / name, given)
         np.testing.assert_array_equal(again.tracks.xy, result.tracks.xy)
         np.testing.assert_array_equal(again.tracks.sigma, result.tracks.sigma)

@@ -318,7 +318,11 @@ def test_what_a_fit_warns_of_comes_back_from_its_worker_and_is_said_with_the_vie
 
 @pytest.mark.parametrize(
     ("sigma", "stated"),
-    [((3.0, 4.0, 99.0), np.sqrt(12.5)), ((0.0, 0.0, 1.0), None), ((np.nan, 1.0, 1.0), None)],
+    [
+        ((3.0, 4.0, 99.0), np.sqrt(12.5)),
+        ((np.nan, 1.0, 1.0), None),
+        pytest.param((0.0, 0.0, 1.0), None, marks=pytest.mark.slow),
+    ],
 )
 def test_a_new_rpc_states_the_error_of_the_scene_and_the_noise_of_the_old_one(sigma, stated) -> None:
     rpc = make_rpc()

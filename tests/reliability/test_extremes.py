@@ -32,13 +32,18 @@ def block():
 
 
 @pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(1, 20))]
+    ("seed", "draws"),
+    [
+        (0, 3),
+        pytest.param(0, 12, marks=pytest.mark.slow),
+        *(pytest.param(seed, 12, marks=pytest.mark.nightly) for seed in range(1, 20)),
+    ],
 )
 @pytest.mark.filterwarnings("ignore")
-def test_options_at_their_ends_give_a_result_or_one_line(block, seed) -> None:
+def test_options_at_their_ends_give_a_result_or_one_line(block, seed, draws) -> None:
     rng, known = np.random.default_rng(seed), declared(AdjustOptions)
     ended = 0
-    for _ in range(12):
+    for _ in range(draws):
         numbers = [name for name, one in known.items() if one.kind is float and rng.random() < 0.25]
         given = {name: float(rng.choice(NUMBERS)) for name in numbers}
         gcps = block.gcps if rng.random() < 0.5 else None

@@ -444,9 +444,9 @@ def scene(crops, tmp_path) -> Scene:
     return Scene(tmp_path / "in", *crops)
 
 
-AT_WORK = (  # told or borne after much work or waiting
+AT_WORK = (  # told or borne after much work or waiting, or after dask is imported
     "nine wrong tie points in ten", "an RPC that is wrong by 500 px", "images from nearly the same place",
-    "all views fixed", "nothing but noise", "no scheduler at the address",
+    "all views fixed", "nothing but noise", "no scheduler at the address", "a scheduler address that is none",
 )  # fmt: skip
 
 

@@ -339,7 +339,16 @@ def surrounded(trap: Trap, name: str, file: Path, suffixes: Sequence[str] = BESI
                 write(trap, name, file.with_name(stem + suffix))
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize(
+    "name",
+    [
+        # every verb, a run of seconds: before a commit of a source of pixels and of a service
+        pytest.param(name, marks=pytest.mark.slow if name in KINDS else pytest.mark.nightly)
+        if name not in ("source, element", "a web service")
+        else name
+        for name in CONTENTS
+    ],
+)
 def test_a_hostile_file_beside_another_fetches_nothing(name, crops, tmp_path, trap, request):
     """Beside an image (of which the RPC is readable, else no pixel would be asked for), a DEM and an output."""
     surrounded(trap, name, crops[1], BESIDE[:8])

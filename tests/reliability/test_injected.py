@@ -56,8 +56,13 @@ def failing(
 
 @pytest.mark.parametrize(
     ("where", "name", "least"),
-    [(os, "fsync", 15), (Path, "replace", 8), (os, "open", 15), (Path, "open", 8), (Path, "mkdir", 8)],
-    ids=["fsync", "rename", "open of a descriptor", "open", "mkdir"],
+    [
+        pytest.param(os, "fsync", 15, id="fsync"),
+        pytest.param(Path, "replace", 8, id="rename"),
+        pytest.param(os, "open", 15, id="open of a descriptor", marks=pytest.mark.slow),
+        pytest.param(Path, "open", 8, id="open"),
+        pytest.param(Path, "mkdir", 8, id="mkdir", marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("code", rest_slow([errno.ENOSPC, errno.EIO]))
 def test_a_call_of_a_run_folder_that_fails_loses_nothing(tmp_path, monkeypatch, where, name, least, code):

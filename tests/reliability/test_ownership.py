@@ -13,7 +13,7 @@ import pytest
 import rasterio
 
 from barpc.rpcio import read_rpc, read_rpc_source, write_rpc
-from tests.lanes import diagonal
+from tests.lanes import diagonal, rest_slow
 
 from .conftest import Said, assert_one_line, barpc, hashes
 from .test_interruption import ROOT, posix, relative
@@ -92,7 +92,7 @@ def test_a_user_s_file_is_never_replaced_and_refused_by_name(crops, tmp_path, na
     assert_untouched(tmp_path, before, said, name, "give another -o")
 
 
-@pytest.mark.parametrize("verb", ["adjust", "match"])
+@pytest.mark.parametrize("verb", rest_slow(["adjust", "match"]))
 def test_a_file_that_was_edited_is_refused_and_all_others_are_as_they_were(crops, out, tmp_path, verb):
     if verb == "match":
         kept = (tmp_path / "out").rename(tmp_path / "kept") / ".barpc/cache"
@@ -136,7 +136,7 @@ def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, out):
     assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
 
 
-@pytest.mark.parametrize("number", [2, 9])
+@pytest.mark.parametrize("number", rest_slow([9, 2]))
 def test_stopped_between_two_outputs_the_same_command_finishes(
     crops, ran, out, tmp_path, monkeypatch, number
 ):

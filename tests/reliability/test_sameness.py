@@ -251,8 +251,9 @@ def test_an_image_in_which_only_nan_differs_is_no_twin(scene, tmp_path):
 def test_a_part_of_an_image_is_named_in_the_verdict(scene, tmp_path):
     images = images_of(scene, "")
     part = crop(SAMPLES[0], tmp_path / "part.tif", side=100, start=START + 30)
+    options = RunOptions(stop_after="adjustment", pictures=False)
     with pytest.warns(BarpcWarning, match="held in height"):
-        summary = adjust([*images, part], tmp_path / "out").summary
+        summary = adjust([*images, part], tmp_path / "out", options).summary
     advice = {view["name"]: view["advice"] for view in summary["views"]}
     assert advice["part"].startswith("shows the same pixels as view_00, moved by 30 columns and 30 rows")
     assert advice["view_00"].startswith("shows the same pixels as part, moved by -30 columns and -30 rows")

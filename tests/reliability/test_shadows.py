@@ -56,7 +56,13 @@ VERBS = {
 }
 
 
-@pytest.mark.parametrize("verb", rest_slow(VERBS, len(TARGETS) + 3))
+FITTED = (
+    "export nerfstudio",
+    "export colmap",
+)  # beside the images as the others; pinholes are fitted: tests/export
+
+
+@pytest.mark.parametrize("verb", rest_slow(sorted(VERBS, key=lambda verb: verb in FITTED), len(TARGETS) + 1))
 def test_an_image_stays_the_camera_that_it_was(finished, tmp_path, verb) -> None:
     folder = tmp_path / "in"
     shutil.copytree(finished / "in", folder)

@@ -102,6 +102,7 @@ def test_it_is_light_by_day_and_dark_by_night(block_run, tmp_path):
     assert night == ["rgb(230, 237, 243)", "rgb(13, 17, 23)"]
 
 
+@pytest.mark.slow  # as what it is used for
 def test_the_probe_does_see_overflow_overlap_and_errors(block_run, tmp_path):
     html = (block_run.folder / "report.html").read_text(encoding="utf-8")
     broken = html.replace(

@@ -303,8 +303,8 @@ def test_where_nothing_won_it_is_said_why(record):
     assert "Still standing out: columns 10-99 of B (17 nats; 42 % cut, 0.03 px in common)." in text
     assert "Nothing stood out" not in text
     assert "42 % move, " in said(record, left=(replace(left, moving=True),))
-    many = with_views(record, *[{"unknowns": (0.0,) * 50}] * 9)
-    assert "in blocks of more than 400 unknowns explanations do not compete" in said(many, left=(left,))
+    many = with_views(record, *[{"unknowns": (0.0,) * 1500}] * 9)
+    assert "in blocks of more than 12,000 unknowns explanations do not compete" in said(many, left=(left,))
     won = said(record, left=(left,), explanations=(STRIP,))
     assert "Still standing out" in won
     assert "None of what was tried" not in won

@@ -17,15 +17,22 @@ ADVICE = {"weak": "only 3 tie points", "doubtful": "tie points are left with 2 p
 OVERALL = {"weak": "look", "doubtful": "look", "failed": "bad"}
 
 
-def verdict(run, status, kind="adjust", **changes):
-    views = [replace(view, status=GOOD[kind], advice="") for view in measure(run).views]
-    views[1] = replace(views[1], status=status, advice=ADVICE.get(status, ""))
-    return block_verdict(replace(run, kind=kind, **changes), views)
+@pytest.fixture(scope="module")
+def verdict(block_run):
+    """What is said of the block with a status of its second image."""
+    run, measured = block_run.run, measure(block_run.run).views
+
+    def said(status, kind="adjust", **changes):
+        views = [replace(view, status=GOOD[kind], advice="") for view in measured]
+        views[1] = replace(views[1], status=status, advice=ADVICE.get(status, ""))
+        return block_verdict(replace(run, kind=kind, **changes), views)
+
+    return said
 
 
 @pytest.mark.parametrize(("kind", "status"), diagonal(GOOD, STATUS_WORDS))
-def test_every_status_of_an_image_decides_the_whole(status, kind, block_run):
-    found = verdict(block_run.run, status, kind)
+def test_every_status_of_an_image_decides_the_whole(status, kind, verdict):
+    found = verdict(status, kind)
     assert found["status"] == OVERALL.get(status, "good")
     assert bool(found["reasons"]) == (status in OVERALL)
     assert set(found["reasons"]) <= set(found["lines"])
@@ -35,8 +42,8 @@ def test_every_status_of_an_image_decides_the_whole(status, kind, block_run):
 
 
 @pytest.mark.parametrize("kind", GOOD)
-def test_a_file_that_was_left_out_never_passes(kind, block_run):
-    found = verdict(block_run.run, GOOD[kind], kind, left_out=(("bad.tif", "has no RPC"),))
+def test_a_file_that_was_left_out_never_passes(kind, verdict):
+    found = verdict(GOOD[kind], kind, left_out=(("bad.tif", "has no RPC"),))
     assert found["status"] == "bad"
     assert found["reasons"] == ["bad.tif was left out: has no RPC"]
 

@@ -21,6 +21,7 @@ from barpc.scene import middle_altitude
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import epipolar_offset, view_angles
 from barpc.simulate import simulate_block
+from tests.lanes import rest_slow
 from tests.report.conftest import summarize
 
 SCHEMA = published_schema()
@@ -152,7 +153,7 @@ def test_the_shift_of_a_camera_is_how_far_its_image_points_move(block_run):
         assert np.abs(moved).max() > 0.05
 
 
-@pytest.mark.parametrize("model", ["rotation+translation", "rotation", "translation"])
+@pytest.mark.parametrize("model", rest_slow(["rotation+translation", "rotation", "translation"]))
 def test_its_sigma_is_the_covariance_carried_over_by_the_derivative(block_run, model):
     run = block_run.run
     adjustment = adjust_tracks(run.views, run.tracks, AdjustOptions(model=model, drift=0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from itertools import starmap
 from pathlib import Path
 
 import numpy as np
@@ -90,7 +91,7 @@ def shift(found: np.ndarray, truth, lacking: CorrectionGrid, inside: np.ndarray)
 
 @pytest.mark.parametrize(
     ("dtype", "top"),
-    [("uint8", 250.0), ("float32", 1.0), pytest.param("uint16", 4000.0, marks=pytest.mark.slow)],
+    rest_slow(starmap(pytest.param, [("float32", 1.0), ("uint8", 250.0), ("uint16", 4000.0)])),
 )
 def test_every_pixel_is_what_the_camera_of_the_rpc_sees(tmp_path, dtype, top):
     lacking = grid()
@@ -142,7 +143,11 @@ def test_blocks_leave_no_seams(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("dtype", "nodata"), [("uint8", 0), ("uint16", 65535), ("int16", -9999), ("float32", np.nan)]
+    ("dtype", "nodata"),
+    rest_slow(
+        starmap(pytest.param, [("int16", -9999), ("float32", np.nan), ("uint8", 0), ("uint16", 65535)]),
+        keep=2,
+    ),
 )
 def test_nodata_stays_nodata_where_it_is_and_comes_nowhere_else(tmp_path, dtype, nodata):
     """Rows 100 .. 199 are unknown: the correction moves them by 1.3 px, nothing bleeds, and no known pixel is lost."""

@@ -271,6 +271,7 @@ def all_inside(scene: Rendered, tracks: Tracks, everywhere: Tracks, area: Area) 
     assert tracks.num_points >= 0.9 * expected
 
 
+@pytest.mark.slow  # before a commit: tests/pipeline/test_pairs_and_area.py
 def test_all_tie_points_lie_in_the_area(render, tmp_path) -> None:
     scene = render(views=2, size=(300, 300))
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.5)))
