@@ -245,7 +245,8 @@ def _adjustment(
     for one in (found.after, moved[1]):
         points[one.index] = one.points
     inlier = block.in_order(outcome.inlier)
-    ties = slice(0, len(inlier) - (block.point >= block.num_tracks).sum())
+    of_reference = 0 if block.reference is None else len(block.reference.points.view)
+    ties = slice(0, len(inlier) - len(block.gcps.view) - of_reference)
     is_tie = found.problem.structure.point < block.num_tracks
     view = parts.block.in_order(parts.block.view)[ties]
     before, after = (

@@ -61,12 +61,16 @@ class Agreement:
         By how much the stated accuracies of the points used are too good; 1: they are not.
     alike : bool
         Whether the points that are not used, two or more, agree with each other: in another datum, perhaps.
+    torn : (2,)
+        Residuals of tie points that took no part, without control and with it [px, RMS], where control that agrees with
+        itself would raise them, so that none is used; else empty.
     """
 
     used: BoolArray
     sets: tuple[BoolArray, ...] = ()
     scale: float = 1.0
     alike: bool = False
+    torn: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +98,15 @@ class Offsets:
         return Offsets(self.own, self.motions * factor)
 
 
-def offsets_of(covariance: Covariance, block: Block, points: Array) -> Offsets:
-    """The offsets of the control points of a block at a solution in which their places hold nothing.
+def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array) -> Offsets:
+    """The offsets of the control points of a block at a solution in which they hold nothing.
 
     Parameters
     ----------
     covariance : Covariance, of the solution
     block : Block
     points : (P, 3), adjusted, ECEF [m]
+    faint : (P,), times by which observations of a point count as noisier there
     """
     gcps, first, structure = block.gcps, block.num_tracks, covariance.reduced.structure
     count, q = len(gcps.names), covariance.num_unknowns
@@ -116,7 +121,7 @@ def offsets_of(covariance: Covariance, block: Block, points: Array) -> Offsets:
         for k in mine:
             at = int(np.searchsorted(views, structure.view[k])) * q
             of_cameras[g, :, at : at + q] -= enu[g] @ rays[g] @ covariance.reduced.cross[k]
-    turned = enu @ rays
+    turned = enu @ rays / faint[index, None, None]
     own = turned @ np.swapaxes(turned, 1, 2) + gcps.sigma[:, :, None] ** 2 * np.eye(3)
     whitening = np.linalg.inv(np.linalg.cholesky(own))
     flat = (whitening @ of_cameras).reshape(3 * count, -1)

@@ -120,13 +120,17 @@ def _observations(
     known = np.any(list(held.values()), axis=0)
     if is_free.all() and not known.any():
         return
-    projected = problem.linearise(state.params, state.points)
-    for v, part in enumerate(map(slice, structure.bounds[:-1], structure.bounds[1:])):
-        at = structure.point[part]
+    counted = known[structure.point] | ~is_free[structure.view]
+    rows = np.flatnonzero(counted & (weight > 0))
+    bounds = np.searchsorted(structure.view[rows], np.arange(structure.num_views + 1))
+    ecef = structure.of_points(state.points)[:, rows]
+    projected = problem.cameras.seeing(problem.xy[:, rows]).project(state.params, ecef, bounds)
+    for v, part in enumerate(map(slice, bounds[:-1], bounds[1:])):
+        at = structure.point[rows[part]]
         change = np.einsum("cqk,qm->ckm", projected.by_unknown[..., part], unknowns[v])
         change += np.einsum("cxk,kxm->ckm", projected.by_point[..., part], points[at])
-        cost = ((change * weight[part, None]) ** 2).sum(axis=0)
-        for kind, rows in held.items():
-            paid[kind][:] += cost[rows[at]].sum(axis=0)
+        cost = ((change * weight[rows[part], None]) ** 2).sum(axis=0)
+        for kind, held_points in held.items():
+            paid[kind][:] += cost[held_points[at]].sum(axis=0)
         if not is_free[v]:
             paid["fixed_views"][:] += cost[~known[at]].sum(axis=0)

@@ -61,7 +61,8 @@ class GaugeReport:
     radius: float
     by_unknown: Array = field(repr=False)  # (10, N q) the motions by the unknowns of the cameras
     own: Array = field(repr=False)  # (10, 10) their covariance where the cameras are known [m^2]
-    # (3,) how far off the delivered cameras let the scene be, east, north, up [m]; NaN where that is not known
+    # (3,) how far off the delivered cameras let the scene be, east, north, up [m], by their priors as the block widened
+    # them; NaN where that is not known
     delivered_sigma: Array = field(default_factory=lambda: np.full(3, np.nan))
 
 

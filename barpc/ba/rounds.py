@@ -27,6 +27,7 @@ _LOW = 0.2  # part of the observations, and the |r|^2 over its expectation that 
 _LEAST_NOISE = 0.5  # of the stated sigmas, while outliers are about
 _SAME = 1e-3  # a cut that changes less than this part of the observations is not solved again
 _SAME_NOISE = 0.02  # nor is a change of the noise by less than this part
+FAINT = 100.0  # times their noise have observations of control points that hold nothing, in images with tie points
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
 _BACKFITTING = 6
 _MANY_CUT = 0.01  # of the observations: more are looked at again
@@ -83,17 +84,24 @@ class Rounds:
         self.robust = options.loss != "linear"
         is_tie = block.point < block.num_tracks
         of_reference = block.point >= block.num_known
-        self.observations = Observations(self.problem, block.sigma, options.noise_floor, is_tie, of_reference)
-        self.smooth = Smooth(problem.structure, problem.xy, unknowns, Resemblance.of(block, TERMS))
+        faint = faintness(block, heights)[block.point]
+        sigma = block.sigma * faint
+        self.observations = Observations(self.problem, sigma, options.noise_floor, is_tie, of_reference)
+        alike = Resemblance.of(block, TERMS)
+        self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
         given, control = problem.camera_prior, heights.has_control
         self.variances = Variances.of(given, unknowns, options, control, block.views)
+        if known is not None and known.problem.cameras.unknowns is unknowns:
+            self.problem = replace(self.problem, camera_prior=known.problem.camera_prior)
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
-        self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
+        if known is not None:
+            self.use = self.observations.tied(self.use & known.inlier)
+        self.counted = self.use.astype(np.float64)
         self.is_known = known is not None
         self.projected = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
-        self.misfit: Array | float = 0.0
+        self.misfit: Array | float = 0.0 if known is None or not self.robust else known.smooth.rms
         self.scatter: Array | None = None  # residuals without smooth parts, where they are known
         self.weight = self.counted
 
@@ -137,7 +145,8 @@ class Rounds:
         smooth = self._estimate_noise()
         numbers = self.passes, self.use.sum(), len(self.use), self.noise
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
-        same = self.passes > 1 and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
+        again = self.passes > 1 or self.is_known
+        same = again and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
         # what is known of the place goes with what is shared, and nothing else learns of it
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
@@ -170,8 +179,9 @@ class Rounds:
 
     def _solve(self) -> Minimum:
         """Least squares of what is used; a second pass follows the first robust one always, and is exact."""
+        again = self.passes > 1 or self.is_known
         solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
-        tolerance = TOLERANCE if self.passes > 1 or not self.robust else _FIRST_TOLERANCE
+        tolerance = TOLERANCE if again or not self.robust else _FIRST_TOLERANCE
         noise = self.noise if self.options.estimate_noise else 1.0
         self.weight = weight = self.observations.weight(self.use, noise, self.misfit)
         found = minimise(self.problem, self.state, weight, solver, tolerance, self.projected)
@@ -212,6 +222,21 @@ class Rounds:
         for _ in range(_BACKFITTING):
             part += self.smooth.part(settled(residual - part), counted)
         return settled(residual - part)
+
+
+def faintness(block: Block, heights: Heights) -> Array:
+    """Times (P,) by which observations of a point count as noisier: a control point that holds nothing ties nothing.
+
+    Those of many points marked a pixel off in one image would pull it away from its tie points, which together count
+    for so much only. Points that are seen in an image without tie points are what ties that.
+    """
+    alone = np.bincount(block.view[block.point < block.num_tracks], minlength=len(block.views)) == 0
+    faint = np.zeros(block.num_points, dtype=bool)
+    faint[block.num_tracks : block.num_known] = True
+    faint[block.point[alone[block.view]]] = False
+    if heights.has_control:
+        faint[heights.control[0].index] = False
+    return np.where(faint, FAINT, 1.0)
 
 
 def _robust(

@@ -57,12 +57,21 @@ class SmoothTest:
 
 
 class Smooth:
-    """The smooth model of a block's views, of observations at `xy` (2, K) [px], which may resemble each other."""
+    """The smooth model of a block's views, of observations at `xy` (2, K) [px], which may resemble each other.
+
+    Only those that `tells` (K,) are looked at.
+    """
 
     def __init__(
-        self, structure: Structure, xy: Array, unknowns: Unknowns, alike: Resemblance | None = None
+        self,
+        structure: Structure,
+        xy: Array,
+        unknowns: Unknowns,
+        alike: Resemblance | None = None,
+        tells: BoolArray | None = None,
     ) -> None:
         self.structure, self.alike = structure, alike
+        self._tells = np.ones(xy.shape[1], dtype=bool) if tells is None else tells
         col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
         self._place = xy
         self._col, self._row = col, row
@@ -93,6 +102,7 @@ class Smooth:
         """
         n = self.structure.num_views
         rms, significance, by_row = np.zeros(n), np.ones(n), np.full(n, np.nan)
+        use = use & self._tells
         weight = use.astype(np.float64)
         residual = np.where(use, residual, 0.0)
         share, precision = (
@@ -118,7 +128,7 @@ class Smooth:
 
     def test_neighbours(self, tested: SmoothTest, residual: Array, use: BoolArray) -> SmoothTest:
         """The same test with what neighbours share, of views in which something was fitted."""
-        shared = np.zeros_like(tested.rms)
+        shared, use = np.zeros_like(tested.rms), use & self._tells
         for v in np.flatnonzero(np.isfinite(tested.by_row)):
             shared[v] = self._shared(slice(*self.structure.bounds[v : v + 2]), residual, use)
         return replace(tested, shared=shared)
@@ -149,7 +159,7 @@ class Smooth:
 
     def fit(self, residual: Array, weight: Array) -> Fit:
         """What `part` is made of, for views with enough observations that count."""
-        bounds = self.structure.bounds
+        bounds, weight = self.structure.bounds, weight * self._tells
         counts = self.structure.sum_views(weight[None])[:, 0]
         found = {}
         for v in np.flatnonzero(counts >= _PER_TERM * TERMS).tolist():

@@ -75,12 +75,17 @@ class ControlTest:
     def agrees(self) -> bool:
         """Whether the points used contradict nothing, each and all together, and one set of them outweighs others."""
         status = [self.status(g) for g in range(len(self.used))]
-        return self.fits and not {"contradicts", "undecided"} & set(status)
+        return self.fits and not self.torn and not {"contradicts", "undecided"} & set(status)
 
     @property
     def sets(self) -> tuple[BoolArray, ...]:
         """Two sets of points (G,) that contradict each other and weigh the same; none is used. Empty where one is."""
         return () if self.agreed is None else self.agreed.sets
+
+    @property
+    def torn(self) -> tuple[float, ...]:
+        """Residuals of tie points that took no part without and with control [px], where that is why none is used."""
+        return () if self.agreed is None else self.agreed.torn
 
     def status(self, point: int) -> str:
         """What became of a point, in a word."""
@@ -90,7 +95,7 @@ class ControlTest:
 
 
 def control_test(
-    covariance: Covariance, points: Array, first: int, gcps: GroundPoints, agreed: Agreement
+    covariance: Covariance, points: Array, first: int, gcps: GroundPoints, agreed: Agreement, faint: Array
 ) -> ControlTest:
     """The test at a solution.
 
@@ -106,12 +111,17 @@ def control_test(
         As given.
     agreed : Agreement
         Whose place was held, and how.
+    faint : (G,)
+        Times by which their observations counted as noisier.
     """
     count, used, sigmas = len(gcps.names), agreed.used, gcps.sigma * agreed.scale
     seen = np.bincount(gcps.point, minlength=count)
     enu = enu_basis(gcps.lonlatalt)
     offset = enu_offsets(points[first : first + count], gcps.lonlatalt)
-    adjusted = enu @ covariance.points(first + np.arange(count)) @ np.swapaxes(enu, 1, 2)
+    index = first + np.arange(count)
+    rays = solve_transposed(covariance.reduced.lower[:, index], np.eye(3)[..., None]).transpose(2, 0, 1)
+    own = (1.0 - faint**-2.0)[:, None, None] * rays @ np.swapaxes(rays, 1, 2)
+    adjusted = enu @ (covariance.points(index) - own) @ np.swapaxes(enu, 1, 2)
     residual, w, redundancy = np.full((count, 3), np.nan), np.full(count, np.nan), np.zeros(count)
     for g in range(count):
         stated = np.diag(sigmas[g] ** 2)

@@ -11,13 +11,13 @@ from barpc.ba.agreement import LOOSE, Agreement, agreement, offsets_of
 from barpc.ba.block import Block
 from barpc.ba.consensus import agreeing
 from barpc.ba.ground import Heights, staying
-from barpc.ba.heldout import HeldOut, measure
+from barpc.ba.heldout import HeldOut, is_better, measure
 from barpc.ba.incremental import BlockPrior
 from barpc.ba.judge import Finding
 from barpc.ba.priors import DRIFT_SIGMA
 from barpc.ba.problem import Problem
 from barpc.ba.relief import Terrain
-from barpc.ba.rounds import Outcome, Rounds, revived
+from barpc.ba.rounds import Outcome, Rounds, faintness, revived
 from barpc.ba.smooth import SmoothTest
 from barpc.ba.snooping import ControlTest, control_test
 from barpc.ba.solve import State
@@ -125,7 +125,7 @@ def solve_block(
     heights = given.loose(LOOSE) if block.gcps.names else given
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, options, heights, block.use)
-    before, agreed = rounds.residual, None
+    before, agreed, free = rounds.residual, None, None
     if (
         block.gcps.names and not (block.point < block.num_tracks).any()
     ):  # control is all that holds the cameras
@@ -147,10 +147,29 @@ def solve_block(
         asked = {"drift": outcome.smooth}
         problem, outcome = bent, Rounds(bent, block, there, options, heights, outcome.inlier).run()
     if block.gcps.names and agreed is None:
+        free = Solution(problem, state, before, heights, outcome, start, start, None, asked)
         agreed, heights = _with_control(block, given, outcome)
         outcome = Rounds(problem, block, outcome.minimum.state, options, heights, block.use, outcome).run()
     first = Solution(problem, state, before, heights, outcome, start, start, None, asked, agreed=agreed)
-    return finished(first, problem, block, outer, options, outcome)
+    found = finished(first, problem, block, outer, options, outcome)
+    return (
+        found
+        if free is None or not found.heights.has_control
+        else _untorn(found, free, block, outer, options)
+    )
+
+
+def _untorn(found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions) -> Solution:
+    """The block held by control; as it was `free` of it where tracks that took no part are met worse with it."""
+    without = measure(free.problem, free.final.params, outer)
+    raised = found.after.whole_rms**2 - without.whole_rms**2
+    # ties of a view are worth 1 / noise_floor^2 in all: its q unknowns are known to q noise_floor^2 [px^2] by them
+    known = free.final.params.shape[1] * options.noise_floor**2
+    if raised <= known or not is_better(without, found.after, outer):
+        return found
+    assert found.agreed is not None
+    none = Agreement(np.zeros_like(found.agreed.used), torn=(without.whole_rms, found.after.whole_rms))
+    return finished(replace(free, agreed=none), free.problem, block, outer, options, free.outcome)
 
 
 def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agreement, Heights]:
@@ -162,7 +181,8 @@ def _with_control(block: Block, heights: Heights, outcome: Outcome) -> tuple[Agr
     )  # by hundreds of sigmas
     told = np.isin(np.arange(count), block.point[mine & outcome.inlier] - first) & ~lost
     covariance = outcome.minimum.covariance(outcome.problem.free)
-    found = agreement(offsets_of(covariance, block, outcome.minimum.state.points), told)
+    faint = faintness(block, heights.loose(LOOSE))
+    found = agreement(offsets_of(covariance, block, outcome.minimum.state.points, faint), told)
     found = replace(found, used=found.used & ~lost)
     kept = heights.control[0].select(found.used[heights.control[0].index - first])
     kept = replace(kept, rows=kept.rows / found.scale)
@@ -176,7 +196,8 @@ def finished(
     tested = None
     if found.agreed is not None:
         covariance, points = outcome.minimum.covariance(problem.free), outcome.minimum.state.points
-        tested = control_test(covariance, points, block.num_tracks, block.gcps, found.agreed)
+        faint = faintness(block, found.heights)[block.num_tracks : block.num_known]
+        tested = control_test(covariance, points, block.num_tracks, block.gcps, found.agreed, faint)
     after = measure(problem, outcome.minimum.state.params, outer)
     return replace(found, problem=problem, outcome=outcome, after=after, tested=tested)
 

@@ -8,7 +8,7 @@ errors-in-variables regression (Fuller, "Measurement error models", 1987).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -34,6 +34,7 @@ _BIWEIGHT = 4.685  # Tukey's: 95 % as efficient as least squares where all is no
 _NEAR = 3.0  # standard deviations within which a height agrees
 _MOST_NOISE = 3.0  # times what is stated: more is not agreement
 _KNOWN = 0.2  # of the information that slopes claim: below, they are their own noise
+_PARTS = 20  # of a scene, left out one by one
 _FEWEST_GROUPS = 14  # of neighbours, that a variance is told by: twice the unknowns
 
 
@@ -170,7 +171,17 @@ def register(surface: Surface, given: Given, radius: float, before: Array) -> Re
     the heights tell nothing, that stays open.
     """
     free = np.diag((10.0 * before) ** -2)
-    motion, noise = _search(surface, given, before), _MOST_NOISE
+    motion, noise = _settled(surface, given, _search(surface, given, before), radius, free)
+    found = _told(surface, given, motion, radius, noise, free)
+    wider = _jackknife(surface, given, found, radius, noise, free)
+    return replace(found, covariance=wider[:, None] * found.covariance * wider)
+
+
+def _settled(
+    surface: Surface, given: Given, motion: Array, radius: float, free: Array, noise: float | None = None
+) -> tuple[Array, float]:
+    """The motion (7,) that reweighted steps end at, and the noise over what is stated; learnt where it is not known."""
+    is_known, noise = noise is not None, _MOST_NOISE if noise is None else noise
     for step in range(_STEPS):
         seen = _Seen.of(surface, given, motion, radius)
         whitened = seen.residual / seen.sigma
@@ -184,11 +195,50 @@ def register(surface: Surface, given: Given, radius: float, before: Array) -> Re
             normal, seen.rows.T @ (weight * np.where(near, seen.residual, 0.0)) - free @ motion
         )
         motion = motion + change
-        among = np.abs(whitened[seen.near & (np.abs(whitened) < 2.0 * _BIWEIGHT * noise)])
-        noise = float(np.clip(1.4826 * np.median(among), 0.5, max(noise, 1.0))) if step >= 2 else noise
-        if step > 5 and np.abs(change).max() < _SETTLED:
+        if not is_known and step >= 2:
+            among = np.abs(whitened[seen.near & (np.abs(whitened) < 2.0 * _BIWEIGHT * noise)])
+            noise = float(np.clip(1.4826 * np.median(among), 0.5, max(noise, 1.0)))
+        if (is_known or step > 5) and np.abs(change).max() < _SETTLED:
             break
-    return _told(surface, given, motion, radius, noise, free)
+    return motion, noise
+
+
+def _jackknife(
+    surface: Surface, given: Given, found: Registration, radius: float, noise: float, free: Array
+) -> Array:
+    """Factors (7,) of standard deviations: how the motion changes where the heights of one part are left out.
+
+    Slopes tell where heights lie on them, and steps of roofs and trees move with the place that is found: no
+    linearisation at its end has that (the delete-a-group jackknife: Shao and Tu, "The Jackknife and Bootstrap", 1995).
+    """
+    group, wider = _parts(given.place[:, :2], found.near), np.ones(len(free))
+    count = int(group.max(initial=-1)) + 1
+    if count < _FEWEST_GROUPS:
+        return wider
+    without = np.array(
+        [
+            _settled(surface, given.select((group != n) & found.near), found.motion, radius, free, noise)[0]
+            for n in range(count)
+        ]
+    )
+    variance = (count - 1.0) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0)
+    ratio = variance / np.diag(found.covariance)
+    for part in ([2, 3, 4], [0, 1, 5, 6]):
+        wider[part] = np.sqrt(max(float(ratio[part].mean()), 1.0))
+    return wider
+
+
+def _parts(place: Array, near: BoolArray) -> IntArray:
+    """Which of some twenty square parts of a scene each place (n, 2) lies in; -1: it is not near."""
+    group, number = np.full(len(place), -1), np.zeros(0, dtype=np.int64)
+    at = place[near]
+    size = float(np.ptp(at, axis=0).max()) if len(at) else 0.0
+    while size > 0.0 and number.max(initial=0) + 1 < min(_PARTS, len(at)):  # of tracks most are empty
+        size /= np.sqrt(2.0)
+        cell = np.floor((at - at.min(axis=0)) / size).astype(np.int64)
+        number = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    group[near] = number if len(number) else 0
+    return group
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ from barpc.sensor.geometry import CameraCenter, camera_center
 from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
-from barpc.tie.reference import PEAK, Registration, register
+from barpc.tie.reference import Registration, register
 from barpc.tie.store import Bucket, Store
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace, timed
@@ -314,11 +314,9 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     gcps, checks = (load_gcps(paths, run.views, options) for paths in (options.gcp, options.check_points))
     centers = tuple(_center(view) for view in run.views)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
-        peak = max(view.peak for view in run.reference.views)
         raise TiePointError(
-            f"{', '.join(options.reference)}: the reference does not show what the images show (its highest peak "
-            f"stands out by {peak:.1f} standard deviations, {PEAK:g} are needed), and nothing else holds them: check "
-            "its place and the DEM's, or take a finer one"
+            f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else holds the "
+            "images: check its place and the DEM's, or take a finer one"
         )
     adjustment = adjust_tracks(
         run.views,

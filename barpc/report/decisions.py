@@ -200,10 +200,17 @@ def _priors(scene: SceneEntry, summary: Summary) -> list[str]:
         return []
     words = f"Squared corrections are {scene.prior_ratio:.2g} times what the accuracies stated let expect"
     widened = [(view.prior_scale, view.name) for view in summary.views if (view.prior_scale or 1.0) > 1.005]
+    together = (
+        f" Taken as shared by all images, the accuracies stated were widened {scene.prior_shared:.1f} times."
+        if (scene.prior_shared or 1.0) > 1.005
+        else ""
+    )
     if not widened:
-        return [f"{words}: none was widened."]
+        return [f"{words}: none was widened.{together}"]
     scale, worst = max(widened)
-    return [f"{words}: those of {len(widened)} images were widened, {scale:.1f} times at most ({worst})."]
+    return [
+        f"{words}: those of {len(widened)} images were widened, {scale:.1f} times at most ({worst}).{together}"
+    ]
 
 
 def _cut(scene: SceneEntry, views: Sequence[ViewEntry]) -> list[str]:
@@ -231,7 +238,8 @@ def _control(gcps: Sequence[GcpEntry]) -> list[str]:
     words = f"{len(seen) - len(rejected) - undecided} of {len(seen)} GCPs that are seen hold the block"
     if undecided:
         return [f"{words}: they fall into sets that contradict each other, and none outweighs the others."]
-    return [f"{words}; the rest contradicts {listed(rejected, _NAMED)}." if rejected else f"{words}."]
+    by = "the images contradict" if len(rejected) == len(seen) else "the rest contradicts"
+    return [f"{words}; {by} {listed(rejected, _NAMED)}." if rejected else f"{words}."]
 
 
 def _counts(words: Iterable[str | None], by: str = "") -> str:

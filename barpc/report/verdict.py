@@ -153,7 +153,7 @@ def _oddity(i: int, adjustment: Adjustment) -> str:
             why = (
                 f"the heights of the DEM (no --geoid), or {why}"
                 if unstated
-                else f"{why}; or the reference bends"
+                else f"{why}; or the reference bends, or the heights under it do"
             )
         size = max(smooth.rms[i], smooth.shared[i])
         return f"an error of {size:.2f} px that changes {along} is left: {why}"
@@ -344,13 +344,13 @@ def _control_reasons(run: Run) -> list[str]:
     """Ground points that were cut, what was left out of their files, a reference of no use."""
     out = []
     if run.reference is not None and run.adjustment is not None and run.reference.control is None:
-        peak = max((view.peak for view in run.reference.views), default=0.0)
-        out.append(
-            f"The reference does not show what the images show (its highest peak stands out by {peak:.1f} standard "
-            f"deviations, {PEAK:g} are needed): another place, too old, or without texture. It was not used, and moved "
-            "nothing."
+        whys = (
+            "another place, too old, or without texture"
+            if all(view.peak < PEAK for view in run.reference.views)
+            else "the DEM under it is of another place, or it is too old or too coarse"
         )
-    out += _bends(run)
+        out.append(f"The reference {run.reference.refusal}: {whys}. It was not used, and moved nothing.")
+    out += _bends(run) + _wrong_heights(run)
     heights = None if run.adjustment is None else run.adjustment.altimetry
     if heights is not None and heights.why_not:
         counts = (
@@ -359,7 +359,7 @@ def _control_reasons(run: Run) -> list[str]:
         out.append(f"The altimetry holds nothing: {heights.why_not} ({counts}).")
     tested = None if run.adjustment is None else run.adjustment.control
     if run.gcps is not None and tested is not None:
-        for status, words in _CONTROL_WORDS.items():
+        for status, words in () if tested.torn else _CONTROL_WORDS.items():
             names = [
                 f"{name} ({_enu(tested.residual[g])}, w = {tested.w[g]:.1f})"
                 if np.isfinite(tested.w[g])
@@ -371,13 +371,29 @@ def _control_reasons(run: Run) -> list[str]:
                 alike = status == "rejected" and tested.agreed is not None and tested.agreed.alike
                 datum = " They agree with each other: is their datum, or their height, another one?" * alike
                 out.append(f"{words.format(_count(len(names), 'GCP'))}: {listed(names)}.{datum}")
-        out += _undecided(run.gcps.names, tested)
+        out += _undecided(run.gcps.names, tested) + _torn(tested)
         if not tested.fits and not any(tested.status(g) == "contradicts" for g in range(len(tested.used))):
             out.append(
                 f"{_count(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
                 "accuracies are too good, or more than one is wrong."
             )
     return out + [f"{line}." for p in (run.gcps, run.check_points) if p is not None for line in p.left_out]
+
+
+def _wrong_heights(run: Run) -> list[str]:
+    """A reference whose points lie off each other along the lines of sight, where the terrain's errors move them."""
+    if run.reference is None or run.adjustment is None:
+        return []
+    stated = run.adjustment.options.dem_sigma
+    wrong = [view for view in run.reference.views if view.points and view.shows_heights(stated)]
+    named = listed([f"{metres(view.along)} in {view.name}" for view in wrong], _MOST_NAMED)
+    words = (
+        f"The heights of the DEM under the reference are not the terrain's: along the lines of sight its points lie "
+        f"off each other by {named}, as heights wrong by {metres(max((v.heights for v in wrong), default=0.0))} would "
+        f"make them ({metres(stated)} stated). What all of them are wrong by does not show, and moves the scene: check "
+        "the DEM."
+    )
+    return [words] if wrong else []
 
 
 def _bends(run: Run) -> list[str]:
@@ -408,6 +424,17 @@ def _undecided(names: Sequence[str], tested: ControlTest) -> list[str]:
     return [
         f"GCPs contradict each other, and no set of them outweighs the others: {one} against {other}{apart}. None of "
         "them was used: check coordinates, axes, datum and image positions, or add a point."
+    ]
+
+
+def _torn(tested: ControlTest) -> list[str]:
+    """Control that agrees with itself and not with the images."""
+    if not tested.torn:
+        return []
+    without, held = tested.torn
+    return [
+        f"Held by the GCPs the images would agree less with each other: {without:.3f} px became {held:.3f} px at tie "
+        "points that took no part. None of the GCPs was used: check coordinates, image positions and stated accuracies."
     ]
 
 
@@ -548,6 +575,9 @@ def _reference_lines(run: Run) -> list[str]:
         f"Reference: {used} of {tried} points matched at {metres(found.step)} in {_count(len(matched), 'image')}, peak "
         f"{min(view.peak for view in matched):.1f} or more; as delivered they were off by {off}{more}."
     )
+    if matched:
+        pixels = found.step / max(view.gsd for view in matched)
+        text += f" Bends of an image by less than its pixel, {pixels:.2g} px here, it does not tell."
     rest = [view.name for view in found.views if not view.points]
     return [text, f"The reference holds no point of {listed(rest)}."] if rest else [text]
 

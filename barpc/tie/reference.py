@@ -38,6 +38,7 @@ _SHOWN = 0.5, 0.3  # of a block and of the reference around it
 _TILE = 192, 48  # px: points of a tile are looked for together; where the rasters are much finer
 _PIXELS = 20e6  # of a tile in a raster, at most, about
 _LEAST = 12  # points that agree in a view
+_BEYOND = 3.0  # times what is expected. Measured: the terrain's 0.5-1.3, of another place, mirrored, flat 6-9
 _MARGIN, _BACK = 0.1, 1.5  # by which a correlation beats its decoy's; px that the way back may miss by
 _NEAR, _FAR, _ROUNDS = (
     3.0,
@@ -57,6 +58,19 @@ class ViewMatch:
     passed: int = 0  # that beat their decoys and came back
     points: int = 0  # of them, those that agree with each other
     scatter: float = float("nan")  # of those, across the line of sight [m]
+    along: float = float("nan")  # the same along it, where errors of the terrain's heights move points [m]
+    slope: float = 0.0  # how far a metre of height moves them along it [m]
+    gsd: float = float("nan")  # of the view [m]
+
+    @property
+    def heights(self) -> float:
+        """What the terrain's heights would be wrong by, point by point, for points to scatter as they do [m]."""
+        more = max(self.along**2 - self.scatter**2, 0.0)
+        return float(np.sqrt(more) / self.slope) if self.slope > 0 else 0.0
+
+    def shows_heights(self, sigma: float) -> bool:
+        """Whether points scatter along the line of sight as no terrain known to `sigma` [m] lets them."""
+        return bool(self.along > _BEYOND * np.hypot(self.scatter, self.slope * sigma))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +81,21 @@ class Registration:
     views: tuple[ViewMatch, ...]
     step: float  # resolution at which they were matched [m]
     sigma: float  # standard deviation of its own place, along an axis [m]
+
+    @property
+    def refusal(self) -> str:
+        """Why it is no control, in words without an end; for one that is none."""
+        best = max(self.views, key=lambda view: view.peak, default=ViewMatch("", 0.0, (0.0, 0.0)))
+        if best.peak < PEAK:
+            return (
+                f"does not show what the images show (its highest peak stands out by {best.peak:.1f} standard "
+                f"deviations, {PEAK:g} are needed)"
+            )
+        tried, passed = sum(view.tried for view in self.views), max(view.passed for view in self.views)
+        return (
+            f"shows the place of the images (its highest peak stands out by {best.peak:.1f} standard deviations), but "
+            f"of {tried} points looked for there no {_LEAST} of an image agree with each other ({passed} found at most)"
+        )
 
 
 def register(
@@ -260,6 +289,8 @@ class _Work:
         if rows:
             view_of, point, xy, xy_sigma = (np.concatenate(column) for column in zip(*rows, strict=True))
             used, closed = np.unique(point, return_inverse=True)
+            shown = [r.heights for r in reports if r.points and r.shows_heights(height_sigma[0])]
+            height_sigma = max(height_sigma[0], *shown, 0.0), max(height_sigma[1], *shown, 0.0)
             single = np.tile([0.1 * self.step, 0.1 * self.step, height_sigma[0]], (len(used), 1))
             ground = np.column_stack([places[used], heights[used]])
             names = tuple(f"reference_{n}" for n in used)
@@ -324,26 +355,28 @@ class _Work:
         report = replace(report, tried=len(point), passed=int(passed.sum()))
         middle = np.append(places[point].mean(axis=0), view.altitude)
         local = (places[point] - middle[:2]) * metres_per_unit(middle)[:2]
-        sight = sight_enu(view.sensor, middle)[:2]
-        sight = sight / max(float(np.linalg.norm(sight)), 1e-9)
+        sight, up = np.split(sight_enu(view.sensor, middle), [2])
+        aside = max(float(np.linalg.norm(sight)), 1e-9)
+        sight = sight / aside
         turned = np.stack(
             [[sight[1], -sight[0]], sight]
         )  # across it; along it, where the terrain's errors move points
         agreed = _affine(local, found.shift * [self.step, -self.step] @ turned.T, passed, self.step)
         if agreed is None:
             return report, None
-        fitted, keep, scatter = agreed
+        fitted, keep, (scatter, along) = agreed
         xy = np.concatenate([tile.patch.seen(view, tile.at + part.shift) for tile, part in parts])
         east, north = ((fitted @ turned)[keep].mean(axis=0) + report.offset).tolist()
         report = replace(report, offset=(east, north), points=int(keep.sum()), scatter=scatter)
         gsd = float(ground_sample_distance(view.sensor, middle)[1])
+        report = replace(report, along=along, slope=aside / abs(float(up[0])), gsd=gsd)
         return report, (point[keep], xy[keep], np.full(int(keep.sum()), scatter / gsd))
 
 
 def _affine(
     local: Array, shift: Array, passed: BoolArray, step: float
-) -> tuple[Array, BoolArray, float] | None:
-    """An affine (n, 2) through most of the shifts (n, 2), those near it, their standard deviation along the first axis.
+) -> tuple[Array, BoolArray, tuple[float, float]] | None:
+    """An affine (n, 2) through most of the shifts (n, 2), those near it, their standard deviations along both axes.
 
     The search starts where most shifts lie together. None where too few agree.
     """
@@ -359,4 +392,4 @@ def _affine(
             return None
         fitted = design @ np.linalg.lstsq(design[keep], shift[keep], rcond=None)[0]
         scale = 1.4826 * np.median(np.abs(shift - fitted)[keep], axis=0).clip(0.02 * step)
-    return fitted, keep, float(scale[0])
+    return fitted, keep, (float(scale[0]), float(scale[1]))

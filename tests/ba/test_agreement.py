@@ -6,6 +6,7 @@ errors of its own. Whole blocks are the worlds of `benchmarks.worlds_families`, 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import starmap
 from typing import Any
@@ -22,7 +23,9 @@ from barpc.geodesy import enu_basis
 from barpc.options import RunOptions
 from barpc.report import Run, summarize
 from barpc.report.decisions import decisions
+from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
+from benchmarks import worlds_families as families
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import CONTROL, make
 from tests.ba.conftest import INDEPENDENT, centers_of
@@ -181,8 +184,9 @@ def test_what_a_block_says_of_points_has_the_covariance_that_it_states_of_them()
     gcps = block.gcps
     taken: list[Any] = []
 
-    def spy(covariance: Any, given: Any, points: Any) -> Offsets:
-        taken.append((covariance, given.num_tracks, offsets_of(covariance, given, points)))
+    def spy(covariance: Any, given: Any, points: Any, faint: Any) -> Offsets:
+        taken.append((covariance, given.num_tracks, offsets_of(covariance, given, points, faint)))
+        assert (faint[given.num_tracks :] == 100.0).all()
         return taken[-1][2]
 
     with pytest.MonkeyPatch.context() as patch:
@@ -192,6 +196,11 @@ def test_what_a_block_says_of_points_has_the_covariance_that_it_states_of_them()
     covariance, first, offsets = taken[-1]
     enu = enu_basis(gcps.lonlatalt)
     stated = enu @ covariance.points(first + np.arange(4)) @ np.swapaxes(enu, 1, 2)
+    for g, column in enumerate(covariance.reduced.lower[:, first : first + 4].T):
+        lower = np.zeros((3, 3))
+        lower[np.tril_indices(3)] = column[[0, 1, 3, 2, 4, 5]]  # its elements 00, 10, 20, 11, 21, 22
+        of_rays = enu[g] @ np.linalg.inv(lower @ lower.T) @ enu[g].T  # a hundred times as noisy as they are
+        stated[g] -= of_rays * (1.0 - 1e-4)
     whole = stated + gcps.sigma[:, :, None] ** 2 * np.eye(3)
     for g in range(4):  # in the units of the offsets the variance of a point is that of its motions, and one
         moved = offsets.motions[g, :, :-3]
@@ -243,3 +252,133 @@ def test_points_that_none_outweighs_are_undecided_and_agree_with_nothing() -> No
     tested = ControlTest(undecided.used, np.zeros((3, 3)), np.ones(3), np.ones(3), agreed=undecided)
     assert [tested.status(g) for g in range(3)] == ["undecided"] * 3
     assert not tested.agrees
+
+
+# --- what the images say of it ----------------------------------------------------------------------------
+
+
+def raised(block: Any, gcps: GroundPoints) -> tuple[Any, float]:
+    """A block held by control, and what that adds to tie points that took no part [px, in quadrature].
+
+    Beside the same control where its places may be wrong by kilometres: its observations are there, and pull nothing.
+    """
+    one = adjust_tracks(block.views, block.tracks, None, gcps)
+    free = adjust_tracks(block.views, block.tracks, None, replace(gcps, sigma=np.full_like(gcps.sigma, 1e4)))
+    held, without = (float((x.held_out_rms**2).mean()) for x in (one, free))
+    return one, float(np.sqrt(max(held - without, 0.0)))
+
+
+def believing(patch: pytest.MonkeyPatch) -> None:
+    """Let every control point pass as one that agrees with all others."""
+    patch.setattr("barpc.ba.solution.agreement", lambda _, told: Agreement(np.ones(len(told), dtype=bool)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["two of six up", "a wave", "all of them marked beside it in one image"])
+def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, monkeypatch) -> None:
+    block = simulate_block(3, 400, seed=5, num_gcps=6)
+    gcps, xy = block.gcps, block.gcps.xy.copy()
+    lonlatalt = gcps.lonlatalt.copy()
+    if what == "two of six up":
+        lonlatalt[:2, 2] += 40.0
+    elif what == "a wave":
+        lonlatalt[:, 0] += 3e-4 * np.sin(np.arange(6) * 2.5)
+    else:
+        xy[gcps.view == 1] += [2.0, -2.0]
+    wrong = replace(gcps, lonlatalt=lonlatalt, xy=xy)
+    believing(monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr("barpc.ba.solution.is_better", lambda *_: False)
+        torn = raised(block, wrong)[1]
+    one, rise = raised(block, wrong)
+    assert torn > 0.04
+    assert rise < 0.03
+    assert not one.control.used.any()
+    assert len(one.control.torn) == 2
+    assert one.control.torn[1] > one.control.torn[0]
+    assert not one.control.agrees
+    assert (one.gauge.sigma > 3.0).all()  # its place is what the delivered cameras tell
+    run = Run("adjust", block.views, (), block.tracks, adjustment=one, gcps=wrong, options=RunOptions())
+    summary = summarize(run)
+    assert not summary.passed
+    assert any("the images would agree less with each other" in reason for reason in summary.reasons)
+    assert any(line.startswith("Without ground control that agrees") for line in summary.verdict)
+    assert [point.status for point in summary.gcps] == ["rejected"] * 6
+    assert any("; the images contradict gcp_000, " in line for line in decisions(summary))
+
+
+@pytest.mark.parametrize("pixels", [1.0, 10.0])
+def test_control_marked_beside_itself_in_one_image_does_not_move_it(pixels) -> None:
+    block = simulate_block(3, 400, seed=5, num_gcps=6)
+    xy = block.gcps.xy.copy()
+    xy[block.gcps.view == 1] += [pixels, -pixels]
+    one = adjust_tracks(block.views, block.tracks, None, replace(block.gcps, xy=xy))
+    free = adjust_tracks(block.views, block.tracks)
+    np.testing.assert_allclose(one.held_out_rms, free.held_out_rms, atol=0.003)
+    assert one.control.torn
+    assert not one.control.used.any()
+    assert one.apart is None  # its RPC is its own
+
+
+def test_control_that_is_right_is_not_let_go_where_the_images_are_worse_with_it_by_less_than_they_are_asked_to_be(
+    monkeypatch,
+) -> None:
+    block = simulate_block(3, 400, seed=5, num_gcps=6)
+    assert adjust_tracks(block.views, block.tracks, None, block.gcps).control.used.all()
+    monkeypatch.setattr("barpc.ba.solution.is_better", lambda *_: True)  # by however little
+    one = adjust_tracks(block.views, block.tracks, None, block.gcps)
+    assert one.control.used.all()
+    assert not one.control.torn
+
+
+def controlled(seed: int, points: int, views: int, sigma: float, tracks: int) -> Any:
+    """A world with control as it is stated."""
+
+    def plan(_: int, rng: np.random.Generator) -> Any:
+        drawn_plan = families.draw(rng, views, side=(8000, 24000))
+        drawn_plan.tracks = tracks
+        drawn_plan.control = families.Control("as stated", np.zeros((points, 3)), sigma=(sigma,) * 3)
+        drawn_plan.injected.append(families.Injected("none", (), 1, 0, 0, 0.0))
+        return drawn_plan
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(families.FAMILIES, "controlled", plan)
+        return make("controlled", seed)
+
+
+@pytest.mark.slow
+def test_of_forty_worlds_with_control_as_stated_none_loses_it() -> None:
+    unused = 0
+    for seed in range(40):
+        sigma, tracks = (0.3, 0.05)[seed // 4 % 2], (400, 2000, 200)[seed % 3]
+        world = controlled(seed, (6, 20, 40, 4)[seed % 4], (2, 3, 4)[seed // 2 % 3], sigma, tracks)
+        one = adjust_tracks(world.views, world.tracks, None, world.gcps)
+        assert not one.control.torn
+        unused += int((~one.control.used).sum())
+    assert unused <= 2  # of 700
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "views"), [(0, 2), (3, 3), (5, 3)])
+@pytest.mark.parametrize("tracks", [400, 8000])
+@pytest.mark.parametrize("kind", ["bend", "wave", "flat wave", "noise"])
+def test_no_wrong_control_raises_what_tie_points_are_left_with(kind, tracks, seed, views) -> None:
+    world = controlled(seed, 40, views, 0.05, tracks)
+    given = world.gcps.lonlatalt
+    at = given[:, :2] - given[:, :2].mean(axis=0)
+    at /= np.abs(at).max(axis=0)
+    enu = np.zeros((40, 3))
+    if kind == "bend":
+        enu[:, 2] = (at**2).sum(axis=1)
+    elif kind == "wave":
+        enu[:, 2] = np.sin(4.0 * at[:, 0])
+    elif kind == "flat wave":
+        enu[:, :2] = np.column_stack([np.sin(4.0 * at[:, 1]), np.cos(3.0 * at[:, 0])])
+    else:
+        enu = np.random.default_rng(seed).normal(size=(40, 3))
+    metres = np.stack([111e3 * np.cos(np.radians(given[:, 1])), np.full(40, 111e3), np.ones(40)], axis=1)
+    moved = replace(world.gcps, lonlatalt=given + 3.0 * enu / metres)
+    _, rise = raised(world, moved)
+    assert (
+        rise < 0.07
+    )  # ties of a view are worth 0.02 px in all, a camera has nine unknowns: 3 x 0.02 px, and chance

@@ -12,7 +12,9 @@ from barpc.ba.gauge import MOTIONS
 from barpc.ba.incremental import BlockPrior
 from barpc.fit import fit_rpc
 from barpc.geodesy import enu_basis, metres_per_unit
+from barpc.options import RunOptions
 from barpc.report import Run, summarize
+from barpc.report.records import plain
 from barpc.scene import GroundPoints, Tracks
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import Block, simulate_block
@@ -174,3 +176,31 @@ def test_what_the_user_states_of_the_cameras_is_taken_as_stated() -> None:
     )
     assert found.prior.shared == 1.0
     assert of_file.prior.shared > 1.2
+
+
+def test_accuracies_that_are_shared_are_in_the_summary() -> None:
+    block = simulate_block(4, 100, seed=8, per_site=4)
+    views = tuple(replace(view, sensor=replace(view.sensor, err_bias=40.0)) for view in block.views)
+    found = adjust_tracks(views, block.tracks, AdjustOptions(), centers=centers_of(block))
+    assert found.prior.shared > 1.2
+    summary = summarize(Run("adjust", views, (), block.tracks, adjustment=found, options=RunOptions()))
+    assert summary.scene.prior_shared == found.prior.shared
+    assert plain(summary)["scene"]["prior_shared"] == pytest.approx(found.prior.shared)
+
+
+@pytest.mark.slow
+def test_what_delivered_cameras_let_the_scene_be_off_by_is_what_it_is_off_by_held_or_not() -> None:
+    """GCPs find where it was; the points that they hold do not make delivered cameras better."""
+    off = []
+    for seed in range(12):
+        block = simulate_block(3, 300, seed=seed, num_gcps=5)
+        free = adjust_tracks(block.views, block.tracks)
+        held = adjust_tracks(block.views, block.tracks, None, block.gcps)
+        if (
+            max(held.prior.scale.max(), free.prior.scale.max()) == 1.0
+        ):  # without control they are widened with more care
+            np.testing.assert_allclose(held.gauge.delivered_sigma, free.gauge.delivered_sigma, rtol=0.1)
+        off.append(held.gauge.shift / held.gauge.delivered_sigma)
+    rms = np.sqrt(np.square(off).mean(axis=0))
+    assert (rms > 0.5).all()
+    assert (rms < 1.6).all()

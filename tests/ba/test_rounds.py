@@ -206,7 +206,7 @@ def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
 
 
 def passes(
-    monkeypatch, cut: list[int], noise: list[float], prior: list[float], **given: Any
+    monkeypatch, cut: list[int], noise: list[float], prior: list[float], known: bool = False, **given: Any
 ) -> tuple[int, list[int]]:
     """Number of passes where so many of 10,000 observations are cut, such noise is seen and such priors are learnt.
 
@@ -225,7 +225,7 @@ def passes(
             self.problem = Problem(None, None, None, learnt(0), None)  # type: ignore[arg-type]
             self.state: Any = SimpleNamespace(points=None)
             self.options, self.everything, self.use = options, every, every
-            self.passes, self.noise, self.robust, self.is_known = 0, noise[0], options.loss != "linear", True
+            self.passes, self.noise, self.robust, self.is_known = 0, noise[0], options.loss != "linear", known
             self.heights: Any = SimpleNamespace(hold=lambda problem, points: problem)
             self.observations: Any = SimpleNamespace(sigma=np.ones(10_000))
             self.variances: Any = SimpleNamespace(
@@ -234,6 +234,9 @@ def passes(
             self.smooth: Any = SimpleNamespace(test_neighbours=lambda *_: "smooth")
             self.residual = self.weight = np.zeros(1)
             self.found = found
+
+        def _search(self) -> None:
+            pass
 
         def _cut(self) -> None:
             if self.robust:
@@ -279,6 +282,22 @@ def test_rounds_end_where_cut_noise_and_priors_stand(
     monkeypatch, cut, noise, prior, options, expected
 ) -> None:
     assert passes(monkeypatch, cut, noise, prior, **options)[0] == expected
+
+
+@pytest.mark.parametrize(
+    ("cut", "noise", "prior", "expected"),
+    [
+        ([0], [1.0], [1.0], 1),  # what was known before stands
+        ([11], [1.0], [1.0], 2),
+        ([0], [1.0, 1.021], [1.0], 2),
+        ([0], [1.0], [1.0, 1.23], 2),
+        ([10], [1.0, 0.981], [1.0, 0.82], 1),
+    ],
+)
+def test_rounds_that_go_on_from_an_outcome_end_at_once_where_nothing_changes(
+    monkeypatch, cut, noise, prior, expected
+) -> None:
+    assert passes(monkeypatch, cut, noise, prior, known=True)[0] == expected
 
 
 @pytest.mark.parametrize(

@@ -141,6 +141,12 @@ def test_priors_hold_or_were_widened(record):
     assert f"those of 2 images were widened, 3.2 times at most ({record.views[1].name})" in text
     assert "none was widened" not in text
     assert "Squared corrections" not in said(held, prior_ratio=None)
+    assert "Taken as shared" not in text
+    shared = said(held, prior_ratio=0.7, prior_shared=1.84)
+    assert (
+        "none was widened. Taken as shared by all images, the accuracies stated were widened 1.8 times."
+        in shared
+    )
 
 
 def test_the_model_in_the_image_is_said_to_be_better(record):
@@ -236,8 +242,13 @@ def test_chance_is_said_to_put_none_below_a_tenth(record):
 def test_five_points_that_are_rejected_are_named(record):
     wrong = tuple(replace(record.gcps[0], name=f"P{k}", status="rejected", used=False) for k in range(7))
     assert (
-        "0 of 7 GCPs that are seen hold the block; the rest contradicts P0, P1, P2, P3, P4 and 2 more."
+        "0 of 7 GCPs that are seen hold the block; the images contradict P0, P1, P2, P3, P4 and 2 more."
         in said(replace(record, gcps=wrong))
+    )
+    held = (*wrong[:6], replace(wrong[0], name="P6", status="used", used=True))
+    assert (
+        "1 of 7 GCPs that are seen hold the block; the rest contradicts P0, P1, P2, P3, P4 and 1 more."
+        in said(replace(record, gcps=held))
     )
 
 

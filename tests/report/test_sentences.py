@@ -568,6 +568,8 @@ def test_a_reference_is_said_to_hold_what_and_how_far_off_the_cameras_were():
         "were off by 5.0 m (A), 1.0 m (B)." in text
     )
     assert "The reference holds no point of C." in text
+    sharp = replace(one, gsd=0.4)
+    assert "Bends of an image by less than its pixel, 1.2 px here, it does not tell." in lines(sharp)
     assert "So its place is known to 10.0 m, 20.0 m, 5.0 m (east, north, up; one sigma)." in text
     assert "holds no point" not in lines(one, two)
     assert "in 1 image," in lines(one)
@@ -623,6 +625,20 @@ def test_a_reference_on_heights_that_may_be_above_a_geoid_is_told_so_and_not_jit
         told = view_status(a_view("A"), run_of(adjusted(**fields, smooth=smooth)))["advice"]
         assert words in told
         assert ("reference" in told) == ("reference" in words)
+
+
+@pytest.mark.parametrize(("along", "told"), [(5.0, False), (20.0, True)])
+def test_a_reference_on_heights_of_another_place_is_told(along, told):
+    seen = ViewMatch("A", 9.0, (1.0, 0.0), 90, 50, 40, 2.0, along, 0.2, 5.0)
+    other = replace(seen, name="B", along=2.0)
+    found = reasons(reference=Registration(SimpleNamespace(), (seen, other), 10.0, 2.5))
+    assert len(found) == told
+    if told:
+        assert (
+            "points lie off each other by 20.0 m in A, as heights wrong by 99.5 m would make them (2.0 m"
+            in found[0]
+        )
+        assert "B" not in found[0].split("in A")[1]
 
 
 @pytest.mark.parametrize(("scatter", "told"), [(9.9, False), (10.1, True)])

@@ -18,7 +18,7 @@ from barpc.pipeline.views import load_views
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
-from barpc.tie.reference import PEAK, _affine, _Work, peak, register
+from barpc.tie.reference import PEAK, Registration, ViewMatch, _affine, _Work, peak, register
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
@@ -342,14 +342,44 @@ def shifts(agree: int, others: int):
 @pytest.mark.parametrize(("agree", "others"), [(200, 0), (60, 100), (12, 3)])
 def test_most_shifts_lie_about_one_affine(agree, others):
     local, shift, true = shifts(agree, others)
-    fitted, keep, scatter = _affine(local, shift, np.ones(len(local), dtype=bool), 2.0)
+    fitted, keep, both = _affine(local, shift, np.ones(len(local), dtype=bool), 2.0)
     assert not keep[agree:].any()
     assert keep.sum() >= min(agree, max(12, 0.9 * agree))
     np.testing.assert_allclose(fitted[keep], true[keep], atol=0.15)
     if agree > 12:
-        assert 0.05 < scatter < 0.13
-        left = np.abs(shift - fitted)[:, 0]
-        assert scatter == pytest.approx(1.4826 * np.median(left[keep]), rel=1e-3)
+        for axis, scatter in enumerate(both):
+            assert 0.05 < scatter < 0.13
+            left = np.abs(shift - fitted)[:, axis]
+            assert scatter == pytest.approx(1.4826 * np.median(left[keep]), rel=1e-3)
+
+
+def test_points_that_scatter_along_the_line_of_sight_show_what_heights_are_wrong_by():
+    """A fifth of a metre aside for a metre of height: 30 m of wrong heights are 6 m, beside 1 m of finding them."""
+    seen = ViewMatch("A", 9.0, (0.0, 0.0), 90, 50, 40, 1.0, float(np.hypot(1.0, 6.0)), 0.2)
+    assert seen.heights == pytest.approx(30.0)
+    assert seen.shows_heights(8.0)  # 6.1 m beside 3 x 1.9 m
+    assert not seen.shows_heights(10.0)  # 3 x 2.2 m
+    assert not replace(seen, slope=0.0).heights
+    assert not replace(seen, along=2.9, slope=0.0).shows_heights(0.0)  # from right above heights do not show
+    assert replace(seen, along=0.5).heights == 0.0
+    assert not ViewMatch("A", 3.0, (0.0, 0.0)).shows_heights(1.0)
+
+
+def test_what_is_refused_is_refused_for_what_it_lacks():
+    low = (ViewMatch("A", 3.2, (0.0, 0.0)), ViewMatch("B", 5.1, (0.0, 0.0)))
+    assert (
+        "highest peak stands out by 5.1 standard deviations, 6.5 are needed"
+        in Registration(None, low, 5.0, 1.25).refusal
+    )
+    found = (*low, ViewMatch("C", 14.4, (3.0, 0.0), tried=900, passed=9))
+    why = Registration(None, found, 5.0, 1.25).refusal
+    assert "are needed" not in why
+    assert (
+        "stands out by 14.4 standard deviations), but of 900 points looked for there no 12 of an image agree"
+        in why
+    )
+    assert "(9 found at most)" in why
+    assert "by 0.0 standard" in Registration(None, (), 5.0, 1.25).refusal
 
 
 def test_fewer_than_twelve_that_agree_are_none():
@@ -365,5 +395,5 @@ def test_shifts_without_any_scatter_are_good_to_a_thirtieth_of_a_pixel():
     local, _, true = shifts(50, 0)
     fitted, keep, scatter = _affine(local, true, np.ones(50, dtype=bool), 2.0)
     assert keep.all()
-    assert scatter == pytest.approx(1.4826 * 0.02 * 2.0)
+    assert scatter == pytest.approx([1.4826 * 0.02 * 2.0] * 2)
     np.testing.assert_allclose(fitted, true, atol=1e-9)

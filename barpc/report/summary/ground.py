@@ -48,8 +48,8 @@ class GcpEntry(KnownPoint):
     )
     used: bool = said("Whether it holds the block", default=True)
     status: Literal["used", "contradicts", "rejected", "undecided", "not seen"] = said(
-        "used; contradicts: used, and off by more than 4 standard deviations; rejected: not used, the others agree "
-        "without it; undecided: not used, others contradict it and weigh as much",
+        "used; contradicts: used, and off by more than 4 standard deviations; rejected: not used, the others "
+        "or the images agree without it; undecided: not used, others contradict it and weigh as much",
         head="verdict",
         default="used",
     )

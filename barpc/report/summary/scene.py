@@ -155,6 +155,10 @@ class SceneEntry(Record):
     num_held_in_height: Count = said("Tie points seen under too small an angle, held in height")
     gcp_residuals_enu_m: tuple[Vector, ...] = said("Adjusted GCPs minus their given place", "m")
     solver: str = said("What the solver did")
+    prior_shared: Number = said(
+        "Times by which accuracies that RPCs state were widened, as images share what they are off by; 1: not at all",
+        default=1.0,
+    )
     datum: tuple[DatumEntry, ...] = said("What holds the scene", default=())
     dem: DemEntry | None = said("What the DEM did; null without one", default=None)
     altimetry: AltimetryEntry | None = said(
@@ -225,6 +229,7 @@ def measure_scene(run: Run) -> SceneEntry | None:
         drift_degree=adjustment.cameras.unknowns.drift,
         drift_sigma_m=tuple(prior.drift_sigma),
         prior_ratio=prior.ratio,
+        prior_shared=prior.shared,
         cost_history=tuple(adjustment.cost_history),
         num_held_in_height=int(np.count_nonzero(adjustment.held)),
         gcp_residuals_enu_m=adjustment.gcp_residuals.tolist(),
