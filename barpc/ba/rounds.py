@@ -94,14 +94,19 @@ class Rounds:
         # what the same unknowns ended with is gone on with: cut, accuracies, misfit
         self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns
         if known is not None and self.goes_on:
-            self.problem, use = replace(self.problem, camera_prior=known.problem.camera_prior), use & known.inlier
+            self.problem, use = (
+                replace(self.problem, camera_prior=known.problem.camera_prior),
+                use & known.inlier,
+            )
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
         self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
         self.is_known = known is not None
         self.projected = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
-        self.misfit: Array | float = known.smooth.rms if known is not None and self.goes_on and self.robust else 0.0
+        self.misfit: Array | float = (
+            known.smooth.rms if known is not None and self.goes_on and self.robust else 0.0
+        )
         self.scatter: Array | None = None  # residuals without smooth parts, where they are known
         self.weight = self.counted
 
