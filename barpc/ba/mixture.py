@@ -101,22 +101,6 @@ def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
     return out
 
 
-def settled(linear: Linear, residual: Array, fitted: Fit) -> Array:
-    """Residuals (2, K) of the right observations once the ground points have moved to where these are smallest.
-
-    In standard deviations that they would have then; 0 of the wrong ones.
-    """
-    out = np.zeros_like(residual)
-    for tracks in linear.tracks:
-        found = _expect(linear, tracks, residual, fitted.noise, fitted.eps)
-        count, n = tracks.rows.shape
-        spread = (tracks.follow**2).sum(axis=2).reshape(count, -1, 3).sum(axis=2)
-        free = (found.of_subset * (2.0 * tracks.subsets.sum(axis=1) - spread)).sum(axis=1) / (2 * n)
-        off = found.pull(tracks) / np.sqrt(np.maximum(free, 0.1))[:, None] / fitted.noise
-        out[:, tracks.rows] = off.reshape(count, n, 2).transpose(2, 0, 1)
-    return out
-
-
 def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array, BoolArray]:
     """Residuals (2, K) of all observations once the ground points are where the right ones (K,) put them.
 

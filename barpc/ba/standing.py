@@ -76,7 +76,7 @@ class Parts:
         rows[~self.kept_out & ~gone] = inlier & (self.inner.point < block.num_tracks)
         size = np.array([view.size for view in block.views], dtype=np.float64).T
         none = np.zeros((2, int(rows.sum())))
-        found = scan(block.view[rows], block.xy[:, rows], size, gone[rows].astype(np.float64), none)
+        found = scan(block.view[rows], block.xy[:, rows], size, gone[rows].astype(np.float64), none, none[0])
         sure = [one for one in found if one.by_share and one.axis == 1 and one.gain > SURE]
         return [replace(one, moves=True) for one in sure if one.share > 0.5]
 
