@@ -334,7 +334,7 @@ class _Search:
             tried = [row for row in self._tried() if row[2] > SURE]
             if not tried and state is best:  # it explains all
                 return states, True
-            for n in [0, *_rival(tried)] if tried else []:
+            for n in [0, *_rivals(tried)] if tried else []:
                 grown.append(state.added([tried[n], *tried[:n], *tried[n + 1 :]]))
             grown += [] if tried else [replace(state, ended=True)]
         kept: list[_State] = []
@@ -473,12 +473,13 @@ def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
     yield Finding(one.kind, one.view, one.where, size, *said, moved)
 
 
-def _rival(tried: list[_Tried]) -> list[int]:
-    """The best that is another than the first and can be gone on with, where it may be its better with some beside."""
-    for n, row in enumerate(tried):
-        if row[0].kind in FOLLOWED and _differs(row[0], tried[0][0]):
-            return [n] if row[2] > tried[0][2] / _PARTS else []
-    return []
+def _rivals(tried: list[_Tried]) -> list[int]:
+    """The best of other kinds or views than the first that may be its betters with some beside them, and gone on with."""
+    found: dict[tuple[str, int], int] = {}
+    for n, (one, _, gain) in enumerate(tried):
+        if one.kind in FOLLOWED and _differs(one, tried[0][0]) and gain > tried[0][2] / _PARTS:
+            found.setdefault((one.kind, one.view), n)
+    return list(found.values())[: _STATES - 1]
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:
