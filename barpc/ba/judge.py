@@ -474,7 +474,7 @@ def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
 
 
 def _rivals(tried: list[_Tried]) -> list[int]:
-    """The best of other kinds or views than the first that may be its betters with some beside them, and gone on with."""
+    """The best of other kinds or views than the first that are followed, and may be its betters with some beside."""
     found: dict[tuple[str, int], int] = {}
     for n, (one, _, gain) in enumerate(tried):
         if one.kind in FOLLOWED and _differs(one, tried[0][0]) and gain > tried[0][2] / _PARTS:

@@ -19,6 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dtrtri
 
 from barpc.ba.linearised import Linear, Tracks
 from barpc.geodesy import Array
@@ -320,8 +321,8 @@ class Mixture:
             matrix = self._matrix()
             factor = cho_factor(matrix, lower=True, check_finite=False)
             if is_new:
-                inverse = cho_solve(factor, np.eye(len(matrix)), check_finite=False)
-                known = len(matrix) - float(inverse.diagonal() @ self.precision)
+                inverse = np.tril(dtrtri(factor[0], lower=1)[0])
+                known = len(matrix) - float((inverse**2).sum(axis=0) @ self.precision)
             self.x = self.x - cho_solve(factor, self._gradient(seen), check_finite=False)
             settled = self._noise(seen, known) and abs(seen.log - last) < _STANDS[1]
             last = seen.log
