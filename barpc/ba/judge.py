@@ -105,9 +105,9 @@ def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]
 
 def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
     rows, off = _whitened(outcome, block)
-    wrong, told = (~outcome.inlier[rows]).astype(np.float64), _told(outcome, block)[rows]
+    right = outcome.inlier[rows].astype(np.float64)  # of few ties some that were cut make a mean by chance
     pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
-    found = scan(block.view[rows], block.xy[:, rows], _sizes(block), wrong, off, told, floor / pixel)
+    found = scan(block.view[rows], block.xy[:, rows], _sizes(block), 1.0 - right, off, right, floor / pixel)
     return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
 
 

@@ -76,8 +76,8 @@ def test_a_spline_that_is_subtracted_makes_it_worse():
     made = scene("jitter 0.5 at 1 Hz", 1, tracks=1500)
     found, after = solved("jitter 0.5 at 1 Hz", 1, tracks=1500)
     turned = [
-        Splined(sensor.sensor, replace(sensor.correction, coeffs=-sensor.correction.coeffs))
-        for sensor in found.sensors
+        Splined(sensor.sensor, replace(one, coeffs=-one.coeffs, swings=-one.swings, moved=-one.moved))
+        for sensor, one in ((sensor, sensor.correction) for sensor in found.sensors)
     ]
     without = judge(made, found.bases)
     assert judge(made, turned).across > 1.8 * without.across > 20 * after.across
