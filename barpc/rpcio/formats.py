@@ -64,6 +64,7 @@ _SYNTAXES = (
     Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"'), xml.read_gdal),
     Format("yaml", (), _has(r"(?m)^[ \t]++line_num_coeff:"), text.read_yaml),
     Format("envi", (), _has(r"(?im)^[ \t]*+rpc info\s*+=\s*+\{"), text.read_envi),
+    Format("bare", (), text.bare, text.read_bare),
     Format("alos", (), _has(r"\A[\d+\-. ]{66}[\d+\-. Ee]{960}"), text.read_alos),
 )
 FORMATS: dict[str, Format] = {row.name: row for row in _SYNTAXES}

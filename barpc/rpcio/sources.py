@@ -20,7 +20,7 @@ from barpc.rpcio.text import decode, read_nitf
 from barpc.rpcio.tiff import read_tag
 from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head
+from barpc.sidefile import IMAGE, RPC_FILE, encoding_of, read_bytes, read_head
 from barpc.vrt import MAGIC, read_vrt
 
 
@@ -101,6 +101,9 @@ def _names(name: str) -> Iterator[tuple[str, str, bool]]:
             yield "alos", f"RPC{stem[cut:]}.txt", True
     yield "pam", f"{name}.aux.xml", False
     yield "geom", f"{stem}.geom", False
+    yield "rpb", f"{name}.RPB", False  # names that GDAL does not look for
+    yield "rpb", f"{stem}_RPB.TXT", False
+    yield "txt", f"{stem}-RPC.txt", False
 
 
 def _holds_rpc(path: Place, kind: str) -> bool:
@@ -172,7 +175,10 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     path = place(path)
     options = ReadOptions(first_pixel, band)
     head = read_head(path, IMAGE, 64)
-    if b"\0" in head or driver_of(head) not in (None, "VRT"):  # no RPC text holds a zero byte near its start
+    text = (
+        encoding_of(head)[:6] == "utf-16" or b"\0" not in head
+    )  # no other text holds a zero byte near its start
+    if not text or driver_of(head) not in (None, "VRT"):
         return _image_source(path, head, options)
     if _is_vrt(head) and isinstance(path, Path):
         items = read_vrt(path).metadata.get("RPC")
