@@ -224,11 +224,13 @@ def _open_terrasar(path: Place) -> Camera:
 
 def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
     """The XML of a SICD image, or a NITF that holds it."""
-    if b"<SICD" in head or not head.startswith(b"NITF02.10") or not isinstance(path, Path):
-        return b"<SICD" in head
-    from barpc.sensor.sicd import find_sicd
+    if b"SICD" not in head and not head.startswith(b"NITF02.10"):
+        return False
+    from barpc.sensor.sicd import find_sicd, is_sicd
 
-    return find_sicd(path) is not None
+    return is_sicd(head) or (
+        head.startswith(b"NITF02.10") and isinstance(path, Path) and find_sicd(path) is not None
+    )
 
 
 def _open_sicd(path: Place) -> Camera:
