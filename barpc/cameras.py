@@ -28,6 +28,7 @@ from barpc.sensor.rpc import RPC
 from barpc.sidefile import IMAGE, read_head
 
 _HEAD = 4096
+_ON_EARTH = (-500.0, 9000.0)  # m: all ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +243,23 @@ def _open_sicd(path: Place) -> Camera:
     return Camera(model, path, "sicd", model.size, model.alt_range)
 
 
+def _is_csm(_path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
+    if b"USGS_ASTRO_" not in head and b'"m_' not in head:
+        return False
+    from barpc.sensor.csm import is_state
+
+    return is_state(head)
+
+
+def _open_csm(path: Place, altitudes: tuple[float, float] = _ON_EARTH) -> Camera:
+    from barpc.sensor.csm import open_state
+
+    if not isinstance(path, Path):
+        raise ImageError(f"{path}: a camera's state is read from disk only")
+    model, size = open_state(path)
+    return Camera(model, path, "csm", size, altitudes)
+
+
 def _is_grid(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
     return driver_of(head) == "GTiff" and ("altitudes" in choices or correspondence_kind(path) == "grid")
 
@@ -297,7 +315,7 @@ def _stated_altitudes(file: Path) -> tuple[float, float]:
             return altitude_range(read_rpc_source(file.parent / name).rpc)
         except (ImageError, RpcError):
             continue
-    return -500.0, 9000.0
+    return _ON_EARTH
 
 
 _YES_NO = {"yes": True, "no": False}.__getitem__
@@ -334,6 +352,7 @@ OPENERS: dict[str, Opener] = {
             "bistatic": {"annotated": "annotated", "full": "full"}.__getitem__,
         },
     ),
+    "csm": Opener(_is_csm, _open_csm, {"altitudes": _interval}, whole=True),
     "terrasar-x": Opener(_is_terrasar, _open_terrasar),
 }
 """Kind -> how it is told from others and opened. The last row that knows a file has it; the first takes any."""

@@ -91,6 +91,7 @@ ARRAYS = Kind("an archive of arrays", 1024 * MB)
 GEOJSON = Kind("a GeoJSON file", 256 * MB, between=_OF_JSON)
 OPTIONS = Kind("an options file", MB)
 NAMES = Kind("a list of names", 16 * MB)
+STATE = Kind("a camera's state", 64 * MB, RpcFormatError, between=_OF_JSON)
 SUMMARY = Kind("a run's summary", 512 * MB, between=_OF_JSON)
 
 
