@@ -21,6 +21,7 @@ from barpc.ba.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.dem import Dem
 from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.fit import RpcFit, fit_rpc
+from barpc.fit.rpc import innermost
 from barpc.handoff import unverified
 from barpc.identity import Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions
@@ -437,7 +438,9 @@ def fit_group(
             warnings.simplefilter("always", BarpcWarning)
             fit, error = None, ""
             try:
-                fit = fit_rpc(model, size, alt_range, options=options, strict=strict)
+                # what a physical camera does beyond an RPC is its own: grids hold it
+                wanted = strict and isinstance(innermost(model), RPC)
+                fit = fit_rpc(model, size, alt_range, options=options, strict=wanted)
             except FitError as failed:
                 error = str(failed)
         out.append((fit, error, tuple(str(one.message) for one in caught)))
