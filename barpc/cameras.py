@@ -19,7 +19,7 @@ from barpc.raster import driver_of, open_raster
 from barpc.remote import Place, located, place
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
-from barpc.rpcio.sources import metadata_beside
+from barpc.rpcio.sources import described, metadata_beside, only_physical
 from barpc.sensor import SensorModel
 from barpc.sensor.correction_grid import GridCorrected
 from barpc.sensor.direct_grid import DirectGrid
@@ -188,7 +188,12 @@ def _pixels(path: Place) -> tuple[int, int] | None:
 
 def _open_rpc(path: Place, first_pixel: float | None = None, band: int = 1) -> Camera:
     source = read_rpc_source(path, first_pixel=first_pixel, band=band)
-    return Camera(source.rpc, source.path, source.format, None, altitude_range(source.rpc), source.notes)
+    size, notes = None, source.notes
+    if source.path == path and source.format in ("xml", "dimap"):  # given alone: it speaks of its whole image
+        size, physical = described(path)
+        if physical:
+            notes = (*notes, "it holds a physical camera model, too: FILE,model=physical")
+    return Camera(source.rpc, source.path, source.format, size, altitude_range(source.rpc), notes)
 
 
 def _is_sentinel1(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
@@ -291,12 +296,15 @@ def _interval(text: str) -> tuple[float, float]:
     return low, high
 
 
-def _is_physical(_path: Place, _head: bytes, choices: Mapping[str, Any]) -> bool:
-    return choices.get("model") == "physical"
+def _is_physical(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
+    """Where it is asked for, or an XML holds it and no RPC."""
+    if "model" in choices or not isinstance(path, Path):
+        return choices.get("model") == "physical"
+    return _VENDORS(head) is not None and only_physical(path)
 
 
 def _open_physical(
-    path: Place, model: str, altitudes: tuple[float, float] | None = None, **choices: Any
+    path: Place, model: str = "physical", altitudes: tuple[float, float] | None = None, **choices: Any
 ) -> Camera:
     from barpc.sensor.linescan import read_linescan
 
@@ -318,6 +326,7 @@ def _stated_altitudes(file: Path) -> tuple[float, float]:
     return _ON_EARTH
 
 
+_VENDORS = re.compile(rb"<(\w+:)?(isd|Dimap_Document)\b").search
 _YES_NO = {"yes": True, "no": False}.__getitem__
 
 OPENERS: dict[str, Opener] = {

@@ -15,7 +15,7 @@ from barpc.errors import BarpcError, ImageError, RpcError, RpcFormatError
 from barpc.raster import driver_of, identify, open_raster
 from barpc.remote import Place, Remote, beside, place
 from barpc.rpcio.fields import ReadOptions
-from barpc.rpcio.formats import FORMATS, files_of, parse
+from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse
 from barpc.rpcio.text import decode, read_nitf
 from barpc.rpcio.tiff import read_tag
 from barpc.rpcio.xml import rpc_from_domain
@@ -72,6 +72,26 @@ def metadata_beside(image: Path) -> Path:
         if name.lower() in present:
             return image.parent / present[name.lower()]
     raise ImageError(f"{image}: no metadata with a physical model beside it ({' or '.join(names[:2])})")
+
+
+def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
+    """Width and height [px] that a vendor's XML states, if it does, and whether it holds a physical model."""
+    text = decode(read_bytes(path, RPC_FILE))
+    found = [
+        re.search(rf"<(?:\w+:)?(?:{tag})>\s*+(\d{{1,7}})\s*+<", text)
+        for tag in ("NUMCOLUMNS|NCOLS", "NUMROWS|NROWS")
+    ]
+    width, height = (int(one[1]) if one is not None else 0 for one in found)
+    return ((width, height) if width and height else None), holds_physical(text)
+
+
+def only_physical(path: Path) -> bool:
+    """Whether an XML holds a physical camera model and no RPC; not of one that cannot be read."""
+    try:
+        text = decode(read_bytes(path, RPC_FILE))
+    except BarpcError:
+        return False
+    return holds_physical(text) and not any(row.sniff(text) for row in FORMATS.values())
 
 
 def _present(image: Place) -> Mapping[str, str]:

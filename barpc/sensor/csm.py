@@ -10,7 +10,7 @@ m_intTimes (l - m_intTimeLines + 0.5). Quaternions are ecef_from_camera, scalar 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -176,8 +176,8 @@ def _sampled(state: _State, what: str, kind: str, width: int, first: float) -> t
             f"{state.name}: m_{what} holds {len(values)} of {stated} numbers; is the file complete?"
         )
     step = state.positive(f"m_dt{kind}", 100.0)
-    times = state.number(f"m_t0{kind}") - first + step * np.arange(len(values) // width)
-    return times, values.reshape(-1, width)
+    times: Array = state.number(f"m_t0{kind}") - first + step * np.arange(float(len(values) // width))
+    return np.asarray(times, np.float64), values.reshape(-1, width)
 
 
 def _look(state: _State, width: int) -> tuple[Array, float]:
@@ -193,7 +193,7 @@ def _look(state: _State, width: int) -> tuple[Array, float]:
     parts = [(part * bend).coef for part in at]
     look = np.stack([np.pad(part, (0, max(map(len, parts)) - len(part))) for part in parts])
     degree = max(1, int(np.flatnonzero(look.any(axis=0)).max(initial=1)))
-    return look[:, : degree + 1], origin
+    return np.asarray(look[:, : degree + 1], np.float64), origin
 
 
 def _frame(state: _State) -> Frame:
@@ -212,4 +212,4 @@ def _frame(state: _State) -> Frame:
     return Frame(center, rotation, plane, state.distortion())
 
 
-_READERS = {LINESCAN: _linescan, FRAME: _frame}
+_READERS: dict[Any, Callable[[_State], Pushbroom | Frame]] = {LINESCAN: _linescan, FRAME: _frame}

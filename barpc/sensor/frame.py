@@ -97,7 +97,7 @@ class Frame(Frozen):
         p = self.rotation.T @ (ecef - self.center[:, None])
         tangents = p[:2] / np.where(p[2] > 0, p[2], np.nan)
         at = tangents * self._farther(np.sqrt((tangents**2).sum(axis=0)))
-        return np.linalg.solve(self.plane[:, :2], at - self.plane[:, 2:]), at, p
+        return np.asarray(np.linalg.solve(self.plane[:, :2], at - self.plane[:, 2:]), np.float64), at, p
 
     def _farther(self, radius: Array) -> Array:
         """By what factor (N,) the place in the focal plane is farther out than the tangents; NaN if nowhere."""
