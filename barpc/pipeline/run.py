@@ -313,7 +313,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     if prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)))
     gcps, checks = (load_gcps(paths, run.views, options) for paths in (options.gcp, options.check_points))
-    centers = tuple(_center(view) for view in run.views)
+    centers = tuple(_center(view, options.adjust.center) for view in run.views)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
         raise TiePointError(
             f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else holds the "
@@ -394,8 +394,8 @@ def _only(run: Run, names: frozenset[str]) -> Run:
     )
 
 
-def _center(view: View) -> CameraCenter:
-    center = camera_center(view.sensor, view.size, view.alt_range)
+def _center(view: View, how: Literal["line", "projective"]) -> CameraCenter:
+    center = camera_center(view.sensor, view.size, view.alt_range, how)
     if center.method == "nominal":
         logger.warning("%s: its camera does not tell where it stands; a nominal centre is used", view.name)
     return center
