@@ -38,7 +38,7 @@ _FLAGS = os.O_RDONLY
 for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # not every system has all
     _FLAGS |= getattr(os, _flag, 0)
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
-_TOLD = 16  # bytes that tell an encoding
+_TOLD, _LETTERS = 16, 4  # bytes that tell an encoding; letters of them, at least
 _LONG = 64 * MB  # what takes longer than two seconds to read and parse says so
 
 
@@ -156,7 +156,7 @@ def encoding_of(head: bytes) -> str:
         ("utf-16-le", head[1:16:2], head[:16:2]),
         ("utf-16-be", head[:16:2], head[1:16:2]),
     ):
-        if zeros and not any(zeros) and all(letters):
+        if len(zeros) >= _LETTERS and not any(zeros) and all(letters):
             return name
     return "utf-8-sig"
 

@@ -394,7 +394,7 @@ def _only(run: Run, names: frozenset[str]) -> Run:
     )
 
 
-def _center(view: View, how: Literal["line", "projective"]) -> CameraCenter:
+def _center(view: View, how: Literal["line", "projective"] = "line") -> CameraCenter:
     center = camera_center(view.sensor, view.size, view.alt_range, how)
     if center.method == "nominal":
         logger.warning("%s: its camera does not tell where it stands; a nominal centre is used", view.name)

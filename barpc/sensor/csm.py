@@ -25,13 +25,15 @@ from barpc.sensor.linescan.samples import Detector, Samples, build, unit
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sidefile import STATE, parse_json, read_text
 
+STATE_END = ".adjusted_state.json"
+"""End of the name of a state, as ASP writes it."""
 LINESCAN, FRAME = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL", "USGS_ASTRO_FRAME_SENSOR_MODEL"
 
 _MOST = 1_000_000  # rows or columns
 _EARTH = 100.0  # m: by which the axes of an Earth's ellipsoid may differ from WGS84's
 _STRAIGHT = 0.01  # rows by which line times may leave a straight line
 _RADIAL = 0  # m_distortionType: 1 - k0 - k1 r^2 - k2 r^4 times the place
-_FLIP = np.diag([1.0, -1.0, -1.0])
+FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def is_state(head: bytes) -> bool:
@@ -143,7 +145,7 @@ def _linescan(state: _State) -> Pushbroom:
     middle = len(rotation) // 2
     look, origin = _look(state, size[0])
     if rotation[middle].as_matrix()[:, 2] @ positions[len(positions) // 2] > 0:  # away from the Earth
-        rotation, look = rotation * Rotation.from_matrix(_FLIP), look * [[-1.0], [1.0]]
+        rotation, look = rotation * Rotation.from_matrix(FLIP), look * [[-1.0], [1.0]]
     samples = Samples(name, times, positions, velocities, ticks, rotation.as_quat(scalar_first=True))
     return build(samples, Detector(look, origin, period, size)).model
 
@@ -208,7 +210,7 @@ def _frame(state: _State) -> Frame:
     plane = state.plane((origin[1], origin[0])) / state.positive("m_focalLength")
     plane[:, 2] += 0.5 * plane[:, :2].sum(axis=1)  # of CSM's (0.5, 0.5) to ours
     if rotation[:, 2] @ center > 0:  # away from the Earth
-        rotation, plane = rotation @ _FLIP, plane * [[-1.0], [1.0]]
+        rotation, plane = rotation @ FLIP, plane * [[-1.0], [1.0]]
     return Frame(center, rotation, plane, state.distortion())
 
 

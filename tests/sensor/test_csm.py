@@ -11,9 +11,11 @@ from scipy.interpolate import BarycentricInterpolator
 from scipy.spatial.transform import Rotation
 
 from barpc.cameras import open_camera
-from barpc.errors import BarpcError, InputError, RpcFormatError
+from barpc.errors import BarpcError, InputError, RpcError, RpcFormatError
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.csm import FRAME, LINESCAN, open_state
+from barpc.sensor.csm_write import is_writable, state_text
 
 State = dict[str, object]
 SIZE = (3000, 4000)
@@ -113,10 +115,10 @@ def _place(state: State, line: float, sample: float, origin: tuple[float, float]
     return np.array([x, y]) * (1.0 - (k[0] + r2 * (k[1] + r2 * k[2])))
 
 
-def _near(values: np.ndarray, start: float, time: float) -> np.ndarray:
+def _near(values: np.ndarray, start: float, step: float, time: float) -> np.ndarray:
     """Lagrange's polynomial through the eight samples around a time."""
-    first = int((time - start) // STEP) - 3
-    nodes = start + STEP * np.arange(first, first + 8)
+    first = min(max(int((time - start) // step) - 3, 0), len(values) - 8)
+    nodes = start + step * np.arange(first, first + 8)
     return BarycentricInterpolator(nodes, values[first : first + 8])(time)
 
 
@@ -134,8 +136,10 @@ def ray(state: State, col: float, row: float) -> tuple[np.ndarray, np.ndarray]:
     time = state["m_intTimeStartTimes"][at] + state["m_intTimes"][at] * late
     origin = (state["m_detectorSampleOrigin"], state["m_detectorLineOrigin"])
     look = -np.array([*(_place(state, 0.0, sample, origin) * state["m_zDirection"]), state["m_focalLength"]])
-    center = _near(np.reshape(state["m_positions"], (-1, 3)), state["m_t0Ephem"], time)
-    quaternion = _near(np.reshape(state["m_quaternions"], (-1, 4)), state["m_t0Quat"], time)
+    center = _near(np.reshape(state["m_positions"], (-1, 3)), state["m_t0Ephem"], state["m_dtEphem"], time)
+    quaternion = _near(
+        np.reshape(state["m_quaternions"], (-1, 4)), state["m_t0Quat"], state["m_dtQuat"], time
+    )
     return center, Rotation.from_quat(quaternion).apply(look)
 
 
@@ -269,3 +273,58 @@ def test_a_delivered_state_is_its_vendor_s_camera_adjusted_by_pixels(shared_data
     moved = camera.model.project(vendor.model.localize(image, np.full(300, 100.0))) - image
     assert np.abs(moved.mean(axis=0)).max() < 3.0  # px; another order of quaternions or lines: thousands
     assert moved.std(axis=0).max() < 0.4
+
+
+# --- written ----------------------------------------------------------------------------------------------
+
+
+def corrected(model: object, rows: int) -> Corrected:
+    """The camera turned by 10 urad, drifting, and moved by metres."""
+    turn, move, drift = [8e-6, -5e-6, 3e-6], [5.0, -3.0, 2.0], [[2e-6, 3e-6, -1e-6]]
+    middle = rows / 2
+    return Corrected(
+        model, Correction(turn, move, model.position(middle), drift, row_offset=middle, row_scale=middle)
+    )
+
+
+@pytest.mark.parametrize(
+    "changes", [{"m_opticalDistCoeffs": [0.0] * 3}, {"m_opticalDistCoeffs": [1e-3, 0.0, 0.0]}]
+)
+@pytest.mark.parametrize("flipped", [False, True])
+def test_a_corrected_camera_is_written_as_a_state_that_the_library_reads_as_meant(changes, flipped, tmp_path):
+    model, _ = open_state(write(linescan(flipped=flipped, **changes), tmp_path / "a.json"))
+    moved = corrected(model, SIZE[1])
+    (tmp_path / "b.json").write_text(state_text(moved, SIZE, (0.0, 1000.0)))
+    again = open_camera(tmp_path / "b.json")
+    rng = np.random.default_rng(4)
+    image, alt = rng.uniform(0, SIZE, (40, 2)), rng.uniform(0.0, 1000.0, 40)
+    ground = moved.localize(image, alt)
+    np.testing.assert_allclose(again.model.project(ground), image, rtol=0, atol=1e-5)
+    text = (tmp_path / "b.json").read_text()
+    assert offset(json.loads(text[text.index("{") :]), ground, image) < 1e-3  # m: pixels of 7
+    off = np.abs(model.project(ground) - image).max()
+    assert off > 0.5  # the correction is seen
+
+
+def test_a_delivered_state_goes_out_again_as_it_came_in(shared_data, tmp_path):
+    """All that ASP's own files hold is in what is written."""
+    camera, given = delivered(shared_data, "1040010074793300.adjusted_state.json")
+    text = state_text(camera.model, camera.size, (-100.0, 2000.0))
+    (tmp_path / "b.json").write_text(text)
+    assert set(json.loads(text[text.index("{") :])) == set(given)
+    assert {k: type(v) for k, v in json.loads(text[text.index("{") :]).items()} == {
+        k: type(v) for k, v in given.items()
+    }
+    again = open_camera(tmp_path / "b.json").model
+    image = np.random.default_rng(0).uniform(0, camera.size, (300, 2))
+    off = again.project(camera.model.localize(image, np.full(300, 500.0))) - image
+    assert np.abs(off).max() < 1e-3
+
+
+def test_only_straight_pushbroom_cameras_are_written(tmp_path):
+    bent, _ = open_state(write(linescan(), tmp_path / "a.json"))  # radial distortion
+    whole, _ = open_state(write(frame(), tmp_path / "b.json"))
+    for model in (bent, whole):
+        assert not is_writable(model)
+        with pytest.raises(RpcError, match="only pushbroom cameras of a straight detector"):
+            state_text(model, SIZE, (0.0, 1000.0))
