@@ -59,9 +59,9 @@ def open_state(path: Path) -> tuple[Pushbroom | Frame, tuple[int, int]]:
     except ValueError as error:
         raise RpcFormatError(f"{path}: no CSM state that can be read ({error})") from error
     state = _State(found if isinstance(found, dict) else {}, str(path))
-    model = state.content.get("m_modelName")
+    model = str(state.content.get("m_modelName"))
     if model not in _READERS:
-        raise InputError(f"{path}: a CSM state of {str(model)[:60]}, read are {' and '.join(_READERS)}")
+        raise InputError(f"{path}: a CSM state of {model[:60]}, read are {' and '.join(_READERS)}")
     axes = np.array([state.number("m_majorAxis"), state.number("m_minorAxis")])
     if not (np.abs(axes - (WGS84_A, WGS84_B)) < _EARTH).all():
         raise InputError(f"{path}: an ellipsoid of {axes[0]:g} and {axes[1]:g} m, which is not the Earth's")
@@ -214,4 +214,4 @@ def _frame(state: _State) -> Frame:
     return Frame(center, rotation, plane, state.distortion())
 
 
-_READERS: dict[Any, Callable[[_State], Pushbroom | Frame]] = {LINESCAN: _linescan, FRAME: _frame}
+_READERS: dict[str, Callable[[_State], Pushbroom | Frame]] = {LINESCAN: _linescan, FRAME: _frame}

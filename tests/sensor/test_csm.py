@@ -201,6 +201,7 @@ LIES: dict[str, tuple[State, str]] = {
         {"m_modelName": "USGS_ASTRO_SAR_SENSOR_MODEL"},
         "state of USGS_ASTRO_SAR_SENSOR_MODEL, read are",
     ),
+    "a model that is a list": ({"m_modelName": [LINESCAN]}, r"state of \['USGS_ASTRO_LINE_SCANNER"),
     "another body": ({"m_majorAxis": 1737400.0}, "not the Earth's"),
     "another distortion": ({"m_distortionType": 4}, "type 4, only radial"),
     "no size": ({"m_nSamples": None}, "m_nSamples is missing"),
