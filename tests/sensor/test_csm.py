@@ -225,7 +225,7 @@ LIES: dict[str, tuple[State, str]] = {
 @pytest.mark.parametrize("lie", LIES)
 def test_a_state_that_lies_is_said_in_one_line(lie, tmp_path):
     change, words = LIES[lie]
-    path = write(linescan(**change), tmp_path / "a.json")
+    path = write(linescan(**change), tmp_path / "a.json", before=f"{LINESCAN}\n")
     with pytest.raises((InputError, RpcFormatError), match=words) as told:
         open_camera(path)
     assert str(told.value).startswith(str(path))
