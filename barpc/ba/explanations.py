@@ -84,14 +84,16 @@ def fade(seen: Seen, interval: Interval) -> list[Explanation]:
     """
     if interval.axis == 0:
         return []
-    size = float(seen.size[1, interval.view])
+    size, own = float(seen.size[1, interval.view]), interval.stop - interval.start
     found = []
     for sign in (1.0, -1.0):
         tried = []
         for origin in (interval.start, interval.stop):
             start, stop = (origin, size) if sign > 0 else (0.0, origin)
             ends = _open_ended(start, stop, size)
-            for length in (stop - start) * _LENGTHS if stop > start else ():
+            # over what is seen to lie off and half of that at least, over the rest of the image at most
+            halved = np.arange(np.ceil(np.log2(max(2.0 * (stop - start) / own, 1.0))) + 1.0)
+            for length in (stop - start) * 0.5**halved if stop > start else ():
                 one = _local(FADE, seen, interval.view, (1, *ends, origin, sign / float(length)), _STRIP)
                 cost = first_guess(seen.few, seen.base, seen.extra, one.extra, one.sigma**-2.0)[2]
                 tried.append((cost - _untouched(seen, one), one))

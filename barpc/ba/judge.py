@@ -27,7 +27,7 @@ from barpc.ba.explanations import (
     sharpened,
 )
 from barpc.ba.linearised import Linear, linearise, numbers
-from barpc.ba.mixture import Fit, fit, off_from_right, settled
+from barpc.ba.mixture import Fit, fit, off_from_right
 from barpc.ba.moving import Found, Ground, Motion, group_of
 from barpc.ba.periods import Swing, swings
 from barpc.ba.rounds import Outcome, revived
@@ -105,10 +105,9 @@ def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]
 
 def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
     rows, off = _whitened(outcome, block)
-    wrong = (~outcome.inlier[rows]).astype(np.float64)
-    off = off * outcome.inlier[rows]
+    wrong, told = (~outcome.inlier[rows]).astype(np.float64), _told(outcome, block)[rows]
     pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
-    found = scan(block.view[rows], block.xy[:, rows], _sizes(block), wrong, off, floor / pixel)
+    found = scan(block.view[rows], block.xy[:, rows], _sizes(block), wrong, off, told, floor / pixel)
     return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
 
 
@@ -137,9 +136,13 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
 def swinging(outcome: Outcome, block: Block) -> list[Swing]:
     """Periods with which the rows of images swing more than chance allows, one of each at most."""
     rows, off = _whitened(outcome, block)
-    # what was cut is seen as well as the rest where others tell its point
-    told = np.bincount(block.point[outcome.inlier], minlength=block.num_points)[block.point] >= 2
-    return swings(block.view[rows], block.xy[1, rows], _sizes(block), told[rows].astype(np.float64), off)
+    return swings(block.view[rows], block.xy[1, rows], _sizes(block), _told(outcome, block)[rows], off)
+
+
+def _told(outcome: Outcome, block: Block) -> Array:
+    """1 for observations (K,) of points that are known: what was cut is seen as well as the rest where others tell."""
+    right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
+    return (right[block.point] >= 2).astype(np.float64)
 
 
 def _whitened(outcome: Outcome, block: Block) -> tuple[BoolArray, Array]:
@@ -331,7 +334,7 @@ class _Search:
             tried = [row for row in self._tried() if row[2] > SURE]
             if not tried and state is best:  # it explains all
                 return states, True
-            for n in [0, *_rival(tried)] if tried else []:
+            for n in [0, *_rivals(tried)] if tried else []:
                 grown.append(state.added([tried[n], *tried[:n], *tried[n + 1 :]]))
             grown += [] if tried else [replace(state, ended=True)]
         kept: list[_State] = []
@@ -348,14 +351,12 @@ class _Search:
         left = (
             linear.left(seen.base.step) + np.einsum("cek,e->ck", seen.extra, seen.base.extra) / linear.sigma
         )
-        wrong, off = (1.0 - seen.base.right)[rows], settled(linear, left, seen.base)[:, rows]
-        view, place = linear.view[rows], seen.place[:, rows]
-        all_off, told = off_from_right(linear, left, seen.base.right)
-        told[rows] |= wrong < 0.5
-        swung = all_off[:, rows] / seen.base.noise
-        periods = swings(view, place[1], seen.size, told[rows].astype(np.float64), swung)
+        wrong, view, place = (1.0 - seen.base.right)[rows], linear.view[rows], seen.place[:, rows]
+        all_off, known = off_from_right(linear, left, seen.base.right)
+        off, told = all_off[:, rows] / seen.base.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
+        periods = swings(view, place[1], seen.size, told, off)
         floor = self.floor / self.sigma / seen.base.noise
-        out = scan(view, place, seen.size, wrong, off, floor)
+        out = scan(view, place, seen.size, wrong, off, told, floor)
         # in a pair more wrong matches at an end explain what was cut there as well, and nothing stands out beside them
         out = [one for one in out if one.gain > SURE] or ([] if self.taken else self.first)
         out = _distinct(out)[:_TRIED]
@@ -406,7 +407,9 @@ class _Search:
     def _members(self, found: Fit, rows: BoolArray) -> Iterator[Explanation]:
         """Parts of images that hold what a group does: rows of one image that lie off move on the ground, too."""
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
-        places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none)
+        places = scan(
+            seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0]
+        )
         best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
         intervals = sorted(best.values(), key=lambda one: -one.gain)[:_HELD_IN]
         return proposed(seen, intervals, [], (MOVING, WANDER))
@@ -470,12 +473,13 @@ def _said(rows: list[_Taken], n: int, seen: Seen) -> Iterator[Finding]:
     yield Finding(one.kind, one.view, one.where, size, *said, moved)
 
 
-def _rival(tried: list[_Tried]) -> list[int]:
-    """The best that is another than the first and can be gone on with, where it may be its better with some beside."""
-    for n, row in enumerate(tried):
-        if row[0].kind in FOLLOWED and _differs(row[0], tried[0][0]):
-            return [n] if row[2] > tried[0][2] / _PARTS else []
-    return []
+def _rivals(tried: list[_Tried]) -> list[int]:
+    """The best of other kinds or views than the first that are followed, and may be its betters with some beside."""
+    found: dict[tuple[str, int], int] = {}
+    for n, (one, _, gain) in enumerate(tried):
+        if one.kind in FOLLOWED and _differs(one, tried[0][0]) and gain > tried[0][2] / _PARTS:
+            found.setdefault((one.kind, one.view), n)
+    return list(found.values())[: _STATES - 1]
 
 
 def _distinct(intervals: list[Interval]) -> list[Interval]:

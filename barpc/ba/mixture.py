@@ -19,6 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dtrtri
 
 from barpc.ba.linearised import Linear, Tracks
 from barpc.geodesy import Array
@@ -98,22 +99,6 @@ def log_likelihoods(linear: Linear, residual: Array, found: Fit) -> Array:
     for tracks in linear.tracks:
         weight = _expect(linear, tracks, residual, found.noise, found.eps)
         out[tracks.rows] = weight.log[:, None]
-    return out
-
-
-def settled(linear: Linear, residual: Array, fitted: Fit) -> Array:
-    """Residuals (2, K) of the right observations once the ground points have moved to where these are smallest.
-
-    In standard deviations that they would have then; 0 of the wrong ones.
-    """
-    out = np.zeros_like(residual)
-    for tracks in linear.tracks:
-        found = _expect(linear, tracks, residual, fitted.noise, fitted.eps)
-        count, n = tracks.rows.shape
-        spread = (tracks.follow**2).sum(axis=2).reshape(count, -1, 3).sum(axis=2)
-        free = (found.of_subset * (2.0 * tracks.subsets.sum(axis=1) - spread)).sum(axis=1) / (2 * n)
-        off = found.pull(tracks) / np.sqrt(np.maximum(free, 0.1))[:, None] / fitted.noise
-        out[:, tracks.rows] = off.reshape(count, n, 2).transpose(2, 0, 1)
     return out
 
 
@@ -336,8 +321,8 @@ class Mixture:
             matrix = self._matrix()
             factor = cho_factor(matrix, lower=True, check_finite=False)
             if is_new:
-                inverse = cho_solve(factor, np.eye(len(matrix)), check_finite=False)
-                known = len(matrix) - float(inverse.diagonal() @ self.precision)
+                inverse = np.tril(dtrtri(factor[0], lower=1)[0])
+                known = len(matrix) - float((inverse**2).sum(axis=0) @ self.precision)
             self.x = self.x - cho_solve(factor, self._gradient(seen), check_finite=False)
             settled = self._noise(seen, known) and abs(seen.log - last) < _STANDS[1]
             last = seen.log

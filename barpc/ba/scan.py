@@ -19,6 +19,7 @@ _STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # all intervals of these
 _WHOLE = BINS - 1  # which of them is all of an image, and no interval
 SURE = 5.0  # nats: an explanation that gains less is none
 _LINE = 0.05  # of the larger extent of residuals: a smaller one is none
+_FOLLOWED = 3  # a constant, a slope and a bend: what a camera follows along an axis
 CLIPPED = 8.0
 """Standard deviations: one residual tells no more."""
 
@@ -45,7 +46,7 @@ def price(views: int) -> float:
 
 
 def scan(
-    view: IntArray, place: Array, size: Array, wrong: Array, off: Array, floor: float = 0.0
+    view: IntArray, place: Array, size: Array, wrong: Array, off: Array, told: Array, floor: float = 0.0
 ) -> list[Interval]:
     """The interval that stands out most, by each statistic, of every view's columns and rows; the best first.
 
@@ -54,36 +55,71 @@ def scan(
     view : (K,)
     place : (2, K), where observations are [px], in images of `size` (2, N)
     wrong : (K,), probability that an observation is wrong
-    off : (2, K), residuals in standard deviations that they would have; 0 of those that are wrong
-    floor : float, what means are let be [the same]: no adjustment is asked to be better
+    off : (2, K), residuals in standard deviations that they would have, of wrong ones, too
+    told : (K,), weights of these; 0 of observations that tell nothing
+    floor : float, what displacements are let be [the same]: no adjustment is asked to be better
     """
-    views = size.shape[1]
+    views, found = size.shape[1], []
     off = np.clip(off, -CLIPPED, CLIPPED)
-    found = []
     for axis in (0, 1):
         bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)
-        rows = np.array([np.ones(len(view)), wrong, *off])
+        rows = np.array([np.ones(len(view)), wrong])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
-        sums = np.pad(sums.reshape(-1, views, BINS).cumsum(axis=-1), ((0, 0), (0, 0), (1, 0)))
-        count, bad, col, row = sums[:, :, _STOPS] - sums[:, :, _STARTS]  # (N, intervals)
-        total, all_bad = sums[:2, :, -1:]
-        both = _shares(count, bad, total, all_bad), _means(count - bad, col, row, floor)
-        for by_share, gain in zip((True, False), both, strict=True):
+        whole = sums.reshape(2, views, BINS)
+        count, bad = _intervals(whole)
+        shares = _shares(count, bad, *whole.sum(axis=2)[..., None])
+        gains, displaced = _displacements(view, bin_, off, told, views, floor)
+        for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[:, _WHOLE] = 0.0
             for v in range(views):
                 at = int(gain[v].argmax())
-                worth = float(gain[v, at]) - price(views)
+                worth, common = float(gain[v, at]) - price(views), float(displaced[v, at])
                 i, j = int(_STARTS[at]), int(_STOPS[at])
                 if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
-                    i, j = (
-                        (0, i) if j == BINS else (j, BINS)
-                    )  # means tell of two parts: the smaller one lies off
+                    i, j = (0, i) if j == BINS else (j, BINS)  # of two parts the smaller one lies off
                 step = size[axis, v] / BINS
-                inside, wrongs, *off_by = (sums[:, v, j] - sums[:, v, i]).tolist()
-                common = float(np.hypot(*off_by) / max(inside - wrongs, 1.0))
+                inside, wrongs = whole[:, v, i:j].sum(axis=1).tolist()
                 ends = float(i * step), float(j * step)
                 found.append(Interval(v, axis, *ends, worth, wrongs / max(inside, 1.0), common, by_share))
     return sorted(found, key=lambda one: -one.gain)
+
+
+def _intervals(bins: Array) -> Array:
+    """Sums (..., intervals) of all intervals of bins (..., `BINS`)."""
+    edges = np.pad(bins.cumsum(axis=-1), [(0, 0)] * (bins.ndim - 1) + [(1, 0)])
+    return np.asarray(edges[..., _STOPS] - edges[..., _STARTS])
+
+
+def _displacements(
+    view: IntArray, bin_: IntArray, off: Array, told: Array, views: int, floor: float
+) -> tuple[Array, Array]:
+    """By how many nats (N, intervals) a displacement of an interval explains residuals, and how large it is.
+
+    The score test beside what a camera follows along an axis: a constant, a slope and a bend are taken off both. What
+    stands out beside a step is its middle; the step itself is what explains it.
+    """
+    at = view * BINS + bin_
+    sums = [np.bincount(at, told * row, views * BINS) for row in (np.ones(len(view)), *off)]
+    count, *shifts = np.array(sums, dtype=np.float64).reshape(3, views, BINS)
+    smooth = np.vander(np.linspace(-1.0, 1.0, BINS), _FOLLOWED, increasing=True)
+    weighted = count[:, :, None] * smooth
+    normal = (
+        np.swapaxes(weighted, 1, 2) @ smooth
+        + 1e-9 * np.eye(_FOLLOWED) * (count.sum(axis=1) + 1.0)[:, None, None]
+    )
+    shift = np.stack(shifts, axis=2)  # (N, bins, 2)
+    followed = smooth @ np.linalg.solve(normal, smooth.T @ shift)
+    left = (off.T - followed[view, bin_]).T * np.sqrt(told)
+    scatter = [[np.bincount(view, a * b, views) for a in left] for b in left]
+    size, axes = np.linalg.eigh(
+        np.moveaxis(np.array(scatter), 2, 0) / (count.sum(axis=1) + 1.0)[:, None, None]
+    )
+    rest = np.swapaxes((shift - count[:, :, None] * followed) @ axes, 1, 2)
+    across = np.moveaxis(_intervals(np.swapaxes(weighted, 1, 2)), 1, 2)  # (N, intervals, 3)
+    own = _intervals(count) - (across @ np.linalg.inv(normal) * across).sum(axis=2)
+    own, score = np.maximum(own, 0.5), _intervals(rest)  # (N, 2, intervals)
+    spread = own[:, None] * np.maximum(size, 1.0)[..., None] + (own * floor)[:, None] ** 2
+    return 0.5 * (score**2 / spread).sum(axis=1), np.hypot(*np.swapaxes(score, 0, 1)) / own
 
 
 def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) -> Array:
@@ -112,15 +148,6 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
             found = count * (np.log(2.0) - entr(share) - entr(1.0 - share))
             out[v] = max(out[v], float(found.max()))
     return out - float(np.log(4 * views))
-
-
-def _means(count: Array, col: Array, row: Array, floor: float) -> Array:
-    """Logarithm of the likelihood ratio of a displacement inside, and another outside, over one of all."""
-    all_of = slice(_WHOLE, _WHOLE + 1)
-    part = count / np.maximum(count[:, all_of], 1.0)
-    inside = np.hypot(col - col[:, all_of] * part, row - row[:, all_of] * part)
-    spread = np.maximum(count * (1.0 - part), 0.5)
-    return np.asarray(0.5 * inside**2 / (spread + (spread * floor) ** 2))
 
 
 def _shares(count: Array, bad: Array, total: Array, all_bad: Array) -> Array:

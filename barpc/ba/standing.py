@@ -76,7 +76,7 @@ class Parts:
         rows[~self.kept_out & ~gone] = inlier & (self.inner.point < block.num_tracks)
         size = np.array([view.size for view in block.views], dtype=np.float64).T
         none = np.zeros((2, int(rows.sum())))
-        found = scan(block.view[rows], block.xy[:, rows], size, gone[rows].astype(np.float64), none)
+        found = scan(block.view[rows], block.xy[:, rows], size, gone[rows].astype(np.float64), none, none[0])
         sure = [one for one in found if one.by_share and one.axis == 1 and one.gain > SURE]
         return [replace(one, moves=True) for one in sure if one.share > 0.5]
 
@@ -132,7 +132,8 @@ def without_moving(
         if one is None or one.moved is None:
             break
         findings = findings[:-1]
-        if options.is_plain:  # what moves may be what the model does not follow
+        # what moves may be what the model does not follow, or the little that is left of what the cameras will
+        if options.is_plain or any(row.gain > one.gain for row in findings):
             break
         less = parts.less(found, one.moved)
         if len(groups) == _GROUPS or not less.is_tied():

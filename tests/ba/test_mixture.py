@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from barpc.ba import linearised, mixture
 from barpc.ba.block import join
 from barpc.ba.linearised import Linear, Tracks, linearise
-from barpc.ba.mixture import Fit, fit, log_likelihoods, off_from_right, settled
+from barpc.ba.mixture import Fit, fit, log_likelihoods, off_from_right
 from barpc.ba.starting import first_state, make_problem
 from barpc.geodesy import Array
 from barpc.options import AdjustOptions
@@ -108,14 +108,6 @@ def test_what_was_put_in_comes_out_warm_or_cold(linear: Linear) -> None:
         np.testing.assert_allclose(one.extra, np.array([8.0, -5.0]) * 0.1, atol=0.05)
     assert found[0].evidence == pytest.approx(found[1].evidence, abs=0.5)
     assert found[0].evidence > fit(moved).evidence + 100.0
-
-
-def test_settled_residuals_have_the_spread_that_is_stated_and_none_where_all_is_wrong(linear: Linear) -> None:
-    found = fit(linear)
-    off = settled(linear, linear.left(found.step), found)
-    assert off[:, found.right > 0.9].std() == pytest.approx(1.0, abs=0.15)
-    none = settled(linear, linear.left(found.step), replace(found, eps=np.full(3, 1.0 - 1e-12)))
-    assert np.abs(none).max() < 1e-3
 
 
 def test_a_track_s_likelihood_falls_where_it_is_displaced(linear: Linear) -> None:

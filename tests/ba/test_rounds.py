@@ -226,6 +226,7 @@ def passes(
             self.state: Any = SimpleNamespace(points=None)
             self.options, self.everything, self.use = options, every, every
             self.passes, self.noise, self.robust, self.is_known = 0, noise[0], options.loss != "linear", known
+            self.goes_on = known
             self.heights: Any = SimpleNamespace(hold=lambda problem, points: problem)
             self.observations: Any = SimpleNamespace(sigma=np.ones(10_000))
             self.variances: Any = SimpleNamespace(
