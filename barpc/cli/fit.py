@@ -61,8 +61,8 @@ def fit(
     r"""Fit an RPC to a camera or to points, and certify it on points that the fit has not seen.
 
     SOURCE is whatever 'barpc info' knows as a camera - an image with an RPC or an RPC file (refitted), a
-    direct-localisation grid, a Sentinel-1 or TerraSAR-X product or annotation, a SICD image, a CSM state - or a table of
-    points (CSV, npz, GeoJSON). Choices stand behind it: 'barpc info --help' lists them.
+    direct-localisation grid, a Sentinel-1 or TerraSAR-X product or annotation, a SICD image, a CSM state - or a table
+    of points (CSV, npz, GeoJSON). Choices stand behind it: 'barpc info --help' lists them.
 
     \b
     Examples:
