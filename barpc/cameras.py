@@ -19,7 +19,7 @@ from barpc.raster import driver_of, open_raster
 from barpc.remote import Place, located, place
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
-from barpc.rpcio.sources import metadata_beside
+from barpc.rpcio.sources import described, metadata_beside, only_physical
 from barpc.sensor import SensorModel
 from barpc.sensor.correction_grid import GridCorrected
 from barpc.sensor.direct_grid import DirectGrid
@@ -28,6 +28,7 @@ from barpc.sensor.rpc import RPC
 from barpc.sidefile import IMAGE, read_head
 
 _HEAD = 4096
+_ON_EARTH = (-500.0, 9000.0)  # m: all ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +188,12 @@ def _pixels(path: Place) -> tuple[int, int] | None:
 
 def _open_rpc(path: Place, first_pixel: float | None = None, band: int = 1) -> Camera:
     source = read_rpc_source(path, first_pixel=first_pixel, band=band)
-    return Camera(source.rpc, source.path, source.format, None, altitude_range(source.rpc), source.notes)
+    size, notes = None, source.notes
+    if source.path == path and source.format in ("xml", "dimap"):  # given alone: it speaks of its whole image
+        size, physical = described(path)
+        if physical:
+            notes = (*notes, "it holds a physical camera model, too: FILE,model=physical")
+    return Camera(source.rpc, source.path, source.format, size, altitude_range(source.rpc), notes)
 
 
 def _is_sentinel1(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
@@ -224,11 +230,13 @@ def _open_terrasar(path: Place) -> Camera:
 
 def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
     """The XML of a SICD image, or a NITF that holds it."""
-    if b"<SICD" in head or not head.startswith(b"NITF02.10") or not isinstance(path, Path):
-        return b"<SICD" in head
-    from barpc.sensor.sicd import find_sicd
+    if b"SICD" not in head and not head.startswith(b"NITF02.10"):
+        return False
+    from barpc.sensor.sicd import find_sicd, is_sicd
 
-    return find_sicd(path) is not None
+    return is_sicd(head) or (
+        head.startswith(b"NITF02.10") and isinstance(path, Path) and find_sicd(path) is not None
+    )
 
 
 def _open_sicd(path: Place) -> Camera:
@@ -238,6 +246,23 @@ def _open_sicd(path: Place) -> Camera:
         raise ImageError(f"{path}: a radar image's metadata are read from disk only")
     model = open_sicd(path)
     return Camera(model, path, "sicd", model.size, model.alt_range)
+
+
+def _is_csm(_path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
+    if b"USGS_ASTRO_" not in head and b'"m_' not in head:
+        return False
+    from barpc.sensor.csm import is_state
+
+    return is_state(head)
+
+
+def _open_csm(path: Place, altitudes: tuple[float, float] = _ON_EARTH) -> Camera:
+    from barpc.sensor.csm import open_state
+
+    if not isinstance(path, Path):
+        raise ImageError(f"{path}: a camera's state is read from disk only")
+    model, size = open_state(path)
+    return Camera(model, path, "csm", size, altitudes)
 
 
 def _is_grid(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
@@ -271,12 +296,15 @@ def _interval(text: str) -> tuple[float, float]:
     return low, high
 
 
-def _is_physical(_path: Place, _head: bytes, choices: Mapping[str, Any]) -> bool:
-    return choices.get("model") == "physical"
+def _is_physical(path: Place, head: bytes, choices: Mapping[str, Any]) -> bool:
+    """Where it is asked for, or an XML holds it and no RPC."""
+    if "model" in choices or not isinstance(path, Path):
+        return choices.get("model") == "physical"
+    return _VENDORS(head) is not None and only_physical(path)
 
 
 def _open_physical(
-    path: Place, model: str, altitudes: tuple[float, float] | None = None, **choices: Any
+    path: Place, model: str = "physical", altitudes: tuple[float, float] | None = None, **choices: Any
 ) -> Camera:
     from barpc.sensor.linescan import read_linescan
 
@@ -295,9 +323,10 @@ def _stated_altitudes(file: Path) -> tuple[float, float]:
             return altitude_range(read_rpc_source(file.parent / name).rpc)
         except (ImageError, RpcError):
             continue
-    return -500.0, 9000.0
+    return _ON_EARTH
 
 
+_VENDORS = re.compile(rb"<(\w+:)?(isd|Dimap_Document)\b").search
 _YES_NO = {"yes": True, "no": False}.__getitem__
 
 OPENERS: dict[str, Opener] = {
@@ -332,6 +361,7 @@ OPENERS: dict[str, Opener] = {
             "bistatic": {"annotated": "annotated", "full": "full"}.__getitem__,
         },
     ),
+    "csm": Opener(_is_csm, _open_csm, {"altitudes": _interval}, whole=True),
     "terrasar-x": Opener(_is_terrasar, _open_terrasar),
 }
 """Kind -> how it is told from others and opened. The last row that knows a file has it; the first takes any."""

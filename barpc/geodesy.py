@@ -188,3 +188,21 @@ def wrap_longitude(lon: npt.ArrayLike, center: npt.ArrayLike = 0.0) -> Array:
     lon = np.asarray(lon, dtype=np.float64)
     turns = np.rint((lon - center) / 360.0)
     return lon - 360.0 * turns
+
+
+def reach(origin: Array, direction: Array, alt: Array) -> Array:
+    """Ground points (N, 3) where lines from points (3, N) [m] along unit vectors (3, N) come down to altitudes (N,).
+
+    NaN where they miss.
+    """
+    axes = np.array([[WGS84_A], [WGS84_A], [WGS84_B]]) + alt
+    o, d = origin / axes, direction / axes
+    a, b, c = (d * d).sum(axis=0), (o * d).sum(axis=0), (o * o).sum(axis=0) - 1.0
+    distance = c / (np.sqrt(b * b - a * c) - b)  # the nearer root, without cancellation
+    for _ in range(2):
+        ground = ground_from_ecef((origin + distance * direction).T)
+        distance += (alt - ground[:, 2]) / (up(ground) * direction).sum(axis=0)
+    ground = ground_from_ecef((origin + distance * direction).T)
+    ground[:, 2] = alt
+    ground[~(distance > 0)] = np.nan
+    return ground

@@ -36,6 +36,7 @@ from barpc.rpcio import Carrier, read_rpc, row_of, sidecars
 from barpc.rpcio.grids import CORRECTION, GRID
 from barpc.sensor import SensorModel
 from barpc.sensor.correction_grid import CorrectionGrid
+from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import image_grid
 from barpc.vrt import Vrt, read_vrt
@@ -154,7 +155,10 @@ def _grid_reading(
 
 def unverified(paths: Sequence[Path | str]) -> list[str]:
     """A sentence for each kind of these files that no installed tool but barpc reads."""
-    kinds = {path.suffix: path for path in map(Path, paths) if not any(_readers(path).values())}
+    files = [
+        path for path in map(Path, paths) if not path.name.endswith(STATE_END)
+    ]  # whose readers are no packages
+    kinds = {path.suffix: path for path in files if not any(_readers(path).values())}
     return [
         f"{path}: only barpc itself has read it ({kind}: {' and '.join(_readers(path)) or 'no other tool'} would, and "
         "is not installed)"
@@ -171,7 +175,7 @@ _MACHINE = frozenset(
 
 def _readers(path: Path) -> dict[str, bool]:
     """The tools besides barpc that read a file, and whether they are installed."""
-    if path.name.endswith((GRID, CORRECTION)):
+    if path.name.endswith((GRID, CORRECTION, STATE_END)):
         return {name: one.installed for name, one in _grid_consumers(path).items() if one.package != "barpc"}
     row = row_of(path)
     return {} if row is None else {name: CONSUMERS[name].installed for name in row.consumers}
@@ -410,6 +414,7 @@ _GRIDS: dict[str, dict[str, Consumer]] = {
         "gdal": Consumer("rasterio", _gdal_correction),
         "barpc": Consumer("barpc", _own_grid),
     },
+    STATE_END: {"barpc": Consumer("barpc", _own_grid)},
     "": {"gdal": Consumer("rasterio", _gdal_raster), "barpc": CONSUMERS["barpc"]},
 }
 

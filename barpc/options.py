@@ -268,6 +268,11 @@ class AdjustOptions(Options):
         """Unknowns of each view; the last three act in the image. `auto`: a rotation and a translation, or an affine in
         the image where they leave a trend that the affine takes away.""",
     )
+    center: Literal["line", "projective"] = option(
+        "line",
+        """What a view turns about: where the rays of its middle line meet, or, as in the paper, the centre of a
+        projective camera over the whole image, at about twice the distance.""",
+    )
     drift: int | None = option(
         None,
         """Degree of the rotation as a polynomial of the image row, 0: constant. Without: 1 for models with a
@@ -579,6 +584,20 @@ class RunOptions(Options):
 
 
 # --- what is made of them ---------------------------------------------------------------------------------
+
+
+PAPER: Mapping[str, Mapping[str, Any]] = {
+    "adjust": {
+        "model": "rotation+translation",
+        "center": "projective",
+        "drift": 0,
+        "jitter": OFF,
+        "learn_priors": False,
+        "solver": "scipy",
+    },
+    "fit": {"method": "lcurve-joint", "space": "ground", "nodes": "uniform", "grid": (20, 20, 10)},
+}
+"""The method of Akiki et al. (2021), beyond which the defaults go: ``with_values(RunOptions(), PAPER)``."""
 
 
 FORMER = {"dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only"}

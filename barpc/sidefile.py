@@ -6,6 +6,7 @@ the open file itself: nothing can be put in its place between the question and t
 
 from __future__ import annotations
 
+import codecs
 import io
 import json
 import logging
@@ -37,6 +38,7 @@ _FLAGS = os.O_RDONLY
 for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # not every system has all
     _FLAGS |= getattr(os, _flag, 0)
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
+_TOLD, _LETTERS = 16, 4  # bytes that tell an encoding; letters of them, at least
 _LONG = 64 * MB  # what takes longer than two seconds to read and parse says so
 
 
@@ -89,6 +91,7 @@ ARRAYS = Kind("an archive of arrays", 1024 * MB)
 GEOJSON = Kind("a GeoJSON file", 256 * MB, between=_OF_JSON)
 OPTIONS = Kind("an options file", MB)
 NAMES = Kind("a list of names", 16 * MB)
+STATE = Kind("a camera's state", 64 * MB, RpcFormatError, between=_OF_JSON)
 SUMMARY = Kind("a run's summary", 512 * MB, between=_OF_JSON)
 
 
@@ -145,9 +148,22 @@ def _regular(path: Path | str, kind: Kind) -> BinaryIO:
     return open(descriptor, "rb")  # noqa: PTH123  (a descriptor, no path)
 
 
+def encoding_of(head: bytes) -> str:
+    """How a text is encoded, by its first bytes: UTF-16 where a byte order mark or zeros between its letters say so."""
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    for name, zeros, letters in (
+        ("utf-16-le", head[1:16:2], head[:16:2]),
+        ("utf-16-be", head[:16:2], head[1:16:2]),
+    ):
+        if len(zeros) >= _LETTERS and not any(zeros) and all(letters):
+            return name
+    return "utf-8-sig"
+
+
 @contextmanager
 def opened_text(path: Path | str, kind: Kind, newline: str | None = None) -> Iterator[TextIO]:
-    """As `opened`, for UTF-8 text, with or without a byte order mark."""
+    """As `opened`, for text in UTF-8, with or without a byte order mark, or UTF-16."""
     with opened(path, kind) as file, _utf8(file, path, kind, newline) as text:
         yield text
 
@@ -155,11 +171,14 @@ def opened_text(path: Path | str, kind: Kind, newline: str | None = None) -> Ite
 @contextmanager
 def _utf8(file: BinaryIO, path: Path | str, kind: Kind, newline: str | None = None) -> Iterator[TextIO]:
     kind.check_numbers(path, file)
+    encoding = encoding_of(file.read(_TOLD))
+    file.seek(0)
     try:
-        with io.TextIOWrapper(file, encoding="utf-8-sig", newline=newline) as text:
+        with io.TextIOWrapper(file, encoding=encoding, newline=newline) as text:
             yield text
     except UnicodeDecodeError as error:
-        raise kind.error(f"{path}: not a UTF-8 text, so not {kind.words} ({error.reason})") from error
+        name = "UTF-16" if "16" in encoding else "UTF-8"
+        raise kind.error(f"{path}: not a {name} text, so not {kind.words} ({error.reason})") from error
 
 
 def read_bytes(path: Path | str, kind: Kind) -> bytes:

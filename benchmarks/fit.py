@@ -17,7 +17,7 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -34,6 +34,7 @@ from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic, vendor
 
+Space = Literal["image", "ground"]
 PECULIAR = "rpc_formats/md_ov_rpc.txt"
 
 
@@ -59,9 +60,11 @@ class Peer:
         return RPC(coeffs, ground_offset, ground_scale, image_offset, image_scale)
 
 
-def grid_of(camera: Camera, grid: tuple[int, int, int]) -> tuple[Array, Array, Array, Array]:
-    """Control and check points of a uniform image-space grid: ground and image of each."""
-    options = FitOptions(grid=grid, nodes="uniform")
+def grid_of(
+    camera: Camera, grid: tuple[int, int, int], space: Space = "image"
+) -> tuple[Array, Array, Array, Array]:
+    """Control and check points of a uniform grid over an image, or a box around it: ground and image of each."""
+    options = FitOptions(grid=grid, nodes="uniform", space=space)
     ground, image = control_points(camera.model, camera.size, camera.alt_range, options)
     check = ground
     for axis in range(3):

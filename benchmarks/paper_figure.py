@@ -3,9 +3,11 @@
 Area: squares around the middle of the image, up to its shorter side, 50 x 50 x 10 control points in each. Grid length:
 n x n x 10 points over the whole image. Check points lie in the middle of the control points' cells. Optical: every
 vendor's RPC behind 30 microradians and 10 m. Radar: the paper's Sentinel-1 points (20 x 20 x 10 at most), cut around
-their middle or thinned, on its own test points. RMSE over col and row: a thin line a file, mean and standard deviation.
+their middle or thinned, on its own test points; and whole Sentinel-1 images of three swaths, mosaicked, their parts of
+the same shape. RMSE over col and row: a thin line a file, mean and standard deviation.
 
     python benchmarks/paper_figure.py --data DATA --rpcfit SITE_PACKAGES -o docs/figures/paper_figure.svg
+    python benchmarks/paper_figure.py --data DATA --rpcfit SITE_PACKAGES --sensors swaths
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ from barpc.fit import FitOptions, fit_rpc_points
 from barpc.geodesy import Array
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
-from benchmarks.fit import Peer, grid_of, rms
+from barpc.sensor.sentinel1 import Annotation, mosaic, read_annotation
+from benchmarks.fit import Peer, Space, grid_of, rms
 from tests.fit.cameras import Camera, vendor
 
 LENGTHS = (5, 7, 10, 15, 20, 30, 40, 50)
@@ -38,6 +41,12 @@ LONGEST, RADAR_LENGTH = 50, 20
 """Grid lengths of the paper's experiment on areas, and of its radar points."""
 Fit = Callable[[Array, Array], RPC]
 Points = tuple[Array, Array, Array, Array]
+
+
+def paper(ground: Array, image: Array) -> RPC:
+    """The paper's solver as kept here."""
+    options = FitOptions(tolerance=10.0, method="lcurve-joint")
+    return fit_rpc_points(ground, image, options=options, strict=False).rpc
 
 
 def ours(ground: Array, image: Array) -> RPC:
@@ -68,6 +77,34 @@ def optical(camera: Camera, length: int, share: float | None) -> Points:
         corner = np.floor((np.array(camera.size) - side) / 2)
         camera = replace(camera, size=(side, side), model=Window(camera.model, corner))
     return grid_of(camera, (length, length, 10))
+
+
+@dataclass(frozen=True)
+class Swaths:
+    """The mosaic of three swaths."""
+
+    name: str
+    model: SensorModel
+    size: tuple[int, int]
+    alt_range: tuple[float, float]
+
+
+def three_swaths(data: Path, altitudes: tuple[float, float] | None = None) -> list[Swaths]:
+    """Every whole image of three swaths, over the altitudes of its scene, or others."""
+    products: dict[str, list[Annotation]] = {}
+    for path in sorted((data / "radar" / "s1_three_swaths").glob("*_iw?.xml")):
+        products.setdefault(path.stem[17:48], []).append(read_annotation(path))
+    models = {name: mosaic(swaths) for name, swaths in products.items()}
+    return [Swaths(name, m, m.size, altitudes or m.alt_range) for name, m in models.items()]
+
+
+def swath(camera: Swaths, length: int, share: float | None, space: Space) -> Points:
+    """Control and check points of a part of the image around its middle, or of all of it."""
+    full = np.array(camera.size)
+    part = np.round(full * np.sqrt(share or 1.0)).astype(int)
+    corner = np.floor((full - part) / 2)
+    cut = replace(camera, size=(int(part[0]), int(part[1])), model=Window(camera.model, corner))
+    return grid_of(cut, (length, length, 10), space)
 
 
 def radar(data: Path, length: int, share: float | None) -> Points:
@@ -106,11 +143,23 @@ def main() -> None:
     )
     parser.add_argument("--rpcfit", metavar="DIR", help="site-packages folder that holds rpcfit")
     parser.add_argument("--every", type=int, default=1, help="take every so many optical files")
+    parser.add_argument(
+        "--sensors", nargs="+", default=["optical", "points", "swaths"], help="which of these"
+    )
+    parser.add_argument(
+        "--altitudes", nargs=2, type=float, help="of the three swaths, in place of the scene's [m]"
+    )
+    parser.add_argument(
+        "--space", choices=("image", "ground"), default="image", help="grids of the three swaths"
+    )
     parser.add_argument("--longest", type=int, default=LONGEST, help="largest grid length")
     parser.add_argument("-o", "--output", type=Path, help="figure to write (svg, png)")
     args = parser.parse_args()
-    cameras = vendor(args.data)[:: args.every]
-    fits: dict[str, Fit] = {"barpc": ours}
+    cameras = vendor(args.data)[:: args.every] if "optical" in args.sensors else []
+    images = (
+        three_swaths(args.data, args.altitudes and tuple(args.altitudes)) if "swaths" in args.sensors else []
+    )
+    fits: dict[str, Fit] = {"barpc": ours, "barpc, lcurve-joint": paper}
     if args.rpcfit:
         fits["rpcfit"] = Peer(args.rpcfit).fit
     lengths = [n for n in LENGTHS if n <= args.longest]
@@ -121,16 +170,22 @@ def main() -> None:
     results: dict[tuple[str, str, str], Array] = {}
     for sweep, (settings, values) in sweeps.items():
         for name, fit in fits.items():
-            found = {
-                "optical": [[error(fit, optical(c, n, s)) for c in cameras] for n, s in settings],
-                "Sentinel-1": [
+            found: dict[str, tuple[list[list[float]], list[str]]] = {}
+            if cameras:
+                errors = [[error(fit, optical(c, n, s)) for c in cameras] for n, s in settings]
+                found["optical"] = errors, [c.name for c in cameras]
+            if "points" in args.sensors:
+                errors = [
                     [error(fit, radar(args.data, n, s))] if s or n <= RADAR_LENGTH else [np.nan]
                     for n, s in settings
-                ],
-            }
-            for sensor, table in found.items():
+                ]
+                found["Sentinel-1"] = errors, ["points"]
+            if images:
+                errors = [[error(fit, swath(c, n, s, args.space)) for c in images] for n, s in settings]
+                found["three swaths"] = errors, [c.name for c in images]
+            for sensor, (table, names) in found.items():
                 results[sensor, sweep, name] = np.array(table)
-                tell(f"{sensor}, {sweep}, {name}", values, np.array(table), [c.name for c in cameras])
+                tell(f"{sensor}, {sweep}, {name}", values, np.array(table), names)
     if args.output:
         draw(results, {name: xs for name, (_, xs) in sweeps.items()}, args.output)
 
@@ -157,10 +212,13 @@ def draw(results: dict[tuple[str, str, str], Array], axes: dict[str, list[float]
     matplotlib.rcParams["svg.hashsalt"] = "barpc"
     import matplotlib.pyplot as plt
 
-    figure, panels = plt.subplots(2, 2, figsize=(8.5, 6.0), sharey="row", layout="constrained")
-    colors = {"barpc": "tab:blue", "rpcfit": "tab:red"}
+    sensors = list(dict.fromkeys(sensor for sensor, _, _ in results))
+    figure, panels = plt.subplots(
+        len(sensors), 2, figsize=(8.5, 3.0 * len(sensors)), sharey="row", layout="constrained", squeeze=False
+    )
+    colors = {"barpc": "tab:blue", "barpc, lcurve-joint": "tab:green", "rpcfit": "tab:red"}
     for (sensor, sweep, name), value in results.items():
-        panel = panels[["optical", "Sentinel-1"].index(sensor), list(axes).index(sweep)]
+        panel = panels[sensors.index(sensor), list(axes).index(sweep)]
         rows = np.ma.masked_invalid(value)
         mean, spread = rows.mean(axis=1), rows.std(axis=1)
         panel.plot(axes[sweep], mean, color=colors[name], label=f"{name}, mean", marker=".", linewidth=2)

@@ -32,6 +32,7 @@ from barpc.errors import AdjustError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.options import AUTO, AdjustOptions
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
+from barpc.sensor.geometry import camera_center
 
 _WORTH = 0.004  # px that an affine must take away: it leaves the tilts of the scene open
 _CLEARLY_BETTER = 0.9  # the same, where the drift that was learnt is no drift
@@ -88,6 +89,8 @@ def adjust_tracks(
     """
     start = time.process_time()
     options = AdjustOptions() if options is None else options
+    if centers is None and options.center != "line":
+        centers = np.array([camera_center(v.sensor, v.size, v.alt_range, options.center).ecef for v in views])
     block = join(tuple(views), tracks, gcps, options, keep_largest, reference)
     rows = keep_out(block) if hold_out else np.zeros_like(block.use)
     parts = Parts(block, rows, np.zeros(len(rows), dtype=np.int64))

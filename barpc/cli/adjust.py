@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.cli.images import Config, corrected, expanded, read_config, with_cameras
-from barpc.cli.options import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, run_options, with_flags
+from barpc.cli.options import (
+    ADJUSTMENT,
+    MATCH,
+    RUN,
+    TIE,
+    Grouped,
+    image_paths,
+    paper,
+    run_options,
+    with_flags,
+)
 from barpc.cli.progress import executor_for, progress_told
 from barpc.cli.terminal import echo, print_comparison, print_summary, say, tell_gate
 
@@ -34,6 +44,7 @@ _out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="F
     help="Images and cameras of a configuration of s2p, cars (both are written back with the corrected cameras) or "
     "sat-bundleadjust.",
 )
+@paper
 @with_flags(*RUN, *TIE, *ADJUSTMENT)
 @click.pass_obj
 def adjust(

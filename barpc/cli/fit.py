@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.options import flag, run_options
+from barpc.cli.options import flag, paper, run_options
 from barpc.cli.terminal import as_json, echo, say, tell_gate
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 @flag("fit.tolerance")
 @flag("fit.pole_margin")
 @flag("fit.localisation")
+@paper
 @click.option("--options", "options_file", metavar="FILE", help="TOML file; its table [fit] counts here.")
 @click.option("--keep-going", is_flag=True, help="Write the RPC although it misses the tolerance; exit 3.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
@@ -60,8 +61,8 @@ def fit(
     r"""Fit an RPC to a camera or to points, and certify it on points that the fit has not seen.
 
     SOURCE is whatever 'barpc info' knows as a camera - an image with an RPC or an RPC file (refitted), a
-    direct-localisation grid, a Sentinel-1 or TerraSAR-X product or annotation, a SICD image - or a table of points
-    (CSV, npz, GeoJSON). Choices stand behind it: 'barpc info --help' lists them.
+    direct-localisation grid, a Sentinel-1 or TerraSAR-X product or annotation, a SICD image, a CSM state - or a table
+    of points (CSV, npz, GeoJSON). Choices stand behind it: 'barpc info --help' lists them.
 
     \b
     Examples:

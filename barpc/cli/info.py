@@ -59,9 +59,10 @@ def info(
 
     The azimuth is that of the direction from the ground to the sensor, clockwise from north. A pair's convergence
     angle is taken at the first image's centre, or at --at. An IMAGE is a file with an RPC, a Sentinel-1 or TerraSAR-X
-    product or annotation, a SICD image (XML or NITF), or a localisation grid; choices stand behind it:
+    product or annotation, a SICD image (XML or NITF), a CSM state, or a localisation grid; choices stand behind:
     ",size=W:H" and ",camera=FILE" (all); ",first_pixel=0.5" and ",band=2" (RPC); ",swath=iw1" (or mosaic),
-    ",pol=vv", ",burst=3", ",orbit=X.EOF", ",atmosphere=yes", ",bistatic=full" (Sentinel-1); ",altitudes=0:500" (grid).
+    ",pol=vv", ",burst=3", ",orbit=X.EOF", ",atmosphere=yes", ",bistatic=full" (Sentinel-1); ",altitudes=0:500"
+    (grid, CSM).
     ",model=physical" takes the orbit and attitude in Maxar's or Airbus' XML, given or beside an image, in place of the
     RPC; with it ",aberration=no", ",refraction=no", ",band=N", ",altitudes=0:500".
 

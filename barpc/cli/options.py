@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_args, get_origin
 import click
 
 from barpc.errors import InputError
-from barpc.options import Declared, RunOptions, checked, declared, read_options, with_values
+from barpc.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -147,6 +147,14 @@ def _shown(default: Any) -> str:
     return ",".join(default) if isinstance(default, tuple) else str(default)
 
 
+paper = click.option(
+    "--paper",
+    is_flag=True,
+    help="The method of Akiki et al. (IGARSS 2021) whole: one rotation and translation about a projective centre, no "
+    "drift, no splines, least_squares, RPCs by the joint L-curve on a grid in lon and lat. Options, other flags win.",
+)
+
+
 def with_flags(*targets: str) -> Callable[[Function], Function]:
     """Give a verb the flags of these fields, and those of every run: image and options files, workers, JSON."""
 
@@ -203,8 +211,9 @@ def image_paths(images: tuple[str, ...], image_list: str | None) -> list[str]:
 
 
 def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOptions:
-    """Defaults, then the options file, then the flags that were given."""
-    options = RunOptions() if options_file is None else read_options(options_file)
+    """Defaults, or the paper's options, then the options file, then the flags that were given."""
+    options = with_values(RunOptions(), PAPER if flags.get("paper") else {})
+    options = options if options_file is None else read_options(options_file, options)
     values: dict[str, Any] = {}
     for target in (*TIE, *ADJUSTMENT, *RUN, REMOTE, "fit.tolerance", "fit.localisation"):
         value = flags.get(_parameter(target))

@@ -11,9 +11,9 @@ takes for noise. Denominators stay above a tenth over the hull of the points and
 ``minimax``: from there on the least largest error, by least squares whose weights grow with the errors (Lawson,
 "Contributions to the theory of linear least maximum approximation", 1961).
 
-``lcurve``, the paper's solver (Akiki et al. 2021, section 3): one h from the corner of the L-curve, then weighted and
-ICCV iterations. All unknowns are penalised alike, as in the paper; its singular value decompositions are taken of
-the compressed system, which has the same singular values.
+``lcurve-joint``, the paper's solver (Akiki et al. 2021, section 3): one h from the corner of the L-curve, then weighted
+and ICCV iterations; ``lcurve``: the same for col and row apart. All unknowns are penalised alike, as in the paper; its
+singular value decompositions are taken of the compressed system, which has the same singular values.
 """
 
 from __future__ import annotations

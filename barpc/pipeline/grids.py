@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from barpc.atomic import write_text
 from barpc.errors import BarpcError, BarpcWarning, FitError, OutputError, RpcError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.certificate import Sample
@@ -30,6 +31,9 @@ from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import ImageAffine, ImageCorrected
 from barpc.sensor.correction_grid import CorrectionGrid, GridCorrected
+from barpc.sensor.csm import STATE_END as STATE
+from barpc.sensor.csm import open_state
+from barpc.sensor.csm_write import is_writable, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress, ordered
@@ -58,10 +62,11 @@ class Files:
 
     grids: bool
     resampled: bool
+    state: bool = False
 
     def names(self, view: View) -> list[str]:
         """Their names."""
-        ends = [GRID] * self.grids + [CORRECTION] * (self.grids or self.resampled)
+        ends = [STATE] * self.state + [GRID] * self.grids + [CORRECTION] * (self.grids or self.resampled)
         return [view.name + end for end in (*ends, *[RESAMPLED] * self.resampled)]
 
 
@@ -69,7 +74,8 @@ def grid_names(view: View, options: RunOptions) -> list[str]:
     """The files that `write_grids` may write for a view, before it is known whether its RPC holds it."""
     boxes = [] if options.tiles is None else tile_boxes(view.size, options.tiles)
     tiles = [*(tile_name(view, box) for box in boxes), *[view.name + TILES] * bool(boxes)]
-    return [*Files(grids=True, resampled=options.resample).names(view), *tiles]
+    files = Files(grids=True, resampled=options.resample, state=is_writable(view.sensor))
+    return [*files.names(view), *tiles]
 
 
 def write_grids(
@@ -84,8 +90,10 @@ def write_grids(
     OutputError where a file cannot be written, or does not hold what was written.
     """
     files = [
-        Files(options.grids or not np.linalg.norm(fit.max_ckp) <= MISFIT, options.resample)
-        for _, fit, _ in fitted
+        Files(
+            options.grids or not np.linalg.norm(fit.max_ckp) <= MISFIT, options.resample, is_writable(model)
+        )
+        for _, fit, model in fitted
     ]
     written: list[Written] = [{} for _ in fitted]
     some = [i for i, one in enumerate(files) if one.names(fitted[i][0])]
@@ -128,7 +136,8 @@ def _write(
             read = seen[name]["barpc"]
             worst = max(largest, read) if isinstance(read, float) else largest
             if not worst <= MISFIT:
-                logger.warning("%s: %.3g px RMS off, up to %.3g px (at steps?)", name, rms, worst)
+                why = "it takes light as straight" if name.endswith(STATE) else "at steps?"
+                logger.warning("%s: %.3g px RMS off, up to %.3g px (%s)", name, rms, worst, why)
     return written
 
 
@@ -138,6 +147,12 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str
     place.mkdir(parents=True, exist_ok=True)
     sample, errors = Sample.of(model, view.size, alts), Misses()
     try:
+        if files.state:
+            text = state_text(model, view.size, alts)
+            write_text(place / (view.name + STATE), text, overwrite=True)
+            errors[view.name + STATE] = _off(sample, open_state(place / (view.name + STATE))[0])
+        if not (files.grids or files.resampled):
+            return errors
         if files.grids:
             grid = DirectGrid.of(model, view.size, alts)
             errors[view.name + GRID] = _off(sample, grid)

@@ -21,6 +21,7 @@ from barpc.ba.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.dem import Dem
 from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.fit import RpcFit, fit_rpc
+from barpc.fit.rpc import innermost
 from barpc.handoff import unverified
 from barpc.identity import Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions
@@ -312,7 +313,7 @@ def _adjusted(run: Run, options: RunOptions, dem: Dem | None, prior: BlockPrior 
     if prior is not None:
         run = replace(run, tracks=only_new(run.tracks, np.isin(names, prior.names)))
     gcps, checks = (load_gcps(paths, run.views, options) for paths in (options.gcp, options.check_points))
-    centers = tuple(_center(view) for view in run.views)
+    centers = tuple(_center(view, options.adjust.center) for view in run.views)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
         raise TiePointError(
             f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else holds the "
@@ -393,8 +394,8 @@ def _only(run: Run, names: frozenset[str]) -> Run:
     )
 
 
-def _center(view: View) -> CameraCenter:
-    center = camera_center(view.sensor, view.size, view.alt_range)
+def _center(view: View, how: Literal["line", "projective"] = "line") -> CameraCenter:
+    center = camera_center(view.sensor, view.size, view.alt_range, how)
     if center.method == "nominal":
         logger.warning("%s: its camera does not tell where it stands; a nominal centre is used", view.name)
     return center
@@ -437,7 +438,9 @@ def fit_group(
             warnings.simplefilter("always", BarpcWarning)
             fit, error = None, ""
             try:
-                fit = fit_rpc(model, size, alt_range, options=options, strict=strict)
+                # what a physical camera does beyond an RPC is its own: grids hold it
+                wanted = strict and isinstance(innermost(model), RPC)
+                fit = fit_rpc(model, size, alt_range, options=options, strict=wanted)
             except FitError as failed:
                 error = str(failed)
         out.append((fit, error, tuple(str(one.message) for one in caught)))

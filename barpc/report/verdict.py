@@ -19,6 +19,7 @@ from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measu
 from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_over, strangeness
 from barpc.report.terrain import dem_lines, dem_reasons, holds_reference
 from barpc.scene import GroundPoints
+from barpc.sensor.rpc import RPC
 from barpc.tie.reference import PEAK
 
 GOOD_RMSE = 0.5  # A view whose tie points are left with more than this [px] is called doubtful
@@ -64,7 +65,9 @@ def _failure(view: ViewEntry, run: Run) -> str:
         if apart.look.as_stated:
             return f"{strangeness(apart)}. {left}clouds, water and change, and that the RPC belongs to this image"
         return f"its RPC is not its own: {strangeness(apart)}. {left}that the RPC belongs to this image"
-    beyond = _follows_more(view) or getattr(run.options, "grids", False)  # grids hold what the RPC does not
+    beyond = _follows_more(view, run) or getattr(
+        run.options, "grids", False
+    )  # grids hold what the RPC does not
     if view.fit is not None and not beyond and not all(_known(v) <= tolerance for v in view.fit.max_px):
         return f"one RPC cannot hold the corrected camera to {tolerance:g} px: lower --drift or the range"
     return ""
@@ -163,7 +166,7 @@ def _oddity(i: int, adjustment: Adjustment) -> str:
 def _beyond(view: ViewEntry, run: Run) -> str:
     """What one RPC does not hold of a camera that jitter or steps between detectors are corrected in."""
     told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
-    if view.fit is None or told or not _follows_more(view):
+    if view.fit is None or told or not _follows_more(view, run):
         return ""
     left, most = (
         float(np.linalg.norm([_known(v) for v in view.fit.rmse_px])),
@@ -173,20 +176,23 @@ def _beyond(view: ViewEntry, run: Run) -> str:
         return ""
     assert view.correction is not None
     follows = "attitude jitter or steps between detectors"
+    if not isinstance(run.views[run.number[view.name]].sensor, RPC):
+        follows = "its own orbit and attitude"
     if view.correction.strip_px:
         follows = "rows or columns that lie off by themselves"
     elif view.correction.swing_px:
         follows = "a swing of its rows"
     return (
         f"its corrected camera follows {follows}, of which one RPC leaves "
-        f"{left:.2f} px (RMS; {most:.2f} px at most): use its grids, --tiles or --resample"
+        f"{left:.2f} px (RMS; {most:.2f} px at most): use its grids ({view.name}_grid.tif), --tiles or --resample"
     )
 
 
-def _follows_more(view: ViewEntry) -> bool:
-    """Whether a camera was corrected by more than one RPC holds."""
+def _follows_more(view: ViewEntry, run: Run) -> bool:
+    """Whether a camera is more than one RPC holds, as it was delivered or by what it was corrected by."""
     one = view.correction
-    return one is not None and any((one.jitter_px, one.detector_px, one.strip_px, one.swing_px))
+    physical = not isinstance(run.views[run.number[view.name]].sensor, RPC)
+    return one is not None and any((physical, one.jitter_px, one.detector_px, one.strip_px, one.swing_px))
 
 
 def _left(i: int, adjustment: Adjustment) -> str:

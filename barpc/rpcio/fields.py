@@ -35,7 +35,7 @@ Fields = dict[str, list[float]]
 """Field name -> its numbers: one, or twenty for the four lists of coefficients (RPC00B order)."""
 
 _INDEXED = re.compile(rf"({'|'.join(LISTS)})_(\d+)")
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?")
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class ReadOptions:
 def number(text: str, name: str, key: str) -> float:
     """The number at the start of `text` (or RpcFormatError); a unit may follow, the exponent may be Fortran's D."""
     text = text.strip()
-    match = _NUMBER.match(text)
+    match = NUMBER.match(text)
     rest = text[match.end() :] if match else text
     if match is None or (rest and not rest[0].isspace() and rest[0] not in "°%"):
         raise RpcFormatError(f"{name}: {key} is not a number ({text[:40]!r})")

@@ -64,6 +64,7 @@ _SYNTAXES = (
     Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"'), xml.read_gdal),
     Format("yaml", (), _has(r"(?m)^[ \t]++line_num_coeff:"), text.read_yaml),
     Format("envi", (), _has(r"(?im)^[ \t]*+rpc info\s*+=\s*+\{"), text.read_envi),
+    Format("bare", (), text.bare, text.read_bare),
     Format("alos", (), _has(r"\A[\d+\-. ]{66}[\d+\-. Ee]{960}"), text.read_alos),
 )
 FORMATS: dict[str, Format] = {row.name: row for row in _SYNTAXES}
@@ -183,12 +184,12 @@ _NAMED = re.compile(
 )
 _TELLING = re.compile(r"(?i)coef|off|scale|num|den|rpc|rfm|lat|lon|samp|line")
 _LOOKED, _SHOWN = 1 << 20, 8
-_PHYSICAL = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b")
+holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b")
 
 
 def _contents(content: str) -> str:
     """The names of the fields in a text, those first that an RPC may have; of a list its name."""
-    if _PHYSICAL(content):
+    if holds_physical(content):
         return "it holds a physical camera model: give FILE,model=physical"
     words = ("".join(found).rstrip("0123456789_") for found in _NAMED.findall(content[:_LOOKED]))
     names = list(dict.fromkeys(filter(None, words)))

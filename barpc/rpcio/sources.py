@@ -15,12 +15,12 @@ from barpc.errors import BarpcError, ImageError, RpcError, RpcFormatError
 from barpc.raster import driver_of, identify, open_raster
 from barpc.remote import Place, Remote, beside, place
 from barpc.rpcio.fields import ReadOptions
-from barpc.rpcio.formats import FORMATS, files_of, parse
+from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse
 from barpc.rpcio.text import decode, read_nitf
 from barpc.rpcio.tiff import read_tag
 from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import IMAGE, RPC_FILE, read_bytes, read_head
+from barpc.sidefile import IMAGE, RPC_FILE, encoding_of, read_bytes, read_head
 from barpc.vrt import MAGIC, read_vrt
 
 
@@ -74,6 +74,26 @@ def metadata_beside(image: Path) -> Path:
     raise ImageError(f"{image}: no metadata with a physical model beside it ({' or '.join(names[:2])})")
 
 
+def described(path: Place) -> tuple[tuple[int, int] | None, bool]:
+    """Width and height [px] that a vendor's XML states, if it does, and whether it holds a physical model."""
+    text = decode(read_bytes(path, RPC_FILE))
+    found = [
+        re.search(rf"<(?:\w+:)?(?:{tag})>\s*+(\d{{1,7}})\s*+<", text)
+        for tag in ("NUMCOLUMNS|NCOLS", "NUMROWS|NROWS")
+    ]
+    width, height = (int(one[1]) if one is not None else 0 for one in found)
+    return ((width, height) if width and height else None), holds_physical(text)
+
+
+def only_physical(path: Path) -> bool:
+    """Whether an XML holds a physical camera model and no RPC; not of one that cannot be read."""
+    try:
+        text = decode(read_bytes(path, RPC_FILE))
+    except BarpcError:
+        return False
+    return holds_physical(text) and not any(row.sniff(text) for row in FORMATS.values())
+
+
 def _present(image: Place) -> Mapping[str, str]:
     """The files beside an image, by name in lower case; on another host those that count."""
     if isinstance(image, Path):
@@ -101,6 +121,9 @@ def _names(name: str) -> Iterator[tuple[str, str, bool]]:
             yield "alos", f"RPC{stem[cut:]}.txt", True
     yield "pam", f"{name}.aux.xml", False
     yield "geom", f"{stem}.geom", False
+    yield "rpb", f"{name}.RPB", False  # names that GDAL does not look for
+    yield "rpb", f"{stem}_RPB.TXT", False
+    yield "txt", f"{stem}-RPC.txt", False
 
 
 def _holds_rpc(path: Place, kind: str) -> bool:
@@ -172,7 +195,10 @@ def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band:
     path = place(path)
     options = ReadOptions(first_pixel, band)
     head = read_head(path, IMAGE, 64)
-    if b"\0" in head or driver_of(head) not in (None, "VRT"):  # no RPC text holds a zero byte near its start
+    text = (
+        encoding_of(head)[:6] == "utf-16" or b"\0" not in head
+    )  # no other text holds a zero byte near its start
+    if not text or driver_of(head) not in (None, "VRT"):
         return _image_source(path, head, options)
     if _is_vrt(head) and isinstance(path, Path):
         items = read_vrt(path).metadata.get("RPC")

@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
+
 from barpc.errors import RpcFormatError
 from barpc.remote import Place
 from barpc.rpcio.fields import (
@@ -16,6 +18,7 @@ from barpc.rpcio.fields import (
     KEYS,
     LISTS,
     MAXAR,
+    NUMBER,
     OFFSETS,
     SCALES,
     SINGLE,
@@ -29,7 +32,7 @@ from barpc.rpcio.fields import (
     rpc_from_fields,
 )
 from barpc.sensor.rpc import RPC
-from barpc.sidefile import IMAGE, parse_json, read_head
+from barpc.sidefile import IMAGE, encoding_of, parse_json, read_head
 
 # Patterns here take time in proportion to the text, whatever it holds: no two repetitions can share a character,
 # and one that may run far begins where a line or a word begins.
@@ -37,9 +40,9 @@ _LINE = re.compile(r"^[ \t]*+([A-Za-z][\w.]*+)[ \t]*+[:=](.*)$", re.MULTILINE)
 
 
 def decode(data: bytes) -> str:
-    """Text of a file, with line ends of one kind: UTF-8, or Latin-1 where it is not (a degree sign, say)."""
+    """Text of a file, with line ends of one kind: UTF-8, UTF-16, else Latin-1 (a degree sign, say)."""
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode(encoding_of(data))
     except UnicodeDecodeError:
         text = data.decode("latin-1")
     return text.replace("\r\n", "\n").replace("\r", "\n")
@@ -143,11 +146,40 @@ def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
     """ENVI's header: offsets, scales, four times twenty coefficients; three more numbers may follow."""
     match = _ENVI.search(text)
     values = numbers(match.group(1), name, "rpc info") if match else []
-    if len(values) not in (90, 93):
-        raise RpcFormatError(f"{name}: rpc info has {len(values)} numbers, expected 90 or 93")
+    return _in_order(values, "rpc info", name, options)
+
+
+def _in_order(values: list[float], what: str, name: str, options: ReadOptions) -> RPC:
+    """The RPC of offsets, scales and four times twenty coefficients."""
+    if len(values) not in _COUNTS:
+        raise RpcFormatError(f"{name}: {what} has {len(values)} numbers, expected 90 or 93")
     fields: Fields = {key: [value] for key, value in zip(OFFSETS + SCALES, values, strict=False)}
     fields |= {key: values[10 + 20 * i : 30 + 20 * i] for i, key in enumerate(COEFFICIENTS)}
     return rpc_from_fields(fields, name, options)
+
+
+_COUNTS = (90, 93)  # numbers of an RPC; three more may follow
+_BETWEEN = re.compile(r"[\s,;]+")
+_ONE = 0.01  # by which the first coefficient of a denominator may miss 1: OrbView's are 0.99995
+
+
+def bare(text: str) -> bool:
+    """Whether a text holds the numbers of an RPC and nothing else."""
+    parts = [part for part in _BETWEEN.split(text, maxsplit=100) if part]
+    return len(parts) in _COUNTS and all(map(NUMBER.fullmatch, parts))
+
+
+def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
+    """Numbers without names, separated by commas, blanks or lines, in the order of ENVI's header (IARPA, s2p)."""
+    values = [number(part, name, "a number") for part in _BETWEEN.split(text) if part]
+    rpc = _in_order(values, "a list without names", name, options)
+    first = rpc.coeffs[1::2, 0]
+    if not (np.abs(first - 1.0) <= _ONE).all():
+        raise RpcFormatError(
+            f"{name}: {len(values)} numbers without names, of which the 31st and 71st are {values[30]:g} and "
+            f"{values[70]:g}: denominators of an RPC begin with 1"
+        )
+    return rpc
 
 
 # The errors are not rpcm's own; it passes over them.

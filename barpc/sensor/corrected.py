@@ -1,6 +1,6 @@
 """Sensor models behind a correction: in space, P_BA, and in the image.
 
-The paper's corrected projection is P_BA(X) = P(R (X - T - C) + C) with X in ECEF (eq. 1 of Akiki et al.
+The paper's corrected projection is P_BA(X) = P(R (X - T - C) + C) with X in ECEF (eq. 7 of Akiki et al.
 2021, "Robust Rational Polynomial Camera Modelling for SAR and Pushbroom Imaging"). A second rotation, a
 polynomial of the image row, may follow R: the drift of the attitude along the strip. `Motion` is all of it with
 its derivatives, for one view here and for blocks of views in the adjustment.

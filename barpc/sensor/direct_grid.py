@@ -35,6 +35,9 @@ _LONGEST = 1024.0, 1024.0, 1000.0  # px, px, m: from node to node of a grid made
 _FEWEST, _CELLS = 3, 1024  # cells along an axis; splines are cubic from three on
 _NODES = 4_000_000  # of a grid made here, at most
 _TRIED = 1000  # cells
+_SHARE = 0.1  # of the tolerance, that nodes may be off
+_FEW = 5, 9  # altitudes, columns of which the first polynomials are made
+_LOOKED, _HALF = 16, 0.5  # rows that they are tried at; share of all nodes from which on they save nothing
 
 _VALUE, _BY_COL, _BY_ROW, _BY_ALT = (0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)
 
@@ -132,9 +135,8 @@ class DirectGrid(Frozen):
             return np.asarray((wrap_longitude(lonlat, center[:2]) - center[:2]) @ to_px)
 
         cols, rows, alts = linear_axes(seen, low, high, np.array(_LONGEST), tolerance)
-        nodes = np.stack(np.meshgrid(cols, rows), axis=-1)
-        ground = [model.localize(nodes, np.full(nodes.shape[:2], alt))[..., :2] for alt in alts]
-        return cls(cols, rows, alts, np.stack(ground))
+        found = _nodes(seen, (alts, rows, cols), _SHARE * tolerance)
+        return cls(cols, rows, alts, found @ np.linalg.inv(to_px) + center[:2])
 
     def project(self, ground: Array) -> Array:
         """Image points (..., 2) [px] of ground points (..., 3) [deg, deg, m]; NaN off the grid."""
@@ -219,6 +221,58 @@ def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:
     basis = monomials(((ground - offset) / scale).T).T
     image = np.column_stack([col.ravel(), row.ravel(), np.zeros(col.size)])
     return np.vstack([offset, scale, np.linalg.lstsq(basis, image, rcond=None)[0]])
+
+
+def _nodes(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array], tolerance: float) -> Array:
+    """What is seen (L, H, W, 2) at the nodes of three axes, altitudes, rows, columns.
+
+    Along altitudes and columns most cameras are smooth, whatever their attitude does along the rows: polynomials
+    through a few of them serve where, at some rows, they miss by no more than `tolerance` [px].
+    """
+    alts, rows, cols = axes
+    some = rows[np.unique(np.linspace(0, len(rows) - 1, _LOOKED).astype(np.int64))]
+    for more in (1, 2, 4):
+        few = [_chebyshev(axis, more * count) for axis, count in ((alts, _FEW[0]), (cols, _FEW[1]))]
+        if len(few[0]) * len(few[1]) > _HALF * len(alts) * len(cols):
+            break
+        between = [_lagrange(part, axis) for part, axis in zip(few, (alts, cols), strict=True)]
+        tried = _spread(_on(seen, (few[0], some, few[1])), *between)
+        if np.linalg.norm(tried - _on(seen, (alts, some, cols)), axis=-1).max() <= tolerance:
+            return _spread(_on(seen, (few[0], rows, few[1])), *between)
+    return _on(seen, axes)
+
+
+def _on(seen: Callable[[Array], Array], axes: tuple[Array, Array, Array]) -> Array:
+    """What is seen (L, H, W, 2) at all nodes, layer by layer."""
+    alts, rows, cols = axes
+    plane = np.stack(np.meshgrid(cols, rows), axis=-1)
+    return np.stack([seen(np.dstack([plane, np.full(plane.shape[:2], alt)])) for alt in alts])
+
+
+def _spread(values: Array, by_alt: Array, by_col: Array) -> Array:
+    """Values (l, H, w, 2) of a few nodes at all of them (L, H, W, 2)."""
+    wide = np.matmul(by_col, values)
+    return np.asarray(np.tensordot(by_alt, wide, axes=1))
+
+
+def _chebyshev(axis: Array, count: int) -> Array:
+    """Places between which a polynomial is at its best, its ends among them."""
+    if count >= len(axis):
+        return axis
+    return np.asarray(
+        (axis[0] + axis[-1] - np.ptp(axis) * np.cos(np.pi * np.arange(count) / (count - 1))) / 2
+    )
+
+
+def _lagrange(nodes: Array, at: Array) -> Array:
+    """Matrix (M, N) from values at nodes (N,) to those of their polynomial at places (M,)."""
+    away = at[:, None] - nodes
+    apart = nodes[:, None] - nodes + np.eye(len(nodes)) * np.ptp(nodes)
+    weight = 1.0 / np.prod(apart / np.ptp(nodes), axis=1)
+    same = away == 0.0
+    share = weight / np.where(same, 1.0, away)
+    share[same.any(axis=1)] = same[same.any(axis=1)]
+    return np.asarray(share / share.sum(axis=1, keepdims=True))
 
 
 def _slopes(model: SensorModel, at: Array) -> Array:

@@ -23,9 +23,10 @@ from barpc.sensor.rpc import RPC
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
-CenterMethod = Literal["line", "nominal", "stated"]
+CenterMethod = Literal["line", "projective", "nominal", "stated"]
 _Rows = list[tuple[SensorModel, slice]]  # the observations of each camera
 
+_REGRESSED = 10  # points along col, row and altitude
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
@@ -220,18 +221,24 @@ class CameraCenter:
     method: CenterMethod  # how it was found: "nominal" where "line" was not plausible, "stated" by a radar
 
 
-def camera_center(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
+def camera_center(
+    sensor: SensorModel,
+    size: tuple[int, int],
+    alt_range: tuple[float, float],
+    how: Literal["line", "projective"] = "line",
+) -> CameraCenter:
     """Camera centre regressed from a sensor model.
 
     One image line of a pushbroom camera IS a perspective camera, so its rays meet in one point, found by least
-    squares. (A projective camera regressed over the whole image, as in the paper, stands at about twice the distance:
-    the image is perspective across the track and affine along it.) A point outside `PLAUSIBLE_ALTITUDE` is replaced
-    by one at `NOMINAL_ALTITUDE` on the central ray, and says so in its ``method``. A radar states where it is.
+    squares. A point outside `PLAUSIBLE_ALTITUDE` is replaced by one at `NOMINAL_ALTITUDE` on the central ray, and says
+    so in its ``method``. A projective camera regressed over the whole image, as in the paper, stands at about twice
+    the distance: the image is perspective across the track and affine along it. A radar states where it is.
 
     Parameters
     ----------
     size : (width, height) [px]
     alt_range : (low, high), altitudes [m] between which rays are drawn
+    how : the rays of the middle line, or a projective camera over image and altitudes
 
     Raises
     ------
@@ -244,10 +251,11 @@ def camera_center(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[f
         if not np.isfinite(ecef).all():
             raise RpcError("camera centre: the model has no ground point at its image's centre")
         return CameraCenter(ecef, float(ground_from_ecef(ecef)[2]), "stated")
-    ecef = _center_of_line(sensor, size, alt_range)
+    ecef = (_center_of_line if how == "line" else _center_projective)(sensor, size, alt_range)
     altitude = float(ground_from_ecef(ecef)[2])
-    if PLAUSIBLE_ALTITUDE[0] <= altitude <= PLAUSIBLE_ALTITUDE[1]:
-        return CameraCenter(ecef, altitude, "line")
+    low, high = PLAUSIBLE_ALTITUDE if how == "line" else (alt_range[1], np.inf)
+    if low <= altitude <= high:
+        return CameraCenter(ecef, altitude, how)
     middle = sensor.localize(np.array(size) / 2.0, np.array(alt_range[0]))
     if not np.isfinite(altitude) and not np.isfinite(middle).all():
         raise RpcError("camera centre: the model has no ground point at its image's centre")
@@ -266,6 +274,25 @@ def _center_of_line(sensor: SensorModel, size: tuple[int, int], alt_range: tuple
     if not np.isfinite(normal).all():
         return np.full(3, np.nan)
     return np.asarray(np.linalg.lstsq(normal, rhs, rcond=1e-15)[0] + shift)
+
+
+def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
+    """Centre (3,) of the 3 x 4 matrix that takes ground points to image points: its null space (Hartley, DLT)."""
+    ends = np.linspace(0.0, 1.0, _REGRESSED)
+    unit = np.stack(np.meshgrid(ends, ends, ends), axis=-1).reshape(-1, 3)
+    image, low = unit[:, :2] * (np.array(size) - 1.0), alt_range[0]
+    ecef = ecef_from_ground(sensor.localize(image, low + unit[:, 2] * (alt_range[1] - low)))
+    if not np.isfinite(ecef).all():
+        return np.full(3, np.nan)
+    middle, spread = ecef.mean(axis=0), float(ecef.std())
+    world = np.column_stack([(ecef - middle) / spread, np.ones(len(ecef))])
+    col, row = ((image - image.mean(axis=0)) / image.std()).T
+    zero = np.zeros_like(world)
+    system = np.concatenate(
+        [np.hstack([world, zero, -col[:, None] * world]), np.hstack([zero, world, -row[:, None] * world])]
+    )
+    matrix = np.linalg.svd(np.linalg.qr(system)[1])[2][-1].reshape(3, 4)
+    return np.asarray(middle - spread * np.linalg.solve(matrix[:, :3], matrix[:, 3]))
 
 
 def _center_nominal(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:

@@ -23,13 +23,12 @@ from barpc.frozen import Frozen
 from barpc.geodesy import (
     EARTH_RATE,
     SPEED_OF_LIGHT,
-    WGS84_A,
-    WGS84_B,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
     pointwise,
+    reach,
     up,
     wrap_longitude,
 )
@@ -222,13 +221,13 @@ class Pushbroom(Frozen):
         """Ground points (N, 3) where lines of sight (N, 2) reach altitudes (N,)."""
         origin, seen = self._rays(image)
         time, (start, stop) = self.time(image[:, 1]), self._span
-        ground = _reach(origin, seen, alt)
+        ground = reach(origin, seen, alt)
         if self.light != STRAIGHT:
             velocity, direction = self.orbit(time)[1], seen
             for _ in range(_BENDS):
                 bent = self.light.seen(ecef_from_ground(ground).T, origin, velocity)
                 direction = direction + seen - bent / np.sqrt((bent * bent).sum(axis=0))
-                ground = _reach(origin, direction / np.sqrt((direction * direction).sum(axis=0)), alt)
+                ground = reach(origin, direction / np.sqrt((direction * direction).sum(axis=0)), alt)
         ground[:, 0] = wrap_longitude(ground[:, 0], self._lon)
         ground[~((time >= start) & (time <= stop))] = np.nan
         return ground
@@ -299,18 +298,3 @@ class Pushbroom(Frozen):
         row = (slope[1] * by_x - slope[0] * by_y) / det / self.line_period
         col = (rate[1] * by_x - rate[0] * by_y) / det
         return np.moveaxis(np.stack([col, row]), 2, 0)
-
-
-def _reach(origin: Array, direction: Array, alt: Array) -> Array:
-    """Ground points (N, 3) where straight lines (3, N) come down to altitudes (N,); NaN where they miss."""
-    axes = np.array([[WGS84_A], [WGS84_A], [WGS84_B]]) + alt
-    o, d = origin / axes, direction / axes
-    a, b, c = (d * d).sum(axis=0), (o * d).sum(axis=0), (o * o).sum(axis=0) - 1.0
-    distance = c / (np.sqrt(b * b - a * c) - b)  # the nearer root, without cancellation
-    for _ in range(2):
-        ground = ground_from_ecef((origin + distance * direction).T)
-        distance += (alt - ground[:, 2]) / (up(ground) * direction).sum(axis=0)
-    ground = ground_from_ecef((origin + distance * direction).T)
-    ground[:, 2] = alt
-    ground[~(distance > 0)] = np.nan
-    return ground

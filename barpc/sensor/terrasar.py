@@ -7,6 +7,7 @@ the product's geolocation grid. Names are those of "TerraSAR-X Level 1b Product 
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ ROOT = "level1Product"
 _NAME = "*1_SAR__*.xml"  # TSX1, TDX1, PAZ1
 _MODES = ("SM", "SL", "HS", "HS300", "ST")  # ScanSAR stores its bursts apart
 _HEIGHTS = 1000.0  # m about the scene's average height, where no grid says which it is used for
+_FRAME = re.compile(r"(WGS-?84|ITRF|IG[Sb])[-_ ()G\d]*")  # of any year: they agree to centimetres
 _MOST = 1_000_000  # rows or columns
 _AGREE = 2.0  # rows or columns that first and last may be off their number times their interval
 _LATEST = 1e-3  # s: no stated delay is longer
@@ -108,8 +110,8 @@ def _model(root: Fields, late: tuple[float, float]) -> RangeDoppler:
                 f"{root.name}: {count} {what} every {step:g} s do not last the {span:g} s from the first to the last"
             )
     frame = root.element.findtext("platform/orbit/orbitHeader/stateVectorRefFrame", "WGS84").strip()
-    if not frame.startswith("WGS84"):
-        raise RpcFormatError(f"{root.name}: state vectors in {frame[:20]}, WGS84 is needed")
+    if not _FRAME.fullmatch(frame):
+        raise RpcFormatError(f"{root.name}: state vectors in {frame[:20]}, WGS84 or ITRF is needed")
     epoch = start - np.timedelta64(round(late[1] * 1e9), "ns")
     vectors = root.all("platform/orbit/stateVec")
     times = np.array([seconds(vector.time("timeUTC"), epoch) for vector in vectors])

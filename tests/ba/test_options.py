@@ -18,6 +18,7 @@ from barpc.ba.priors import prior_sigmas, stated_accuracy
 from barpc.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.geodesy import ground_from_ecef
 from barpc.scene import Tracks
+from barpc.sensor.geometry import camera_center
 from barpc.simulate import Block, simulate_block
 from tests.ba.conftest import centers_of
 from tests.constants import CONSTANTS, chosen
@@ -119,6 +120,7 @@ ROWS = [
     Row("tolerance", 1e-14, 1e-2, steps, -1, rest={"loss": "linear", "solver": "sparse"}),
 ]
 ELSEWHERE = {
+    "center": "test_views_turn_about_the_centre_that_is_asked_for",
     "min_observations": "test_a_view_needs_as_many_observations_as_asked_for",
     "solver": "test_the_solver_that_is_asked_for_is_the_one_that_runs",
 }
@@ -332,3 +334,15 @@ def test_a_view_that_counts_more_has_smaller_sigmas(dirty):
     block = join(dirty.views, dirty.tracks, None, AdjustOptions(view_weights={"view_0002": 4.0}))
     np.testing.assert_allclose(block.sigma[block.view == 2], 0.025)
     np.testing.assert_allclose(block.sigma[block.view != 2], 0.1)
+
+
+def test_views_turn_about_the_centre_that_is_asked_for(dirty):
+    """A view stands where its own camera says; asked for as the paper has it, farther off along the same sight."""
+    line, whole = (
+        adjust_tracks(dirty.views, dirty.tracks, AdjustOptions(drift=0, jitter="off", center=how))
+        for how in ("line", "projective")
+    )
+    for view, near, far in zip(dirty.views, line.corrections, whole.corrections, strict=True):
+        wanted = camera_center(view.sensor, view.size, view.alt_range, "projective").ecef
+        np.testing.assert_array_equal(far.center, wanted)
+        assert np.linalg.norm(far.center - near.center) > 1e4

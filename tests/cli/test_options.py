@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from click.testing import CliRunner
 from barpc.cli.main import cli
 from barpc.cli.options import _jobs, field_of, flag, flag_name, image_paths, run_options
 from barpc.errors import InputError
-from barpc.options import AdjustOptions, RunOptions, TieOptions
+from barpc.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 
 
 def given(target: str, *words: str) -> Any:
@@ -165,6 +166,29 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     )
     with pytest.raises(InputError, match="command line"):
         run_options({"flag_fit_tolerance": -1.0}, None)
+
+
+def test_one_word_gives_the_paper_s_method_and_the_file_and_flags_win_over_it(tmp_path: Path) -> None:
+    whole = run_options({"paper": True}, None)
+    told = whole.adjust
+    assert (told.model, told.center, told.drift, told.jitter) == (
+        "rotation+translation",
+        "projective",
+        0,
+        "off",
+    )
+    assert (told.solver, told.learn_priors) == ("scipy", False)
+    assert (whole.fit.method, whole.fit.space, whole.fit.nodes) == ("lcurve-joint", "ground", "uniform")
+    assert (whole.tie, replace(whole, adjust=AdjustOptions(), fit=FitOptions())) == (
+        TieOptions(),
+        RunOptions(),
+    )
+    file = tmp_path / "a.toml"
+    file.write_text('[adjust]\ncenter = "line"\n')
+    mixed = run_options({"paper": True, "flag_adjust_drift": 1}, str(file))
+    assert (mixed.adjust.center, mixed.adjust.drift, mixed.adjust.jitter) == ("line", 1, "off")
+    assert run_options({"paper": False}, None) == RunOptions()
+    assert run_options({}, None) == RunOptions()
 
 
 def test_the_help_of_a_run_has_its_flags_under_what_they_are_about() -> None:

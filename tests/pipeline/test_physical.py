@@ -154,3 +154,54 @@ def test_pixels_of_another_size_are_refused(tmp_path):
             open_camera(f"{tmp_path / 'a.XML'},model=physical,altitudes={wrong}")
     with pytest.raises(InputError, match="model is no choice for the kind rpc"):
         open_camera(f"{tmp_path / 'a.XML'},model=rigorous")
+
+
+def test_an_xml_alone_tells_its_size_and_that_it_holds_a_physical_model(tmp_path):
+    text, _ = isd(Flight(size=SIZE, swing=0.0))
+    path = tmp_path / "a.XML"
+    path.write_text(text)
+    bare = open_camera(path)  # no RPC in it: what it holds is taken
+    assert (bare.format, bare.size) == ("maxar physical model", SIZE)
+    assert bare.model == open_camera(path, model="physical").model
+    path.write_text(text.replace("</isd>", f"{_rpb()}</isd>"))
+    both = open_camera(path)
+    assert (both.format, both.size, both.rpc) == ("xml", SIZE, make_rpc())
+    assert both.notes == ("it holds a physical camera model, too: FILE,model=physical",)
+    image = write_image(tmp_path / "a.tif", (1, 40, 60))  # a part of the image: its own size counts
+    assert (open_camera(image).size, open_camera(image).notes) == ((60, 40), ())
+    dim, _ = dimap(Flight(size=SIZE, swing=0.0))
+    (tmp_path / "DIM_b.XML").write_text(dim)
+    assert open_camera(tmp_path / "DIM_b.XML").size == SIZE
+
+
+@pytest.mark.slow
+def test_a_run_on_swinging_platforms_ends_with_grids_that_hold_them(tmp_path):
+    """An attitude that swings by 100 urad at 2 Hz: a single RPC misses it by pixels."""
+    cameras = []
+    for name, look in zip("ab", LOOKS, strict=False):
+        text, _ = isd(Flight(size=SIZE, look=look, swing=1e-4))
+        (tmp_path / f"{name}.XML").write_text(text)
+        blank(tmp_path / f"{name}.tif")
+        cameras.append(open_camera(tmp_path / f"{name}.XML", altitudes=(0.0, 1000.0)).model)
+    rng = np.random.default_rng(2)
+    ground = cameras[0].localize(rng.uniform(30, np.array(SIZE) - 30, (300, 2)), rng.uniform(0, 300, 300))
+    xy = np.stack([camera.project(ground) for camera in cameras], axis=1)
+    xy = xy[((xy > 0) & (xy < np.array(SIZE) - 1)).all(axis=(1, 2))]
+    xy += rng.normal(0, 0.1, xy.shape)
+    count = len(xy)
+    assert count > 100
+    tracks = Tracks(
+        np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy.reshape(-1, 2), np.full(2 * count, 0.1)
+    )
+    write_matches(tmp_path / "ties.csv", tracks, ["a", "b"])
+    options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True)
+    given = [f"{tmp_path / name}.tif,model=physical,altitudes=0:1000" for name in "ab"]
+    result = adjust(given, tmp_path / "out", options)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    for view, name, sensor in zip(summary["views"], "ab", result.adjustment.sensors, strict=True):
+        assert view["fit"]["max_px"][1] > 0.5
+        assert "follows its own orbit and attitude, of which one RPC leaves" in view["advice"]
+        assert f"({name}_grid.tif)" in view["advice"]
+        grid = open_camera(tmp_path / "out" / f"{name}_grid.tif").model
+        image, alt = rng.uniform(0, np.array(SIZE) - 1, (200, 2)), rng.uniform(0, 1000, 200)
+        np.testing.assert_allclose(grid.project(sensor.localize(image, alt)), image, rtol=0, atol=0.01)

@@ -17,6 +17,7 @@ from barpc.report import verdict as verdicts
 from barpc.report.summary import FitEntry
 from barpc.report.verdict import block_verdict, view_status
 from barpc.tie.reference import PEAK, Registration, ViewMatch
+from tests.rpcio.conftest import make_rpc
 
 from .made import a_correction, a_view
 
@@ -47,7 +48,7 @@ def run_of(adjustment: Any = None, kind: str = "adjust", **fields: Any) -> Any:
         "kind": kind, "adjustment": adjustment or adjusted(), "options": SimpleNamespace(), "reference": None,
         "copies": {}, "number": {name: k for k, name in enumerate(NAMES)}, "gcps": None, "check_points": None,
         "left_out": (), "after": None, "tracks": [0] * 9, "met_worse": (),
-        "views": tuple(SimpleNamespace(name=name) for name in NAMES),
+        "views": tuple(SimpleNamespace(name=name, sensor=make_rpc()) for name in NAMES),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
 

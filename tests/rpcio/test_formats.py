@@ -11,7 +11,7 @@ import pytest
 
 from barpc.errors import ImageError, OutputError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
-from barpc.rpcio.fields import number
+from barpc.rpcio.fields import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc, number
 from barpc.rpcio.formats import parse
 from barpc.rpcio.text import nitf_record, write_rpb, write_txt
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
@@ -310,3 +310,34 @@ def test_hdf5_is_named_as_what_is_not_read(tmp_path):
     path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(200))
     with pytest.raises(ImageError, match="HDF5 files are not read"):
         read_rpc(path)
+
+
+def plain(rpc, order: tuple[str, ...] = (*OFFSETS, *SCALES, *COEFFICIENTS)) -> list[str]:
+    """The numbers of an RPC without their names."""
+    fields = fields_from_rpc(rpc)
+    return [repr(value) for key in order for value in fields[key]]
+
+
+@pytest.mark.parametrize("between", [",", " ", "\n", ", ", " ,\r\n", "\t"])
+def test_numbers_without_names_are_read_in_the_order_of_envi(between, rpc):
+    text = between.join(plain(rpc)) + "\n"
+    found, kind = parse(text.encode(), "memory")
+    assert kind == "bare"
+    assert found == replace(rpc, err_bias=None, err_rand=None)
+    assert parse((text + "0 0 1").encode(), "memory") == (found, "bare")
+
+
+def test_numbers_without_names_that_are_no_rpc_are_refused_with_what_was_found(rpc):
+    with pytest.raises(RpcFormatError, match=r"31st and 71st are .*begin with 1"):
+        parse(" ".join(plain(rpc, (*OFFSETS, *SCALES, *reversed(COEFFICIENTS)))).encode(), "memory")
+    for wrong in (plain(rpc)[:-1], [*plain(rpc), "1"], [*plain(rpc)[:-1], "x"]):
+        with pytest.raises(RpcFormatError, match="no RPC format recognised"):
+            parse(",".join(wrong).encode(), "memory")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("row", WRITABLE, ids=lambda row: row.name)
+def test_a_text_in_utf_16_is_read(row, encoding, rpc, tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_bytes(row.write(rpc).encode(encoding))
+    assert read_rpc_source(path).rpc == rpc

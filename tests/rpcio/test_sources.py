@@ -13,7 +13,16 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.errors import ImageError, RpcError, RpcFormatError
-from barpc.rpcio import read_rpc, read_rpc_source, shadows, sidecars, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio import (
+    FORMATS,
+    read_rpc,
+    read_rpc_source,
+    shadows,
+    sidecars,
+    write_rpc,
+    write_rpc_copy,
+    write_rpc_vrt,
+)
 from barpc.rpcio.xml import rpc_domain
 from tests.rpcio.conftest import dimap_v2, grid, write_image
 
@@ -206,3 +215,16 @@ def test_a_file_that_may_not_be_read_is_an_error_in_one_line(rpc, tmp_path):
     (tmp_path / "a.geom").chmod(0)
     with pytest.raises((RpcError, ImageError), match=r"a\.geom"):
         read_rpc(tmp_path / "a.geom")
+
+
+@pytest.mark.parametrize("name", [f"{STEM}.tif.rpb", f"{STEM}_RPB.TXT", f"{STEM}-RPC.txt"])
+def test_a_side_file_that_gdal_does_not_look_for_is_found_where_the_image_has_no_rpc(name, rpc, tagged):
+    other = rpc.crop(300, 400)
+    text = FORMATS["rpb" if "rpb" in name.lower() else "txt"].write(other)
+    (tagged.parent / name).write_text(text)
+    assert gdal_line_offset(tagged) == pytest.approx(rpc.image_offset[1])
+    source = read_rpc_source(tagged)
+    assert (source.rpc, source.notes) == (rpc, (f"not used: {name}",))
+    plain = write_image(tagged)
+    assert read_rpc_source(plain).rpc == other
+    assert [sidecar.path.name for sidecar in shadows(plain)] == [name]

@@ -11,6 +11,7 @@ import pytest
 from barpc.cameras import open_camera
 from barpc.errors import RpcError
 from barpc.sensor.geometry import NOMINAL_ALTITUDE, PLAUSIBLE_ALTITUDE, camera_center
+from barpc.simulate.orbit import Look, fly
 from tests.sensor.conftest import make_rpc
 
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
@@ -103,3 +104,22 @@ def test_centres_of_real_cameras_are_where_their_satellites_fly(shared_data, nam
     found = camera_center(camera.rpc, (width, height), camera.alt_range)
     assert found.method == method
     assert low * 1e3 < found.altitude < high * 1e3
+
+
+def test_a_projective_camera_of_a_perspective_one_stands_where_it_stands() -> None:
+    camera: Any = Pinhole()
+    found = camera_center(camera, SIZE, ALTITUDES, "projective")
+    assert found.method == "projective"
+    assert np.linalg.norm(found.ecef - camera.center) < 1e-3 * 7e5
+
+
+def test_a_projective_camera_over_a_pushbroom_image_stands_at_about_twice_its_distance() -> None:
+    """Perspective across the track, affine along it: what Pleiades shows, 1420 to 1630 km for 694."""
+    sensor = fly(np.array([5.4, 43.2, 0.0]), Look(10.0, 100.0), (20000, 20000), 0.5)
+    line, whole = (
+        camera_center(sensor, (20000, 20000), (0.0, 2000.0), how) for how in ("line", "projective")
+    )
+    assert whole.altitude / line.altitude == pytest.approx(2.1, abs=0.3)
+    blind: Any = Pinhole(columns=100.0)
+    with pytest.raises(RpcError):
+        camera_center(blind, SIZE, ALTITUDES, "projective")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center, triangulate, view_angles
-from barpc.sensor.sicd import find_sicd, open_sicd
+from barpc.sensor.sicd import find_sicd, is_sicd, open_sicd
 from barpc.simulate.orbit import Look, fly
 from tests.sensor.radar_documents import DURATION, KINDS, SIZE, document, nitf
 
@@ -117,6 +118,19 @@ def test_a_part_of_an_image_and_a_nitf_are_read_as_they_are(kind, tmp_path, mode
     assert camera.model == whole
     assert camera.extent == SIZE
     assert camera.alt_range == pytest.approx((-880.0, 1120.0), abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_namespace_with_a_prefix_changes_nothing(kind, tmp_path, model_of):
+    text = re.sub(r"<(/?)(?=[A-Za-z])", r"<\1sicd:", document(kind)).replace("xmlns=", "xmlns:sicd=")
+    assert "<SICD" not in text
+    path = tmp_path / "prefixed.xml"
+    for written in (path, nitf(text, tmp_path / "prefixed.ntf")):
+        if written == path:
+            path.write_text(text)
+        camera = open_camera(written)
+        assert (camera.format, camera.model) == ("sicd", model_of(kind))
+    assert not any(map(is_sicd, (b"<SICDX>", b"<a:SICDS/>", b"SICD>")))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,10 @@ import pytest
 from barpc.cameras import open_camera
 from barpc.errors import BarpcError, BarpcWarning, InputError, RpcFormatError
 from barpc.fit import fit_rpc
+from barpc.sensor.document import Fields
+from barpc.sensor.geometry import view_angles
 from barpc.sensor.terrasar import open_terrasar
+from barpc.sidefile import parse_xml
 from tests.sensor.terrasar_files import INTERVAL, NAME, SIZE, SPACING, START, Terrasar
 
 
@@ -88,6 +91,7 @@ LIES = {
     ),
     "columns of another length": (f">{SPACING!r}<", ">8.1e-09<", "12000 columns every 8.1e-09 s do not last"),
     "an inertial orbit": (">WGS84<", ">ICRF<", "state vectors in ICRF"),
+    "an inertial orbit of a like name": (">WGS84<", ">ITRF2014 TOD<", "state vectors in ITRF2014 TOD"),
     "no orbit": ("stateVec", "stateVek", "orbit: 0 state vectors"),
     "an orbit of another time": ("T15:1[123]:", "T16:11:", "orbit: .*state vectors"),
     "no number": ("<sceneAverageHeight>4.5E", "<sceneAverageHeight>high", "sceneAverageHeight is not a list"),
@@ -207,7 +211,8 @@ def test_a_grid_five_pixels_off_belongs_to_another_orbit(tmp_path, rows, columns
 def test_state_vectors_are_those_of_the_earth(tmp_path):
     path = Terrasar().write(tmp_path)
     whole = open_terrasar(path)
-    assert opened(path, ">WGS84<", ">WGS84-G873<") == whole
+    for frame in ("WGS84-G873", "WGS84-G1150", "WGS84 (G1762)", "ITRF97", "ITRF2014", "IGS08", "IGb14"):
+        assert opened(path, ">(WGS|ITRF|IG)[^<]*<", f">{frame}<") == whole
     assert opened(path, "<orbitHeader>.*</orbitHeader>", "") == whole  # it says nothing of them
     assert whole.frame.sampling_rate == pytest.approx(1 / SPACING)
     assert whole.frame.interval == INTERVAL
@@ -220,3 +225,29 @@ def test_stripmaps_and_spotlights_are_read(tmp_path, mode):
     if mode != "SM":
         assert opened(path, "<imagingMode>SM<", f"<imagingMode>{mode}<").size == SIZE
     assert open_camera(path).alt_range == (-97.0, 1399.0)
+
+
+def test_the_corners_of_a_delivered_product_are_on_their_rows(shared_data):
+    """By lon, lat and range time of each corner its height is solved for; the row is the product's own word."""
+    path = next((shared_data / "radar").glob("TDX1_SAR__SSC*.xml"))
+    with pytest.warns(BarpcWarning, match=r"no ANNOTATION/GEOREF\.xml"):
+        model = open_terrasar(path)
+    corners = Fields(parse_xml(path, strip_namespaces=True), "").all("productInfo/sceneInfo/sceneCornerCoord")
+    lon, lat, col, row, incidence = np.array(
+        [[k.number(tag) for tag in ("lon", "lat", "refColumn", "refRow", "incidenceAngle")] for k in corners]
+    ).T
+    height = np.zeros(4)
+    for _ in range(5):
+        at = np.column_stack([lon, lat, height])
+        image, slope = model.project_jacobian(at)
+        height -= (image[:, 0] - (col - 1)) / slope[:, 0, 2]
+    image = model.project(np.column_stack([lon, lat, height]))
+    np.testing.assert_allclose(image[:, 0], col - 1, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(image[:, 1], row - 1, rtol=0, atol=0.03)  # px: 0.023 of all four
+    assert np.ptp(image[:, 1] - row) < 0.002
+    np.testing.assert_allclose(
+        view_angles(model, np.column_stack([lon, lat, height]))[0], incidence, atol=0.02
+    )
+    assert (
+        np.abs(height[[1, 3]] + 28.0) < 3.0
+    ).all()  # m: the sea, 24 to 26 m below the ellipsoid, 2 m in range late

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import BinaryIO, Literal
 
@@ -25,6 +26,11 @@ _SEGMENTS = ((6, 10), (4, 6), (0, 0), (4, 5), (4, 9))
 """Digits of the lengths of subheader and data: images, graphics, reserved, texts, data extensions."""
 
 
+def is_sicd(head: bytes) -> bool:
+    """Whether the first bytes of a document begin a SICD, its namespace with a prefix or without."""
+    return re.search(rb"<([\w.-]{1,40}:)?SICD[\s>]", head) is not None
+
+
 def find_sicd(path: Path) -> bytes | None:
     """The SICD document that a file is or, in a NITF, holds; None where there is none.
 
@@ -33,9 +39,9 @@ def find_sicd(path: Path) -> bytes | None:
     with opened(path, PRODUCT) as file:
         head = file.read(4096)
         if not head.startswith(_NITF):
-            return head + file.read(MAX_XML + 1 - len(head)) if b"<SICD" in head else None
+            return head + file.read(MAX_XML + 1 - len(head)) if is_sicd(head) else None
         try:
-            return next((text for text in _extensions(file) if b"<SICD" in text[:4096]), None)
+            return next((text for text in _extensions(file) if is_sicd(text[:4096])), None)
         except ValueError as error:
             raise RpcFormatError(f"{path}: a NITF with a damaged header ({error})") from error
 

@@ -1,0 +1,217 @@
+"""States of the Community Sensor Model, as USGS' library and the Ames Stereo Pipeline keep them: linescan and frame.
+
+A state is JSON, ``image.json`` or ``image.adjusted_state.json``, mostly behind a line with the model's name. Line l and
+sample s of CSM have the first pixel's centre at (0.5, 0.5). The place in the focal plane is where iTransS and iTransL
+(offset, by x, by y) give the detector's sample and line; a pixel looks along -(x z, y z, f) with z = m_zDirection
+(linescan), (x, y, f) (frame), or the other way if that is towards the ground. Line r is taken at m_intTimeStartTimes +
+m_intTimes (l - m_intTimeLines + 0.5). Quaternions are ecef_from_camera, scalar last.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from scipy.spatial.transform import Rotation
+
+from barpc.errors import InputError, RpcFormatError
+from barpc.geodesy import WGS84_A, WGS84_B, Array
+from barpc.sensor.frame import Frame
+from barpc.sensor.linescan.samples import Detector, Samples, build, unit
+from barpc.sensor.pushbroom import Pushbroom
+from barpc.sidefile import STATE, parse_json, read_text
+
+STATE_END = ".adjusted_state.json"
+"""End of the name of a state, as ASP writes it."""
+LINESCAN, FRAME = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL", "USGS_ASTRO_FRAME_SENSOR_MODEL"
+
+_MOST = 1_000_000  # rows or columns
+_EARTH = 100.0  # m: by which the axes of an Earth's ellipsoid may differ from WGS84's
+_STRAIGHT = 0.01  # rows by which line times may leave a straight line
+_RADIAL = 0  # m_distortionType: 1 - k0 - k1 r^2 - k2 r^4 times the place
+FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+def is_state(head: bytes) -> bool:
+    """Whether the first bytes of a file begin a state."""
+    return re.match(rb"\s*(USGS_ASTRO_\w+\s*)?\{", head) is not None and (
+        b"USGS_ASTRO_" in head or b'"m_centerEphemerisTime"' in head or b'"m_modelName"' in head
+    )
+
+
+def open_state(path: Path) -> tuple[Pushbroom | Frame, tuple[int, int]]:
+    """The camera of a state and the size (width, height) [px] of its image.
+
+    Raises
+    ------
+    RpcFormatError
+        No state, or a damaged one.
+    InputError
+        A state of another model, body or distortion than is read.
+    """
+    text = read_text(path, STATE)
+    try:
+        found = parse_json(text[max(text.find("{"), 0) :])
+    except ValueError as error:
+        raise RpcFormatError(f"{path}: no CSM state that can be read ({error})") from error
+    state = _State(found if isinstance(found, dict) else {}, str(path))
+    model = str(state.content.get("m_modelName"))
+    if model not in _READERS:
+        raise InputError(f"{path}: a CSM state of {model[:60]}, read are {' and '.join(_READERS)}")
+    axes = np.array([state.number("m_majorAxis"), state.number("m_minorAxis")])
+    if not (np.abs(axes - (WGS84_A, WGS84_B)) < _EARTH).all():
+        raise InputError(f"{path}: an ellipsoid of {axes[0]:g} and {axes[1]:g} m, which is not the Earth's")
+    return _READERS[model](state), state.size
+
+
+class _State:
+    """The fields of a state; what is missing or malformed is refused by name."""
+
+    def __init__(self, content: Mapping[str, Any], name: str) -> None:
+        self.content, self.name = content, name
+
+    def numbers(self, key: str, count: int | None = None) -> Array:
+        """A list of finite numbers, perhaps of a stated length."""
+        value = self.content.get(key)
+        if not isinstance(value, list) or not all(type(v) in (int, float) for v in value):
+            raise RpcFormatError(
+                f"{self.name}: {key} is missing or no list of numbers; is the file complete?"
+            )
+        if count not in (None, len(value)):
+            raise RpcFormatError(f"{self.name}: {key} holds {len(value)} numbers, expected {count}")
+        return np.array(value, dtype=np.float64)
+
+    def number(self, key: str) -> float:
+        """A finite number."""
+        value = self.content.get(key)
+        if type(value) not in (int, float):
+            raise RpcFormatError(f"{self.name}: {key} is missing or no number; is the file complete?")
+        return float(value)  # type: ignore[arg-type]  # looked at
+
+    def positive(self, key: str, most: float = 1e9) -> float:
+        """A number above 0 and at most `most`."""
+        value = self.number(key)
+        if not 0 < value <= most:
+            raise RpcFormatError(f"{self.name}: {key} is {value:g}, expected above 0 and at most {most:g}")
+        return value
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return int(self.positive("m_nSamples", _MOST)), int(self.positive("m_nLines", _MOST))
+
+    def plane(self, origin: tuple[float, float]) -> Array:
+        """(2, 3): detector's sample and line of CSM's (sample, line, 1) to the place in the focal plane."""
+        by_sample, by_line = self.numbers("m_iTransS", 3), self.numbers("m_iTransL", 3)
+        forth = np.stack([by_sample[1:], by_line[1:]])
+        if not abs(np.linalg.det(forth)) > 0:
+            raise RpcFormatError(f"{self.name}: m_iTransS and m_iTransL span no plane")
+        detector = np.array(
+            [
+                [self.number(f"m_detector{axis}Summing") * (k == i) for k in range(2)]
+                + [self.number(f"m_startingDetector{axis}") - origin[i] - (by_sample, by_line)[i][0]]
+                for i, axis in enumerate(("Sample", "Line"))
+            ]
+        )
+        return np.linalg.solve(forth, detector)
+
+    def distortion(self) -> Array:
+        """Coefficients (3,) by powers of the squared distance from the axis, in focal lengths."""
+        given = np.trim_zeros(self.numbers("m_opticalDistCoeffs"), "b")
+        if len(given) and (self.number("m_distortionType") != _RADIAL or len(given) > 3):
+            raise InputError(
+                f"{self.name}: a distortion of type {self.number('m_distortionType'):g}, only radial (0) is read"
+            )
+        return np.asarray(
+            np.pad(given, (0, 3 - len(given))) * self.positive("m_focalLength") ** np.array([0, 2, 4])
+        )
+
+
+def _linescan(state: _State) -> Pushbroom:
+    size, name = state.size, state.name
+    if np.any(state.numbers("m_currentParameterValue")):
+        raise InputError(f"{name}: adjustable parameters that are not 0, which are not read")
+    first, period = _lines(state)
+    times, positions = _sampled(state, "positions", "Ephem", 3, first)
+    _, velocities = _sampled(state, "velocities", "Ephem", 3, first)
+    ticks, quaternions = _sampled(state, "quaternions", "Quat", 4, first)
+    if len(velocities) != len(positions):
+        raise RpcFormatError(f"{name}: {len(velocities)} velocities of {len(positions)} positions")
+    rotation = Rotation.from_quat(unit(quaternions, name))
+    middle = len(rotation) // 2
+    look, origin = _look(state, size[0])
+    if rotation[middle].as_matrix()[:, 2] @ positions[len(positions) // 2] > 0:  # away from the Earth
+        rotation, look = rotation * Rotation.from_matrix(FLIP), look * [[-1.0], [1.0]]
+    samples = Samples(name, times, positions, velocities, ticks, rotation.as_quat(scalar_first=True))
+    return build(samples, Detector(look, origin, period, size)).model
+
+
+def _lines(state: _State) -> tuple[float, float]:
+    """Time of row 0 and from one row to the next [s]."""
+    line, start, step = (state.numbers(f"m_intTime{what}") for what in ("Lines", "StartTimes", "s"))
+    if not 0 < len(line) == len(start) == len(step):
+        raise RpcFormatError(
+            f"{state.name}: {len(line)} m_intTimeLines, {len(start)} times, {len(step)} steps"
+        )
+    rows, period = (
+        line - 1.0,
+        float(step[0]),
+    )  # the centre of row r is line r + 0.5, half a line after its start
+    first = float(start[0] - period * rows[0])
+    here = rows < state.size[1]
+    bent = np.abs(start - first - period * rows)[here].max(initial=0.0)
+    if not (period and bent <= _STRAIGHT * abs(period) and (np.abs(step[here] / period - 1) < 1e-6).all()):
+        raise RpcFormatError(f"{state.name}: the line rate changes, or is none, which is not read")
+    return first, period
+
+
+def _sampled(state: _State, what: str, kind: str, width: int, first: float) -> tuple[Array, Array]:
+    """Times [s from row 0] and rows of a list of samples at equal steps."""
+    values = state.numbers(f"m_{what}")
+    stated = state.content.get(f"m_num{what.capitalize()}", len(values))
+    if len(values) % width or stated != len(values):
+        raise RpcFormatError(
+            f"{state.name}: m_{what} holds {len(values)} of {stated} numbers; is the file complete?"
+        )
+    step = state.positive(f"m_dt{kind}", 100.0)
+    times: Array = state.number(f"m_t0{kind}") - first + step * np.arange(float(len(values) // width))
+    return np.asarray(times, np.float64), values.reshape(-1, width)
+
+
+def _look(state: _State, width: int) -> tuple[Array, float]:
+    """`Pushbroom.look` of the column and its origin, the middle of the image; exact, distortion too."""
+    origin = (width - 1) / 2.0
+    plane = state.plane((state.number("m_detectorSampleOrigin"), state.number("m_detectorLineOrigin")))
+    plane = plane / state.positive("m_focalLength") * np.sign(state.number("m_zDirection"))
+    at = [
+        Polynomial([part[0] * (origin + 0.5) + part[2], part[0]]) for part in plane
+    ]  # of line 0 of the detector
+    square = at[0] ** 2 + at[1] ** 2
+    bend = 1.0 - Polynomial(state.distortion())(square)
+    parts = [(part * bend).coef for part in at]
+    look = np.stack([np.pad(part, (0, max(map(len, parts)) - len(part))) for part in parts])
+    degree = max(1, int(np.flatnonzero(look.any(axis=0)).max(initial=1)))
+    return np.asarray(look[:, : degree + 1], np.float64), origin
+
+
+def _frame(state: _State) -> Frame:
+    pose = state.numbers("m_currentParameterValue", 7)
+    if np.any(state.content.get("m_lineTimes") or 0):
+        raise InputError(f"{state.name}: a rolling shutter with jitter, which is not read")
+    center, quaternion = pose[:3], pose[3:]
+    if not np.linalg.norm(quaternion) > 0:
+        raise RpcFormatError(f"{state.name}: m_currentParameterValue holds a quaternion of length 0")
+    rotation = Rotation.from_quat(quaternion).as_matrix()
+    origin = state.numbers("m_ccdCenter", 2)
+    plane = state.plane((origin[1], origin[0])) / state.positive("m_focalLength")
+    plane[:, 2] += 0.5 * plane[:, :2].sum(axis=1)  # of CSM's (0.5, 0.5) to ours
+    if rotation[:, 2] @ center > 0:  # away from the Earth
+        rotation, plane = rotation @ FLIP, plane * [[-1.0], [1.0]]
+    return Frame(center, rotation, plane, state.distortion())
+
+
+_READERS: dict[str, Callable[[_State], Pushbroom | Frame]] = {LINESCAN: _linescan, FRAME: _frame}
