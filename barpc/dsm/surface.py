@@ -163,7 +163,7 @@ class Grid:
         middle = first.sensor.localize((np.array(first.size) - 1) / 2, np.array(first.altitude))
         crs = _crs(options.crs, middle)
         pixel = [_pixel(view) for view in block.views]
-        step = options.gsd or 2.0 * float(np.round(max(pixel), 3))
+        step = options.gsd or float(f"{2 * max(pixel):.2g}")
         outlines = tuple(_common(block.views[i], block.views[j], crs) for i, j in block.pairs)
         whole = shapely.union_all(outlines)
         if whole.is_empty:
