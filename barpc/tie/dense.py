@@ -139,7 +139,8 @@ def dense_matches(
     seen = shown_left & (cv2.remap(shown_right.astype(np.uint8), at, rows, cv2.INTER_NEAREST) > 0)
     good &= seen
     sigma = _sigma(left, partner, good)
-    row, col = np.nonzero(good & _inside(shape, low, frame))
+    row, col = np.nonzero((good & _inside(shape, low, frame))[:, ::FINER])  # a match a pixel
+    col *= FINER
     place = np.column_stack([col, row]) + low
     moved = place - np.column_stack([disparity[row, col], np.zeros(len(row))])
     known = np.column_stack([place, disparity[row, col], np.ones(len(row))])
