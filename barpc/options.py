@@ -590,10 +590,15 @@ class DsmOptions(Options):
     """How `barpc.dsm.make_dsm` makes a surface."""
 
     gsd: float | None = option(
-        None, "Side of a cell. Without: twice the side of a pixel on the ground.", unit="m", above=0, most=1000
+        None,
+        "Side of a cell. Without: twice the side of a pixel on the ground.",
+        unit="m",
+        above=0,
+        most=1000,
     )
     crs: str | None = option(
-        None, "Reference system of the map, in metres, such as `EPSG:32631`. Without: the UTM zone of the images."
+        None,
+        "Reference system of the map, in metres, such as `EPSG:32631`. Without: the UTM zone of the images.",
     )
     alt: tuple[float, float] | None = option(
         None,
@@ -603,7 +608,9 @@ class DsmOptions(Options):
         least=-1000,
         most=10000,
     )
-    pairs: int = option(4, "Pairs of images that a place is matched in, at most; the best come first.", least=1, most=16)
+    pairs: int = option(
+        4, "Pairs of images that a place is matched in, at most; the best come first.", least=1, most=16
+    )
     band: int = option(1, "Band of multi-band images, from 1.", least=1)
     overwrite: bool = option(False, "Replace the file if it exists.")
 

@@ -40,7 +40,9 @@ def _flag(name: str, kind: Any, metavar: str | None = None) -> Any:
 @_flag("overwrite", bool)
 @as_json
 @click.pass_obj
-def dsm(obj: dict[str, Any], source: tuple[str, ...], out: str, jobs: int | str, as_json: bool, **flags: Any) -> int:
+def dsm(
+    obj: dict[str, Any], source: tuple[str, ...], out: str, jobs: int | str, as_json: bool, **flags: Any
+) -> int:
     r"""Make a first surface model (DSM) of a finished run, or of images with the cameras that come with them.
 
     The best pairs of images are matched pixel by pixel, matches are intersected with the corrected cameras, and every
@@ -79,12 +81,16 @@ def _plain(value: Any) -> Any:
 
 def _tell(surface: Surface) -> None:
     cells = surface.size[0] * surface.size[1]
-    echo(f"{surface.known} of {cells} cells of {surface.gsd:g} m have a height, by {', '.join(surface.pairs)}")
+    echo(
+        f"{surface.known} of {cells} cells of {surface.gsd:g} m have a height, by {', '.join(surface.pairs)}"
+    )
     said = {
         "pairs disagree by": surface.nmad,
         "sigma by matching": surface.sigma,
         "by cameras": surface.sigma_cameras,
         "shared by all cells": surface.datum,
     }
-    echo(", ".join(f"{words} {value:.2f} m" for words, value in said.items() if value == value) + " (medians)")
+    echo(
+        ", ".join(f"{words} {value:.2f} m" for words, value in said.items() if value == value) + " (medians)"
+    )
     echo(f"Written to {surface.path}")

@@ -71,9 +71,7 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None) -> Block
     return Block(tuple(views), _best(views, worth), errors, str(folder))
 
 
-def block_of_images(
-    images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1
-) -> Block:
+def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> Block:
     """Images with the cameras that come with them; altitudes are those of the cameras unless given."""
     views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
     for view in views:

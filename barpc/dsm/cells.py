@@ -17,8 +17,11 @@ from barpc.tie.dense import ACROSS, FINER, EpipolarFrame, Matches, dense_matches
 
 SIDE = 512
 """Cells a side of a tile: the blocks of the file."""
-MATCHED = 0.25
-"""Share of the pixels of a part that is matched at least, or the pair says nothing there: see docs/recipes/dsm.md."""
+MATCHED = 0.2
+"""Share of the pixels of a part that is matched at least, or the pair says nothing there.
+
+Of pictures of different ground 2 to 11 % are (22 trials, rendered, and real ones turned over), of real pairs 92 to 97 %.
+"""
 _NODES = 5  # a side of a tile, at which cameras and maps are asked
 _LEVELS = 3  # altitudes
 _SPAN = 128.0  # px of disparity that are searched at once, else a coarser picture says where
@@ -72,9 +75,7 @@ class Tile:
     def places(self) -> Callable[[Array], Array]:
         """A function of lon, lat (n, 2) [deg]: col, row (n, 2) of its cells. Cubics: to 0.1 mm over 10 km."""
         nodes = self.nodes()
-        col, row = np.meshgrid(
-            np.linspace(0, self.size[0], _NODES), np.linspace(0, self.size[1], _NODES)
-        )
+        col, row = np.meshgrid(np.linspace(0, self.size[0], _NODES), np.linspace(0, self.size[1], _NODES))
         middle = nodes.mean(axis=0) if np.ptp(nodes[:, 0]) < 180.0 else nodes[0]
         spread = np.abs(self._near(nodes, middle)).max(axis=0)
         rows = _cubic(self._near(nodes, middle) / spread)
@@ -147,7 +148,9 @@ def _points(
             return found
         low, high = np.percentile(found[0][:, 2], [_ENDS, 100.0 - _ENDS])
         room = _ROOM * zoom * frame.metres
-        tile = replace(tile, alts=(max(tile.alts[0], float(low) - room), min(tile.alts[1], float(high) + room)))
+        tile = replace(
+            tile, alts=(max(tile.alts[0], float(low) - room), min(tile.alts[1], float(high) + room))
+        )
         frame = _frame(pair, tile)
         zoom = 1 if frame is None else min(zoom // 2, _zoom(frame))
     if frame is not None and frame.across > ACROSS and halved < _SPLIT:

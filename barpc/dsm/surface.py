@@ -17,7 +17,7 @@ import rasterio.shutil
 import shapely
 from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning
-from rasterio.transform import from_origin
+from rasterio import Affine
 from rasterio.warp import transform
 from rasterio.windows import Window
 
@@ -111,7 +111,13 @@ def make_dsm(
             )
         with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
             rasterio.shutil.copy(
-                rough, partial, driver="COG", COMPRESS="DEFLATE", PREDICTOR="YES", BLOCKSIZE=str(SIDE), BIGTIFF="IF_SAFER"
+                rough,
+                partial,
+                driver="COG",
+                COMPRESS="DEFLATE",
+                PREDICTOR="YES",
+                BLOCKSIZE=str(SIDE),
+                BIGTIFF="IF_SAFER",
             )
     shutil.rmtree(run.folder, ignore_errors=True)  # (what was kept for going on; it is done)
     return sums.told(out, grid)
@@ -246,7 +252,9 @@ class Grid:
         height, nmad, sigma, seen, _ = result
         bits, cameras = np.nan_to_num(seen).astype(np.int64), np.full(height.shape, np.nan, np.float32)
         count, independent = np.zeros(height.shape), np.ones(height.shape)
-        of_pairs = [] if self.block.errors is None else [self.block.errors.rows(p, _nodes(tile)) for p in pairs]
+        of_pairs = (
+            [] if self.block.errors is None else [self.block.errors.rows(p, _nodes(tile)) for p in pairs]
+        )
         for pattern in np.unique(bits[bits > 0]):
             chosen, cells = [k for k in range(len(pairs)) if pattern >> k & 1], bits == pattern
             count[cells] = len(chosen)
@@ -260,9 +268,15 @@ class Grid:
     @contextmanager
     def _opened(self, path: Path, datum: float) -> Iterator[Any]:
         profile: dict[str, Any] = {"width": self.size[0], "height": self.size[1], "count": len(BANDS)}
-        profile |= {"dtype": "float32", "nodata": float("nan"), "crs": self.crs, "tiled": True, "BIGTIFF": "IF_SAFER"}
+        profile |= {
+            "dtype": "float32",
+            "nodata": float("nan"),
+            "crs": self.crs,
+            "tiled": True,
+            "BIGTIFF": "IF_SAFER",
+        }
         profile |= {"blockxsize": SIDE, "blockysize": SIDE, "compress": "deflate", "SPARSE_OK": True}
-        profile["transform"] = from_origin(self.west, self.north, self.step, self.step)
+        profile["transform"] = Affine(self.step, 0.0, self.west, 0.0, -self.step, self.north)
         tags = {"BARPC": __version__, "VERTICAL_REFERENCE": "WGS84 ellipsoid", "IMAGES": self.block.source}
         if np.isfinite(datum):
             tags["SIGMA_SHARED_BY_ALL_CELLS_M"] = f"{datum:.4f}"
@@ -305,7 +319,9 @@ def _crs(given: str | None, middle: Array) -> CRS:
     except CRSError as error:
         raise InputError(f"--crs {given}: no reference system that PROJ knows ({error})") from error
     if not found.is_projected or found.linear_units_factor[1] != 1.0:
-        raise InputError(f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631")
+        raise InputError(
+            f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631"
+        )
     return found
 
 

@@ -15,7 +15,9 @@ from barpc.tie.raster import Box, FloatImage, Stretch, levelled, read_pixels
 
 ACROSS = 0.02
 """A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""
-FINER = 2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
+FINER = (
+    2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
+)
 _BLOCK = 5  # px of the frame
 _SGBM = {
     "blockSize": _BLOCK,
@@ -154,9 +156,7 @@ def dense_matches(
     )
 
 
-def _window(
-    sizes: Sequence[tuple[int, int]], frame: EpipolarFrame
-) -> tuple[Array, tuple[int, int]] | None:
+def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
     """First pixel (2,) and width, height of what is resampled: the part as far as both images reach, with margins."""
     low, high = frame.low - _MARGIN, frame.high + _MARGIN
     reach = np.array([frame.num, 0.0])

@@ -1,0 +1,67 @@
+"""The surface of real images: pairs agree, more so by corrected cameras, and cost what they are said to."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.cli import main
+from barpc.dsm import make_dsm
+from barpc.options import DsmOptions
+from barpc.pipeline import adjust
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def run(shared_data, tmp_path_factory):
+    images = sorted((shared_data / "optical" / "phr_triplet_north").glob("*.tif"))
+    out = tmp_path_factory.mktemp("triplet") / "run"
+    adjust(images, out)
+    return images, out
+
+
+def test_pairs_of_the_triplet_agree_to_a_third_of_a_metre_and_delivered_cameras_do_not(run, tmp_path):
+    images, folder = run
+    after = make_dsm(folder, tmp_path / "after.tif")
+    before = make_dsm([str(path) for path in images], tmp_path / "before.tif", DsmOptions(alt=(37.0, 355.0)))
+    assert after.pairs[0] == "img_01 - img_03"  # the largest angle
+    assert after.nmad < 0.40
+    assert after.nmad < 0.5 * before.nmad
+    with rasterio.open(tmp_path / "after.tif") as file:
+        bands, tags = file.read(), file.tags()
+    known = np.isfinite(bands[0])
+    assert known.sum() > 125_000  # m^2 of the 140,000 that any two images show
+    low, high = np.percentile(bands[0][known], [1, 99])
+    assert 75.0 < low < 90.0
+    assert 305.0 < high < 320.0
+    assert (bands[4][known] > 0).all()
+    assert np.median(bands[4][known]) < 2.0  # without what all cells share,
+    assert 10.0 < float(tags["SIGMA_SHARED_BY_ALL_CELLS_M"]) < 100.0  # which ties do not tell
+
+
+def test_the_command_says_what_it_made(run, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(
+            [
+                "-q",
+                "dsm",
+                str(run[1]),
+                "-o",
+                str(tmp_path / "dsm.tif"),
+                "--pairs",
+                "1",
+                "--gsd",
+                "2",
+                "--json",
+            ]
+        )
+    assert not stop.value.code
+    told = json.loads(capsys.readouterr().out)
+    assert told["gsd"] == 2.0
+    assert told["pairs"] == ["img_01 - img_03"]
+    assert told["nmad"] is None
+    assert told["known"] > 25_000
