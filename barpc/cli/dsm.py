@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.cli.images import expanded
-from barpc.cli.options import jobs_option
+from barpc.cli.options import Function, jobs_option
 from barpc.cli.progress import executor_for, progress_told
 from barpc.cli.terminal import as_json, echo, tell_gate
 from barpc.options import DsmOptions, declared
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from barpc.dsm import Surface
 
 
-def _flag(name: str, kind: Any, metavar: str | None = None) -> Any:
+def _flag(name: str, kind: Any, metavar: str | None = None) -> Callable[[Function], Function]:
     """A click option whose words and default are the field's own."""
     one = declared(DsmOptions)[name]
     default = "" if one.default in (None, False) else f"  [default: {one.default}]"
@@ -41,14 +42,14 @@ def _flag(name: str, kind: Any, metavar: str | None = None) -> Any:
 @as_json
 @click.pass_obj
 def dsm(
-    obj: dict[str, Any], source: tuple[str, ...], out: str, jobs: int | str, as_json: bool, **flags: Any
+    obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | str, as_json: bool, **flags: Any
 ) -> int:
     r"""Make a first surface model (DSM) of a finished run, or of images with the cameras that come with them.
 
     The best pairs of images are matched pixel by pixel, matches are intersected with the corrected cameras, and every
     cell of a map gets the median of its pairs. The file, a Cloud-Optimised GeoTIFF, has five bands: height above the
     ellipsoid, number of pairs, their disagreement, and the height's standard deviation by matching and by cameras; its
-    tag SIGMA_SHARED_BY_ALL_CELLS_M says how well the height of the whole is known. Bands by cameras come from a run only.
+    tag SIGMA_SHARED_BY_ALL_CELLS_M says how well the height of the whole is known. Only a run knows its cameras'.
 
     Exit code 3: nothing is written, as the images cannot be matched in this way, and a line says why.
 
@@ -58,7 +59,7 @@ def dsm(
       barpc dsm adjusted/*.vrt -o dsm.tif --alt 80 320
       barpc dsm adjusted -o dsm.tif --gsd 2 --crs EPSG:2154 -j 4
     """
-    from barpc.dsm import NoSurface, make_dsm
+    from barpc.dsm import NoSurfaceError, make_dsm
 
     run = Path(source[0]) if len(source) == 1 and (Path(source[0]) / "summary.json").is_file() else None
     options = DsmOptions(**{name: value for name, value in flags.items() if value is not None})
@@ -66,7 +67,7 @@ def dsm(
         with executor_for(jobs) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
             given = expanded(source) if run is None else run
             surface = make_dsm(given, out, options, executor=executor, progress=progress)
-    except NoSurface as error:
+    except NoSurfaceError as error:
         return tell_gate(f"no surface: {error}", [])
     if as_json:
         echo(json.dumps({key: _plain(value) for key, value in asdict(surface).items()}, indent=1))

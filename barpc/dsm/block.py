@@ -28,7 +28,7 @@ ANGLES = 2.0, 45.0
 _RADAR = ("sentinel-1", "terrasar-x", "sicd")
 
 
-class NoSurface(BarpcError):
+class NoSurfaceError(BarpcError):
     """Images of which no surface can be made in this way: why, in a sentence."""
 
 
@@ -49,7 +49,7 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None) -> Block
     ------
     InputError
         No finished adjustment, or an image that is on another host.
-    NoSurface
+    NoSurfaceError
         Images that are not matched: radar, angles.
     """
     scene = read_scene(folder, alts)
@@ -57,7 +57,7 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None) -> Block
     for shot in scene.shots:
         source = shot.entry.rpc_source
         if source is not None and source.format in _RADAR:
-            raise NoSurface(_radar(shot.name))
+            raise NoSurfaceError(_radar(shot.name))
         if is_url(shot.file):
             raise InputError(f"{shot.file}: is on another host; a surface is made of images on this one")
         if not shot.file:
@@ -76,7 +76,7 @@ def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = No
     views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
     for view in views:
         if isinstance(view.sensor, Radar):
-            raise NoSurface(_radar(view.name))
+            raise NoSurfaceError(_radar(view.name))
     return Block(tuple(views), _best(views), None, ", ".join(view.name for view in views))
 
 
@@ -107,8 +107,8 @@ def _best(
     if not usable:
         said = [f"{views[p.views[0]].name} and {views[p.views[1]].name} {p.angle:.1f} deg" for p in found[:3]]
         if not said:
-            raise NoSurface("no two images overlap at the altitudes that they are used for")
-        raise NoSurface(
+            raise NoSurfaceError("no two images overlap at the altitudes that they are used for")
+        raise NoSurfaceError(
             f"no pair meets under {ANGLES[0]:g} to {ANGLES[1]:g} degrees, where SGBM can match ({'; '.join(said)})"
         )
     rows = []

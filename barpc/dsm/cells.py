@@ -20,7 +20,7 @@ SIDE = 512
 MATCHED = 0.2
 """Share of the pixels of a part that is matched at least, or the pair says nothing there.
 
-Of pictures of different ground 2 to 11 % are (22 trials, rendered, and real ones turned over), of real pairs 92 to 97 %.
+Of pictures of different ground 2 to 11 % are (22 trials, rendered, and real ones turned over), of pairs 92 to 97 %.
 """
 _NODES = 5  # a side of a tile, at which cameras and maps are asked
 _LEVELS = 3  # altitudes

@@ -71,4 +71,5 @@ class CameraErrors:
 
     def sigma(self, rows: Array) -> Array:
         """Standard deviation (n,) [m] of heights, or differences of them, with these derivatives (n, V q)."""
-        return np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", rows, self.covariance, rows), 0.0))
+        square: Array = np.einsum("ni,ij,nj->n", rows, self.covariance, rows)
+        return np.asarray(np.sqrt(np.maximum(square, 0.0)))

@@ -15,15 +15,15 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 import shapely
+from rasterio import Affine
 from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning
-from rasterio import Affine
 from rasterio.warp import transform
 from rasterio.windows import Window
 
 from barpc import __version__
 from barpc.atomic import replacing
-from barpc.dsm.block import Block, NoSurface, block_of_images, block_of_run
+from barpc.dsm.block import Block, NoSurfaceError, block_of_images, block_of_run
 from barpc.dsm.cells import F32, MATCHED, SIDE, Tile, surface_tile
 from barpc.errors import InputError, OutputError
 from barpc.geodesy import Array
@@ -86,7 +86,7 @@ def make_dsm(
 
     Raises
     ------
-    NoSurface
+    NoSurfaceError
         Images that SGBM cannot match: radar, too large an angle, hardly a pixel that is found back.
     InputError, OutputError
         See `barpc.errors`; nothing is written then.
@@ -105,9 +105,9 @@ def make_dsm(
         with run.stage("surface"):
             sums = grid.fill(rough, run, executor, progress)
         if not sums.known:
-            raise NoSurface(
-                f"of the pixels that both images show {100 * max(sums.share, 0):.0f} % are found back at most, fewer than "
-                f"{100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
+            raise NoSurfaceError(
+                f"of the pixels that both images show {100 * max(sums.share, 0):.0f} % are found back at most, "
+                f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
             )
         with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
             rasterio.shutil.copy(
@@ -145,8 +145,9 @@ class _Sums:
         pairs = tuple(f"{names[i]} - {names[j]}" for i, j in grid.used)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            middle = [float(np.nanmedian(rows)) for rows in np.concatenate(self.medians, axis=1)]
-        return Surface(str(out), pairs, grid.step, grid.size, self.known, self.share, *middle, self.datum)
+            nmad, sigma, cameras = (float(np.nanmedian(row)) for row in np.concatenate(self.medians, axis=1))
+        found = self.known, self.share, nmad, sigma, cameras, self.datum
+        return Surface(str(out), pairs, grid.step, grid.size, *found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +174,7 @@ class Grid:
         outlines = tuple(_common(block.views[i], block.views[j], crs) for i, j in block.pairs)
         whole = shapely.union_all(outlines)
         if whole.is_empty:
-            raise NoSurface("no two images overlap at the altitudes that they are used for")
+            raise NoSurfaceError("no two images overlap at the altitudes that they are used for")
         low, high = np.array(whole.bounds).reshape(2, 2)
         west, north = float(np.floor(low[0] / step) * step), float(np.ceil(high[1] / step) * step)
         size = int(np.ceil((high[0] - west) / step)), int(np.ceil((north - low[1]) / step))
@@ -241,9 +242,8 @@ class Grid:
         if errors is None:
             return np.zeros(0)
         some = range(0, len(tiles), 1 + len(tiles) // _DATUM_NODES)
-        return np.mean(
-            [errors.rows(pair, _nodes(tiles[n])).mean(axis=0) for n in some for pair in pairs[n]], axis=0
-        )
+        rows = [errors.rows(pair, _nodes(tiles[n])).mean(axis=0) for n in some for pair in pairs[n]]
+        return np.asarray(np.mean(rows, axis=0))
 
     def _bands(
         self, tile: Tile, pairs: Sequence[tuple[int, int]], result: Sequence[F32], shared: Array
@@ -336,5 +336,5 @@ def _common(first: View, second: View, crs: CRS) -> Any:
             ring = ring[np.isfinite(ring).all(axis=1)]
             x, y = transform(CRS.from_epsg(4326), crs, ring[:, 0], ring[:, 1])
             rings.append(shapely.make_valid(shapely.Polygon(np.column_stack([x, y]))))
-        parts.append(shapely.intersection(*rings))
+        parts.append(shapely.intersection(rings[0], rings[1]))
     return shapely.union_all(parts)

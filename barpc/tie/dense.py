@@ -137,7 +137,7 @@ def dense_matches(
     disparity, good = _both_ways(left, right, frame.num)
     cols, rows = np.meshgrid(np.arange(shape[0], dtype=np.float32), np.arange(shape[1], dtype=np.float32))
     at = cols - disparity
-    partner = cv2.remap(right, at, rows, cv2.INTER_LINEAR)
+    partner = np.asarray(cv2.remap(right, at, rows, cv2.INTER_LINEAR), np.uint8)
     seen = shown_left & (cv2.remap(shown_right.astype(np.uint8), at, rows, cv2.INTER_NEAREST) > 0)
     good &= seen
     sigma = _sigma(left, partner, good)
@@ -217,7 +217,7 @@ def _resampled(
     # the affine map of the box's own pixels; positions are rounded to 1/32 px, 0.016 px at most
     to_frame = np.column_stack([one[:, :2], one[:, 2] + one[:, :2] @ low])
     cv2.setNumThreads(1)  # the work is spread by processes
-    moved: FloatImage = cv2.warpAffine(picture, to_frame, shape, flags=cv2.INTER_CUBIC)
+    moved = cv2.warpAffine(picture, to_frame, shape, flags=cv2.INTER_CUBIC)
     shown = cv2.warpAffine(valid.astype(np.uint8) * 255, to_frame, shape, flags=cv2.INTER_LINEAR)
     return np.asarray(moved, np.uint8), np.asarray(shown == 255)
 
@@ -230,7 +230,7 @@ def _both_ways(
     there = matcher.compute(left, right).astype(np.float32) / 16.0
     turned = [np.ascontiguousarray(one[:, ::-1]) for one in (right, left)]
     back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / 16.0
-    rows, cols = np.indices(left.shape, sparse=True)
+    rows, cols = np.ogrid[: left.shape[0], : left.shape[1]]
     at = np.clip(np.rint(cols - there).astype(np.int64), 0, left.shape[1] - 1)
     good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= _BACK * FINER)
     return there, good

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 import rasterio
 
+from barpc.ba.result import pair_heights
 from barpc.cli import main
 from barpc.dsm import make_dsm
+from barpc.dsm.block import block_of_run
+from barpc.geodesy import ground_from_ecef
 from barpc.options import DsmOptions
 from barpc.pipeline import adjust
 
@@ -65,3 +68,14 @@ def test_the_command_says_what_it_made(run, tmp_path, capsys):
     assert told["pairs"] == ["img_01 - img_03"]
     assert told["nmad"] is None
     assert told["known"] > 25_000
+
+
+def test_what_the_cameras_leave_of_a_height_is_what_their_adjustment_says(run):
+    """Of the run's folder alone as of the adjustment that wrote it: the pair's absolute sigma at its tie points."""
+    images, folder = run
+    adjustment = adjust(images, folder.parent / "again").adjustment
+    block = block_of_run(folder)
+    assert block.errors is not None
+    points = adjustment.points[np.isfinite(adjustment.points[:, 0])][::20]
+    stated = block.errors.sigma(block.errors.rows((0, 2), ground_from_ecef(points)))
+    assert np.sqrt(np.mean(stated**2)) == pytest.approx(pair_heights(adjustment, 0, 2).absolute, rel=0.01)

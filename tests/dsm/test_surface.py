@@ -10,7 +10,7 @@ import pytest
 import rasterio
 
 from barpc.cli import main
-from barpc.dsm import NoSurface, make_dsm
+from barpc.dsm import NoSurfaceError, make_dsm
 from barpc.dsm import surface as surface_module
 from barpc.errors import InputError, OutputError
 from barpc.options import DsmOptions
@@ -160,7 +160,7 @@ def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp
             return ground
 
     radar = replace(views[0], sensor=Seen(views[0].sensor, ImageAffine(np.zeros(2), np.zeros((2, 2)))))
-    with pytest.raises(NoSurface, match="view_00: a radar image"):
+    with pytest.raises(NoSurfaceError, match="view_00: a radar image"):
         block.block_of_images([radar, views[1]])
     assert not list(tmp_path.iterdir())
 
