@@ -612,6 +612,12 @@ class DsmOptions(Options):
         4, "Pairs of images that a place is matched in, at most; the best come first.", least=1, most=16
     )
     band: int = option(1, "Band of multi-band images, from 1.", least=1)
+    minus: str | None = option(
+        None,
+        """Take away the surface of the images that this run has, and give what changed: a finished run of one date's
+        images, which the run of both dates has, too. What both dates share is no error of the difference.""",
+        unit="dir",
+    )
     overwrite: bool = option(False, "Replace the file if it exists.")
 
     def __post_init__(self) -> None:

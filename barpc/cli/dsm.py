@@ -37,6 +37,7 @@ def _flag(name: str, kind: Any, metavar: str | None = None) -> Callable[[Functio
 @_flag("alt", (float, float), "LOW HIGH")
 @_flag("pairs", int, "N")
 @_flag("band", int, "N")
+@_flag("minus", str, "OTHER_RUN")
 @jobs_option
 @_flag("overwrite", bool)
 @as_json
@@ -57,12 +58,15 @@ def dsm(
     Examples:
       barpc dsm adjusted -o dsm.tif
       barpc dsm adjusted/*.vrt -o dsm.tif --alt 80 320
+      barpc dsm both_dates -o change.tif --minus first_date
       barpc dsm adjusted -o dsm.tif --gsd 2 --crs EPSG:2154 -j 4
     """
     from barpc.dsm import NoSurfaceError, make_dsm
 
     run = Path(source[0]) if len(source) == 1 and (Path(source[0]) / "summary.json").is_file() else None
     options = DsmOptions(**{name: value for name, value in flags.items() if value is not None})
+    if run is None and options.minus is not None:
+        raise click.UsageError("--minus goes with a RUN: what two dates share is not known of images")
     try:
         with executor_for(jobs) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
             given = expanded(source) if run is None else run

@@ -17,6 +17,7 @@ from barpc.options import TieOptions
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import PRIOR
 from barpc.remote import is_url
+from barpc.report.tables import read_summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
 from barpc.sensor import SensorModel
@@ -28,22 +29,31 @@ ANGLES = 2.0, 45.0
 _RADAR = ("sentinel-1", "terrasar-x", "sicd")
 
 
+Pairs = tuple[tuple[int, int], ...]
+"""Indices of two views each, the best pair first."""
+
+
 class NoSurfaceError(BarpcError):
     """Images of which no surface can be made in this way: why, in a sentence."""
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Views with the cameras that are believed, pairs of them, the best first, and the cameras' errors if known."""
+    """Views with the cameras that are believed, their pairs, and the cameras' errors if they are known.
+
+    `groups`: the pairs of which a surface is made; of a difference those of the surface that is taken away, too.
+    """
 
     views: tuple[View, ...]
-    pairs: tuple[tuple[int, int], ...]
+    groups: tuple[Pairs, ...]
     errors: CameraErrors | None
     source: str
 
 
-def block_of_run(folder: Path, alts: tuple[float, float] | None = None) -> Block:
+def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: Path | None = None) -> Block:
     """The images of a finished run behind its corrected cameras; altitudes by its tie points unless given.
+
+    `minus`: a run of some of these images (an earlier one, that this one went on from); they are another group then.
 
     Raises
     ------
@@ -68,7 +78,21 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None) -> Block
     names = [view.name for view in views]
     errors = CameraErrors.of(BlockPrior.load(folder / PRIOR), views)
     worth = {(i, j): ties.get(frozenset((names[i], names[j])), 0.0) for i, j in _numbered(len(views))}
-    return Block(tuple(views), _best(views, worth), errors, str(folder))
+    parts = [range(len(views))] if minus is None else _split(folder, names, minus)
+    groups = tuple(_best(views, worth, part) for part in parts)
+    return Block(tuple(views), groups, errors, str(folder) + ("" if minus is None else f" minus {minus}"))
+
+
+def _split(folder: Path, names: Sequence[str], minus: Path) -> list[list[int]]:
+    """The images that another run does not have, and those that it has; InputError where either are too few."""
+    there = {view.name for view in read_summary(minus).views}
+    parts = [[i for i, name in enumerate(names) if (name in there) == old] for old in (False, True)]
+    if min(map(len, parts)) < 2:
+        raise InputError(
+            f"{minus}: has {len(parts[1])} of the {len(names)} images of {folder}; a change, and what both dates share, "
+            "is told by a run with at least two images of each, minus one of a single date: adjust both together"
+        )
+    return parts
 
 
 def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> Block:
@@ -77,7 +101,7 @@ def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = No
     for view in views:
         if isinstance(view.sensor, Radar):
             raise NoSurfaceError(_radar(view.name))
-    return Block(tuple(views), _best(views), None, ", ".join(view.name for view in views))
+    return Block(tuple(views), (_best(views),), None, ", ".join(view.name for view in views))
 
 
 def _camera(folder: Path, shot: Shot) -> SensorModel:
@@ -95,14 +119,17 @@ def _numbered(count: int) -> list[tuple[int, int]]:
 
 
 def _best(
-    views: Sequence[View], ties: dict[tuple[int, int], float] | None = None
-) -> tuple[tuple[int, int], ...]:
-    """Pairs in the order of what they say of heights: of one date first, then by tie points times (B/H)^2.
+    views: Sequence[View],
+    ties: dict[tuple[int, int], float] | None = None,
+    among: Sequence[int] | None = None,
+) -> Pairs:
+    """Pairs (`among` some views) by what they say of heights: of one date first, then by tie points times (B/H)^2.
 
     A height's variance is that of a match over (B/H)^2, and where tie points are found, dense matches are. Without
     tie points the overlap and the angle stand for them (`barpc.tie.pairs.Pair.score`).
     """
     found = overlapping_pairs(views, TieOptions(angles=(0.0, 180.0)))
+    found = [pair for pair in found if among is None or set(pair.views) <= set(among)]
     usable = [pair for pair in found if ANGLES[0] <= pair.angle <= ANGLES[1]]
     if not usable:
         said = [f"{views[p.views[0]].name} and {views[p.views[1]].name} {p.angle:.1f} deg" for p in found[:3]]

@@ -11,7 +11,7 @@ import rasterio
 
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm
-from barpc.dsm import surface as surface_module
+from barpc.dsm import grid as surface_module
 from barpc.errors import InputError, OutputError
 from barpc.options import DsmOptions
 from barpc.pipeline import load_views
