@@ -89,7 +89,7 @@ def _split(folder: Path, names: Sequence[str], minus: Path) -> list[list[int]]:
     parts = [[i for i, name in enumerate(names) if (name in there) == old] for old in (False, True)]
     if min(map(len, parts)) < 2:
         raise InputError(
-            f"{minus}: has {len(parts[1])} of the {len(names)} images of {folder}; a change, and what both dates share, "
+            f"{minus}: has {len(parts[1])} of the {len(names)} images of {folder}; a change, and what dates share, "
             "is told by a run with at least two images of each, minus one of a single date: adjust both together"
         )
     return parts

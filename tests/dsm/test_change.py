@@ -36,7 +36,7 @@ def heights(sensors, seen, pair, ground):
 def one_block(seed):
     """Error of the height difference of two dates at some points, its sigma, and that of independent dates."""
     # (an image's tie points are never believed beyond 0.02 px together: 0.3 px of 60 are 0.04)
-    block = simulate_block(4, 60, seed=seed, noise=0.3)
+    block = simulate_block(4, 60, seed=seed, per_site=4, size=(6000, 6000), noise=0.3)
     found = adjust_tracks(block.views, block.tracks, AdjustOptions(drift=0, learn_priors=False))
     views = [replace(view, sensor=sensor) for view, sensor in zip(block.views, found.sensors, strict=True)]
     errors = CameraErrors.of(block_prior(found), views)
