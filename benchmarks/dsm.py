@@ -76,21 +76,29 @@ def rendered(side: int) -> dict[str, object]:
         alt = options.alt - options.relief / 2 - 10.0, options.alt + options.relief / 2 + 40.0
         out, call = Path(folder) / "dsm.tif", json.dumps([made.paths, alt])
         code = (
-            "import json,resource,sys,time; from barpc.dsm import make_dsm; from barpc.options import DsmOptions\n"
+            "import json,sys,time; from barpc.dsm import make_dsm; from barpc.options import DsmOptions\n"
             "paths, alt = json.loads(sys.argv[1]); start = time.process_time()\n"
             "make_dsm(paths, sys.argv[2], DsmOptions(alt=tuple(alt))); cpu = time.process_time() - start\n"
-            "print(cpu, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+            "print(cpu, open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"
         )
         done = subprocess.run(
             [sys.executable, "-c", code, call, str(out)], capture_output=True, text=True, check=True
         )
-        cpu, peak = map(float, done.stdout.split())
+        cpu, peak = map(
+            float, done.stdout.split()
+        )  # (what getrusage says is the parent's, where that was larger)
         with rasterio.open(out) as file:
             height, sigma = file.read(1), file.read(4)
         error = height - made.truth(out)
         known = np.isfinite(error)
         within = float(np.mean(np.abs(error[known]) < sigma[known]))
-        return {"cells": int(known.sum()), "nmad": nmad(error), "within": within, "cpu": cpu, "peak": peak}
+        return {
+            "cells": int(known.sum()),
+            "nmad": nmad(error),
+            "within": within,
+            "cpu": cpu,
+            "peak": peak / 1024,
+        }
 
 
 def main() -> None:

@@ -33,7 +33,7 @@ _SGBM = {
 _BACK = 1.0  # px that a match may come back beside where it began
 _MARGIN = 16  # px about a part that are matched, too: paths of SGBM begin at the ends
 _WINDOW = 5  # px a side, over which grey values are compared
-_FLOOR, _FACTOR = 0.08, 1.9  # px; over what least squares matching states: see docs/recipes/dsm.md
+_FLOOR, _FACTOR = 0.07, 1.8  # px; over what least squares matching states: see docs/recipes/dsm.md
 _FEW = 32  # px a side of what is matched at all
 
 
@@ -41,13 +41,12 @@ _FEW = 32  # px a side of what is matched at all
 class EpipolarFrame:
     """Affine maps (2, 2, 3) of two images to a frame whose rows are epipolar lines, and what is to be matched there.
 
-    `low`, `high` (2,) [px of the frame]: the part; `num`: disparities, from 0 on; `across`: how far rows miss the
+    `places` (N, 2) [px of the frame]: points about the part; `num`: disparities, from 0 on; `across`: how far rows miss the
     lines at most [px]; `altitude` (4,): of a match, by col, row of the frame, disparity and 1 [m].
     """
 
     maps: Array
-    low: Array
-    high: Array
+    places: Array
     num: int
     across: float
     altitude: Array
@@ -106,10 +105,7 @@ def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
     across = float(np.abs(rows - system @ second[1]).max())
     known = np.column_stack([along, rows, disparity, np.ones(len(a))])
     altitude = np.linalg.lstsq(known, alt, rcond=None)[0]
-    place = np.column_stack([along, rows])
-    return EpipolarFrame(
-        np.stack([first, second]), place.min(axis=0), place.max(axis=0), num, across, altitude
-    )
+    return EpipolarFrame(np.stack([first, second]), known[:, :2], num, across, altitude)
 
 
 def dense_matches(
@@ -158,7 +154,7 @@ def dense_matches(
 
 def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
     """First pixel (2,) and width, height of what is resampled: the part as far as both images reach, with margins."""
-    low, high = frame.low - _MARGIN, frame.high + _MARGIN
+    low, high = frame.places.min(axis=0) - _MARGIN, frame.places.max(axis=0) + _MARGIN
     reach = np.array([frame.num, 0.0])
     for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):
         corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - 0.5) @ one[:, :2].T + one[:, 2]
@@ -170,12 +166,10 @@ def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Arr
 
 
 def _inside(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> BoolArray:
-    """Which pixels of the window belong to the part."""
-    cols, rows = np.arange(shape[0]) + low[0], np.arange(shape[1]) + low[1]
-    in_cols = (cols >= frame.low[0]) & (cols <= frame.high[0])
-    in_rows = (rows >= frame.low[1]) & (rows <= frame.high[1])
-    inside: BoolArray = in_rows[:, None] & in_cols
-    return inside
+    """Which pixels of the window belong to the part: the others only led there."""
+    hull = cv2.convexHull((frame.places - low).astype(np.float32))
+    mask = cv2.fillConvexPoly(np.zeros(shape[::-1], np.uint8), np.rint(hull).astype(np.int32), 1)
+    return np.asarray(mask > 0)
 
 
 def _moved(one: Array, by: Array) -> Array:
