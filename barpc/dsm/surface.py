@@ -17,6 +17,7 @@ from barpc.atomic import replacing
 from barpc.dsm.block import NoSurfaceError, block_of_images, block_of_run
 from barpc.dsm.cells import MATCHED, SIDE
 from barpc.dsm.grid import Counts, Grid
+from barpc.dsm.relief import show_in_report
 from barpc.errors import InputError, OutputError
 from barpc.options import DsmOptions
 from barpc.sidefile import plain_path
@@ -100,6 +101,8 @@ def make_dsm(
                 BLOCKSIZE=str(SIDE),
                 BIGTIFF="IF_SAFER",
             )
+    if isinstance(source, str | Path) and options.minus is None:
+        show_in_report(Path(source), grid, out)
     shutil.rmtree(run.folder, ignore_errors=True)  # (what was kept for going on; it is done)
     return _told(out, grid, counts)
 

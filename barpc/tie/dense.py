@@ -41,8 +41,8 @@ _FEW = 32  # px a side of what is matched at all
 class EpipolarFrame:
     """Affine maps (2, 2, 3) of two images to a frame whose rows are epipolar lines, and what is to be matched there.
 
-    `places` (N, 2) [px of the frame]: points about the part; `num`: disparities, from 0 on; `across`: how far rows miss the
-    lines at most [px]; `altitude` (4,): of a match, by col, row of the frame, disparity and 1 [m].
+    `places` (N, 2) [px of the frame]: points about the part; `num`: disparities, from 0 on; `across`: how far rows miss
+    the lines at most [px]; `altitude` (4,): of a match, by col, row of the frame, disparity and 1 [m].
     """
 
     maps: Array

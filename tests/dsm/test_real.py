@@ -12,9 +12,11 @@ from barpc.ba.result import pair_heights
 from barpc.cli import main
 from barpc.dsm import make_dsm
 from barpc.dsm.block import block_of_run
+from barpc.errors import InputError
 from barpc.geodesy import ground_from_ecef
 from barpc.options import DsmOptions
 from barpc.pipeline import adjust
+from barpc.report.tables import read_summary, read_tables
 
 pytestmark = pytest.mark.slow
 
@@ -79,3 +81,17 @@ def test_what_the_cameras_leave_of_a_height_is_what_their_adjustment_says(run):
     points = adjustment.points[np.isfinite(adjustment.points[:, 0])][::20]
     stated = block.errors.sigma(block.errors.rows((0, 2), ground_from_ecef(points)))
     assert np.sqrt(np.mean(stated**2)) == pytest.approx(pair_heights(adjustment, 0, 2).absolute, rel=0.01)
+
+
+def test_the_report_shows_the_same_window_before_and_after(run, tmp_path):
+    make_dsm(run[1], tmp_path / "dsm.tif")
+    before, after = read_tables(read_summary(run[1]), run[1]).reliefs
+    assert before.nmad_m > 2.0 * after.nmad_m
+    assert after.share > 0.4
+    page = (run[1] / "report.html").read_text(encoding="utf-8")
+    assert "What do they make of the ground?" in page
+    assert page.count("by the delivered cameras, lit") == page.count("by the corrected cameras, lit") == 2
+    assert f"{after.nmad_m:.2f} m" in page or f"{100 * after.nmad_m:.0f} cm" in page
+    (run[1] / "surface.json").write_text("[]")
+    with pytest.raises(InputError, match=r"surface\.json: damaged"):
+        read_tables(read_summary(run[1]), run[1])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import BlockPrior
+from barpc.dsm.relief import shaded
 from barpc.dsm.sigma import CameraErrors
 from barpc.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import View
@@ -98,3 +99,15 @@ def test_rows_of_the_frame_are_epipolar_lines_and_disparity_tells_height(views):
         scale = np.linalg.norm(one[:, :2], axis=1)
         np.testing.assert_allclose(scale, [2.0, 1.0], rtol=0.1)  # two columns and one row a pixel
         assert len(points) == 75
+
+
+def test_a_slope_to_the_light_is_bright_and_one_away_from_it_dark_and_the_unknown_black():
+    """The sign that could be wrong: rows count to the south, light comes from the north-west."""
+    east, south = np.meshgrid(np.arange(20.0), np.arange(16.0))
+    falls = {"north-west": 0.5 * (east + south), "south-east": -0.5 * (east + south), "flat": 0.0 * east}
+    grey = {name: float(np.median(shaded(height.astype(np.float32), 1.0))) for name, height in falls.items()}
+    assert grey["north-west"] > grey["flat"] > grey["south-east"]
+    height = np.full((6, 6), np.nan, np.float32)
+    height[:, :4] = 1.0
+    assert (shaded(height, 1.0)[:, 4:] == 0).all()
+    assert (shaded(height, 1.0)[:, :3] > 0).all()
