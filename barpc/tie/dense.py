@@ -33,7 +33,7 @@ _SGBM = {
 _BACK = 1.0  # px that a match may come back beside where it began
 _MARGIN = 16  # px about a part that are matched, too: paths of SGBM begin at the ends
 _WINDOW = 5  # px a side, over which grey values are compared
-_FLOOR, _FACTOR = 0.07, 1.8  # px; over what least squares matching states: see docs/recipes/dsm.md
+_FLOOR, _FACTOR = 0.065, 1.9  # px; over what least squares matching states: see docs/recipes/dsm.md
 _FEW = 32  # px a side of what is matched at all
 
 
