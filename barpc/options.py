@@ -604,6 +604,47 @@ FORMER = {"dem_for_all": "a dem holds all tie points; dem_for_weak = true: those
 """Former option -> how it is said now."""
 
 
+@dataclass(frozen=True, repr=False)
+class DsmOptions(Options):
+    """How `barpc.dsm.make_dsm` makes a surface."""
+
+    gsd: float | None = option(
+        None,
+        "Side of a cell. Without: twice the side of a pixel on the ground.",
+        unit="m",
+        above=0,
+        most=1000,
+    )
+    crs: str | None = option(
+        None,
+        "Reference system of the map, in metres, such as `EPSG:32631`. Without: the UTM zone of the images.",
+    )
+    alt: tuple[float, float] | None = option(
+        None,
+        """Altitudes between which the ground is looked for. Without: those of a run's tie points and a margin, or
+        those that the cameras are made for.""",
+        unit="m",
+        least=-1000,
+        most=10000,
+    )
+    pairs: int = option(
+        4, "Pairs of images that a place is matched in, at most; the best come first.", least=1, most=16
+    )
+    band: int = option(1, "Band of multi-band images, from 1.", least=1)
+    minus: str | None = option(
+        None,
+        """Take away the surface of the images that this run has, and give what changed: a finished run of one date's
+        images, which the run of both dates has, too. What both dates share is no error of the difference.""",
+        unit="dir",
+    )
+    overwrite: bool = option(False, "Replace the file if it exists.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.alt is not None and not self.alt[0] < self.alt[1]:
+            raise InputError(f"alt: the lower altitude comes first, found {self.alt}")
+
+
 def with_values(options: Record, values: Mapping[str, Any], where: str = "options") -> Record:
     """A copy of a record with some fields changed, nested records by nested mappings.
 

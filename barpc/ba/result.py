@@ -250,21 +250,36 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     if not len(seen):
         return PairHeights((first, second), np.nan, np.nan, 0)
     points = adjustment.points[seen[:: len(seen) // _SAMPLE + 1]]
-    n, pair = len(points), sorted((first, second))
-    bounds = np.searchsorted(np.repeat(pair, n), np.arange(structure.num_views + 1))
-    ecef = np.concatenate([points, points]).T
-    projected = adjustment.cameras.project(adjustment.params, ecef, bounds)
+    n, pair = len(points), (min(first, second), max(first, second))
+    cameras, params = adjustment.cameras, adjustment.params
+    by_camera = height_by_unknowns(cameras, params, pair, points).reshape(n, -1)
+    covariance = adjustment.covariance.joint(np.array(pair))
+    relative = by_camera - by_camera.mean(axis=0)
+    return PairHeights((first, second), _rms(by_camera, covariance), _rms(relative, covariance), n)
+
+
+def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], points: Array) -> Array:
+    """Derivative (n, 2, q) of heights that two views measure, by the unknowns (N, q) of either.
+
+    Parameters
+    ----------
+    cameras : Cameras, of N views
+    pair : (int, int), the views, ascending
+    points : (n, 3), ECEF [m]
+    """
+    n, num, ground = len(points), len(cameras.sensors), ground_from_ecef(points)
+    cameras = cameras.seeing(np.concatenate([cameras.sensors[view].project(ground) for view in pair]).T)
+    bounds = np.searchsorted(np.repeat(pair, n), np.arange(num + 1))
+    projected = cameras.project(params, np.concatenate([points, points]).T, bounds)
     by_point = projected.by_point.reshape(2, 3, 2, n).transpose(3, 2, 0, 1)  # point, view, coordinate, axis
     by_unknown = projected.by_unknown.reshape(2, -1, 2, n).transpose(3, 2, 0, 1)
-    up = enu_basis(ground_from_ecef(points))[:, 2]
+    up = enu_basis(ground)[:, 2]
     stacked = by_point.reshape(n, 4, 3)
     normal = np.swapaxes(stacked, 1, 2) @ stacked
     weights = np.linalg.solve(normal, up[..., None])[..., 0]
     pull = np.einsum("nvca,na->nvc", by_point, weights)
-    by_camera = -np.einsum("nvc,nvcq->nvq", pull, by_unknown).reshape(n, -1)
-    covariance = adjustment.covariance.joint(np.array(pair))
-    relative = by_camera - by_camera.mean(axis=0)
-    return PairHeights((first, second), _rms(by_camera, covariance), _rms(relative, covariance), n)
+    found: Array = -np.einsum("nvc,nvcq->nvq", pull, by_unknown)
+    return found
 
 
 def _rms(rows: Array, covariance: Array) -> float:

@@ -42,6 +42,7 @@ COMMANDS = {
     "triangulate": "Corresponding image points to ground points.",
     "convert": "Write RPCs in other formats, cut out windows, hand images over.",
     "export": "Hand a finished run to renderers, COLMAP, s2p, CARS, ASP or a catalogue.",
+    "dsm": "A first surface model, with its uncertainty.",
     "verify": "Whether a finished run is still what it was: inputs, outputs, cameras.",
     "report": "Make report.html of a finished run again, or compare two runs.",
 }

@@ -175,6 +175,14 @@ def _jobs(_context: click.Context, _parameter: click.Parameter, value: str) -> i
     return int(value)
 
 
+jobs_option = click.option(
+    "-j",
+    "--jobs",
+    metavar="N|ADDRESS",
+    callback=_jobs,
+    default="1",
+    help="Worker processes, or a dask.distributed cluster (tcp://host:8786).  [default: 1]",
+)
 _RUN_OPTIONS = (
     click.option(
         "--rpc",
@@ -185,14 +193,7 @@ _RUN_OPTIONS = (
     ),
     click.option("--image-list", metavar="FILE", help="More image paths from a file, one a line."),
     click.option("--options", "options_file", metavar="FILE", help="Options from a TOML file; flags win."),
-    click.option(
-        "-j",
-        "--jobs",
-        metavar="N|ADDRESS",
-        callback=_jobs,
-        default="1",
-        help="Worker processes, or a dask.distributed cluster (tcp://host:8786).  [default: 1]",
-    ),
+    jobs_option,
     click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
 )
 

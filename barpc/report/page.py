@@ -40,7 +40,7 @@ from barpc.report.summary import (
     listed,
     metres,
 )
-from barpc.report.tables import RunFiles, TiePatches, read_summary, read_tables
+from barpc.report.tables import Relief, RunFiles, TiePatches, read_summary, read_tables
 from barpc.report.verdict import GOOD
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
@@ -255,6 +255,30 @@ def _ties(files: RunFiles) -> Section | None:
     return Section("ties", "What do tie points look like?", answer, ties=ties)
 
 
+def _surface(files: RunFiles) -> Section | None:
+    if not files.reliefs:
+        return None
+    before, after = files.reliefs
+    answer = (
+        f"A window of the surface made of it: {100 * before.share:.0f} % of its cells have a height by the delivered"
+        f" cameras, {100 * after.share:.0f} % by the corrected ones."
+    )
+    if before.nmad_m is not None and after.nmad_m is not None:
+        answer += (
+            f" Pairs of images disagree by {metres(before.nmad_m)} and by {metres(after.nmad_m)} (medians)."
+        )
+    return Section(
+        "surface", "What do they make of the ground?", answer, [_relief(one) for one in files.reliefs]
+    )
+
+
+def _relief(one: Relief) -> tuple[str, str]:
+    width, height = one.size
+    shown = charts.tag("image", href=f"data:image/jpeg;base64,{one.picture}", width=width, height=height)
+    words = f"The ground by the {one.cameras} cameras, lit from the north-west; black: no height"
+    return f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{words}">{shown}</svg>', f"{words}."
+
+
 def _pairs(files: RunFiles) -> Section | None:
     pairs, number = files.summary.pairs, files.number
     if not pairs:
@@ -445,6 +469,7 @@ def _run(files: RunFiles) -> Section:
 
 
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
-    _images, _map, _errors, _randomness, _ties, _pairs, _corrections, _gauge, _decisions, _check_points, _files, _run,
+    _images, _map, _errors, _randomness, _ties, _pairs, _surface, _corrections, _gauge, _decisions, _check_points,
+    _files, _run,
 )  # fmt: skip
 """In the order of the page; a section that has nothing to show is None."""

@@ -188,6 +188,8 @@ TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
 """File name -> its bytes, of a run and its summary."""
 PICTURES = "pictures.json"
 """Pixels for the report, of a run that wrote them."""
+SURFACE = "surface.json"
+"""Two reliefs for the report, of a run of which a surface was made."""
 
 
 # --- read back --------------------------------------------------------------------------------------------
@@ -230,6 +232,20 @@ class Pictures:
     ties: Sequence[TiePatches]
 
 
+@dataclass(frozen=True)
+class Relief:
+    """A window of the ground by the cameras "delivered" or "corrected": a shaded relief, a JPEG in base64.
+
+    `size`: of the picture [px]; `share`: of the window that has heights; `nmad_m`: how far pairs disagree, by median.
+    """
+
+    cameras: str
+    size: tuple[int, int]
+    share: float
+    nmad_m: float | None
+    picture: str
+
+
 @dataclass(frozen=True, eq=False)
 class RunFiles:
     """What lies in the folder of a run.
@@ -244,6 +260,7 @@ class RunFiles:
     tracks: IntArray
     outlines: Sequence[Sequence[Array]]
     pictures: Pictures
+    reliefs: Sequence[Relief] = ()
 
     @property
     def number(self) -> dict[str, int]:
@@ -305,7 +322,9 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     points, tracks = _read(folder / "residuals.csv", TABLE, _points)
     there = os.path.lexists(folder / PICTURES)
     pictures = _read(folder / PICTURES, SUMMARY, _pictures) if there else Pictures({}, ())
-    return RunFiles(summary, observations, points, tracks, outlines, pictures)
+    there = os.path.lexists(folder / SURFACE)
+    reliefs = _read(folder / SURFACE, SUMMARY, _reliefs) if there else ()
+    return RunFiles(summary, observations, points, tracks, outlines, pictures, reliefs)
 
 
 _BASE64 = re.compile(r"[A-Za-z0-9+/]{4,400000}={0,2}")
@@ -327,6 +346,22 @@ def _pictures(text: str) -> Pictures:
     if any(len(tie.patches) != len(tie.offset_px) + 1 or not tie.offset_px for tie in ties):
         raise ValueError("a tie point without its patches")
     return Pictures(looks, ties)
+
+
+def _reliefs(text: str) -> tuple[Relief, ...]:
+    found = tuple(
+        Relief(
+            {"delivered": "delivered", "corrected": "corrected"}[one["cameras"]],
+            (int(one["size"][0]), int(one["size"][1])),
+            float(one["share"]),
+            None if one["nmad_m"] is None else float(one["nmad_m"]),
+            _jpeg(one["picture"]),
+        )
+        for one in parse_json(text)
+    )
+    if [one.cameras for one in found] != ["delivered", "corrected"]:
+        raise ValueError("reliefs that are not one before and one after")
+    return found
 
 
 def _jpeg(data: str) -> str:

@@ -200,7 +200,7 @@ def _levels(views: Sequence[View]) -> tuple[float, float, float]:
     return 0.5 * (low + high), low, high
 
 
-def _overlapping(
+def overlapping_pairs(
     views: Sequence[View], options: TieOptions, reaches: Sequence[float] = (), area: Area | None = None
 ) -> list[Pair]:
     """All pairs that overlap enough at some altitude, under an angle that is asked for, ascending."""
@@ -285,7 +285,7 @@ def _candidates(
     area: Area | None,
 ) -> list[Pair]:
     """Pairs that overlap, of those wanted (none: all); with grown outlines where that leaves something out."""
-    pairs = _overlapping(views, options, area=area)
+    pairs = overlapping_pairs(views, options, area=area)
     pairs = [pair for pair in pairs if not wanted or pair.views in wanted]
     known = {pair.views for pair in pairs}
     partners = np.bincount([i for pair in known for i in pair], minlength=len(views))
@@ -293,7 +293,7 @@ def _candidates(
     lonely |= ~np.isin(np.arange(len(views)), connected_groups(len(views), sorted(known))[0])
     if not (wanted - known if wanted else lonely.any()):
         return pairs
-    grown = _overlapping(views, options, [reach_of(view, options) for view in views], area)
+    grown = overlapping_pairs(views, options, [reach_of(view, options) for view in views], area)
     for pair in grown:
         worth = pair.views in wanted if wanted else lonely[list(pair.views)].any()
         if worth and pair.views not in known:

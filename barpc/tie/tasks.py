@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
@@ -28,14 +29,23 @@ def ordered(
     tasks, stage, progress
         Its arguments; `progress(stage, done, total)` is called as they are done.
     """
-    results = []
-    futures = [executor.submit(function, *task) for task in tasks] if executor is not None else []
+    return list(one_by_one(executor, function, tasks, stage, progress))
+
+
+def one_by_one(
+    executor: Executor | None,
+    function: Callable[..., Any],
+    tasks: Sequence[tuple[Any, ...]],
+    stage: str,
+    progress: Progress | None = None,
+) -> Iterator[Any]:
+    """As `ordered`, each result as it comes: none is kept here."""
+    futures = deque(executor.submit(function, *task) for task in tasks) if executor is not None else deque()
     try:
         for done, task in enumerate(tasks, start=1):
-            results.append(futures[done - 1].result() if futures else function(*task))
+            yield futures.popleft().result() if executor is not None else function(*task)
             if progress is not None:
                 progress(stage, done, len(tasks))
     finally:
         for future in futures:
             future.cancel()
-    return results

@@ -1,0 +1,149 @@
+"""What a surface is made of: views with the cameras to be believed, their best pairs, what is known of the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from barpc.ba import BlockPrior
+from barpc.cameras import open_camera
+from barpc.dsm.sigma import CameraErrors
+from barpc.errors import BarpcError, InputError
+from barpc.export.scene import Shot, read_scene
+from barpc.options import TieOptions
+from barpc.pipeline import load_views
+from barpc.pipeline.inputs import PRIOR
+from barpc.remote import is_url
+from barpc.report.tables import read_summary
+from barpc.rpcio.grids import CORRECTION
+from barpc.scene import View
+from barpc.sensor import SensorModel
+from barpc.sensor.geometry import Radar, base_to_height
+from barpc.tie.pairs import overlapping_pairs
+
+ANGLES = 2.0, 45.0
+"""Convergence angles [deg] of pairs that are matched: below, a pixel is 30 of height; above, SGBM finds decoys."""
+_RADAR = ("sentinel-1", "terrasar-x", "sicd")
+
+
+Pairs = tuple[tuple[int, int], ...]
+"""Indices of two views each, the best pair first."""
+
+
+class NoSurfaceError(BarpcError):
+    """Images of which no surface can be made in this way: why, in a sentence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Views with the cameras that are believed, their pairs, and the cameras' errors if they are known.
+
+    `groups`: the pairs of which a surface is made; of a difference those of the surface that is taken away, too.
+    """
+
+    views: tuple[View, ...]
+    groups: tuple[Pairs, ...]
+    errors: CameraErrors | None
+    source: str
+
+
+def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: Path | None = None) -> Block:
+    """The images of a finished run behind its corrected cameras; altitudes by its tie points unless given.
+
+    `minus`: a run of some of these images (an earlier one, that this one went on from); they are another group then.
+
+    Raises
+    ------
+    InputError
+        No finished adjustment, or an image that is on another host.
+    NoSurfaceError
+        Images that are not matched: radar, angles.
+    """
+    scene = read_scene(folder, alts)
+    views = []
+    for shot in scene.shots:
+        source = shot.entry.rpc_source
+        if source is not None and source.format in _RADAR:
+            raise NoSurfaceError(_radar(shot.name))
+        if is_url(shot.file):
+            raise InputError(f"{shot.file}: is on another host; a surface is made of images on this one")
+        if not shot.file:
+            raise InputError(f"{folder}: {shot.name} has no pixels")
+        date = (shot.light.time or "")[:10]
+        views.append(View(shot.name, shot.file, shot.size, _camera(folder, shot), scene.alt_range, date))
+    ties = {frozenset((pair.a, pair.b)): float(pair.num_matches) for pair in scene.summary.pairs}
+    names = [view.name for view in views]
+    errors = CameraErrors.of(BlockPrior.load(folder / PRIOR), views)
+    worth = {(i, j): ties.get(frozenset((names[i], names[j])), 0.0) for i, j in _numbered(len(views))}
+    parts = [range(len(views))] if minus is None else _split(folder, names, minus)
+    groups = tuple(_best(views, worth, part) for part in parts)
+    return Block(tuple(views), groups, errors, str(folder) + ("" if minus is None else f" minus {minus}"))
+
+
+def _split(folder: Path, names: Sequence[str], minus: Path) -> list[list[int]]:
+    """The images that another run does not have, and those that it has; InputError where either are too few."""
+    there = {view.name for view in read_summary(minus).views}
+    parts = [[i for i, name in enumerate(names) if (name in there) == old] for old in (False, True)]
+    if min(map(len, parts)) < 2:
+        raise InputError(
+            f"{minus}: has {len(parts[1])} of the {len(names)} images of {folder}; a change, and what dates share, "
+            "is told by a run with at least two images of each, minus one of a single date: adjust both together"
+        )
+    return parts
+
+
+def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> Block:
+    """Images with the cameras that come with them; altitudes are those of the cameras unless given."""
+    views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
+    for view in views:
+        if isinstance(view.sensor, Radar):
+            raise NoSurfaceError(_radar(view.name))
+    return Block(tuple(views), (_best(views),), None, ", ".join(view.name for view in views))
+
+
+def _camera(folder: Path, shot: Shot) -> SensorModel:
+    """What a run says of a camera: its RPC with the correction grid, where it wrote one."""
+    grid = shot.name + CORRECTION
+    return open_camera(folder / grid).model if grid in shot.entry.outputs else shot.rpc
+
+
+def _radar(name: str) -> str:
+    return f"{name}: a radar image: its speckle and layover are nothing that SGBM matches"
+
+
+def _numbered(count: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(count) for j in range(i + 1, count)]
+
+
+def _best(
+    views: Sequence[View],
+    ties: dict[tuple[int, int], float] | None = None,
+    among: Sequence[int] | None = None,
+) -> Pairs:
+    """Pairs (`among` some views) by what they say of heights: of one date first, then by tie points times (B/H)^2.
+
+    A height's variance is that of a match over (B/H)^2, and where tie points are found, dense matches are. Without
+    tie points the overlap and the angle stand for them (`barpc.tie.pairs.Pair.score`).
+    """
+    found = overlapping_pairs(views, TieOptions(angles=(0.0, 180.0)))
+    found = [pair for pair in found if among is None or set(pair.views) <= set(among)]
+    usable = [pair for pair in found if ANGLES[0] <= pair.angle <= ANGLES[1]]
+    if not usable:
+        said = [f"{views[p.views[0]].name} and {views[p.views[1]].name} {p.angle:.1f} deg" for p in found[:3]]
+        if not said:
+            raise NoSurfaceError("no two images overlap at the altitudes that they are used for")
+        raise NoSurfaceError(
+            f"no pair meets under {ANGLES[0]:g} to {ANGLES[1]:g} degrees, where SGBM can match ({'; '.join(said)})"
+        )
+    rows = []
+    for pair in usable:
+        first, second = (views[i] for i in pair.views)
+        middle = first.sensor.localize((np.array(first.size) - 1.0) / 2.0, np.array(first.altitude))
+        base = float(base_to_height(first.sensor, second.sensor, middle))
+        worth = pair.score if ties is None else ties[pair.views]
+        rows.append((first.date != second.date, -worth * base**2, pair.views))
+    same = [row for row in rows if not row[0]]
+    return tuple(row[2] for row in sorted(same or rows))

@@ -1,0 +1,123 @@
+"""A surface model of a block of images, or what changed between two dates, as a Cloud-Optimised GeoTIFF."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import rasterio.shutil
+
+from barpc.atomic import replacing
+from barpc.dsm.block import NoSurfaceError, block_of_images, block_of_run
+from barpc.dsm.cells import MATCHED, SIDE
+from barpc.dsm.grid import Counts, Grid
+from barpc.dsm.relief import show_in_report
+from barpc.errors import InputError, OutputError
+from barpc.options import DsmOptions
+from barpc.sidefile import plain_path
+from barpc.tie.tasks import Progress
+from barpc.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What became of a surface: the file, its cells, and medians over them [m]; NaN where not known.
+
+    `known`: cells with a height; `share`: of the pixels that both images of a pair show so many were matched;
+    `datum`: standard deviation of the height that all cells share.
+    """
+
+    path: str
+    pairs: tuple[str, ...]
+    gsd: float
+    size: tuple[int, int]
+    known: int
+    share: float
+    nmad: float
+    sigma: float
+    sigma_cameras: float
+    datum: float
+
+
+def make_dsm(
+    source: str | Path | Sequence[str],
+    out: str | Path,
+    options: DsmOptions | None = None,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Surface:
+    """Make a first surface model of a finished run, or of images with their cameras.
+
+    Parameters
+    ----------
+    source : path of a run folder, or a list of images
+    out : path of the GeoTIFF
+    options : DsmOptions, optional
+    executor, progress : as of `barpc.adjust`; the bytes written do not depend on them
+
+    Raises
+    ------
+    NoSurfaceError
+        Images that SGBM cannot match: radar, too large an angle, hardly a pixel that is found back.
+    InputError, OutputError
+        See `barpc.errors`; nothing is written then.
+    """
+    options, out = options or DsmOptions(), Path(out)
+    plain_path(out.absolute())
+    if isinstance(source, str | Path):
+        block = block_of_run(
+            Path(source), options.alt, None if options.minus is None else Path(options.minus)
+        )
+    elif options.minus is not None:
+        raise InputError("minus: what two dates share is known of a run alone, not of images")
+    else:
+        block = block_of_images(source, options.alt, options.band)
+    if out.is_dir() or out.resolve() in {Path(view.path).resolve() for view in block.views}:
+        raise OutputError(f"{out}: is a folder or one of the images; give -o the name of a new file")
+    grid = Grid.of(block, options)
+    with replacing(out, overwrite=options.overwrite) as partial, Workspace(_room(out)) as run:
+        rough = run.partial / "tiles.tif"
+        with run.stage("surface"):
+            counts = grid.fill(rough, run, executor, progress)
+        if not counts.known:
+            raise NoSurfaceError(
+                f"of the pixels that both images show {100 * max(counts.share, 0):.0f} % are found back at most, "
+                f"fewer than {100 * MATCHED:.0f} %: other seasons, water, clouds or wrong cameras; nothing is written"
+            )
+        with run.stage("write"), rasterio.Env(GDAL_NUM_THREADS="1"):
+            rasterio.shutil.copy(
+                rough,
+                partial,
+                driver="COG",
+                COMPRESS="DEFLATE",
+                PREDICTOR="YES",
+                BLOCKSIZE=str(SIDE),
+                BIGTIFF="IF_SAFER",
+            )
+    if isinstance(source, str | Path) and options.minus is None:
+        show_in_report(Path(source), grid, out)
+    shutil.rmtree(run.folder, ignore_errors=True)  # (what was kept for going on; it is done)
+    return _told(out, grid, counts)
+
+
+def _room(out: Path) -> Path:
+    """Where results of tiles are kept beside the file until it is whole: the same command goes on with them."""
+    return out.parent / f"{out.name}.unfinished"
+
+
+def _told(out: Path, grid: Grid, counts: Counts) -> Surface:
+    names = [view.name for view in grid.block.views]
+    used = dict.fromkeys(pair for _, groups in grid.tiles() for group in groups for pair in group)
+    pairs = tuple(f"{names[i]} - {names[j]}" for i, j in used)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        nmad, sigma, cameras = (float(np.nanmedian(row)) for row in np.concatenate(counts.some, axis=1))
+    found = counts.known, counts.share, nmad, sigma, cameras, counts.datum
+    return Surface(str(out), pairs, grid.step, grid.size, *found)

@@ -1,0 +1,254 @@
+"""Dense matching of a part of two images: resampled along their epipolar lines, matched both ways by OpenCV's SGBM."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from barpc.geodesy import Array
+from barpc.scene import BoolArray
+from barpc.tie.raster import Box, FloatImage, Stretch, levelled, read_pixels
+
+ACROSS = 0.02
+"""A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""
+FINER = (
+    2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
+)
+_BLOCK = 5  # px of the frame
+_SGBM = {
+    "blockSize": _BLOCK,
+    "P1": 16 * _BLOCK**2,  # twice OpenCV's own, as disparities are twice as fine: 0.62 m, of its own 0.71 m
+    "P2": 64 * _BLOCK**2,
+    "preFilterCap": 63,  # of 15, OpenCV's own, 0.96 m in place of 0.83 m: it cuts strong edges
+    "uniquenessRatio": 5,
+    "speckleWindowSize": 100,
+    "speckleRange": 4,
+    "disp12MaxDiff": -1,  # asked for here, of a second pass
+    "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
+}
+_BACK = 1.0  # px that a match may come back beside where it began
+_MARGIN = 16  # px about a part that are matched, too: paths of SGBM begin at the ends
+_WINDOW = 5  # px a side, over which grey values are compared
+_FLOOR, _FACTOR = 0.065, 1.9  # px; over what least squares matching states: see docs/recipes/dsm.md
+_FEW = 32  # px a side of what is matched at all
+
+
+@dataclass(frozen=True, eq=False)
+class EpipolarFrame:
+    """Affine maps (2, 2, 3) of two images to a frame whose rows are epipolar lines, and what is to be matched there.
+
+    `places` (N, 2) [px of the frame]: points about the part; `num`: disparities, from 0 on; `across`: how far rows miss
+    the lines at most [px]; `altitude` (4,): of a match, by col, row of the frame, disparity and 1 [m].
+    """
+
+    maps: Array
+    places: Array
+    num: int
+    across: float
+    altitude: Array
+
+    @property
+    def metres(self) -> float:
+        """Height that a pixel of disparity stands for [m]."""
+        return abs(float(self.altitude[2])) * FINER
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Places (n, 2) in both images [px], their altitude to begin with [m], standard deviation along the line [px].
+
+    `share`: of the pixels that both images show so many were matched.
+    """
+
+    a: Array
+    b: Array
+    alt: Array
+    sigma: Array
+    share: float
+
+
+def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
+    """The frame of a part of two images, by where they show the same ground points at several altitudes.
+
+    Parameters
+    ----------
+    a, b : (N, 2), col, row [px]; at least three altitudes, at each at least three points
+    alt : (N,), altitudes [m]
+    """
+    both = np.hstack([a, b])
+    mean = both.mean(axis=0)
+    normal = np.linalg.svd(both - mean, full_matrices=False)[2][-1]  # normal . (a, b) is the same everywhere
+    normal = normal if normal[1] > 0 else -normal
+    lengths = np.hypot(*normal[:2]), np.hypot(*normal[2:])
+    scale = np.sqrt(lengths[0] * lengths[1])
+    first = np.zeros((2, 3))
+    first[0, :2] = np.array([normal[1], -normal[0]]) * (FINER / lengths[0])
+    first[1] = np.array([*normal[:2], -normal[:2] @ mean[:2]]) / scale
+    along = a @ first[0, :2]
+    middle = np.abs(alt - np.median(alt)) < 1e-6 * (1.0 + np.ptp(alt))
+    system = np.column_stack([b, np.ones(len(b))])
+    second = np.array(
+        [
+            np.linalg.lstsq(system[middle], along[middle], rcond=None)[0],
+            np.array([*-normal[2:], normal[2:] @ mean[2:]]) / scale,
+        ]
+    )
+    disparity = along - system @ second[0]
+    second[0, 2] += np.floor(disparity.min()) - FINER
+    disparity = along - system @ second[0]
+    num = 16 * int(np.ceil((disparity.max() + 2 * FINER) / 16))
+    rows = a @ first[1, :2] + first[1, 2]
+    across = float(np.abs(rows - system @ second[1]).max())
+    known = np.column_stack([along, rows, disparity, np.ones(len(a))])
+    altitude = np.linalg.lstsq(known, alt, rcond=None)[0]
+    return EpipolarFrame(np.stack([first, second]), known[:, :2], num, across, altitude)
+
+
+def dense_matches(
+    images: Sequence[str], sizes: Sequence[tuple[int, int]], frame: EpipolarFrame, band: int = 1
+) -> Matches | None:
+    """Match a part of two images; None where they do not show enough of it.
+
+    Parameters
+    ----------
+    images : paths of both; pictures of them of `sizes` (width, height) are matched, means of whole pixels
+    frame : EpipolarFrame, of places in these pictures
+    band : int, the band that is read, from 1
+    """
+    window = _window(sizes, frame)
+    if window is None:
+        return None
+    low, shape = window
+    parts = [
+        _resampled(path, size, _moved(one, -low), shape, band)
+        for path, size, one in zip(images, sizes, frame.maps, strict=True)
+    ]
+    if any(part is None for part in parts):
+        return None
+    (left, shown_left), (right, shown_right) = parts  # type: ignore[misc]
+    disparity, good = _both_ways(left, right, frame.num)
+    cols, rows = np.meshgrid(np.arange(shape[0], dtype=np.float32), np.arange(shape[1], dtype=np.float32))
+    at = cols - disparity
+    partner = np.asarray(cv2.remap(right, at, rows, cv2.INTER_LINEAR), np.uint8)
+    seen = shown_left & (cv2.remap(shown_right.astype(np.uint8), at, rows, cv2.INTER_NEAREST) > 0)
+    good &= seen
+    sigma = _sigma(left, partner, good)
+    row, col = np.nonzero((good & _inside(shape, low, frame))[:, ::FINER])  # a match a pixel
+    col *= FINER
+    place = np.column_stack([col, row]) + low
+    moved = place - np.column_stack([disparity[row, col], np.zeros(len(row))])
+    known = np.column_stack([place, disparity[row, col], np.ones(len(row))])
+    both = int(np.count_nonzero(shown_left & _shifted(shown_right, frame.num // 2)))
+    return Matches(
+        _back(frame.maps[0], place),
+        _back(frame.maps[1], moved),
+        known @ frame.altitude,
+        sigma[row, col].astype(np.float64),
+        np.count_nonzero(good) / max(both, 1),
+    )
+
+
+def _window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
+    """First pixel (2,) and width, height of what is resampled: the part as far as both images reach, with margins."""
+    low, high = frame.places.min(axis=0) - _MARGIN, frame.places.max(axis=0) + _MARGIN
+    reach = np.array([frame.num, 0.0])
+    for size, one, more in zip(sizes, frame.maps, (np.zeros(2), reach), strict=True):
+        corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - 0.5) @ one[:, :2].T + one[:, 2]
+        low, high = np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0) + more)
+    if (high - low < _FEW).any():
+        return None
+    low, high = np.floor(low - reach), np.ceil(high + reach)
+    return low, (int(high[0] - low[0]), int(high[1] - low[1]))
+
+
+def _inside(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> BoolArray:
+    """Which pixels of the window belong to the part: the others only led there."""
+    hull = cv2.convexHull((frame.places - low).astype(np.float32))
+    mask = cv2.fillConvexPoly(np.zeros(shape[::-1], np.uint8), np.rint(hull).astype(np.int32), 1)
+    return np.asarray(mask > 0)
+
+
+def _moved(one: Array, by: Array) -> Array:
+    return np.column_stack([one[:, :2], one[:, 2] + by])
+
+
+def _back(one: Array, place: Array) -> Array:
+    """Image points (n, 2) of places (n, 2) in the frame."""
+    out: Array = (place - one[:, 2]) @ np.linalg.inv(one[:, :2]).T
+    return out
+
+
+def _shifted(shown: BoolArray, by: int) -> BoolArray:
+    """A mask moved to the right, as matches of the middle disparity are."""
+    out = np.zeros_like(shown)
+    out[:, by:] = shown[:, : shown.shape[1] - by]
+    return out
+
+
+def _resampled(
+    path: str, size: tuple[int, int], one: Array, shape: tuple[int, int], band: int
+) -> tuple[npt.NDArray[np.uint8], BoolArray] | None:
+    """An image in the frame, in 8 bits, and where it is known; None where it holds nothing there."""
+    corners = _back(one, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]) * shape)
+    low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, size)
+    high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, 0, size)
+    if (high - low < 2).any():
+        return None
+    box: Box = int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+    raw, valid = read_pixels(path, box, band, size)
+    pixels = levelled(raw, valid)
+    known = pixels[valid]
+    if not len(known):
+        return None
+    dark, bright = np.percentile(known[:: 1 + len(known) // 100_000], [0.5, 99.5])
+    if not bright > dark:
+        return None
+    picture = Stretch(float(dark), float(bright)).apply(pixels, valid)
+    # the affine map of the box's own pixels; positions are rounded to 1/32 px, 0.016 px at most
+    to_frame = np.column_stack([one[:, :2], one[:, 2] + one[:, :2] @ low])
+    cv2.setNumThreads(1)  # the work is spread by processes
+    moved = cv2.warpAffine(picture, to_frame, shape, flags=cv2.INTER_CUBIC)
+    shown = cv2.warpAffine(valid.astype(np.uint8) * 255, to_frame, shape, flags=cv2.INTER_LINEAR)
+    return np.asarray(moved, np.uint8), np.asarray(shown == 255)
+
+
+def _both_ways(
+    left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: int
+) -> tuple[FloatImage, BoolArray]:
+    """Disparities of `left`, and where the way back from `right` ends at most a pixel beside."""
+    matcher = cv2.StereoSGBM.create(minDisparity=0, numDisparities=num, **_SGBM)
+    there = matcher.compute(left, right).astype(np.float32) / 16.0
+    turned = [np.ascontiguousarray(one[:, ::-1]) for one in (right, left)]
+    back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / 16.0
+    rows, cols = np.ogrid[: left.shape[0], : left.shape[1]]
+    at = np.clip(np.rint(cols - there).astype(np.int64), 0, left.shape[1] - 1)
+    good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= _BACK * FINER)
+    return there, good
+
+
+def _sigma(left: npt.NDArray[np.uint8], partner: npt.NDArray[np.uint8], good: BoolArray) -> FloatImage:
+    """Standard deviation of a match along the line [px]: of grey values that differ, over their slope.
+
+    As least squares matching states it, of windows with a gain and an offset of their own; SGBM's own
+    interpolation is never better than `_FLOOR`.
+    """
+    weight = good.astype(np.float32)
+    side = (FINER * _WINDOW, _WINDOW)
+    total = np.maximum(cv2.boxFilter(weight, cv2.CV_32F, side), 1e-3)
+
+    def mean(values: FloatImage) -> FloatImage:
+        return np.asarray(cv2.boxFilter(values * weight, cv2.CV_32F, side) / total, np.float32)
+
+    a, b = left.astype(np.float32), partner.astype(np.float32)
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+    both = mean(a * b) - mean_a * mean_b
+    noise = np.maximum(var_a - both**2 / np.maximum(var_b, 1e-3), 0.0)
+    slope = np.zeros_like(a)
+    slope[:, 1:-1] = (a[:, 2:] - a[:, :-2]) * (FINER / 2)
+    stated = noise / np.maximum(mean(slope * slope), 1e-3) / _WINDOW**2
+    return np.asarray(np.sqrt(_FLOOR**2 + _FACTOR**2 * stated), np.float32)

@@ -1,0 +1,57 @@
+"""A rendered scene whose ground is known, as images with exact or delivered cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.dsm.cells import Tile, _gathered
+from tests.scenes import ImageOptions, Scene
+from tests.scenes.files import _write_image
+
+SMALL = ImageOptions(views=3, size=(360, 320), seed=5, buildings=4.0, relief=30.0)
+ALTS = SMALL.alt - 25.0, SMALL.alt + 55.0
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Images in a folder, and the surface that they show."""
+
+    scene: Scene
+    folder: Path
+
+    def write(self) -> Rendered:
+        for shot, picture in zip(self.scene.shots, self.pictures, strict=True):
+            _write_image(self.folder / f"{shot.name}.tif", picture.numbers, shot.exact_rpc)
+        return self
+
+    @cached_property
+    def pictures(self):
+        return [self.scene.picture(i) for i in range(len(self.scene.shots))]
+
+    @property
+    def paths(self) -> list[str]:
+        return [str(self.folder / f"{shot.name}.tif") for shot in self.scene.shots]
+
+    def truth(self, path: Path) -> np.ndarray:
+        """Median altitude of what the images show in each cell of a file; through the exact pushbroom cameras."""
+        with rasterio.open(path) as file:
+            place = file.transform
+            tile = Tile(file.crs.to_wkt(), place.c, place.f, place.a, (file.width, file.height), (0.0, 1.0))
+        ground = []
+        for shot, picture in zip(self.scene.shots, self.pictures, strict=True):
+            row, col = np.nonzero(np.isfinite(picture.altitude))
+            at = np.column_stack([col, row]).astype(np.float64)
+            ground.append(shot.exact.localize(at, picture.altitude[row, col].astype(np.float64)))
+        every = np.concatenate(ground)
+        return _gathered(tile, every, np.ones(len(every)))[0]
+
+
+@pytest.fixture(scope="session")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Rendered:
+    return Rendered(Scene(SMALL), tmp_path_factory.mktemp("rendered")).write()

@@ -1,0 +1,98 @@
+"""The surface of real images: pairs agree, more so by corrected cameras, and cost what they are said to."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.ba.result import pair_heights
+from barpc.cli import main
+from barpc.dsm import make_dsm
+from barpc.dsm.block import block_of_run
+from barpc.errors import InputError
+from barpc.geodesy import ground_from_ecef
+from barpc.options import DsmOptions
+from barpc.pipeline import adjust
+from barpc.report.summary.words import metres
+from barpc.report.tables import read_summary, read_tables
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def run(shared_data, tmp_path_factory):
+    images = sorted((shared_data / "optical" / "phr_triplet_north").glob("*.tif"))
+    out = tmp_path_factory.mktemp("triplet") / "run"
+    adjust(images, out)
+    return images, out
+
+
+def test_pairs_of_the_triplet_agree_to_a_third_of_a_metre_and_delivered_cameras_do_not(run, tmp_path):
+    images, folder = run
+    after = make_dsm(folder, tmp_path / "after.tif")
+    before = make_dsm([str(path) for path in images], tmp_path / "before.tif", DsmOptions(alt=(37.0, 355.0)))
+    assert after.pairs[0] == "img_01 - img_03"  # the largest angle
+    assert after.nmad < 0.40
+    assert after.nmad < 0.5 * before.nmad
+    with rasterio.open(tmp_path / "after.tif") as file:
+        bands, tags = file.read(), file.tags()
+    known = np.isfinite(bands[0])
+    assert known.sum() > 125_000  # m^2 of the 140,000 that any two images show
+    low, high = np.percentile(bands[0][known], [1, 99])
+    assert 75.0 < low < 90.0
+    assert 305.0 < high < 320.0
+    assert (bands[4][known] > 0).all()
+    assert np.median(bands[4][known]) < 2.0  # without what all cells share,
+    assert 10.0 < float(tags["SIGMA_SHARED_BY_ALL_CELLS_M"]) < 100.0  # which ties do not tell
+
+
+def test_the_command_says_what_it_made(run, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(
+            [
+                "-q",
+                "dsm",
+                str(run[1]),
+                "-o",
+                str(tmp_path / "dsm.tif"),
+                "--pairs",
+                "1",
+                "--gsd",
+                "2",
+                "--json",
+            ]
+        )
+    assert not stop.value.code
+    told = json.loads(capsys.readouterr().out)
+    assert told["gsd"] == 2.0
+    assert told["pairs"] == ["img_01 - img_03"]
+    assert told["nmad"] is None
+    assert told["known"] > 25_000
+
+
+def test_what_the_cameras_leave_of_a_height_is_what_their_adjustment_says(run):
+    """Of the run's folder alone as of the adjustment that wrote it: the pair's absolute sigma at its tie points."""
+    images, folder = run
+    adjustment = adjust(images, folder.parent / "again").adjustment
+    block = block_of_run(folder)
+    assert block.errors is not None
+    points = adjustment.points[np.isfinite(adjustment.points[:, 0])][::20]
+    stated = block.errors.sigma(block.errors.rows((0, 2), ground_from_ecef(points)))
+    assert np.sqrt(np.mean(stated**2)) == pytest.approx(pair_heights(adjustment, 0, 2).absolute, rel=0.01)
+
+
+def test_the_report_shows_the_same_window_before_and_after(run, tmp_path):
+    make_dsm(run[1], tmp_path / "dsm.tif")
+    before, after = read_tables(read_summary(run[1]), run[1]).reliefs
+    assert before.nmad_m > 2.0 * after.nmad_m
+    assert after.share > 0.4
+    page = (run[1] / "report.html").read_text(encoding="utf-8")
+    assert "What do they make of the ground?" in page
+    assert page.count("by the delivered cameras, lit") == page.count("by the corrected cameras, lit") == 2
+    assert f"disagree by {metres(before.nmad_m)} and by {metres(after.nmad_m)}" in page
+    (run[1] / "surface.json").write_text("[]")
+    with pytest.raises(InputError, match=r"surface\.json: damaged"):
+        read_tables(read_summary(run[1]), run[1])

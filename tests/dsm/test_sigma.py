@@ -1,0 +1,113 @@
+"""The cameras' share of sigma, and the frames of matching, against cameras that are moved by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barpc.ba import BlockPrior
+from barpc.dsm.relief import shaded
+from barpc.dsm.sigma import CameraErrors
+from barpc.geodesy import ecef_from_ground, ground_from_ecef
+from barpc.scene import View
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.geometry import camera_center, triangulate
+from barpc.tie.dense import epipolar_frame
+from tests.dsm.conftest import ALTS
+
+
+@pytest.fixture(scope="module")
+def views(rendered):
+    size = rendered.scene.options.size
+    return [View(s.name, "", size, s.exact_rpc, rendered.scene.alt_range) for s in rendered.scene.shots]
+
+
+def prior_of(views, information):
+    centers = np.array([camera_center(v.sensor, v.size, v.alt_range).ecef for v in views])
+    names = tuple(view.name for view in views)
+    return BlockPrior(names, "rotation+translation", 0, np.zeros((len(views), 6)), information, centers)
+
+
+@pytest.mark.parametrize("unknown", range(12))
+def test_a_height_moves_as_its_derivative_says_when_a_camera_does(unknown, views):
+    """One metre of an unknown of either camera: the pair's points are intersected again, with the others' rays."""
+    prior = prior_of(views, np.eye(18))
+    errors = CameraErrors.of(prior, views)
+    ground = np.array([[5.4, 43.3, 230.0], [5.4005, 43.3004, 250.0]])
+    pair, view, part = (0, 2), (0, 2)[unknown // 6], unknown % 6
+    seen = [views[k].sensor.project(ground) for k in pair]
+    rotation, translation = np.zeros(3), np.zeros(3)
+    scene = views[view].sensor.localize((np.array(views[view].size) - 1) / 2, np.array(views[view].altitude))
+    distance = np.linalg.norm(prior.center[view] - ecef_from_ground(scene))
+    if part < 3:
+        rotation[part] = 1.0 / distance
+    else:
+        translation[part - 3] = 1.0
+    moved = Corrected(views[view].sensor, Correction(rotation, translation, prior.center[view]))
+    sensors = [moved if k == view else views[k].sensor for k in pair]
+    num = len(ground)
+    found = triangulate(
+        sensors,
+        np.tile([0, 1], num),
+        np.repeat(np.arange(num), 2),
+        np.stack(seen, 1).reshape(-1, 2),
+        alt=230.0,
+    )
+    change = ground_from_ecef(found.points)[:, 2] - ground[:, 2]
+    stated = errors.rows(pair, ground)[:, view * 6 + part]
+    np.testing.assert_allclose(change, stated, atol=2e-3 * max(1.0, np.abs(stated).max()))
+
+
+def test_what_is_shared_by_both_cameras_moves_all_heights_alike(views):
+    """Of cameras that can only be moved together, the height has that motion's sigma and no more."""
+    direction = np.tile(np.r_[np.zeros(3), ecef_up()], 3)  # all translated upwards
+    information = (
+        1e12 * (np.eye(18) - np.outer(direction, direction) / 3.0)
+        + np.outer(direction, direction) / 9.0 / 4.0
+    )
+    errors = CameraErrors.of(prior_of(views, information), views)
+    rows = errors.rows((0, 1), np.array([[5.4, 43.3, 230.0], [5.4005, 43.3004, 250.0]]))
+    # (each camera by a metre is the sum of the three: information 1 / 4 is a sigma of 2 m)
+    np.testing.assert_allclose(errors.sigma(rows), 2.0, rtol=2e-3)
+    np.testing.assert_allclose(errors.sigma(rows - rows.mean(axis=0)), 0.0, atol=5e-3)
+
+
+def ecef_up():
+    at = np.array([5.4, 43.3, 230.0])
+    step = ecef_from_ground(at + [0, 0, 1.0]) - ecef_from_ground(at)
+    return step / np.linalg.norm(step)
+
+
+def test_rows_of_the_frame_are_epipolar_lines_and_disparity_tells_height(views):
+    lon, lat = np.meshgrid(np.linspace(5.3995, 5.4005, 5), np.linspace(43.2997, 43.3003, 5))
+    alt = np.repeat(np.linspace(*ALTS, 3), lon.size)
+    ground = np.column_stack([np.tile(lon.ravel(), 3), np.tile(lat.ravel(), 3), alt])
+    a, b = (view.sensor.project(ground) for view in views[:2])
+    frame = epipolar_frame(a, b, alt)
+    assert frame.across < 0.02
+    other = np.array([[5.40021, 43.29991, 260.0], [5.39972, 43.30022, 215.0]])
+    first, second = (
+        view.sensor.project(other) @ one[:, :2].T + one[:, 2]
+        for view, one in zip(views, frame.maps, strict=False)
+    )
+    assert np.abs(first[:, 1] - second[:, 1]).max() < 0.02
+    disparity = first[:, 0] - second[:, 0]
+    assert ((disparity > 0) & (disparity < frame.num)).all()
+    told = np.column_stack([first, disparity, np.ones(2)]) @ frame.altitude
+    np.testing.assert_allclose(told, other[:, 2], atol=0.2)
+    for one, points in zip(frame.maps, (a, b), strict=True):
+        scale = np.linalg.norm(one[:, :2], axis=1)
+        np.testing.assert_allclose(scale, [2.0, 1.0], rtol=0.1)  # two columns and one row a pixel
+        assert len(points) == 75
+
+
+def test_a_slope_to_the_light_is_bright_and_one_away_from_it_dark_and_the_unknown_black():
+    """The sign that could be wrong: rows count to the south, light comes from the north-west."""
+    east, south = np.meshgrid(np.arange(20.0), np.arange(16.0))
+    falls = {"north-west": 0.5 * (east + south), "south-east": -0.5 * (east + south), "flat": 0.0 * east}
+    grey = {name: float(np.median(shaded(height.astype(np.float32), 1.0))) for name, height in falls.items()}
+    assert grey["north-west"] > grey["flat"] > grey["south-east"]
+    height = np.full((6, 6), np.nan, np.float32)
+    height[:, :4] = 1.0
+    assert (shaded(height, 1.0)[:, 4:] == 0).all()
+    assert (shaded(height, 1.0)[:, :3] > 0).all()

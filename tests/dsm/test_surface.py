@@ -1,0 +1,186 @@
+"""The surface against the ground that was rendered: its heights, its sigma, its file; what is refused."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+
+from barpc.cli import main
+from barpc.dsm import NoSurfaceError, make_dsm
+from barpc.dsm import grid as surface_module
+from barpc.errors import InputError, OutputError
+from barpc.options import DsmOptions
+from barpc.pipeline import load_views
+from barpc.rpcio import read_rpc
+from barpc.sensor.corrected import ImageAffine, ImageCorrected
+from tests.dsm.conftest import ALTS, SMALL
+from tests.scenes import Scene
+from tests.scenes.files import _write_image
+
+OPTIONS = DsmOptions(alt=ALTS)
+
+
+def run(*args: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(arg) for arg in args])
+    return int(stop.value.code or 0)
+
+
+def nmad(values: np.ndarray) -> float:
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+@pytest.fixture(scope="module")
+def made(rendered, tmp_path_factory):
+    out = tmp_path_factory.mktemp("dsm") / "dsm.tif"
+    return make_dsm(rendered.paths[:2], out, OPTIONS), out
+
+
+def test_heights_are_those_of_the_ground_and_sigma_says_how_well(made, rendered):
+    surface, out = made
+    with rasterio.open(out) as file:
+        bands = file.read()
+    error = bands[0] - rendered.truth(out)
+    known = np.isfinite(error)
+    assert surface.known == np.isfinite(bands[0]).sum()
+    assert known.mean() > 0.65  # of the rectangle about what both images show
+    assert abs(np.median(error[known])) < 0.1
+    assert nmad(error[known]) < 0.5  # a pixel of disparity is 2.4 m
+    within = np.mean(np.abs(error[known]) < bands[3][known])
+    assert 0.60 < within < 0.82
+    assert np.isnan(bands[2]).all()  # one pair disagrees with nobody
+    assert np.isnan(bands[4]).all()
+    assert np.array_equal(bands[1] == 1.0, np.isfinite(bands[0]))
+
+
+def test_the_file_is_a_cog_in_utm_that_says_what_it_is(made):
+    surface, out = made
+    with rasterio.open(out) as file:
+        assert file.crs.to_epsg() == 32631
+        assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert file.transform.a == surface.gsd == 1.0
+        assert file.transform.c % 1.0 == file.transform.f % 1.0 == 0.0
+        assert file.tags()["VERTICAL_REFERENCE"] == "WGS84 ellipsoid"
+        assert "SIGMA_SHARED_BY_ALL_CELLS_M" not in file.tags()
+        assert file.descriptions[0].startswith("height above the WGS84 ellipsoid")
+    assert sorted(path.name for path in out.parent.iterdir()) == ["dsm.tif"]
+
+
+def test_the_same_bytes_whoever_works_and_in_whatever_order_images_are_given(made, rendered, tmp_path):
+    with ThreadPoolExecutor(2) as executor:
+        make_dsm(rendered.paths[1::-1], tmp_path / "again.tif", OPTIONS, executor=executor)
+    assert (tmp_path / "again.tif").read_bytes() == made[1].read_bytes()
+
+
+def test_an_interrupted_command_goes_on_where_it_was(rendered, tmp_path, monkeypatch):
+    monkeypatch.setattr(surface_module, "SIDE", 128)
+    asked = []
+    whole = surface_module.surface_tile
+
+    def surface_tile(pairs, tile, band):
+        asked.append(tile)
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return whole(pairs, tile, band)
+
+    surface_tile.__module__, surface_tile.__qualname__ = whole.__module__, whole.__qualname__
+    monkeypatch.setattr(surface_module, "surface_tile", surface_tile)
+    options = replace(OPTIONS, gsd=1.5)
+    with pytest.raises(KeyboardInterrupt):
+        make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", options)
+    assert not (tmp_path / "dsm.tif").exists()
+    make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", options)
+    assert len({(t.west, t.north) for t in asked}) == len(asked) - 1  # the first was not made again
+    assert [path.name for path in tmp_path.iterdir()] == ["dsm.tif"]
+
+
+@pytest.mark.slow
+def test_three_views_are_better_than_two_and_say_so(rendered, tmp_path):
+    one = make_dsm(rendered.paths[:2], tmp_path / "two.tif", OPTIONS)
+    three = make_dsm(rendered.paths, tmp_path / "three.tif", OPTIONS)
+    assert len(one.pairs) == 1
+    assert len(three.pairs) == 3
+    errors = []
+    for name in ("two", "three"):
+        with rasterio.open(tmp_path / f"{name}.tif") as file:
+            errors.append((file.read(1) - rendered.truth(tmp_path / f"{name}.tif"), file.read(4)))
+    assert nmad(errors[1][0][np.isfinite(errors[1][0])]) < nmad(errors[0][0][np.isfinite(errors[0][0])])
+    known = np.isfinite(errors[1][0])
+    assert 0.60 < np.mean(np.abs(errors[1][0][known]) < errors[1][1][known]) < 0.82
+    assert three.sigma < one.sigma
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snr", [30.0, 300.0])
+def test_sigma_follows_the_noise_of_the_images(snr, tmp_path):
+    from tests.dsm.conftest import Rendered
+
+    found = Rendered(Scene(replace(SMALL, snr=snr, views=2, size=(500, 500))), tmp_path).write()
+    make_dsm(found.paths, tmp_path / "dsm.tif", OPTIONS)
+    with rasterio.open(tmp_path / "dsm.tif") as file:
+        error, sigma = file.read(1) - found.truth(tmp_path / "dsm.tif"), file.read(4)
+    known = np.isfinite(error)
+    assert 0.56 < np.mean(np.abs(error[known]) < sigma[known]) < 0.80
+
+
+# --- what is refused --------------------------------------------------------------------------------------
+
+
+def test_other_ground_is_refused_with_exit_code_3_and_leaves_nothing(rendered, tmp_path, capsys):
+    other = Scene(replace(SMALL, seed=77))
+    path = tmp_path / "other.tif"
+    _write_image(path, other.picture(1).numbers, rendered.scene.shots[1].exact_rpc)
+    out = tmp_path / "out" / "dsm.tif"
+    assert run("dsm", rendered.paths[0], path, "-o", out, "--alt", *ALTS) == 3
+    said = capsys.readouterr().err
+    assert "no surface: of the pixels that both images show" in said
+    assert said.count("\n") == 1
+    assert not out.exists()
+    assert not any(tmp_path.rglob("*.unfinished"))
+
+
+def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp_path, monkeypatch, capsys):
+    import barpc.dsm.block as block
+
+    monkeypatch.setattr(block, "ANGLES", (2.0, 3.0))
+    assert run("dsm", *rendered.paths[:2], "-o", tmp_path / "dsm.tif") == 3
+    assert (
+        "no pair meets under 2 to 3 degrees, where SGBM can match (view_00 and view_01"
+        in capsys.readouterr().err
+    )
+    monkeypatch.undo()
+    views = load_views(rendered.paths[:2]).views
+
+    class Seen(ImageCorrected):
+        def to_radar(self, ground):
+            return ground
+
+    radar = replace(views[0], sensor=Seen(views[0].sensor, ImageAffine(np.zeros(2), np.zeros((2, 2)))))
+    with pytest.raises(NoSurfaceError, match="view_00: a radar image"):
+        block.block_of_images([radar, views[1]])
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_existing_file_stays_and_an_image_is_never_written(rendered, tmp_path):
+    out = tmp_path / "dsm.tif"
+    out.write_bytes(b"mine")
+    with pytest.raises(OutputError, match="exists already"):
+        make_dsm(rendered.paths[:2], out, OPTIONS)
+    assert out.read_bytes() == b"mine"
+    before = read_rpc(rendered.paths[0])
+    with pytest.raises(OutputError, match="one of the images"):
+        make_dsm(rendered.paths[:2], rendered.paths[0], replace(OPTIONS, overwrite=True))
+    assert read_rpc(rendered.paths[0]) == before
+
+
+@pytest.mark.parametrize(
+    ("crs", "said"), [("EPSG:4326", "projected reference system in metres"), ("EPSG:99999999", "PROJ knows")]
+)
+def test_a_map_without_metres_is_refused(crs, said, rendered, tmp_path):
+    with pytest.raises(InputError, match=said):
+        make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", replace(OPTIONS, crs=crs))
+    assert not list(tmp_path.iterdir())
