@@ -20,7 +20,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from barpc.errors import InputError
-from barpc.remote import BUCKET, HOST
+from barpc.remote import HOST
 from barpc.sidefile import NUMBER, OPTIONS, TABLE, read_text
 
 T = TypeVar("T")
@@ -498,14 +498,6 @@ class RunOptions(Options):
         unit="host",
         spoken=True,
     )
-    store: str | None = option(
-        None,
-        """Folder of an object store (`s3://BUCKET/...`, gs, az) where workers keep what they read from each other, in
-        place of the run folder: with images by URL they need no disk of the caller. Never taken from an options
-        file.""",
-        unit="url",
-        spoken=True,
-    )
     matches: tuple[str, ...] = option(
         (),
         """Matches of pairs (CSV, npz, COLMAP, hloc, ASP), to be verified and registered; the other pairs are matched. A
@@ -566,8 +558,6 @@ class RunOptions(Options):
             raise InputError("reference_sigma is given without reference")
         if self.matches_only and not self.matches:
             raise InputError("matches_only is given without matches: there would be no tie points")
-        if self.store is not None and not BUCKET.fullmatch(self.store):
-            raise InputError(f"store {self.store!r} is no s3://BUCKET/FOLDER")
         for host in self.allow_remote:
             if not HOST.fullmatch(host):
                 raise InputError(f"allow_remote {host!r} is no HOST, HOST:PORT or s3://BUCKET")
@@ -581,7 +571,10 @@ class RunOptions(Options):
 # --- what is made of them ---------------------------------------------------------------------------------
 
 
-FORMER = {"dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only"}
+FORMER = {
+    "dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only",
+    "store": "the run folder is on a disk that all workers see",
+}
 """Former option -> how it is said now."""
 
 

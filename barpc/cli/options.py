@@ -48,7 +48,7 @@ GROUND = (
     "reference_sigma",
 )
 ADJUSTMENT = (*CAMERA, *GROUND)
-MATCH = ("overwrite", "keep_going", "store")
+MATCH = ("overwrite", "keep_going")
 RUN = (*MATCH, "images", "rpc_formats", "grids", "tiles", "resample")
 """Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
 _NAMES = {"tie.keypoints_per_image": "--ip-per-image", "rpc_formats": "--rpc-format"}

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
-from uuid import uuid4
 
 import numpy as np
 
@@ -50,7 +49,6 @@ from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
 from barpc.tie.reference import Registration, register
-from barpc.tie.store import Bucket, Store
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace, timed
 
@@ -154,7 +152,7 @@ def adjust(
         with workspace.stage("fingerprints"), recorded(seen):
             given = side_inputs(options, run.views)
             inputs = hash_inputs(run, options, seen, executor, progress)
-        with CachingExecutor(workspace, inputs, executor, store=_store(options)) as caching:
+        with CachingExecutor(workspace, inputs, executor) as caching:
             with guarded(inputs.values()):
                 run = _solve(run, options, given, workspace, caching, progress)
             if run.adjustment is not None and options.stop_after == "all":
@@ -162,8 +160,8 @@ def adjust(
                     run = _fitted(run, options, caching, progress)
         with guarded(inputs.values()):  # asked again before outputs appear, and before the last one
             ask()
-            if run.fits:  # workers that do not see the run folder do not write there
-                run = _written(run, options, workspace, executor if options.store is None else None, progress)
+            if run.fits:
+                run = _written(run, options, workspace, executor, progress)
         if run.adjustment is not None:
             with _told(workspace, "block", progress), workspace.output(PRIOR) as partial:
                 block_prior(run.adjustment).save(partial)
@@ -278,10 +276,6 @@ def _solve(
         with _told(workspace, "adjustment" + again, progress):
             run = _adjusted(run, options, *given)
     return run
-
-
-def _store(options: RunOptions) -> Store | None:
-    return None if options.store is None else Bucket(options.store, uuid4().hex)
 
 
 def _references(options: RunOptions) -> list[str]:

@@ -22,8 +22,6 @@ from barpc.errors import ImageError
 
 HOST = re.compile(r"(?:(?:https?|s3|gs|az)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:]+\])(?::\d{1,5})?")
 """An entry of the list of hosts: a host is that of https; http, and the buckets of object stores, say so."""
-BUCKET = re.compile(r"(?:s3|gs|az)://[A-Za-z0-9._-]+(?:/[A-Za-z0-9._-]+)*")
-"""A folder of an object store."""
 _URL = re.compile(r"(https?|s3|gs|az)://([^/?#]+)/([^?#]+)", re.IGNORECASE)
 _FLAT = re.compile(r"(?:https?|s3|gs|az):/[^/]")  # what pathlib makes of a URL
 

@@ -337,12 +337,6 @@ def allow_remote(run: Run, out: Path, scene: Path) -> None:  # what is read so: 
         RunOptions(allow_remote=("a b",))
 
 
-def store(run: Run, out: Path, scene: Path) -> None:  # what goes there: tests/remote/test_stores.py
-    assert RunOptions(store="s3://bucket/folder").store == "s3://bucket/folder"
-    with pytest.raises(InputError, match="store 'folder' is no s3://BUCKET/FOLDER"):
-        RunOptions(store="folder")
-
-
 ROWS = {
     "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
     "pictures": pictures, "grids": grids, "tiles": tiles, "resample": resample,
@@ -350,7 +344,7 @@ ROWS = {
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "altimetry": altimetry, "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
     "reference": reference, "reference_sigma": reference_sigma,
-    "allow_remote": allow_remote, "store": store, "tie": tie, "adjust": adjust_, "fit": fit,
+    "allow_remote": allow_remote, "tie": tie, "adjust": adjust_, "fit": fit,
 }  # fmt: skip
 
 
