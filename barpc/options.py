@@ -484,11 +484,6 @@ class RunOptions(Options):
         connected group is not tied to, write an RPC that misses the fit's tolerance. Such a run ends with exit code
         3.""",
     )
-    pictures: bool = option(
-        True,
-        """Show a quick-look of each image and patches about tie points in the report: pixels, which go where the report
-        goes.""",
-    )
     overwrite: bool = option(False, "Replace the results of an earlier run in the same folder.")
     allow_remote: tuple[str, ...] = option(
         (),
@@ -572,6 +567,7 @@ class RunOptions(Options):
 
 
 FORMER = {
+    "pictures": "the report shows no pixels; open the images beside observations.csv",
     "dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only",
     "store": "the run folder is on a disk that all workers see",
 }

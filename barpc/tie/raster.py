@@ -264,11 +264,6 @@ def _reduced(picture: ByteImage, valid: BoolArray, zoom: int) -> tuple[ByteImage
     return small, known
 
 
-def jpeg(pixels: ByteImage) -> bytes:
-    """Grey values (H, W) as a JPEG file."""
-    return bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 70])[1])
-
-
 def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
     """A box with a margin on every side, cut at an image of `size` (width, height); a pixel at least."""
     col, row, width, height = box

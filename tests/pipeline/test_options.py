@@ -35,7 +35,7 @@ class Run:
     ) -> AdjustResult:
         given = () if matches is None else str(self.scene / matches)
         images = options.pop("given", sorted(self.scene.glob("*.tif")))
-        options = {"matches_only": matches is not None, "pictures": False, **options}
+        options = {"matches_only": matches is not None, **options}
         return adjust(images, self.out / out, RunOptions(matches=given, **options))
 
     def once(self, name: str, *given: Any, **options: Any) -> AdjustResult:
@@ -49,7 +49,7 @@ class Run:
     @property
     def plain(self) -> AdjustResult:
         """The run without any option; its files: `folder`."""
-        return self.once("plain", pictures=True)
+        return self.once("plain")
 
     @property
     def folder(self) -> Path:
@@ -68,7 +68,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene") / "in"
     folder.mkdir()
     images = part(folder, SIDE, 240, gcps=4).images
-    adjust(images, folder / "first", RunOptions(stop_after="matching", pictures=False))
+    adjust(images, folder / "first", RunOptions(stop_after="matching"))
     first = RunOptions(matches_only=True, matches=str(folder / "first/matches.csv"), stop_after="adjustment")
     adjust(images[:2], folder / "earlier", first)
     (folder / "dem").mkdir()
@@ -101,12 +101,6 @@ def images(run: Run, out: Path, scene: Path) -> None:
     for chosen, suffix in (("copy", {".tif"}), ("none", set())):
         run(chosen, images=chosen)
         assert _names(out / chosen) & {".vrt", ".tif"} == suffix
-
-
-def pictures(run: Run, out: Path, scene: Path) -> None:
-    run("without")
-    assert [(folder / "pictures.json").exists() for folder in (run.folder, out / "without")] == [True, False]
-    assert "data:image/jpeg" not in (out / "without/report.html").read_text()
 
 
 def grids(run: Run, out: Path, scene: Path) -> None:
@@ -339,7 +333,7 @@ def allow_remote(run: Run, out: Path, scene: Path) -> None:  # what is read so: 
 
 ROWS = {
     "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
-    "pictures": pictures, "grids": grids, "tiles": tiles, "resample": resample,
+    "grids": grids, "tiles": tiles, "resample": resample,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "altimetry": altimetry, "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,

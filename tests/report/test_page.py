@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from barpc.cli.main import cli
 from barpc.errors import BarpcError, InputError
 from barpc.pipeline import outputs
-from barpc.report import Run, charts, maps, page, records, summarize
+from barpc.report import Run, maps, page, records, summarize
 from barpc.report.summary import metres
 from barpc.report.tables import TABLES, Observations, RunFiles
 from barpc.scene import Tracks
@@ -115,12 +115,9 @@ def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_pat
 def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatch):
     monkeypatch.setattr(maps, "_MOST", 4)
     monkeypatch.setattr(records, "MAX_TABLE_ROWS", 5)
-    monkeypatch.setattr(charts, "MAX_ROWS", 3)
-    monkeypatch.setattr(page, "MAX_ROWS", 3)
     html = page.report_html(block_run.record, block_run.folder)
     assert "The 4 of 9 images with the largest systematic part are shown." in html
     assert "the first 5 of 9, all in the files beside this page" in html
-    assert "The 3 of 9 images with the largest error." in html
     assert html.count('id="panel-after') == 2 * 4  # title and description
 
 
@@ -157,9 +154,7 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
         *(np.concatenate([column] * copies) for column in columns),
     )
     told = replace(summary, views=tuple(views), pairs=tuple(pairs), verdict=tuple(lines))
-    return RunFiles(
-        told, observations, np.concatenate(points), np.concatenate(tracks), outlines, found.pictures
-    )
+    return RunFiles(told, observations, np.concatenate(points), np.concatenate(tracks), outlines)
 
 
 @pytest.mark.slow
