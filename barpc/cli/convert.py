@@ -15,7 +15,7 @@ import numpy as np
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.images import expanded
 from barpc.cli.moving import moved, read_move
-from barpc.cli.terminal import as_json, echo, say, tell_gate
+from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, opened_dem
 from barpc.dem import Dem
 from barpc.errors import FitError, InputError, OutputError
@@ -84,7 +84,6 @@ Box = tuple[float, float, float, float]
 @dem_option
 @geoid_option
 @click.option("--overwrite", is_flag=True, help="Replace an existing file, or files of an earlier run.")
-@as_json
 def convert(
     files: tuple[str, ...],
     out_dir: str | None,
@@ -99,7 +98,6 @@ def convert(
     dem: str | None,
     geoid: str | None,
     overwrite: bool,
-    as_json: bool,
 ) -> int:
     r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.
 
@@ -129,7 +127,7 @@ def convert(
         cameras = _cameras(images, rpcs)
         if move is not None or transform is not None:
             cameras = moved(cameras, move, transform, carrier or "vrt")
-        return _hand_off(images, cameras, Path(out_dir), carrier or "vrt", names, overwrite, as_json)
+        return _hand_off(images, cameras, Path(out_dir), carrier or "vrt", names, overwrite)
     if len(files) != 2 or rpcs or carrier or move is not None or transform:
         with_it = "--rpc, --images, --move, --transform"
         raise click.UsageError(f"give SOURCE and TARGET, or images and -o DIR (with it: {with_it})")
@@ -137,7 +135,7 @@ def convert(
     camera, image, cut = open_camera(source), Path(split_spec(source)[0]), bool(window or bbox)
     if target.endswith(GRID) and not cut:
         check_target(target, [image, camera.path], overwrite)
-        return _as_grid(camera, target, overwrite, as_json)
+        return _as_grid(camera, target, overwrite)
     if camera.format in ("grid", "correction"):
         options = FitOptions()
         fit = fit_rpc(camera.model, camera.extent, camera.alt_range, options=options, strict=False)
@@ -150,17 +148,15 @@ def convert(
         window = _window(camera, image, window, bbox, alt, opened_dem(dem, geoid, alt))
         write_crop(camera.rpc, image, target, window, overwrite=overwrite)
         text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
-        echo(json.dumps({"path": target, "window": window}) if as_json else text)
+        echo(json.dumps({"path": target, "window": window}) if wants_json() else text)
         return 0
-    return _copy(camera, image, target, formats, overwrite, as_json)
+    return _copy(camera, image, target, formats, overwrite)
 
 
 # --- one file ---------------------------------------------------------------------------------------------
 
 
-def _copy(
-    camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool, as_json: bool
-) -> int:
+def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool) -> int:
     """Write an RPC as it is, read it back and say how far off it is."""
     if formats is None:
         write_camera(camera.rpc, target, image, overwrite=overwrite)
@@ -169,8 +165,8 @@ def _copy(
     lost = float(camera.rpc.off(read_rpc(target)).max())
     row = {"source": str(camera.path), "format": camera.format, "target": target, "max_px": lost}
     text = f"{camera.path} ({camera.format}) -> {target} (read back: {lost:.1g} px)"
-    echo(json.dumps(row) if as_json else text)
-    for note in () if as_json else camera.notes:
+    echo(json.dumps(row) if wants_json() else text)
+    for note in () if wants_json() else camera.notes:
         say(note)
     if lost <= TOLERANCE:
         return 0
@@ -181,12 +177,12 @@ def _copy(
     )
 
 
-def _as_grid(camera: Camera, target: str, overwrite: bool, as_json: bool) -> int:
+def _as_grid(camera: Camera, target: str, overwrite: bool) -> int:
     """Write a camera as a localisation grid, and say what linear interpolation in it is off by."""
     alts = widened(camera.alt_range)
     write_grid(DirectGrid.of(camera.model, camera.extent, alts), target, overwrite=overwrite)
     readings = verify_grid(Path(target), Sample.of(camera.model, camera.extent, alts))
-    _tell(readings, as_json)
+    _tell(readings)
     off = [f"{one.consumer}: {one.note or one.max_error}" for one in readings if not one.max_error <= LINEAR]
     return tell_gate(f"{target} does not hold the camera to {LINEAR:g} px", off) if off else 0
 
@@ -263,7 +259,6 @@ def _hand_off(
     carrier: str,
     formats: list[str],
     overwrite: bool,
-    as_json: bool,
 ) -> int:
     """Write images with their RPCs, open every file as its readers do, and say what they see."""
     files = [Path(split_spec(image)[0]) for image in images]
@@ -283,7 +278,7 @@ def _hand_off(
                 size = dataset.width, dataset.height
             readings += verify(written, camera.rpc, size, camera.alt_range)
             reasons += _shadow_reasons(file, written)
-    _tell(readings, as_json)
+    _tell(readings)
     for sentence in unverified([folder / name for name in names[0]]):
         say(sentence)
     off = [reading for reading in readings if not reading.passed]
@@ -291,9 +286,9 @@ def _hand_off(
     return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
 
 
-def _tell(readings: list[Reading], as_json: bool) -> None:
+def _tell(readings: list[Reading]) -> None:
     rows = [(str(r.path), r.consumer, None if r.note else r.max_error, r.note) for r in readings]
-    if as_json:
+    if wants_json():
         keys = ("path", "consumer", "max_px", "note")
         echo(json.dumps([dict(zip(keys, row, strict=True)) for row in rows]))
         return

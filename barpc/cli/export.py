@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from barpc.cli.terminal import as_json, echo, say
+from barpc.cli.terminal import echo, say, wants_json
 
 _TARGETS = ("satnerf", "eogs", "nerfstudio", "colmap", "s2p", "cars", "asp", "stac", "points")
 
@@ -23,10 +23,7 @@ _TARGETS = ("satnerf", "eogs", "nerfstudio", "colmap", "s2p", "cars", "asp", "st
     help="Altitudes of the scene [m above the ellipsoid].  [default: of its tie points, and a margin]",
 )
 @click.option("--overwrite", is_flag=True, help="Replace what an earlier export wrote.")
-@as_json
-def export(
-    run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | None, overwrite: bool, as_json: bool
-) -> int:
+def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | None, overwrite: bool) -> int:
     r"""Hand a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
     satnerf, eogs: JSON an image with the RPC; nerfstudio, colmap: pinhole cameras that come near the RPCs, with the
@@ -42,7 +39,7 @@ def export(
     from barpc.export import export_run
 
     paths = export_run(run_dir, target, out_dir, alt_range=alt, overwrite=overwrite)
-    if as_json:
+    if wants_json():
         echo(json.dumps([str(path) for path in paths]))
         return 0
     for path in paths:

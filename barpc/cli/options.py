@@ -185,7 +185,6 @@ _RUN_OPTIONS = (
         default="1",
         help="Worker processes, or a dask.distributed cluster (tcp://host:8786).  [default: 1]",
     ),
-    click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
 )
 
 

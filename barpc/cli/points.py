@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from barpc.cameras import open_camera, split_spec
-from barpc.cli.terminal import as_json, echo, tell_gate
+from barpc.cli.terminal import echo, tell_gate, wants_json
 from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, ground_at, opened_dem
 from barpc.errors import InputError
 from barpc.geodesy import Array, ground_from_ecef
@@ -34,7 +34,6 @@ def _points(columns: str) -> Callable[..., Any]:
 @click.option("--alt", type=float, help="Altitude of points without one [m above the ellipsoid].")
 @dem_option
 @geoid_option
-@as_json
 def project(
     image: str,
     numbers: tuple[float, ...],
@@ -42,7 +41,6 @@ def project(
     alt: float | None,
     dem: str | None,
     geoid: str | None,
-    as_json: bool,
 ) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
 
@@ -57,7 +55,7 @@ def project(
     if terrain is not None:
         ground[:, 2] = terrain(ground[:, 0], ground[:, 1])
     found = camera.model.project(ground)
-    _print_points(("col", "row"), found, (6, 6), as_json)
+    _print_points(("col", "row"), found, (6, 6))
     if wrong := exchanged(camera, np.nan_to_num(ground)):
         return tell_gate(f"{image}: {wrong}", [])
     return _tell_failures(found, "could not be projected")
@@ -74,7 +72,6 @@ def project(
 )
 @dem_option
 @geoid_option
-@as_json
 def localize(
     image: str,
     numbers: tuple[float, ...],
@@ -82,7 +79,6 @@ def localize(
     alt: float | None,
     dem: str | None,
     geoid: str | None,
-    as_json: bool,
 ) -> int:
     r"""Print the ground points (lon, lat, alt) seen at image points.
 
@@ -97,7 +93,7 @@ def localize(
     if terrain is None and (without := np.isnan(at[:, 2])).any():
         at[without, 2] = altitude_of(camera, split_spec(image)[0], alt)
     ground = ground_at(camera, at[:, :2], at[:, 2], terrain)
-    _print_points(("lon", "lat", "alt"), ground, (10, 10, 4), as_json)
+    _print_points(("lon", "lat", "alt"), ground, (10, 10, 4))
     return _tell_failures(ground, "have no ground point")
 
 
@@ -105,10 +101,7 @@ def localize(
 @click.argument("images", nargs=-1, required=True, metavar="IMAGE IMAGE...")
 @click.option("--at", type=(float, float), multiple=True, help="COL ROW, once for each image.")
 @_points("col1, row1, col2, row2, ...")
-@as_json
-def triangulate(
-    images: tuple[str, ...], at: tuple[tuple[float, float], ...], points: str | None, as_json: bool
-) -> int:
+def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], points: str | None) -> int:
     r"""Print the ground points where the lines of sight of several images meet, and the error that is left.
 
     A point that an image does not see has nan there. `error` is the root mean square distance between a
@@ -134,7 +127,7 @@ def triangulate(
     table[:count, :3] = ground_from_ecef(found.points)
     with np.errstate(invalid="ignore", divide="ignore"):
         table[:count, 3] = np.sqrt(square / np.bincount(point, minlength=count))
-    _print_points(("lon", "lat", "alt", "error"), table, (10, 10, 4, 4), as_json)
+    _print_points(("lon", "lat", "alt", "error"), table, (10, 10, 4, 4))
     return _tell_failures(table[:, :1], "could not be intersected")
 
 
@@ -195,10 +188,10 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_json: bool) -> None:
+def _print_points(names: Sequence[str], values: Array, digits: Sequence[int]) -> None:
     """A table of points as CSV with a header, or as a JSON list of objects (null for NaN)."""
     rows = [list(zip(row, digits, strict=True)) for row in values.tolist()]
-    if as_json:
+    if wants_json():
         plain = [[round(v, d) if np.isfinite(v) else None for v, d in row] for row in rows]
         echo(json.dumps([dict(zip(names, row, strict=True)) for row in plain]))
         return

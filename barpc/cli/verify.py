@@ -9,14 +9,13 @@ from pathlib import Path
 
 import click
 
-from barpc.cli.terminal import as_json, echo, tell_gate
+from barpc.cli.terminal import echo, tell_gate, wants_json
 
 
 @click.command("verify")
 @click.argument("run_dir", metavar="RUN_DIR")
 @click.argument("places", nargs=-1, metavar="[FOLDER...]")
-@as_json
-def verify(run_dir: str, places: tuple[str, ...], as_json: bool) -> int:
+def verify(run_dir: str, places: tuple[str, ...]) -> int:
     r"""Say which inputs and outputs of a finished run are still the same, and whether its cameras read as certified.
 
     Files are compared by the SHA-256 in summary.json. An input that is no longer where it was is looked for by its name
@@ -31,7 +30,7 @@ def verify(run_dir: str, places: tuple[str, ...], as_json: bool) -> int:
 
     found = prove(Path(run_dir), [Path(place) for place in places])
     wrong = [one for one in found if one.now not in GOOD]
-    if as_json:
+    if wants_json():
         echo(json.dumps([asdict(one) for one in found]))
     else:
         for one in found:

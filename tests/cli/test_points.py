@@ -106,11 +106,14 @@ def test_a_table_that_lacks_something_says_what(
 # --- what goes out ----------------------------------------------------------------------------------------
 
 
-def test_points_are_printed_with_their_digits(capsys: pytest.CaptureFixture[str]) -> None:
+def test_points_are_printed_with_their_digits(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     values = np.array([[1 / 3, 2.0], [np.nan, -2 / 3]])
-    _print_points(("a", "b"), values, (6, 3), as_json=False)
+    _print_points(("a", "b"), values, (6, 3))
     assert capsys.readouterr().out == "a,b\n0.333333,2.000\nnan,-0.667\n"
-    _print_points(("a", "b"), values, (6, 3), as_json=True)
+    monkeypatch.setattr("barpc.cli.points.wants_json", lambda: True)
+    _print_points(("a", "b"), values, (6, 3))
     assert json.loads(capsys.readouterr().out) == [{"a": 0.333333, "b": 2.0}, {"a": None, "b": -0.667}]
 
 
