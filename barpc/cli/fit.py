@@ -40,7 +40,6 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 )
 @click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
 @flag("fit.tolerance")
-@flag("fit.pole_margin")
 @flag("fit.localisation")
 @click.option("--options", "options_file", metavar="FILE", help="TOML file; its table [fit] counts here.")
 @click.option("--keep-going", is_flag=True, help="Write the RPC although it misses the tolerance; exit 3.")

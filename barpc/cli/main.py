@@ -77,6 +77,7 @@ MOVED = {
     "--min-triangulation-angle": "[tie] angles of a file given with --options",
     "--joint": "[fit] method of a file given with --options",
     "--dem-for-all": "--dem, which holds all tie points (--dem-for-weak: those under a small angle only)",
+    "--ip-per-image": "[tie] keypoints_per_image of a file given with --options",
     "--store": "the run folder (-o) is on a disk that all workers see",
     "--for-format": "[fit] precision of a file given with --options",
 }

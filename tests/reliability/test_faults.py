@@ -302,7 +302,7 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     "a flag without its value": (given("NO -o", "--dem"), 2, ("--dem",)),
     "no output folder": (lambda s: [s.a, s.b, "NO -o"], 2, ("--out-dir",)),
     "zero workers": (given("-j", 0), 2, ("0",)),
-    "a number that is none": (given("--search", "far"), 2, ("far",)),
+    "a number that is none": (given("--drift", "far"), 2, ("far",)),
     "a choice that is none": (given("--images", "jpeg"), 2, ("jpeg",)),
     "an unknown loss": (
         given("--options", "o.toml", o__toml=b"[adjust]\nloss = 'magic'\n"),
@@ -318,13 +318,12 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     "an unknown RPC format": (given("--rpc-format", "doc"), 2, ("doc", "txt")),
     "a fixed view that is not there": (given("--fixed", "nobody"), 1, ("nobody",)),
     "all views fixed": (given("--fixed", "view_00", "--fixed", "view_01"), 3, ()),
-    "a negative sigma": (given("--sigma-attitude", "-1"), 2, ("sigma",)),
+    "a negative drift": (given("--drift", "-1"), 2, ("drift",)),
     "a share above one": (
         given("--options", "o.toml", o__toml=b"[tie]\nmin_overlap = 2.0\n"),
         1,
         ("min_overlap",),
     ),
-    "a negative search": (given("--search", "-5"), 2, ("search",)),
     "a tolerance that cannot be met": (
         given("--options", "o.toml", o__toml=b"[fit]\ntolerance = 1e-30\n"),
         1,
