@@ -118,7 +118,9 @@ def page() -> str:
     for name, record in TABLES.items():
         lines += option_table(name, record, flags)
     lines += ["", "## Verbs", ""]
-    lines += ["Before or behind every verb: `--json` (results as JSON on stdout), `-q`, `-v`, `-vv`, `--debug`."]
+    lines += [
+        "Before or behind every verb: `--json` (results as JSON on stdout), `-q`, `-v`, `-vv`, `--debug`."
+    ]
     for name in COMMANDS:
         lines += verb_section(name)
     return "\n".join(lines) + "\n"

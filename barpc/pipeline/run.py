@@ -24,13 +24,20 @@ from barpc.handoff import unverified
 from barpc.identity import Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.cluster import watched
-from barpc.pipeline.control import load_gcps
+from barpc.pipeline.control import load_altimetry, load_gcps
 from barpc.pipeline.executor import CachingExecutor
-from barpc.pipeline.given import given_matches, given_tracks
 from barpc.pipeline.grids import write_grids
-from barpc.pipeline.hashed import hash_inputs
-from barpc.pipeline.heights import load_altimetry
-from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs, with_located
+from barpc.pipeline.inputs import (
+    PRIOR,
+    given_matches,
+    given_tracks,
+    hash_inputs,
+    input_files,
+    only_new,
+    read_pairs,
+    side_inputs,
+    with_located,
+)
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.views import Image, image_path, load_views
 from barpc.pointio.matches import asp_text, write_matches

@@ -24,11 +24,11 @@ from barpc.report.charts import (
     tag,
     titled,
 )
-from barpc.report.shading import moving_ground
 from barpc.report.summary import (
     CELLS,
     CheckPointEntry,
     GcpEntry,
+    Summary,
     ViewEntry,
     cell_numbers,
 )
@@ -43,6 +43,7 @@ _VECTORS = 6000
 _PANEL = 180.0
 _MANY = 30  # stacks of images: of more there are fewer numbers, and thinner lines
 _REACH = 12.0  # units of a long residual
+_DARKEST = 0.7  # opacity where all tie points move
 
 Link = tuple[Sequence[float] | Array, Sequence[float] | Array, int, str]
 """Two places (x, y), the matches between them, a title."""
@@ -108,7 +109,7 @@ def ground_map(files: RunFiles) -> str:
     points = plane(files.points[:: max(1, -(-len(files.points) // MAX_DOTS)), :2])
     parts = [
         *grid,
-        *moving_ground(plane, summary),
+        *_moving_ground(plane, summary),
         tag("path", d="".join(f"M{x:.1f} {y:.1f}h0" for x, y in points.tolist()) or "M0 0", class_="point"),
     ]
     outlines = list(zip(range(len(summary.views)), summary.views, files.outlines, strict=True))
@@ -130,6 +131,25 @@ def ground_map(files: RunFiles) -> str:
     )
     many = {"class_": "many"} if len(stacks) > _MANY else {}
     return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees], **many)
+
+
+def _moving_ground(plane: Plane, summary: Summary) -> list[str]:
+    """Cells of the ground in which tie points move together, stronger with more of them, and where each group lies."""
+    scene = summary.scene
+    if scene is None:
+        return []
+    parts = []
+    for one in scene.moving:
+        shape = _box(plane, one.box, "moves", fill_opacity=_DARKEST * one.share)
+        parts.append(titled(shape, f"{100 * one.share:.0f} % of {one.count} tie points move together"))
+    groups = [one for one in scene.explanations if one.box is not None]
+    return parts + [titled(_box(plane, one.box or (), "group"), one.sentence) for one in groups]
+
+
+def _box(plane: Plane, box: Sequence[float], class_: str, **style: float) -> str:
+    west, south, east, north = box
+    (x, y), (right, bottom) = plane(np.array([(west, north), (east, south)])).tolist()
+    return tag("rect", x=x, y=y, width=right - x, height=bottom - y, class_=class_, **style)
 
 
 @dataclass(frozen=True, eq=False)

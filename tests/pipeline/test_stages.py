@@ -17,8 +17,16 @@ from barpc.fit import FitOptions, fit_rpc
 from barpc.options import AdjustOptions, RunOptions
 from barpc.pipeline import inputs
 from barpc.pipeline import run as stages
-from barpc.pipeline.given import given_matches, given_tracks
-from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs, with_located
+from barpc.pipeline.inputs import (
+    PRIOR,
+    given_matches,
+    given_tracks,
+    input_files,
+    only_new,
+    read_pairs,
+    side_inputs,
+    with_located,
+)
 from barpc.pipeline.outputs import output_names
 from barpc.report import Run
 from barpc.scene import Tracks, View

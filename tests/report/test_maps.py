@@ -14,7 +14,7 @@ from barpc.report import maps
 from barpc.report.maps import Plane, cells_of, ground_map, residual_panels
 from barpc.report.summary import CheckPointEntry
 from barpc.report.summary.causes import ExplanationEntry
-from barpc.report.summary.moving import MovingEntry
+from barpc.report.summary.scene import MovingEntry
 
 from .made import (
     Drawing,
