@@ -105,7 +105,7 @@ def identity_of_a_run(side: int = 1000) -> None:
     import barpc
     from barpc import identity
     from barpc.options import RunOptions
-    from barpc.pipeline import hashed
+    from barpc.pipeline import inputs
 
     hashing, asking = Spent(), Spent()
     ask = asking.timed(identity.Input.ask)
@@ -122,7 +122,7 @@ def identity_of_a_run(side: int = 1000) -> None:
                 out.write(whole, 1)
         barpc.adjust(images, Path(folder) / "warm", RunOptions())
         with (
-            mock.patch.object(hashed, "hashed", hashing.timed(hashed.hashed)),
+            mock.patch.object(inputs, "hashed", hashing.timed(inputs.hashed)),
             mock.patch.object(identity.Input, "ask", lambda one: ask(one)),
         ):
             began = time.process_time()

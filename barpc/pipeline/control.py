@@ -1,4 +1,4 @@
-"""Files of ground points and altimetry against the cameras as delivered: what cannot be meant is said before any work."""
+"""Files of ground points and altimetry against the cameras: what cannot be meant is said before any work starts."""
 
 from __future__ import annotations
 
