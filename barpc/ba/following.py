@@ -57,16 +57,21 @@ def without_strips(
         return found
     waves, params = _waves_of(parts, len(block.views))
     tried = _with_waves(_judged(found, judged, block), block, outer, options, waves, start=params)
+    plainly = replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
     if is_better(found.after, tried.after, outer):
-        return replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
-    # rows that wander have competed with these already, detectors that all images have in common have not
-    if not any(one.where is not None and one.where[0] == 0 for one in parts):
+        return plainly
+    # one image's rows that wander have competed with these already; what all images have in common has not: detectors,
+    # or a platform that shakes
+    shaken = len({one.view for one in parts}) == len(block.views)
+    if not shaken and not any(one.where is not None and one.where[0] == 0 for one in parts):
         return tried
     plain = follow(
         found, block, outer, options
     )  # splines and detectors may explain the same, and leave nothing
     calm = plain is not found and not standing_out(plain.outcome, block, options.noise_floor)
-    return found if calm and not is_better(tried.after, plain.after, outer) else tried
+    if not calm or is_better(tried.after, plain.after, outer):
+        return tried
+    return plainly if shaken else found
 
 
 def _judged(found: Solution, judged: Judgement, block: Block) -> Solution:

@@ -14,8 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
-from scipy.optimize import lsq_linear
 
 from barpc.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.scene import BoolArray, IntArray
@@ -58,6 +56,8 @@ class Bands:
     @classmethod
     def of(cls, terrain: Terrain, ground: Array) -> Bands:
         """The bands over ground points (n, 3)."""
+        from scipy.ndimage import gaussian_filter  # a tenth of a second, of blocks with a DEM alone
+
         lon = wrap_longitude(ground[:, 0], ground[0, 0])
         low, high = np.percentile(
             np.column_stack([lon, ground[:, 1]]), [1, 99], axis=0
@@ -103,6 +103,8 @@ class Bands:
 
 
 def _sampled(layer: Array, at: Array) -> Array:
+    from scipy.ndimage import map_coordinates
+
     return np.asarray(map_coordinates(layer, at, order=1, mode="nearest"), dtype=np.float64)
 
 
@@ -270,6 +272,8 @@ def _compared(
 
     Where hills are too few to be told from what errors happen to be, no slope is believed.
     """
+    from scipy.optimize import lsq_linear  # a fifth of a second, of blocks with a DEM alone
+
     gains, fits, both, believes = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
     for _ in range(_ROUNDS):
         rising = np.einsum("k,knx->nx", gains, slopes)

@@ -91,17 +91,22 @@ class Rounds:
         self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
         given, control = problem.camera_prior, heights.has_control
         self.variances = Variances.of(given, unknowns, options, control, block.views)
-        if known is not None and known.problem.cameras.unknowns is unknowns:
-            self.problem = replace(self.problem, camera_prior=known.problem.camera_prior)
+        # what the same unknowns ended with is gone on with: cut, accuracies, misfit
+        self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns
+        if known is not None and self.goes_on:
+            self.problem, use = (
+                replace(self.problem, camera_prior=known.problem.camera_prior),
+                use & known.inlier,
+            )
         self.everything = self.observations.tied(block.use & np.isfinite(residual).all(axis=0))
         self.use = self.observations.tied(use & self.everything)
-        if known is not None:
-            self.use = self.observations.tied(self.use & known.inlier)
-        self.counted = self.use.astype(np.float64)
+        self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
         self.is_known = known is not None
         self.projected = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
-        self.misfit: Array | float = 0.0 if known is None or not self.robust else known.smooth.rms
+        self.misfit: Array | float = (
+            known.smooth.rms if known is not None and self.goes_on and self.robust else 0.0
+        )
         self.scatter: Array | None = None  # residuals without smooth parts, where they are known
         self.weight = self.counted
 
@@ -145,7 +150,7 @@ class Rounds:
         smooth = self._estimate_noise()
         numbers = self.passes, self.use.sum(), len(self.use), self.noise
         _LOG.info("pass %d: %d of %d observations, noise %.3f", *numbers)
-        again = self.passes > 1 or self.is_known
+        again = self.passes > 1 or self.goes_on
         same = again and int((self.use != was_in_use).sum()) <= _SAME * len(self.use)
         settled = not options.estimate_noise or abs(self.noise / noise - 1.0) < _SAME_NOISE
         # what is known of the place goes with what is shared, and nothing else learns of it
@@ -179,7 +184,7 @@ class Rounds:
 
     def _solve(self) -> Minimum:
         """Least squares of what is used; a second pass follows the first robust one always, and is exact."""
-        again = self.passes > 1 or self.is_known
+        again = self.passes > 1 or self.goes_on
         solver = "sparse" if self.options.solver == "auto" and self.passes == 1 else self.options.solver
         tolerance = TOLERANCE if again or not self.robust else _FIRST_TOLERANCE
         noise = self.noise if self.options.estimate_noise else 1.0

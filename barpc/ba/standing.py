@@ -132,7 +132,8 @@ def without_moving(
         if one is None or one.moved is None:
             break
         findings = findings[:-1]
-        if options.is_plain:  # what moves may be what the model does not follow
+        # what moves may be what the model does not follow, or the little that is left of what the cameras will
+        if options.is_plain or any(row.gain > one.gain for row in findings):
             break
         less = parts.less(found, one.moved)
         if len(groups) == _GROUPS or not less.is_tied():

@@ -191,7 +191,7 @@ def _attempt(
     errors = search.errors(found)
     keep, residual = agreeing(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
-    if report.verified < options.min_matches:
+    if _apart(found.xy[keep, 0], getattr(kind, "patch", 0.0)) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches on common epipolar lines")
     spread, share = robust_spread(residual[keep]), report.verified / len(found)
     along, across = np.median(errors[keep], axis=0).tolist()
@@ -202,6 +202,11 @@ def _attempt(
         )
         found = replace(found, index=index)
     return replace(found.select(keep), sigma=max(spread, 0.05)), report
+
+
+def _apart(xy: Array, side: float) -> int:
+    """How many points (M, 2) stand so far apart that what is compared about them is not the same."""
+    return len(np.unique(np.floor(xy / side), axis=0)) if side else len(xy)
 
 
 def _loaded(

@@ -52,6 +52,8 @@ class Structure:
     """The place in each point's band that looks most alike, where nothing beside the band is more alike."""
 
     detects: ClassVar[bool] = False
+    patch: ClassVar[float] = 4.0 * _HALF
+    """Side of a template [px], in the finest picture that is searched freely: matches nearer to each other are one."""
 
     def __init__(self, options: TieOptions, keypoints: tuple[Keypoints, Keypoints]) -> None:
         self._band = options.band

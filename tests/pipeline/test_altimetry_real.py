@@ -88,7 +88,7 @@ def test_real_images_are_placed_by_heights_within_what_is_said(swept):
     free = adjust_tracks(run.views, run.tracks)
     basis = enu_basis(ground_from_ecef(np.nanmean(free.points, axis=0)))
     error, said = [], []
-    for seed in range(10):
+    for seed in range(30):
         held = adjust_tracks(run.views, run.tracks, altimetry=along_tracks(swept, seed))
         assert not held.altimetry.why_not
         error.append(np.nanmean(held.points - free.points, axis=0) @ basis.T - MOVE)
@@ -98,5 +98,5 @@ def test_real_images_are_placed_by_heights_within_what_is_said(swept):
     assert (np.median(np.abs(error), axis=0) < [1.2, 1.2, 0.2]).all()
     assert (rms < [2.5, 2.5, 0.4]).all()
     ratio = np.sqrt(np.square(np.array(error) / said).mean(axis=0))
-    assert (ratio < 1.5).all()  # of ten draws; 1.3 wanted
+    assert (ratio < 1.5).all()  # 1.3 wanted; ten draws say it to a fifth only
     assert (ratio > 0.2).all()

@@ -124,3 +124,17 @@ def test_a_place_along_the_line_has_no_error_across_it(render) -> None:
         second.sensor.project(first.sensor.localize(xy, np.full(50, first.alt_range[1]))),
         atol=1e-6,
     )
+
+
+class Blocks(Correlated):
+    """What it compares is so wide that all its matches rest on the same few pixels."""
+
+    patch: ClassVar[float] = 150.0
+
+
+def test_matches_of_a_few_patches_are_not_many(render, monkeypatch) -> None:
+    """Templates wider than their pitch share their pixels: of noise so many agree by chance as stand on one patch."""
+    monkeypatch.setitem(MATCHERS, "another", Blocks)
+    scene = render(views=2, size=(300, 300))
+    with pytest.raises(TiePointError, match="too few matches on common epipolar lines"):
+        find_tracks(scene.views, TieOptions(matcher="another"))
