@@ -1,4 +1,4 @@
-"""`barpc adjust`, `match` and `check`: runs of the pipeline; `report`: their pages and differences."""
+"""`barpc adjust`, `match` and `check`: runs of the pipeline."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import click
 from barpc.cli.images import Config, corrected, expanded, read_config, with_cameras
 from barpc.cli.options import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, run_options, with_flags
 from barpc.cli.progress import executor_for, progress_told
-from barpc.cli.terminal import echo, print_comparison, print_summary, say, tell_gate, wants_json
+from barpc.cli.terminal import echo, print_summary, say, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.options import RunOptions
@@ -110,37 +110,6 @@ def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, 
     if against is not None:
         return _compare(_given(images, flags), Path(against))
     return _run(obj, pipeline.check, images, flags)
-
-
-@click.command("report")
-@click.argument("run_dir", metavar="RUN_DIR")
-@click.argument("other", required=False, metavar="[OTHER_RUN]")
-def report(run_dir: str, other: str | None) -> int:
-    r"""Make report.html of a finished run again, from its summary.json and tables; or compare two runs.
-
-    Two finished runs of the same images are compared on the terminal: errors, cameras, options.
-
-    \b
-    Examples:
-      barpc report adjusted
-      barpc report adjusted adjusted_with_drift
-      barpc report --json monday tuesday
-    """
-    if other is None:
-        if wants_json():
-            raise click.UsageError("--json goes with two runs; the summary.json of one is there already")
-        from barpc.report.page import remake_report
-
-        echo(remake_report(run_dir))
-        return 0
-    from barpc.report.compare import compare_runs
-
-    comparison = compare_runs(run_dir, other)
-    if wants_json():
-        echo(json.dumps(comparison, indent=1))
-    else:
-        print_comparison(comparison)
-    return 0
 
 
 def _run(

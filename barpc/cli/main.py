@@ -47,7 +47,8 @@ COMMANDS = {
 }
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
 _MODULES = {
-    **dict.fromkeys(("match", "check", "report"), "adjust"),
+    **dict.fromkeys(("match", "check"), "adjust"),
+    **dict.fromkeys(("report", "export", "verify"), "finished"),
     **dict.fromkeys(("project", "localize", "triangulate"), "points"),
 }
 

@@ -365,7 +365,7 @@ def test_the_verb_prints_what_it_wrote(southern, tmp_path, capsys):
 
 
 def test_the_verb_offers_every_target():
-    from barpc.cli.export import _TARGETS
+    from barpc.cli.finished import _TARGETS
 
     assert tuple(TARGETS) == _TARGETS
 
