@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -16,13 +17,12 @@ from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.images import expanded
 from barpc.cli.moving import moved, read_move
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
-from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, opened_dem
+from barpc.cli.terrain import Heights, altitude_of, exchanged, with_heights
 from barpc.dem import Dem
 from barpc.errors import FitError, InputError, OutputError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
-from barpc.geodesy import Array
 from barpc.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
 from barpc.raster import open_raster
 from barpc.rpcio import (
@@ -76,29 +76,11 @@ Box = tuple[float, float, float, float]
 )
 @click.option("--window", type=(int, int, int, int), help="Cut out COL ROW WIDTH HEIGHT [px].")
 @click.option("--bbox", type=(float, float, float, float), help="Cut out WEST SOUTH EAST NORTH [deg].")
-@click.option(
-    "--alt",
-    type=float,
-    help="Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]",
+@with_heights(
+    "Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]"
 )
-@dem_option
-@geoid_option
 @click.option("--overwrite", is_flag=True, help="Replace an existing file, or files of an earlier run.")
-def convert(
-    files: tuple[str, ...],
-    out_dir: str | None,
-    rpcs: str | None,
-    carrier: str | None,
-    formats: str | None,
-    move: Array | None,
-    transform: str | None,
-    window: Window | None,
-    bbox: Box | None,
-    alt: float | None,
-    dem: str | None,
-    geoid: str | None,
-    overwrite: bool,
-) -> int:
+def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
     r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.
 
     TARGET ends as --rpc-format says (xml is Maxar's, json rpcm's); .vrt, .tif and .ntf carry the image, too;
@@ -116,44 +98,61 @@ def convert(
       barpc convert scene/*.tif --rpc adjusted -o handoff
       barpc convert scene/*.tif --rpc adjusted -o aligned --transform run-transform.txt
     """
-    if move is not None and transform is not None:
+    if flags["move"] is not None and flags["transform"] is not None:
         raise click.UsageError("give either --move or --transform")
-    if out_dir is not None:
-        if window or bbox:
-            raise click.UsageError("--window and --bbox go with a TARGET, not with -o")
-        names = [name.strip() for name in (formats or "txt").split(",") if name.strip()]
-        images = tuple(expanded(files))
-        _check([Path(split_spec(image)[0]) for image in images], Path(out_dir), names)
-        cameras = _cameras(images, rpcs)
-        if move is not None or transform is not None:
-            cameras = moved(cameras, move, transform, carrier or "vrt")
-        return _hand_off(images, cameras, Path(out_dir), carrier or "vrt", names, overwrite)
-    if len(files) != 2 or rpcs or carrier or move is not None or transform:
+    return _to_target(files, flags) if out_dir is None else _to_folder(files, Path(out_dir), flags)
+
+
+def _to_folder(files: tuple[str, ...], folder: Path, flags: Mapping[str, Any]) -> int:
+    """Images with their RPCs, or those of --rpc, moved or not, in a new folder."""
+    if flags["window"] or flags["bbox"]:
+        raise click.UsageError("--window and --bbox go with a TARGET, not with -o")
+    carrier: str = flags["carrier"] or "vrt"
+    names = [name.strip() for name in (flags["formats"] or "txt").split(",") if name.strip()]
+    images = tuple(expanded(files))
+    _check([Path(split_spec(image)[0]) for image in images], folder, names)
+    cameras = _cameras(images, flags["rpcs"])
+    if flags["move"] is not None or flags["transform"] is not None:
+        cameras = moved(cameras, flags["move"], flags["transform"], carrier)
+    return _hand_off(images, cameras, folder, carrier, names, flags["overwrite"])
+
+
+# --- one file ---------------------------------------------------------------------------------------------
+
+
+def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
+    """One RPC, in another syntax, as a grid, or with a part of its image."""
+    overwrite: bool = flags["overwrite"]
+    if len(files) != 2 or any(flags[name] is not None for name in ("rpcs", "carrier", "move", "transform")):
         with_it = "--rpc, --images, --move, --transform"
         raise click.UsageError(f"give SOURCE and TARGET, or images and -o DIR (with it: {with_it})")
     source, target = files
-    camera, image, cut = open_camera(source), Path(split_spec(source)[0]), bool(window or bbox)
+    camera, image = open_camera(source), Path(split_spec(source)[0])
+    cut = bool(flags["window"] or flags["bbox"])
     if target.endswith(GRID) and not cut:
         check_target(target, [image, camera.path], overwrite)
         return _as_grid(camera, target, overwrite)
     if camera.format in ("grid", "correction"):
-        options = FitOptions()
-        fit = fit_rpc(camera.model, camera.extent, camera.alt_range, options=options, strict=False)
-        if wrong := fit.verdict(options.tolerance):
-            raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
-        say(f"{camera.path}: {camera.format}, fitted to {float(fit.max_ckp.max()):.1g} px")
-        camera = replace(camera, model=fit.rpc)
+        camera = _refitted(camera)
     check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
-    if cut:
-        window = _window(camera, image, window, bbox, alt, opened_dem(dem, geoid, alt))
-        write_crop(camera.rpc, image, target, window, overwrite=overwrite)
-        text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
-        echo(json.dumps({"path": target, "window": window}) if wants_json() else text)
-        return 0
-    return _copy(camera, image, target, formats, overwrite)
+    if not cut:
+        return _copy(camera, image, target, flags["formats"], overwrite)
+    heights: Heights = flags["heights"]
+    window = _window(camera, image, flags["window"], flags["bbox"], heights.alt, heights.terrain())
+    write_crop(camera.rpc, image, target, window, overwrite=overwrite)
+    text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
+    echo(json.dumps({"path": target, "window": window}) if wants_json() else text)
+    return 0
 
 
-# --- one file ---------------------------------------------------------------------------------------------
+def _refitted(camera: Camera) -> Camera:
+    """A grid as an RPC; FitError where none holds it."""
+    options = FitOptions()
+    fit = fit_rpc(camera.model, camera.extent, camera.alt_range, options=options, strict=False)
+    if wrong := fit.verdict(options.tolerance):
+        raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
+    say(f"{camera.path}: {camera.format}, fitted to {float(fit.max_ckp.max()):.1g} px")
+    return replace(camera, model=fit.rpc)
 
 
 def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool) -> int:

@@ -19,7 +19,7 @@ from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
 from barpc.cli.images import expanded
 from barpc.cli.terminal import echo, wants_json
-from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, ground_at, opened_dem
+from barpc.cli.terrain import Heights, altitude_of, exchanged, ground_at, with_heights
 from barpc.dem import Dem
 from barpc.errors import InputError, RpcError
 from barpc.fit.poles import smallest_denominator
@@ -33,13 +33,9 @@ from barpc.sensor.rpc import RPC
 @click.option(
     "--at", type=(float, float, float), help="Ground point of the angles: LON LAT ALT.  [default: the centre]"
 )
-@click.option(
-    "--alt",
-    type=float,
-    help="Altitude of the ground [m].  [default: of the run's tie points, else the middle of the camera's]",
+@with_heights(
+    "Altitude of the ground [m].  [default: of the run's tie points, else the middle of the camera's]"
 )
-@dem_option
-@geoid_option
 @click.option(
     "--footprint", "outlines", is_flag=True, help="Print outlines on the ground as GeoJSON instead."
 )
@@ -47,9 +43,7 @@ from barpc.sensor.rpc import RPC
 def info(
     images: tuple[str, ...],
     at: tuple[float, float, float] | None,
-    alt: float | None,
-    dem: str | None,
-    geoid: str | None,
+    heights: Heights,
     outlines: bool,
     doctor: bool,
 ) -> int:
@@ -74,7 +68,7 @@ def info(
         return _examine()
     if not images:
         raise click.UsageError("give at least one IMAGE")
-    images, terrain = tuple(expanded(images)), opened_dem(dem, geoid, alt)
+    images, terrain, alt = tuple(expanded(images)), heights.terrain(), heights.alt
     cameras = [open_camera(image) for image in images]
     if outlines:
         echo(json.dumps(_outlines(images, cameras, alt, terrain)))

@@ -14,7 +14,7 @@ import numpy as np
 
 from barpc.cameras import open_camera, split_spec
 from barpc.cli.terminal import echo, tell_gate, wants_json
-from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, ground_at, opened_dem
+from barpc.cli.terrain import Heights, altitude_of, exchanged, ground_at, opened_dem, with_heights
 from barpc.errors import InputError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.sensor import geometry
@@ -31,16 +31,12 @@ def _points(columns: str) -> Callable[..., Any]:
 @click.argument("image")
 @click.argument("numbers", nargs=-1, type=float, metavar="[LON LAT ALT]...")
 @_points("lon, lat, alt")
-@click.option("--alt", type=float, help="Altitude of points without one [m above the ellipsoid].")
-@dem_option
-@geoid_option
+@with_heights("Altitude of points without one [m above the ellipsoid].")
 def project(
     image: str,
     numbers: tuple[float, ...],
     points: str | None,
-    alt: float | None,
-    dem: str | None,
-    geoid: str | None,
+    heights: Heights,
 ) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
 
@@ -49,9 +45,9 @@ def project(
       barpc project image.tif 5.44 43.26 180
       barpc project image.tif --points ground.csv --json
     """
-    terrain = opened_dem(dem, geoid)
+    terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)
-    ground = read_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else alt)
+    ground = read_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else heights.alt)
     if terrain is not None:
         ground[:, 2] = terrain(ground[:, 0], ground[:, 1])
     found = camera.model.project(ground)
@@ -65,20 +61,14 @@ def project(
 @click.argument("image")
 @click.argument("numbers", nargs=-1, type=float, metavar="[COL ROW]...")
 @_points("col, row and perhaps alt")
-@click.option(
-    "--alt",
-    type=float,
-    help="Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]",
+@with_heights(
+    "Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]"
 )
-@dem_option
-@geoid_option
 def localize(
     image: str,
     numbers: tuple[float, ...],
     points: str | None,
-    alt: float | None,
-    dem: str | None,
-    geoid: str | None,
+    heights: Heights,
 ) -> int:
     r"""Print the ground points (lon, lat, alt) seen at image points.
 
@@ -87,11 +77,11 @@ def localize(
       barpc localize image.tif 512.5 300 --alt 180
       barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96_15.gtx
     """
-    terrain = opened_dem(dem, geoid)
+    terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)
     at = read_points(numbers, points, ("col", "row", "alt"), fill=np.nan)
     if terrain is None and (without := np.isnan(at[:, 2])).any():
-        at[without, 2] = altitude_of(camera, split_spec(image)[0], alt)
+        at[without, 2] = altitude_of(camera, split_spec(image)[0], heights.alt)
     ground = ground_at(camera, at[:, :2], at[:, 2], terrain)
     _print_points(("lon", "lat", "alt"), ground, (10, 10, 4))
     return _tell_failures(ground, "have no ground point")

@@ -147,19 +147,19 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     flags = {
         "flag_tie_band": 9,
         "flag_adjust_model": None,
-        "flag_adjust_drift": 2,
+        "flag_adjust_dem_for_weak": True,
         "flag_overwrite": None,
         "flag_fit_tolerance": 0.5,
         "flag_dem": "d.tif",
         "other": 3,
     }
     found = run_options(flags, str(path))
-    assert (found.tie.band, found.adjust.model, found.adjust.drift) == (9, "shift", 2)
+    assert (found.tie.band, found.adjust.model, found.adjust.dem_for_weak) == (9, "shift", True)
     assert (found.overwrite, found.fit.tolerance, found.dem) == (True, 0.5, "d.tif")
     alone = run_options(flags, None)
     assert (alone.tie, alone.adjust) == (
         TieOptions(band=9),
-        AdjustOptions(drift=2),
+        AdjustOptions(dem_for_weak=True),
     )
     with pytest.raises(InputError, match="command line"):
         run_options({"flag_fit_tolerance": -1.0}, None)
