@@ -21,7 +21,7 @@ from barpc.dem import Dem
 from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.fit import RpcFit, fit_rpc
 from barpc.handoff import unverified
-from barpc.identity import Stamp, ask, guarded, recorded
+from barpc.identity import Input, Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.cluster import watched
 from barpc.pipeline.control import load_altimetry, load_gcps
@@ -174,10 +174,8 @@ def adjust(
                 block_prior(run.adjustment).save(partial)
         with _told(workspace, "summary", progress):
             run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
-            summary = summarize(run)
-        files = {one.path: one for given in inputs.values() for one in given.every()}
-        read = tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
-        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)), inputs=read)
+            summary = replace(summarize(run), inputs=_entries(inputs.values()))
+        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
         _tell(progress, REPORT, 0)
         summary = write_tables(workspace, run, summary)
         _tell(progress, REPORT, 1)
@@ -185,6 +183,12 @@ def adjust(
     sensors = run.after or run.before
     views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
     return AdjustResult(_as_given(views, images, options), run, summary)
+
+
+def _entries(inputs: Iterable[Input]) -> tuple[InputEntry, ...]:
+    """Every file that was read, once, by its path."""
+    files = {one.path: one for given in inputs for one in given.every()}
+    return tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
 
 
 def _tell(progress: Progress | None, stage: str, done: int) -> None:

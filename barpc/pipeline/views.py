@@ -67,6 +67,17 @@ class _Read:
     error: BarpcError | None = None
     files: Mapping[str, Stamp] = field(default_factory=dict)  # all that was opened for it
 
+    def usable(self, twins: Twins | None) -> tuple[View, Camera]:
+        """The image and its camera; what was found wrong with it, or that it is there twice, is raised."""
+        if self.error is not None:
+            raise self.error
+        also_seen(self.files)
+        assert self.view is not None
+        assert self.camera is not None
+        if twins is not None:
+            twins.add(self.view, self.sampled)
+        return self.view, self.camera
+
 
 _Given = tuple[str, Place, Image]  # name, file, and what was given
 
@@ -111,33 +122,23 @@ def load_views(
         raise InputError(
             f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed"
         )
-    views: list[View] = []
-    sources: list[Camera] = []
-    left_out: list[tuple[str, str]] = []
-    twins = Twins(band)
     given = sorted(zip(unique_names(files), files, images, strict=True), key=lambda row: row[:2])
-    images_read, spent = _read_all(
-        given, (band, distinct, tuple(hosts)), executor if len(given) >= _MANY else None, progress
-    )
-    for (_, file, _), read in zip(given, images_read, strict=True):
+    how = (band, distinct, tuple(hosts))
+    opened, spent = _read_all(given, how, executor if len(given) >= _MANY else None, progress)
+    twins, left_out = Twins(band), list[tuple[str, str]]()
+    used: list[tuple[View, Camera]] = []
+    for (_, file, _), read in zip(given, opened, strict=True):
         try:
-            if read.error is not None:
-                raise read.error
-            also_seen(read.files)
-            assert read.view is not None
-            assert read.camera is not None
-            if distinct:
-                twins.add(read.view, read.sampled)
-            views.append(read.view)
-            sources.append(read.camera)
+            used.append(read.usable(twins if distinct else None))
         except BarpcError as error:
             if not keep_going:
                 raise
             logger.warning("%s is left out: %s", file, error)
             left_out.append((str(file), str(error)))
-    if len(views) < min_views:
-        raise InputError(f"{len(views)} of {len(files)} images can be used: at least {min_views} are needed")
-    return LoadedViews(tuple(views), tuple(sources), tuple(left_out), spent)
+    if len(used) < min_views:
+        raise InputError(f"{len(used)} of {len(files)} images can be used: at least {min_views} are needed")
+    views, sources = zip(*used, strict=True) if used else ((), ())
+    return LoadedViews(views, sources, tuple(left_out), spent)
 
 
 def _read_all(
