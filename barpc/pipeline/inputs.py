@@ -22,7 +22,7 @@ from barpc.pointio.links import Links
 from barpc.pointio.matches import read_links, tracks_of
 from barpc.pointio.names import ViewNames
 from barpc.raster import hashed
-from barpc.remote import Remote, located, place
+from barpc.remote import here, located, place
 from barpc.report import Run
 from barpc.scene import BoolArray, Tracks, View
 from barpc.sensor.geometry import footprint
@@ -77,10 +77,15 @@ def with_located(options: RunOptions) -> RunOptions:
 
     def at(path: str) -> str:
         found = located(path, options.allow_remote)
-        return os.fspath(versioned(found, IMAGE)) if isinstance(found, Remote) else path
+        return path if here([found]) else os.fspath(versioned(found, IMAGE))
 
     dem, geoid = (path if path is None else at(path) for path in (options.dem, options.geoid))
     return replace(options, dem=dem, geoid=geoid, reference=tuple(map(at, options.reference)))
+
+
+def reference_names(options: RunOptions) -> list[str]:
+    """The references as tasks call them."""
+    return [os.fspath(place(path).absolute()) for path in options.reference]
 
 
 def input_files(options: RunOptions) -> list[Path]:
@@ -90,7 +95,7 @@ def input_files(options: RunOptions) -> list[Path]:
         value = getattr(options, name)
         if one.rule.unit == "file" and value is not None:
             paths = value if isinstance(value, tuple) else (value,)
-            found += [Path(path) for path in paths if not isinstance(path, Remote)]
+            found += here(paths)
     return found
 
 
@@ -142,7 +147,7 @@ def _finder(
 
 
 def _resolved(path: str | Path) -> object:
-    return str(path) if isinstance(path, Remote) else Path(path).resolve()
+    return place(path).resolve()
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
@@ -173,8 +178,7 @@ def hash_inputs(
     `seen` holds the files that were opened so far. A matcher of the user's goes by its name, with all its files.
     """
     images = [view.path for view in run.views]
-    references = [os.fspath(place(path).absolute()) for path in options.reference]
-    rasters = dict.fromkeys([*images, *references])
+    rasters = dict.fromkeys([*images, *reference_names(options)])
     others = dict.fromkeys(
         [*seen, *(os.fspath(path.absolute()) for path in input_files(options) if path.is_file())]
     )
@@ -198,7 +202,7 @@ def _groups(names: Sequence[str]) -> list[tuple[tuple[str, ...]]]:
     size = 0
     for name in names:
         groups[-1].append(name)
-        size += 0 if isinstance(name, Remote) else Path(name).stat().st_size
+        size += sum(path.stat().st_size for path in here([name]))
         if size >= _TOGETHER:
             groups.append([])
             size = 0

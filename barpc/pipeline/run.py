@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -35,6 +34,7 @@ from barpc.pipeline.inputs import (
     input_files,
     only_new,
     read_pairs,
+    reference_names,
     side_inputs,
     with_located,
 )
@@ -42,7 +42,7 @@ from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_
 from barpc.pipeline.views import Image, image_path, load_views
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
-from barpc.remote import Remote, place
+from barpc.remote import here
 from barpc.report import Run, Summary, summarize
 from barpc.report.page import REPORT, remake_report
 from barpc.report.records import plain
@@ -259,7 +259,7 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
         for view in views:
             plain_source(view.path)
     inputs = (*(view.path for view in views), *(source.path for source in run.sources))
-    keep = {Path(path) for path in inputs if not isinstance(path, Remote)}
+    keep = set(here(inputs))
     keep |= set(input_files(options))
     names = output_names(views, options, folder)
     refuse_shadows(folder, names)
@@ -289,10 +289,6 @@ def _solve(
     return run
 
 
-def _references(options: RunOptions) -> list[str]:
-    return [os.fspath(place(path).absolute()) for path in options.reference]
-
-
 def _registered(
     run: Run, options: RunOptions, dem: Dem, executor: Executor, progress: Progress | None
 ) -> Registration:
@@ -301,7 +297,7 @@ def _registered(
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
     return register(
         run.views,
-        _references(options),
+        reference_names(options),
         dem,
         options.tie.band,
         sigma=options.reference_sigma,

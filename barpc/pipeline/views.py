@@ -6,6 +6,7 @@ The same image twice ties itself to itself, perfectly and uselessly.
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -22,7 +23,7 @@ from barpc.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.identity import Stamp, also_seen, recorded
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
-from barpc.remote import Place, Remote, located
+from barpc.remote import Place, here, located
 from barpc.rpcio.acquisition import date_taken
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
@@ -183,12 +184,11 @@ def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str])
             raise InputError(f"{file}: is {size} px large, but its view says {image.size}")
     else:
         path, choices = split_spec(image, hosts)
-        camera = open_split(file if isinstance(file, Remote) else path, choices, size=size)
+        camera = open_split(path if here([path]) else file, choices, size=size)
         if camera.format in ("grid", "correction") and "camera" not in choices:
             raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
-    pixels = file if isinstance(file, Remote) else str(file)
     day = (image.date if isinstance(image, View) else "") or date_taken(file, camera.path, tags)
-    view = View(name, pixels, size, camera.model, _altitudes(camera), day)
+    view = View(name, os.fspath(file), size, camera.model, _altitudes(camera), day)
     ring = footprint(view.sensor, size, view.altitude)
     if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
         raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
@@ -260,7 +260,7 @@ def _sampled(view: View, band: int) -> bytes | None:
 
 
 def _identity(path: str) -> Hashable:
-    if isinstance(path, Remote):
+    if not here([path]):
         return str(path)
     file = Path(path).stat()
     return file.st_dev, file.st_ino
