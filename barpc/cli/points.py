@@ -47,7 +47,7 @@ def project(
     """
     terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)
-    ground = read_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else heights.alt)
+    ground = given_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else heights.alt)
     if terrain is not None:
         ground[:, 2] = terrain(ground[:, 0], ground[:, 1])
     found = camera.model.project(ground)
@@ -79,7 +79,7 @@ def localize(
     """
     terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)
-    at = read_points(numbers, points, ("col", "row", "alt"), fill=np.nan)
+    at = given_points(numbers, points, ("col", "row", "alt"), fill=np.nan)
     if terrain is None and (without := np.isnan(at[:, 2])).any():
         at[without, 2] = altitude_of(camera, split_spec(image)[0], heights.alt)
     ground = ground_at(camera, at[:, :2], at[:, 2], terrain)
@@ -108,7 +108,7 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
     names = [f"{axis}{i}" for i in range(1, len(cameras) + 1) for axis in ("col", "row")]
     if points is None and len(at) != len(cameras):
         raise click.UsageError(f"{len(at)} points given with --at for {len(cameras)} images")
-    xy = read_points([v for pair in at for v in pair], points, names).reshape(-1, len(cameras), 2)
+    xy = given_points([v for pair in at for v in pair], points, names).reshape(-1, len(cameras), 2)
     point, view = np.nonzero(np.isfinite(xy).all(axis=2))
     models = [camera.model for camera in cameras]
     found = geometry.triangulate(models, view, point, xy[point, view], alt=cameras[0].altitude)
@@ -124,7 +124,7 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
 # --- tables of points -------------------------------------------------------------------------------------
 
 
-def read_points(
+def given_points(
     numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None
 ) -> Array:
     """Points (N, columns) from arguments, a CSV file, or standard input ("-").

@@ -257,7 +257,7 @@ class Cells:
         return float(self.systematic.sum() / max(np.isfinite(self.rms).sum(), 1))
 
 
-def cells_of(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
+def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
     """Mean and spread of residuals (m, 2) [px] over a grid of cells on the image."""
     cell, num = cell_numbers(xy, size), CELLS**2
     count = np.bincount(cell, minlength=num)
@@ -288,7 +288,7 @@ def residual_panels(
     order = order[np.argsort(observations.view[order], kind="stable")]
     rows_of = np.split(order, np.searchsorted(observations.view[order], np.arange(1, len(views))))
     grids = [
-        cells_of(observations.xy[rows], residuals[rows], view.size)
+        residual_cells(observations.xy[rows], residuals[rows], view.size)
         for view, rows in zip(views, rows_of, strict=True)
     ]
     shares = [cells.share for cells in grids]

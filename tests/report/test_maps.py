@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barpc.report import maps
-from barpc.report.maps import Plane, cells_of, ground_map, residual_panels
+from barpc.report.maps import Plane, ground_map, residual_cells, residual_panels
 from barpc.report.summary import CheckPointEntry
 from barpc.report.summary.causes import ExplanationEntry
 from barpc.report.summary.scene import MovingEntry
@@ -311,13 +311,13 @@ def shapes_of(svg: str):
 
 def test_a_cell_has_the_rms_and_the_mean_of_its_residuals():
     xy = np.array([[10.0, 10.0], [20.0, 20.0], [799.0, 399.0]])
-    found = cells_of(xy, np.array([[3.0, 4.0], [1.0, 0.0], [0.0, -2.0]]), (800, 400))
+    found = residual_cells(xy, np.array([[3.0, 4.0], [1.0, 0.0], [0.0, -2.0]]), (800, 400))
     assert found.rms[0, 0] == pytest.approx(math.sqrt(13))
     assert found.rms[7, 7] == 2.0
     assert found.mean[0, 0] == pytest.approx([2.0, 2.0])
     assert np.isfinite(found.rms).sum() == 2
     assert found.share == 0.0
-    assert cells_of(np.zeros((0, 2)), np.zeros((0, 2)), (800, 400)).share == 0.0
+    assert residual_cells(np.zeros((0, 2)), np.zeros((0, 2)), (800, 400)).share == 0.0
 
 
 @pytest.mark.parametrize(
@@ -328,7 +328,7 @@ def test_a_mean_of_ten_or_more_above_three_times_its_error_is_systematic(num, me
     residuals = np.column_stack([np.full(num, mean), np.where(np.arange(num) % 2, 1.0, -1.0)])
     if num % 2:
         residuals[-1, 1] = 0.0
-    found = cells_of(np.full((num, 2), 10.0), residuals, (800, 800))
+    found = residual_cells(np.full((num, 2), 10.0), residuals, (800, 800))
     assert bool(found.systematic[0, 0]) == marked
     assert found.systematic.sum() == marked
     assert found.share == float(marked)

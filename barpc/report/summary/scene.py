@@ -20,7 +20,7 @@ from barpc.report.summary.causes import (
     LeftEntry,
     explanations,
     held_out_places,
-    left_over,
+    left_entries,
 )
 from barpc.report.summary.words import Count, Share, Vector, metres, percent_of
 
@@ -245,7 +245,7 @@ def measure_scene(run: Run) -> SceneEntry | None:
         solver=adjustment.status,
         explanations=explanations(adjustment),
         moving=moving_cells(run),
-        left=left_over(adjustment),
+        left=left_entries(adjustment),
         held_out_places=held_out_places(run.met_worse, adjustment.names),
     )
 
