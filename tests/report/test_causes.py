@@ -16,7 +16,7 @@ from barpc.ba.moving import Motion
 from barpc.ba.placing import Look
 from barpc.ba.scan import Interval
 from barpc.report import verdict
-from barpc.report.summary.causes import _WORDS, _place, explanations, strangeness
+from barpc.report.summary.causes import _WORDS, _place, explanations, left_entries, strangeness
 
 NAMES = "west", "east"
 
