@@ -472,9 +472,6 @@ class RunOptions(Options):
     resample: bool = option(
         False, "Write every image resampled, too, so that one RPC holds its camera; and its correction grid."
     )
-    num_passes: int = option(
-        1, "Passes of matching and adjustment; the second matches with the adjusted cameras.", least=1
-    )
     stop_after: Literal["matching", "adjustment", "all"] = option(
         "all", "End early: after the tracks, or before RPCs are written."
     )
@@ -567,6 +564,7 @@ class RunOptions(Options):
 
 
 FORMER = {
+    "num_passes": "a second pass is a run of its own, with the RPCs that the first one wrote",
     "pictures": "the report shows no pixels; open the images beside observations.csv",
     "dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only",
     "store": "the run folder is on a disk that all workers see",

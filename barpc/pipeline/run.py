@@ -274,19 +274,16 @@ def _solve(
     executor: Executor,
     progress: Progress | None,
 ) -> Run:
-    for number in range(1 if options.matches_only else options.num_passes):
-        again = f" (pass {number + 1})" if number else ""
-        with workspace.stage("tie points" + again):
-            run = _with_ties(run, options, executor, progress, given[0])
-        if options.stop_after == "matching":
-            _write_matches(run, workspace)
-            return replace(run, kind="match")
-        if run.reference is None and given[0] is not None and options.reference:
-            with workspace.stage("reference"):
-                run = replace(run, reference=_registered(run, options, given[0], executor, progress))
-        with _told(workspace, "adjustment" + again, progress):
-            run = _adjusted(run, options, *given)
-    return run
+    with workspace.stage("tie points"):
+        run = _with_ties(run, options, executor, progress, given[0])
+    if options.stop_after == "matching":
+        _write_matches(run, workspace)
+        return replace(run, kind="match")
+    if given[0] is not None and options.reference:
+        with workspace.stage("reference"):
+            run = replace(run, reference=_registered(run, options, given[0], executor, progress))
+    with _told(workspace, "adjustment", progress):
+        return _adjusted(run, options, *given)
 
 
 def _registered(
@@ -341,15 +338,12 @@ def _with_ties(
     progress: Progress | None,
     terrain: Dem | None = None,
 ) -> Run:
-    """The run with tie points: from a file, or matched, with the corrected cameras in a later pass."""
+    """The run with tie points: from a file, or matched."""
     views = run.views
     if options.matches and options.matches_only:
         return replace(run, tracks=given_tracks(options.matches, views))
     if len(views) < 2:
         return run
-    if run.adjustment is not None:
-        corrected = zip(views, run.adjustment.sensors, strict=True)
-        views = tuple(replace(view, sensor=sensor) for view, sensor in corrected)
     given: dict[str, Any] = {"executor": executor, "progress": progress, "terrain": terrain}
     if options.overlap_list is not None:
         given["only"] = read_pairs(options.overlap_list, views, [path for path, _ in run.left_out])

@@ -160,17 +160,6 @@ def test_what_the_earlier_block_knew_does_not_count_twice():
 
 
 @pytest.mark.slow
-@WHOLE_AT_NIGHT
-def test_a_second_pass_matches_with_the_adjusted_cameras(known, tmp_path):
-    images = known.images if known.whole else known.images[:2]
-    result = adjust(images, tmp_path / "out", RunOptions(num_passes=2))
-    truth = {**known.truth, "views": known.truth["views"][: len(images)]}
-    rms, _ = errors_at_check_points([read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], truth)
-    assert rms <= 0.02
-    assert "tie points (pass 2)" in [stage["stage"] for stage in result.summary["stages"]]
-
-
-@pytest.mark.slow
 def test_a_dem_holds_heights_and_says_what_it_took(shared_data, tmp_path):
     source = shared_data / "optical/phr_ventoux"
     for path in source.glob("*_image.*"):

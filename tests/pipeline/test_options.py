@@ -132,12 +132,6 @@ def rpc_formats(run: Run, out: Path, scene: Path) -> None:
         RunOptions(rpc_formats=("nitf",))
 
 
-def num_passes(run: Run, out: Path, scene: Path) -> None:
-    two = run("two", matches=None, num_passes=2, stop_after="adjustment")
-    stages = [{stage["stage"] for stage in found.summary["stages"]} for found in (run.plain, two)]
-    assert stages[1] - stages[0] == {"tie points (pass 2)", "adjustment (pass 2)"}
-
-
 def stop_after(run: Run, out: Path, scene: Path) -> None:
     run("m", stop_after="matching")
     assert (out / "m/matches.csv").exists()
@@ -332,7 +326,7 @@ def allow_remote(run: Run, out: Path, scene: Path) -> None:  # what is read so: 
 
 
 ROWS = {
-    "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
+    "images": images, "rpc_formats": rpc_formats, "stop_after": stop_after,
     "grids": grids, "tiles": tiles, "resample": resample,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "altimetry": altimetry, "check_points": check_points,
@@ -347,7 +341,7 @@ def test_every_option_has_a_row() -> None:
 
 
 ELSEWHERE = (
-    "overlap_list", "aoi", "gcp", "check_points", "geoid", "num_passes", "grids", "tiles", "allow_remote", "dem",
+    "overlap_list", "aoi", "gcp", "check_points", "geoid", "grids", "tiles", "allow_remote", "dem",
     "keep_going", "images",
 )  # fmt: skip
 """Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids, tests/test_dem,
@@ -369,7 +363,7 @@ def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene:
     [
         ({"images": "jpeg"}, "images"),
         ({"stop_after": "lunch"}, "stop_after"),
-        ({"num_passes": 0}, "num_passes"),
+        ({"tiles": 0}, "tiles"),
         ({"matches": "a", "matches_only": True, "aoi": "b"}, "aoi is given with matches_only"),
         (
             {"matches": "a", "matches_only": True, "overlap_list": "b"},

@@ -48,7 +48,6 @@ def scene(tmp_path_factory) -> Path:
 def ways(scene: Path) -> dict[str, RunOptions]:
     return {
         "the defaults": RunOptions(),
-        "two passes": RunOptions(num_passes=2),
         "given matches": RunOptions(matches=str(scene / "ties/matches.csv"), matches_only=True),
         "matches to be verified": RunOptions(matches=str(scene / "ties/matches.csv")),
         "control points": RunOptions(
