@@ -14,10 +14,10 @@ import click
 import numpy as np
 
 from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cli.alignment import moved, read_move
+from barpc.cli.heights import Heights, altitude_of, exchanged, with_heights
 from barpc.cli.images import expanded
-from barpc.cli.moving import moved, read_move
 from barpc.cli.terminal import echo, say, tell_gate, wants_json
-from barpc.cli.terrain import Heights, altitude_of, exchanged, with_heights
 from barpc.dem import Dem
 from barpc.errors import FitError, InputError, OutputError
 from barpc.fit import FitOptions, fit_rpc

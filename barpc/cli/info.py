@@ -17,9 +17,9 @@ import numpy as np
 
 from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cli.heights import Heights, altitude_of, exchanged, ground_at, with_heights
 from barpc.cli.images import expanded
 from barpc.cli.terminal import echo, wants_json
-from barpc.cli.terrain import Heights, altitude_of, exchanged, ground_at, with_heights
 from barpc.dem import Dem
 from barpc.errors import InputError, RpcError
 from barpc.fit.poles import smallest_denominator

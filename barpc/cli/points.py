@@ -13,8 +13,8 @@ import click
 import numpy as np
 
 from barpc.cameras import open_camera, split_spec
+from barpc.cli.heights import Heights, altitude_of, exchanged, ground_at, opened_dem, with_heights
 from barpc.cli.terminal import echo, tell_gate, wants_json
-from barpc.cli.terrain import Heights, altitude_of, exchanged, ground_at, opened_dem, with_heights
 from barpc.errors import InputError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.sensor import geometry

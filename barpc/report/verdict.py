@@ -13,11 +13,11 @@ from barpc.ba.apart import APART, Apart
 from barpc.ba.scan import SURE
 from barpc.ba.snooping import ControlTest
 from barpc.geodesy import Array
+from barpc.report.dem_lines import dem_lines, dem_reasons, holds_reference
 from barpc.report.records import plain
 from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
 from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries, strangeness
-from barpc.report.terrain import dem_lines, dem_reasons, holds_reference
 from barpc.scene import GroundPoints
 from barpc.tie.reference import PEAK
 
