@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -204,10 +205,15 @@ def _is_sentinel1(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool
 def _open_sentinel1(path: Place, pol: str | None = None, **choices: Any) -> Camera:
     from barpc.sensor.sentinel1 import open_product
 
+    return _radar("sentinel-1", path, partial(open_product, polarisation=pol, **choices))
+
+
+def _radar(key: str, path: Place, opened: Callable[[Path], Any]) -> Camera:
+    """A radar's own model; ImageError on another host, for it is of many files."""
     if not isinstance(path, Path):
         raise ImageError(f"{path}: a radar product is read from disk only")
-    model = open_product(path, polarisation=pol, **choices)
-    return Camera(model, path, "sentinel-1", model.size, model.alt_range)
+    model = opened(path)
+    return Camera(model, path, key, model.size, model.alt_range)
 
 
 def _is_terrasar(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
@@ -222,10 +228,7 @@ def _is_terrasar(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
 def _open_terrasar(path: Place) -> Camera:
     from barpc.sensor.terrasar import open_terrasar
 
-    if not isinstance(path, Path):
-        raise ImageError(f"{path}: a radar product is read from disk only")
-    model = open_terrasar(path)
-    return Camera(model, path, "terrasar-x", model.size, model.alt_range)
+    return _radar("terrasar-x", path, open_terrasar)
 
 
 def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
@@ -242,10 +245,7 @@ def _is_sicd(path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:
 def _open_sicd(path: Place) -> Camera:
     from barpc.sensor.sicd import open_sicd
 
-    if not isinstance(path, Path):
-        raise ImageError(f"{path}: a radar image's metadata are read from disk only")
-    model = open_sicd(path)
-    return Camera(model, path, "sicd", model.size, model.alt_range)
+    return _radar("sicd", path, open_sicd)
 
 
 def _is_csm(_path: Place, head: bytes, _choices: Mapping[str, Any]) -> bool:

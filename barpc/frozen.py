@@ -188,11 +188,10 @@ def load_npz(path: Path | str, kind: Kind = ARRAYS) -> Arrays:
     What the archive claims is added up before anything is unpacked: a few kilobytes can hold gigabytes of zeros.
     """
     with opened(path, kind) as file:
-        return unpack(file, path, kind)
+        return _unpack(file, path, kind)
 
 
-def unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
-    """As `load_npz`, of an open file."""
+def _unpack(file: IO[bytes], path: Path | str, kind: Kind) -> Arrays:
     try:
         with zipfile.ZipFile(file) as archive:
             members = archive.infolist()

@@ -20,7 +20,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from barpc.errors import InputError
-from barpc.remote import BUCKET, HOST
+from barpc.remote import HOST
 from barpc.sidefile import NUMBER, OPTIONS, TABLE, read_text
 
 T = TypeVar("T")
@@ -477,9 +477,6 @@ class RunOptions(Options):
     resample: bool = option(
         False, "Write every image resampled, too, so that one RPC holds its camera; and its correction grid."
     )
-    num_passes: int = option(
-        1, "Passes of matching and adjustment; the second matches with the adjusted cameras.", least=1
-    )
     stop_after: Literal["matching", "adjustment", "all"] = option(
         "all", "End early: after the tracks, or before RPCs are written."
     )
@@ -489,11 +486,6 @@ class RunOptions(Options):
         connected group is not tied to, write an RPC that misses the fit's tolerance. Such a run ends with exit code
         3.""",
     )
-    pictures: bool = option(
-        True,
-        """Show a quick-look of each image and patches about tie points in the report: pixels, which go where the report
-        goes.""",
-    )
     overwrite: bool = option(False, "Replace the results of an earlier run in the same folder.")
     allow_remote: tuple[str, ...] = option(
         (),
@@ -501,14 +493,6 @@ class RunOptions(Options):
         without. `HOST` is that of `https://HOST/...`; a bucket is given as `s3://BUCKET` (or gs, az). Never taken from
         an options file.""",
         unit="host",
-        spoken=True,
-    )
-    store: str | None = option(
-        None,
-        """Folder of an object store (`s3://BUCKET/...`, gs, az) where workers keep what they read from each other, in
-        place of the run folder: with images by URL they need no disk of the caller. Never taken from an options
-        file.""",
-        unit="url",
         spoken=True,
     )
     matches: tuple[str, ...] = option(
@@ -571,8 +555,6 @@ class RunOptions(Options):
             raise InputError("reference_sigma is given without reference")
         if self.matches_only and not self.matches:
             raise InputError("matches_only is given without matches: there would be no tie points")
-        if self.store is not None and not BUCKET.fullmatch(self.store):
-            raise InputError(f"store {self.store!r} is no s3://BUCKET/FOLDER")
         for host in self.allow_remote:
             if not HOST.fullmatch(host):
                 raise InputError(f"allow_remote {host!r} is no HOST, HOST:PORT or s3://BUCKET")
@@ -600,7 +582,12 @@ PAPER: Mapping[str, Mapping[str, Any]] = {
 """The method of Akiki et al. (2021), beyond which the defaults go: ``with_values(RunOptions(), PAPER)``."""
 
 
-FORMER = {"dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only"}
+FORMER = {
+    "num_passes": "a second pass is a run of its own, with the RPCs that the first one wrote",
+    "pictures": "the report shows no pixels; open the images beside observations.csv",
+    "dem_for_all": "a dem holds all tie points; dem_for_weak = true: those under a small angle only",
+    "store": "the run folder is on a disk that all workers see",
+}
 """Former option -> how it is said now."""
 
 

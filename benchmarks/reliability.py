@@ -105,7 +105,7 @@ def identity_of_a_run(side: int = 1000) -> None:
     import barpc
     from barpc import identity
     from barpc.options import RunOptions
-    from barpc.pipeline import hashed
+    from barpc.pipeline import inputs
 
     hashing, asking = Spent(), Spent()
     ask = asking.timed(identity.Input.ask)
@@ -120,13 +120,13 @@ def identity_of_a_run(side: int = 1000) -> None:
                 whole = np.zeros((side, side), pixels.dtype)
                 whole[: pixels.shape[0], : pixels.shape[1]] = pixels[:side, :side]
                 out.write(whole, 1)
-        barpc.adjust(images, Path(folder) / "warm", RunOptions(pictures=False))
+        barpc.adjust(images, Path(folder) / "warm", RunOptions())
         with (
-            mock.patch.object(hashed, "hashed", hashing.timed(hashed.hashed)),
+            mock.patch.object(inputs, "hashed", hashing.timed(inputs.hashed)),
             mock.patch.object(identity.Input, "ask", lambda one: ask(one)),
         ):
             began = time.process_time()
-            barpc.adjust(images, Path(folder) / "out", RunOptions(pictures=False))
+            barpc.adjust(images, Path(folder) / "out", RunOptions())
             seconds = time.process_time() - began
     print(
         f"a run of {len(images)} x {side**2 / 1e6:.1f} Mpx: {seconds:.2f} CPU s, of which hashing "

@@ -117,7 +117,10 @@ def page() -> str:
     lines = [HEAD, "## Options of a run"]
     for name, record in TABLES.items():
         lines += option_table(name, record, flags)
-    lines += ["", "## Verbs"]
+    lines += ["", "## Verbs", ""]
+    lines += [
+        "Before or behind every verb: `--json` (results as JSON on stdout), `-q`, `-v`, `-vv`, `--debug`."
+    ]
     for name in COMMANDS:
         lines += verb_section(name)
     return "\n".join(lines) + "\n"

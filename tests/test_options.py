@@ -276,4 +276,4 @@ def test_the_names_are_public_and_cost_no_numpy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "--sigma-attitude M" in done.stdout
+    assert "--reference FILE" in done.stdout

@@ -1,4 +1,4 @@
-"""`barpc adjust`, `match` and `check`: runs of the pipeline; `report`: their pages and differences."""
+"""`barpc adjust`, `match` and `check`: runs of the pipeline."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from barpc.cli.options import (
     with_flags,
 )
 from barpc.cli.progress import executor_for, progress_told
-from barpc.cli.terminal import echo, print_comparison, print_summary, say, tell_gate
+from barpc.cli.terminal import echo, print_summary, say, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.options import RunOptions
@@ -119,40 +119,8 @@ def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, 
     from barpc import pipeline
 
     if against is not None:
-        return _compare(_given(images, flags), Path(against), flags["as_json"])
+        return _compare(_given(images, flags), Path(against))
     return _run(obj, pipeline.check, images, flags)
-
-
-@click.command("report")
-@click.argument("run_dir", metavar="RUN_DIR")
-@click.argument("other", required=False, metavar="[OTHER_RUN]")
-@click.option("--json", "as_json", is_flag=True, help="Print the comparison of two runs as JSON on stdout.")
-def report(run_dir: str, other: str | None, as_json: bool) -> int:
-    r"""Make report.html of a finished run again, from its summary.json and tables; or compare two runs.
-
-    Two finished runs of the same images are compared on the terminal: errors, cameras, options.
-
-    \b
-    Examples:
-      barpc report adjusted
-      barpc report adjusted adjusted_with_drift
-      barpc report --json monday tuesday
-    """
-    if other is None:
-        if as_json:
-            raise click.UsageError("--json goes with two runs; the summary.json of one is there already")
-        from barpc.report.page import remake_report
-
-        echo(remake_report(run_dir))
-        return 0
-    from barpc.report.compare import compare_runs
-
-    comparison = compare_runs(run_dir, other)
-    if as_json:
-        echo(json.dumps(comparison, indent=1))
-    else:
-        print_comparison(comparison)
-    return 0
 
 
 def _run(
@@ -166,7 +134,7 @@ def _run(
     """Run an entry of the pipeline with what the command line says and what the verb has `fixed`, and tell."""
     paths = _given(images, flags)
     options = replace(run_options(flags, flags["options_file"]), **(fixed or {}))
-    return _tell(obj, flags, _result(obj, work, paths, options, flags, where))
+    return _tell(obj, _result(obj, work, paths, options, flags, where))
 
 
 def _given(images: tuple[str, ...], flags: Mapping[str, Any]) -> list[str]:
@@ -208,18 +176,18 @@ def _run_from(
     elif config.tool != "sat-bundleadjust":
         with Workspace(out_dir, overwrite=True, keep=[config.path], names=[name], adds=True) as workspace:
             workspace.write_text(name, corrected(config, workspace.folder, result.views))
-    return _tell(obj, flags, result)
+    return _tell(obj, result)
 
 
-def _tell(obj: Mapping[str, Any], flags: Mapping[str, Any], result: AdjustResult) -> int:
-    if flags["as_json"]:
+def _tell(obj: Mapping[str, Any], result: AdjustResult) -> int:
+    if wants_json():
         echo(json.dumps(result.summary, indent=1))
     elif not obj["quiet"]:
         print_summary(result.record)
     return 0 if result.passed else tell_gate(result.record.headline, list(result.record.reasons))
 
 
-def _compare(images: list[str], against: Path, as_json: bool) -> int:
+def _compare(images: list[str], against: Path) -> int:
     from barpc.cameras import open_camera
     from barpc.handoff import TOLERANCE, difference
     from barpc.pipeline import load_views
@@ -230,7 +198,7 @@ def _compare(images: list[str], against: Path, as_json: bool) -> int:
         other = find_rpc(against, Path(view.path)) if against.is_dir() else against
         far = difference(view.sensor, open_camera(other).model, view.size, view.alt_range)
         found.append((view.path, str(other), far))
-    if as_json:
+    if wants_json():
         rows = [dict(zip(("image", "against", "max_px"), row, strict=True)) for row in found]
         echo(json.dumps(rows, indent=1))
     else:

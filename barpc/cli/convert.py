@@ -5,24 +5,24 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
 from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cli.alignment import moved, read_move
+from barpc.cli.heights import Heights, altitude_of, exchanged, with_heights
 from barpc.cli.images import expanded
-from barpc.cli.moving import moved, read_move
-from barpc.cli.terminal import as_json, echo, say, tell_gate
-from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, opened_dem
+from barpc.cli.terminal import echo, say, tell_gate, wants_json
 from barpc.dem import Dem
 from barpc.errors import FitError, InputError, OutputError
 from barpc.fit import FitOptions, fit_rpc
 from barpc.fit.certificate import Sample
 from barpc.fit.points import widened
-from barpc.geodesy import Array
 from barpc.handoff import TOLERANCE, Reading, unverified, verify, verify_grid
 from barpc.raster import open_raster
 from barpc.rpcio import (
@@ -76,31 +76,11 @@ Box = tuple[float, float, float, float]
 )
 @click.option("--window", type=(int, int, int, int), help="Cut out COL ROW WIDTH HEIGHT [px].")
 @click.option("--bbox", type=(float, float, float, float), help="Cut out WEST SOUTH EAST NORTH [deg].")
-@click.option(
-    "--alt",
-    type=float,
-    help="Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]",
+@with_heights(
+    "Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]"
 )
-@dem_option
-@geoid_option
 @click.option("--overwrite", is_flag=True, help="Replace an existing file, or files of an earlier run.")
-@as_json
-def convert(
-    files: tuple[str, ...],
-    out_dir: str | None,
-    rpcs: str | None,
-    carrier: str | None,
-    formats: str | None,
-    move: Array | None,
-    transform: str | None,
-    window: Window | None,
-    bbox: Box | None,
-    alt: float | None,
-    dem: str | None,
-    geoid: str | None,
-    overwrite: bool,
-    as_json: bool,
-) -> int:
+def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
     r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.
 
     TARGET ends as --rpc-format says (xml is Maxar's, json rpcm's); .vrt, .tif and .ntf carry the image, too;
@@ -118,49 +98,64 @@ def convert(
       barpc convert scene/*.tif --rpc adjusted -o handoff
       barpc convert scene/*.tif --rpc adjusted -o aligned --transform run-transform.txt
     """
-    if move is not None and transform is not None:
+    if flags["move"] is not None and flags["transform"] is not None:
         raise click.UsageError("give either --move or --transform")
-    if out_dir is not None:
-        if window or bbox:
-            raise click.UsageError("--window and --bbox go with a TARGET, not with -o")
-        names = [name.strip() for name in (formats or "txt").split(",") if name.strip()]
-        images = tuple(expanded(files))
-        _check([Path(split_spec(image)[0]) for image in images], Path(out_dir), names)
-        cameras = _cameras(images, rpcs)
-        if move is not None or transform is not None:
-            cameras = moved(cameras, move, transform, carrier or "vrt")
-        return _hand_off(images, cameras, Path(out_dir), carrier or "vrt", names, overwrite, as_json)
-    if len(files) != 2 or rpcs or carrier or move is not None or transform:
-        with_it = "--rpc, --images, --move, --transform"
-        raise click.UsageError(f"give SOURCE and TARGET, or images and -o DIR (with it: {with_it})")
-    source, target = files
-    camera, image, cut = open_camera(source), Path(split_spec(source)[0]), bool(window or bbox)
-    if target.endswith(GRID) and not cut:
-        check_target(target, [image, camera.path], overwrite)
-        return _as_grid(camera, target, overwrite, as_json)
-    if camera.format in ("grid", "correction"):
-        options = FitOptions()
-        fit = fit_rpc(camera.model, camera.extent, camera.alt_range, options=options, strict=False)
-        if wrong := fit.verdict(options.tolerance):
-            raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
-        say(f"{camera.path}: {camera.format}, fitted to {float(fit.max_ckp.max()):.1g} px")
-        camera = replace(camera, model=fit.rpc)
-    check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
-    if cut:
-        window = _window(camera, image, window, bbox, alt, opened_dem(dem, geoid, alt))
-        write_crop(camera.rpc, image, target, window, overwrite=overwrite)
-        text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
-        echo(json.dumps({"path": target, "window": window}) if as_json else text)
-        return 0
-    return _copy(camera, image, target, formats, overwrite, as_json)
+    return _to_target(files, flags) if out_dir is None else _to_folder(files, Path(out_dir), flags)
+
+
+def _to_folder(files: tuple[str, ...], folder: Path, flags: Mapping[str, Any]) -> int:
+    """Images with their RPCs, or those of --rpc, moved or not, in a new folder."""
+    if flags["window"] or flags["bbox"]:
+        raise click.UsageError("--window and --bbox go with a TARGET, not with -o")
+    carrier: str = flags["carrier"] or "vrt"
+    names = [name.strip() for name in (flags["formats"] or "txt").split(",") if name.strip()]
+    images = tuple(expanded(files))
+    _check([Path(split_spec(image)[0]) for image in images], folder, names)
+    cameras = _cameras(images, flags["rpcs"])
+    if flags["move"] is not None or flags["transform"] is not None:
+        cameras = moved(cameras, flags["move"], flags["transform"], carrier)
+    return _hand_off(images, cameras, folder, carrier, names, flags["overwrite"])
 
 
 # --- one file ---------------------------------------------------------------------------------------------
 
 
-def _copy(
-    camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool, as_json: bool
-) -> int:
+def _to_target(files: tuple[str, ...], flags: Mapping[str, Any]) -> int:
+    """One RPC, in another syntax, as a grid, or with a part of its image."""
+    overwrite: bool = flags["overwrite"]
+    if len(files) != 2 or any(flags[name] is not None for name in ("rpcs", "carrier", "move", "transform")):
+        with_it = "--rpc, --images, --move, --transform"
+        raise click.UsageError(f"give SOURCE and TARGET, or images and -o DIR (with it: {with_it})")
+    source, target = files
+    camera, image = open_camera(source), Path(split_spec(source)[0])
+    cut = bool(flags["window"] or flags["bbox"])
+    if target.endswith(GRID) and not cut:
+        check_target(target, [image, camera.path], overwrite)
+        return _as_grid(camera, target, overwrite)
+    if camera.format in ("grid", "correction"):
+        camera = _refitted(camera)
+    check_target(target, [image, camera.path], overwrite, None if cut else camera.rpc)
+    if not cut:
+        return _copy(camera, image, target, flags["formats"], overwrite)
+    heights: Heights = flags["heights"]
+    window = _window(camera, image, flags["window"], flags["bbox"], heights.alt, heights.terrain())
+    write_crop(camera.rpc, image, target, window, overwrite=overwrite)
+    text = f"{target}: col {window[0]}, row {window[1]}, {window[2]} x {window[3]} px"
+    echo(json.dumps({"path": target, "window": window}) if wants_json() else text)
+    return 0
+
+
+def _refitted(camera: Camera) -> Camera:
+    """A grid as an RPC; FitError where none holds it."""
+    options = FitOptions()
+    fit = fit_rpc(camera.model, camera.extent, camera.alt_range, options=options, strict=False)
+    if wrong := fit.verdict(options.tolerance):
+        raise FitError(f"{camera.path}: {wrong} ('barpc fit --keep-going' writes it all the same)")
+    say(f"{camera.path}: {camera.format}, fitted to {float(fit.max_ckp.max()):.1g} px")
+    return replace(camera, model=fit.rpc)
+
+
+def _copy(camera: Camera, image: Path, target: str, formats: str | None, overwrite: bool) -> int:
     """Write an RPC as it is, read it back and say how far off it is."""
     if formats is None:
         write_camera(camera.rpc, target, image, overwrite=overwrite)
@@ -169,8 +164,8 @@ def _copy(
     lost = float(camera.rpc.off(read_rpc(target)).max())
     row = {"source": str(camera.path), "format": camera.format, "target": target, "max_px": lost}
     text = f"{camera.path} ({camera.format}) -> {target} (read back: {lost:.1g} px)"
-    echo(json.dumps(row) if as_json else text)
-    for note in () if as_json else camera.notes:
+    echo(json.dumps(row) if wants_json() else text)
+    for note in () if wants_json() else camera.notes:
         say(note)
     if lost <= TOLERANCE:
         return 0
@@ -181,12 +176,12 @@ def _copy(
     )
 
 
-def _as_grid(camera: Camera, target: str, overwrite: bool, as_json: bool) -> int:
+def _as_grid(camera: Camera, target: str, overwrite: bool) -> int:
     """Write a camera as a localisation grid, and say what linear interpolation in it is off by."""
     alts = widened(camera.alt_range)
     write_grid(DirectGrid.of(camera.model, camera.extent, alts), target, overwrite=overwrite)
     readings = verify_grid(Path(target), Sample.of(camera.model, camera.extent, alts))
-    _tell(readings, as_json)
+    _tell(readings)
     off = [f"{one.consumer}: {one.note or one.max_error}" for one in readings if not one.max_error <= LINEAR]
     return tell_gate(f"{target} does not hold the camera to {LINEAR:g} px", off) if off else 0
 
@@ -263,7 +258,6 @@ def _hand_off(
     carrier: str,
     formats: list[str],
     overwrite: bool,
-    as_json: bool,
 ) -> int:
     """Write images with their RPCs, open every file as its readers do, and say what they see."""
     files = [Path(split_spec(image)[0]) for image in images]
@@ -283,7 +277,7 @@ def _hand_off(
                 size = dataset.width, dataset.height
             readings += verify(written, camera.rpc, size, camera.alt_range)
             reasons += _shadow_reasons(file, written)
-    _tell(readings, as_json)
+    _tell(readings)
     for sentence in unverified([folder / name for name in names[0]]):
         say(sentence)
     off = [reading for reading in readings if not reading.passed]
@@ -291,9 +285,9 @@ def _hand_off(
     return tell_gate("The hand-off needs a look.", reasons) if reasons else 0
 
 
-def _tell(readings: list[Reading], as_json: bool) -> None:
+def _tell(readings: list[Reading]) -> None:
     rows = [(str(r.path), r.consumer, None if r.note else r.max_error, r.note) for r in readings]
-    if as_json:
+    if wants_json():
         keys = ("path", "consumer", "max_px", "note")
         echo(json.dumps([dict(zip(keys, row, strict=True)) for row in rows]))
         return

@@ -13,7 +13,7 @@ import click
 from barpc.cli.images import expanded
 from barpc.cli.options import Function, jobs_option
 from barpc.cli.progress import executor_for, progress_told
-from barpc.cli.terminal import as_json, echo, tell_gate
+from barpc.cli.terminal import echo, tell_gate, wants_json
 from barpc.options import DsmOptions, declared
 
 if TYPE_CHECKING:
@@ -40,11 +40,8 @@ def _flag(name: str, kind: Any, metavar: str | None = None) -> Callable[[Functio
 @_flag("minus", str, "OTHER_RUN")
 @jobs_option
 @_flag("overwrite", bool)
-@as_json
 @click.pass_obj
-def dsm(
-    obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | str, as_json: bool, **flags: Any
-) -> int:
+def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | str, **flags: Any) -> int:
     r"""Make a first surface model (DSM) of a finished run, or of images with the cameras that come with them.
 
     The best pairs of images are matched pixel by pixel, matches are intersected with the corrected cameras, and every
@@ -75,7 +72,7 @@ def dsm(
             surface = make_dsm(given, out, options, executor=executor, progress=progress)
     except NoSurfaceError as error:
         return tell_gate(f"no surface: {error}", [])
-    if as_json:
+    if wants_json():
         echo(json.dumps({key: _plain(value) for key, value in asdict(surface).items()}, indent=1))
     elif not obj["quiet"]:
         _tell(surface)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.cli.options import flag, paper, run_options
-from barpc.cli.terminal import as_json, echo, say, tell_gate
+from barpc.cli.terminal import echo, say, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.fit import Localisation, RpcFit
@@ -40,13 +40,11 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 )
 @click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
 @flag("fit.tolerance")
-@flag("fit.pole_margin")
 @flag("fit.localisation")
 @paper
 @click.option("--options", "options_file", metavar="FILE", help="TOML file; its table [fit] counts here.")
 @click.option("--keep-going", is_flag=True, help="Write the RPC although it misses the tolerance; exit 3.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-@as_json
 @click.pass_obj
 def fit(
     obj: dict[str, Any],
@@ -55,7 +53,6 @@ def fit(
     output: str | None,
     keep_going: bool,
     overwrite: bool,
-    as_json: bool,
     **flags: Any,
 ) -> int:
     r"""Fit an RPC to a camera or to points, and certify it on points that the fit has not seen.
@@ -83,7 +80,7 @@ def fit(
     if output is not None and (keep_going or not fit.verdict(tolerance)):
         fit, written = _write(fit, image, output, overwrite, None if keep_going else tolerance)
     verdict = fit.verdict(tolerance)
-    if as_json:
+    if wants_json():
         summary = {**fit.summary(), "verdict": verdict, "output": output if written else None}
         echo(json.dumps(summary, indent=1))
     elif not obj["quiet"]:

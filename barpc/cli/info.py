@@ -17,9 +17,9 @@ import numpy as np
 
 from barpc import __version__
 from barpc.cameras import Camera, open_camera, split_spec
+from barpc.cli.heights import Heights, altitude_of, exchanged, ground_at, with_heights
 from barpc.cli.images import expanded
-from barpc.cli.terminal import as_json, echo
-from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, ground_at, opened_dem
+from barpc.cli.terminal import echo, wants_json
 from barpc.dem import Dem
 from barpc.errors import InputError, RpcError
 from barpc.fit.poles import smallest_denominator
@@ -33,27 +33,19 @@ from barpc.sensor.rpc import RPC
 @click.option(
     "--at", type=(float, float, float), help="Ground point of the angles: LON LAT ALT.  [default: the centre]"
 )
-@click.option(
-    "--alt",
-    type=float,
-    help="Altitude of the ground [m].  [default: of the run's tie points, else the middle of the camera's]",
+@with_heights(
+    "Altitude of the ground [m].  [default: of the run's tie points, else the middle of the camera's]"
 )
-@dem_option
-@geoid_option
 @click.option(
     "--footprint", "outlines", is_flag=True, help="Print outlines on the ground as GeoJSON instead."
 )
 @click.option("--doctor", is_flag=True, help="Print versions and try the installation instead.")
-@as_json
 def info(
     images: tuple[str, ...],
     at: tuple[float, float, float] | None,
-    alt: float | None,
-    dem: str | None,
-    geoid: str | None,
+    heights: Heights,
     outlines: bool,
     doctor: bool,
-    as_json: bool,
 ) -> int:
     r"""Say where a camera comes from, what it covers and how it looks at the ground; of several, each pair's angle.
 
@@ -74,10 +66,10 @@ def info(
       barpc info --doctor
     """
     if doctor:
-        return _examine(as_json)
+        return _examine()
     if not images:
         raise click.UsageError("give at least one IMAGE")
-    images, terrain = tuple(expanded(images)), opened_dem(dem, geoid, alt)
+    images, terrain, alt = tuple(expanded(images)), heights.terrain(), heights.alt
     cameras = [open_camera(image) for image in images]
     if outlines:
         echo(json.dumps(_outlines(images, cameras, alt, terrain)))
@@ -89,7 +81,7 @@ def info(
     if len(cameras) > 1:
         for i, report in enumerate(reports):
             report["pairs"] = _pairs(images, cameras, i, alts[i], at)
-    if as_json:
+    if wants_json():
         echo(json.dumps(reports))
     else:
         _print(images, reports)
@@ -306,7 +298,7 @@ _CHECKS: dict[str, Callable[[], str]] = {
 }
 
 
-def _examine(as_json: bool) -> int:
+def _examine() -> int:
     """Print the versions of what barpc stands on, try each part once, and give the exit code."""
     versions = {"barpc": __version__, "python": platform.python_version()}
     missing = {name: f"not installed (pip install 'barpc[{extra}]')" for name, extra in _OPTIONAL.items()}
@@ -322,7 +314,7 @@ def _examine(as_json: bool) -> int:
         except Exception as error:  # noqa: BLE001  whatever is broken is what this is there to show
             results[name] = {"ok": False, "found": f"{type(error).__name__}: {error}"}
     good = all(result["ok"] for result in results.values()) and "MISSING" not in versions.values()
-    if as_json:
+    if wants_json():
         echo(json.dumps({"versions": versions, "checks": results, "ok": good}, indent=1))
         return 0 if good else 1
     for name, found in versions.items():

@@ -48,7 +48,8 @@ COMMANDS = {
 }
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
 _MODULES = {
-    **dict.fromkeys(("match", "check", "report"), "adjust"),
+    **dict.fromkeys(("match", "check"), "adjust"),
+    **dict.fromkeys(("report", "export", "verify"), "finished"),
     **dict.fromkeys(("project", "localize", "triangulate"), "points"),
 }
 
@@ -78,11 +79,16 @@ MOVED = {
     "--min-triangulation-angle": "[tie] angles of a file given with --options",
     "--joint": "[fit] method of a file given with --options",
     "--dem-for-all": "--dem, which holds all tie points (--dem-for-weak: those under a small angle only)",
+    "--ip-per-image": "[tie] keypoints_per_image of a file given with --options",
+    "--store": "the run folder (-o) is on a disk that all workers see",
     "--for-format": "[fit] precision of a file given with --options",
 }
 """Former verb or flag -> how it is said now; options that have no flag are found in `barpc.options`."""
 
-_GENERAL = {"-q": "quiet", "--quiet": "quiet", "--debug": "debug", "-v": "verbose", "--verbose": "verbose"}
+_GENERAL = {
+    **{"-q": "quiet", "--quiet": "quiet", "-v": "verbose", "--verbose": "verbose"},
+    **{"--debug": "debug", "--json": "as_json"},
+}
 
 
 def _kept_lines(text: str | None) -> str | None:
@@ -159,9 +165,10 @@ class Verbs(click.Group):
 @click.version_option(__version__, message="barpc %(version)s")
 @click.option("-v", "--verbose", count=True, help="Log stages with their seconds (-vv: everything).")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no log: results and errors only.")
+@click.option("--json", "as_json", is_flag=True, help="Results as JSON on stdout.")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 @click.pass_context
-def cli(ctx: click.Context, verbose: int, quiet: bool, debug: bool) -> None:
+def cli(ctx: click.Context, /, verbose: int, quiet: bool, **_: bool) -> None:
     r"""Correct the camera models (RPCs) of satellite images.
 
     \b

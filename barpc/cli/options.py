@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any, TypeVar, get_origin
 
 import click
 
@@ -23,16 +23,11 @@ TIE = (
     "matches_only",
     "overlap_list",
     "aoi",
-    "tie.keypoints_per_image",
-    "tie.search",
 )
 CAMERA = (
     "adjust.model",
     "adjust.drift",
     "adjust.jitter",
-    "adjust.detectors",
-    "adjust.sigma_attitude",
-    "adjust.sigma_position",
     "adjust.fixed",
 )
 GROUND = (
@@ -41,17 +36,15 @@ GROUND = (
     "check_points",
     "fixed_run",
     "dem",
-    "adjust.dem_sigma",
     "adjust.dem_for_weak",
     "geoid",
     "reference",
-    "reference_sigma",
 )
 ADJUSTMENT = (*CAMERA, *GROUND)
-MATCH = ("overwrite", "keep_going", "store")
+MATCH = ("overwrite", "keep_going")
 RUN = (*MATCH, "images", "rpc_formats", "grids", "tiles", "resample")
 """Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
-_NAMES = {"tie.keypoints_per_image": "--ip-per-image", "rpc_formats": "--rpc-format"}
+_NAMES = {"rpc_formats": "--rpc-format"}
 
 
 def flag_name(target: str) -> str:
@@ -105,9 +98,6 @@ def flag(target: str) -> Callable[[Function], Function]:
         elif kind in (int, float):
             with suppress(ValueError):  # a text is refused by what follows
                 value = kind(value)
-        elif get_args(kind)[:1] == (float,):
-            with suppress(ValueError):
-                value = [float(word) for words in value for word in words.split(",")]
         try:
             return checked(target.rpartition(".")[2], kind, rule, value)
         except InputError as error:
@@ -194,7 +184,6 @@ _RUN_OPTIONS = (
     click.option("--image-list", metavar="FILE", help="More image paths from a file, one a line."),
     click.option("--options", "options_file", metavar="FILE", help="Options from a TOML file; flags win."),
     jobs_option,
-    click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
 )
 
 

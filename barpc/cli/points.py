@@ -13,8 +13,8 @@ import click
 import numpy as np
 
 from barpc.cameras import open_camera, split_spec
-from barpc.cli.terminal import as_json, echo, tell_gate
-from barpc.cli.terrain import altitude_of, dem_option, exchanged, geoid_option, ground_at, opened_dem
+from barpc.cli.heights import Heights, altitude_of, exchanged, ground_at, opened_dem, with_heights
+from barpc.cli.terminal import echo, tell_gate, wants_json
 from barpc.errors import InputError
 from barpc.geodesy import Array, ground_from_ecef
 from barpc.sensor import geometry
@@ -31,18 +31,12 @@ def _points(columns: str) -> Callable[..., Any]:
 @click.argument("image")
 @click.argument("numbers", nargs=-1, type=float, metavar="[LON LAT ALT]...")
 @_points("lon, lat, alt")
-@click.option("--alt", type=float, help="Altitude of points without one [m above the ellipsoid].")
-@dem_option
-@geoid_option
-@as_json
+@with_heights("Altitude of points without one [m above the ellipsoid].")
 def project(
     image: str,
     numbers: tuple[float, ...],
     points: str | None,
-    alt: float | None,
-    dem: str | None,
-    geoid: str | None,
-    as_json: bool,
+    heights: Heights,
 ) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
 
@@ -51,13 +45,13 @@ def project(
       barpc project image.tif 5.44 43.26 180
       barpc project image.tif --points ground.csv --json
     """
-    terrain = opened_dem(dem, geoid)
+    terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)
-    ground = read_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else alt)
+    ground = given_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else heights.alt)
     if terrain is not None:
         ground[:, 2] = terrain(ground[:, 0], ground[:, 1])
     found = camera.model.project(ground)
-    _print_points(("col", "row"), found, (6, 6), as_json)
+    _print_points(("col", "row"), found, (6, 6))
     if wrong := exchanged(camera, np.nan_to_num(ground)):
         return tell_gate(f"{image}: {wrong}", [])
     return _tell_failures(found, "could not be projected")
@@ -67,22 +61,14 @@ def project(
 @click.argument("image")
 @click.argument("numbers", nargs=-1, type=float, metavar="[COL ROW]...")
 @_points("col, row and perhaps alt")
-@click.option(
-    "--alt",
-    type=float,
-    help="Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]",
+@with_heights(
+    "Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]"
 )
-@dem_option
-@geoid_option
-@as_json
 def localize(
     image: str,
     numbers: tuple[float, ...],
     points: str | None,
-    alt: float | None,
-    dem: str | None,
-    geoid: str | None,
-    as_json: bool,
+    heights: Heights,
 ) -> int:
     r"""Print the ground points (lon, lat, alt) seen at image points.
 
@@ -91,13 +77,13 @@ def localize(
       barpc localize image.tif 512.5 300 --alt 180
       barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96_15.gtx
     """
-    terrain = opened_dem(dem, geoid)
+    terrain = opened_dem(heights.dem, heights.geoid)
     camera = open_camera(image)
-    at = read_points(numbers, points, ("col", "row", "alt"), fill=np.nan)
+    at = given_points(numbers, points, ("col", "row", "alt"), fill=np.nan)
     if terrain is None and (without := np.isnan(at[:, 2])).any():
-        at[without, 2] = altitude_of(camera, split_spec(image)[0], alt)
+        at[without, 2] = altitude_of(camera, split_spec(image)[0], heights.alt)
     ground = ground_at(camera, at[:, :2], at[:, 2], terrain)
-    _print_points(("lon", "lat", "alt"), ground, (10, 10, 4), as_json)
+    _print_points(("lon", "lat", "alt"), ground, (10, 10, 4))
     return _tell_failures(ground, "have no ground point")
 
 
@@ -105,10 +91,7 @@ def localize(
 @click.argument("images", nargs=-1, required=True, metavar="IMAGE IMAGE...")
 @click.option("--at", type=(float, float), multiple=True, help="COL ROW, once for each image.")
 @_points("col1, row1, col2, row2, ...")
-@as_json
-def triangulate(
-    images: tuple[str, ...], at: tuple[tuple[float, float], ...], points: str | None, as_json: bool
-) -> int:
+def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], points: str | None) -> int:
     r"""Print the ground points where the lines of sight of several images meet, and the error that is left.
 
     A point that an image does not see has nan there. `error` is the root mean square distance between a
@@ -125,7 +108,7 @@ def triangulate(
     names = [f"{axis}{i}" for i in range(1, len(cameras) + 1) for axis in ("col", "row")]
     if points is None and len(at) != len(cameras):
         raise click.UsageError(f"{len(at)} points given with --at for {len(cameras)} images")
-    xy = read_points([v for pair in at for v in pair], points, names).reshape(-1, len(cameras), 2)
+    xy = given_points([v for pair in at for v in pair], points, names).reshape(-1, len(cameras), 2)
     point, view = np.nonzero(np.isfinite(xy).all(axis=2))
     models = [camera.model for camera in cameras]
     found = geometry.triangulate(models, view, point, xy[point, view], alt=cameras[0].altitude)
@@ -134,14 +117,14 @@ def triangulate(
     table[:count, :3] = ground_from_ecef(found.points)
     with np.errstate(invalid="ignore", divide="ignore"):
         table[:count, 3] = np.sqrt(square / np.bincount(point, minlength=count))
-    _print_points(("lon", "lat", "alt", "error"), table, (10, 10, 4, 4), as_json)
+    _print_points(("lon", "lat", "alt", "error"), table, (10, 10, 4, 4))
     return _tell_failures(table[:, :1], "could not be intersected")
 
 
 # --- tables of points -------------------------------------------------------------------------------------
 
 
-def read_points(
+def given_points(
     numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None
 ) -> Array:
     """Points (N, columns) from arguments, a CSV file, or standard input ("-").
@@ -195,10 +178,10 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _print_points(names: Sequence[str], values: Array, digits: Sequence[int], as_json: bool) -> None:
+def _print_points(names: Sequence[str], values: Array, digits: Sequence[int]) -> None:
     """A table of points as CSV with a header, or as a JSON list of objects (null for NaN)."""
     rows = [list(zip(row, digits, strict=True)) for row in values.tolist()]
-    if as_json:
+    if wants_json():
         plain = [[round(v, d) if np.isfinite(v) else None for v, d in row] for row in rows]
         echo(json.dumps([dict(zip(names, row, strict=True)) for row in plain]))
         return

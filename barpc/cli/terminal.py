@@ -27,7 +27,11 @@ GAP = "  "
 NARROWEST = 12  # The first column of a table is not folded below so many characters
 _COLORS = {"good": "green", "look": "yellow", "bad": "red"}
 
-as_json = click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
+
+def wants_json() -> bool:
+    """Whether results go to stdout as JSON: `--json`, before or behind the verb."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.find_root().params.get("as_json"))
 
 
 def echo(text: object = "", *, err: bool = False, nl: bool = True, **style: Any) -> None:

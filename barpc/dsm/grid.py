@@ -26,7 +26,7 @@ from barpc.errors import InputError
 from barpc.geodesy import Array
 from barpc.options import DsmOptions
 from barpc.pipeline.executor import CachingExecutor
-from barpc.pipeline.hashed import hash_files
+from barpc.pipeline.inputs import hash_files
 from barpc.scene import View
 from barpc.sensor.geometry import footprint, ground_sample_distance
 from barpc.tie.tasks import Progress, one_by_one

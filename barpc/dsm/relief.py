@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import rasterio
 from rasterio.windows import Window
 
 from barpc.cameras import open_camera
 from barpc.dsm.cells import F32, surface_tile
 from barpc.dsm.grid import Grid
 from barpc.errors import BarpcError
+from barpc.raster import open_raster
 from barpc.report.page import can_render, remake_report
 from barpc.report.tables import SURFACE, read_summary
 from barpc.scene import View
@@ -42,7 +42,7 @@ def show_in_report(folder: Path, grid: Grid, out: Path) -> None:
 
 def _reliefs(folder: Path, grid: Grid, out: Path) -> list[dict[str, object]]:
     """What `barpc.report.tables` reads: of the tile that has most heights."""
-    with rasterio.open(out) as file:
+    with open_raster(out) as file:
         found = []
         for at, groups in grid.tiles():
             bands = file.read([1, 3], window=Window(*at, *grid.tile(*at).size))

@@ -5,6 +5,66 @@
 
 from __future__ import annotations
 
-from barpc.export.targets import TARGETS, export_run
+from collections.abc import Callable
+from pathlib import Path
+
+from barpc.errors import InputError, OutputError
+from barpc.export.catalogue import CATALOGUE
+from barpc.export.neural import NEURAL, Files
+from barpc.export.scene import Scene, read_scene
+from barpc.export.stereo import STEREO
+from barpc.sidefile import plain_path
+from barpc.workspace import Workspace
 
 __all__ = ["TARGETS", "export_run"]
+
+TARGETS: dict[str, Callable[[Scene, Path], Files]] = {**NEURAL, **STEREO, **CATALOGUE}
+"""Tool -> the files made for it, by name, of a scene and the folder where they will lie."""
+
+
+def export_run(
+    folder: Path | str,
+    target: str,
+    out: Path | str,
+    *,
+    alt_range: tuple[float, float] | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Hand a finished run to another tool.
+
+    Parameters
+    ----------
+    folder : path, of a finished adjustment
+    target : str, a row of `TARGETS`
+    out : path, a new folder; files in it point at images and run relative to it
+    alt_range : (low, high), optional, altitudes of the scene [m above the ellipsoid]; None: by its tie points
+    overwrite : bool, replace what an earlier export wrote there
+
+    Returns
+    -------
+    paths : list of Path, the files written
+
+    Raises
+    ------
+    InputError
+        No such target, no finished adjustment, altitudes that are no interval.
+    OutputError
+        The folder is in use, not empty, or the run's own.
+    """
+    folder, out = Path(folder), Path(out)
+    if target not in TARGETS:
+        raise InputError(f"{target}: no export of that name; there are {', '.join(TARGETS)}")
+    if alt_range is not None and not alt_range[0] < alt_range[1]:
+        raise InputError(f"altitudes {alt_range}: the lower one first, in metres")
+    plain_path(out.absolute())
+    scene = read_scene(folder, alt_range)
+    if out.resolve() == folder.resolve():
+        raise OutputError(f"{out}: the folder of the run; give the export one of its own")
+    files = TARGETS[target](scene, out.absolute())
+    inputs = [Path(shot.file) for shot in scene.shots if "\0" not in shot.file]
+    with Workspace(out, overwrite=overwrite, keep=inputs, names=files) as workspace:
+        for name, data in files.items():
+            with workspace.output(name) as partial:
+                partial.write_bytes(data)
+        workspace.remove_stale()
+    return [out / name for name in files]

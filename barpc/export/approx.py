@@ -22,7 +22,7 @@ _TIMES = (
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class Sampled:
     """Points (N, 3) of the scene [m] and where an image shows them (N, 2) [px]."""
 
     world: Array
@@ -48,7 +48,7 @@ class Pinhole:
         return np.asarray(seen[:, :2] / seen[:, 2:] * self.focal + self.center)
 
 
-def fit_affine(samples: Samples) -> Array:
+def fit_affine(samples: Sampled) -> Array:
     """The matrix (2, 4) of (X, Y, Z, 1), by least squares."""
     scale = np.abs(samples.world).max()
     rows = np.column_stack([samples.world / scale, np.ones(len(samples.world))])
@@ -61,7 +61,7 @@ def project_affine(matrix: Array, world: Array) -> Array:
     return np.asarray(world @ matrix[:, :3].T + matrix[:, 3])
 
 
-def fit_projective(samples: Samples) -> Array:
+def fit_projective(samples: Sampled) -> Array:
     """The matrix (3, 4) of a pinhole with skew, 1 in its last place, by least squares weighted anew with its depths."""
     scale, middle = np.abs(samples.world).max(), samples.image.mean(axis=0)
     reach = np.abs(samples.image - middle).max()
@@ -96,7 +96,7 @@ def factored(matrix: Array) -> tuple[Array, Array, Array]:
     return calibration / calibration[2, 2], turn * rotation, translation
 
 
-def fit_pinhole(samples: Samples, at: Array, pixel: Array, rows: Array, sight: Array, far: float) -> Pinhole:
+def fit_pinhole(samples: Sampled, at: Array, pixel: Array, rows: Array, sight: Array, far: float) -> Pinhole:
     """The nearest pinhole camera without skew.
 
     Parameters
@@ -129,7 +129,7 @@ def _start(sign: float, at: Array, pixel: Array, rows: Array, sight: Array, far:
     return Pinhole(focal, pixel - focal * ray[:2], rotation, -rotation @ (at + far * sight))
 
 
-def _refined(start: Pinhole, samples: Samples) -> Pinhole:
+def _refined(start: Pinhole, samples: Sampled) -> Pinhole:
     """The least squares solution, by Levenberg's method on a small turn, move, focal lengths, principal point."""
     pinhole, damping = start, 1e-3
     cost, left = _cost(pinhole, samples)
@@ -150,7 +150,7 @@ def _refined(start: Pinhole, samples: Samples) -> Pinhole:
     return pinhole
 
 
-def _cost(pinhole: Pinhole, samples: Samples) -> tuple[float, Array]:
+def _cost(pinhole: Pinhole, samples: Sampled) -> tuple[float, Array]:
     left = (samples.image - pinhole.project(samples.world)).ravel()
     return float(left @ left) if np.isfinite(left).all() else np.inf, left
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from barpc.errors import InputError
-from barpc.export.approx import Samples
+from barpc.export.approx import Sampled
 from barpc.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
 from barpc.remote import is_url
 from barpc.report.compare import written_rpc
@@ -93,14 +93,14 @@ class Scene:
         away = ecef_from_ground(ground) - ecef_from_ground(self.origin)
         return np.asarray(away @ enu_basis(self.origin).T)
 
-    def samples(self, shot: Shot, checked: bool = False) -> Samples:
+    def samples(self, shot: Shot, checked: bool = False) -> Sampled:
         """Points over an image and the scene's altitudes; to measure errors on, more of them."""
         image, alt = image_grid(shot.size, self.alt_range, _CHECKED if checked else _NODES)
         ground = shot.rpc.localize(image, alt)
         known = np.isfinite(ground).all(axis=1)
         if known.sum() < 12:
             raise InputError(f"{shot.name}: its RPC sees no ground between {self.alt_range} m")
-        return Samples(self.world(ground[known]), image[known])
+        return Sampled(self.world(ground[known]), image[known])
 
     def view_of(self, shot: Shot) -> dict[str, Any]:
         """How a shot sees the middle of its own ground: what `approx.fit_pinhole` starts from."""

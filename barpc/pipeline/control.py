@@ -1,4 +1,4 @@
-"""Files of ground points against the cameras as delivered: what cannot be meant is said before any work starts."""
+"""Files of ground points and altimetry against the cameras: what cannot be meant is said before any work starts."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from barpc.errors import InputError
-from barpc.geodesy import Array, ecef_from_ground
+from barpc.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.options import RunOptions
+from barpc.pointio.altimetry import read_altimetry
 from barpc.pointio.ground import read_gcps
-from barpc.scene import BoolArray, GroundPoints, View
-from barpc.sensor.geometry import ground_sample_distance
+from barpc.scene import Altimetry, BoolArray, GroundPoints, View
+from barpc.sensor.geometry import footprint, ground_sample_distance
 from barpc.tie.pairs import reach_of
 
 _REACH = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
@@ -124,3 +125,43 @@ def _distance(points: GroundPoints, shown: Array, columns: tuple[int, int], sign
     level = points.lonlatalt[points.point][:, columns] * signs
     given = np.column_stack([level, shown[:, 2]])
     return np.asarray(np.linalg.norm(ecef_from_ground(given) - ecef_from_ground(shown), axis=1))
+
+
+def load_altimetry(paths: Sequence[str], views: Sequence[View]) -> Altimetry | None:
+    """The heights of several files in the images, one after the other; None without files.
+
+    InputError for a file that cannot be read or has no height in the images.
+    """
+    parts = [_heights_of(path, views) for path in paths]
+    if not parts:
+        return None
+    columns = ("lonlatalt", "sigma", "sigma_flat")
+    return Altimetry(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in columns})
+
+
+def _heights_of(path: str, views: Sequence[View]) -> Altimetry:
+    given = read_altimetry(path)
+    inside = _inside(given.lonlatalt, views)
+    if not inside.any():
+        swapped = given.lonlatalt[:, [1, 0, 2]]
+        at = f"{len(inside)} heights about {', '.join(f'{x:.4f}' for x in np.median(given.lonlatalt[:, :2], axis=0))}"
+        what = "are longitude and latitude exchanged?" if _inside(swapped, views).any() else "another place?"
+        raise InputError(f"{path}: none of its {at} (lon, lat) lies in the images: {what}")
+    return Altimetry(given.lonlatalt[inside], given.sigma[inside], given.sigma_flat[inside])
+
+
+def _inside(lonlatalt: Array, views: Sequence[View]) -> BoolArray:
+    """Which places (n, 3) are within the bounds of any image on the ground, or near them."""
+    found = np.zeros(len(lonlatalt), dtype=bool)
+    for view in views:
+        ring = footprint(view.sensor, view.size, view.altitude)
+        ring = ring[np.isfinite(ring).all(axis=1)]
+        if not len(ring):
+            continue
+        middle = ring.mean(axis=0)
+        margin = _REACH / metres_per_unit([*middle, 0.0])[:2]
+        ring[:, 0] = wrap_longitude(ring[:, 0], middle[0])
+        place = np.column_stack([wrap_longitude(lonlatalt[:, 0], middle[0]), lonlatalt[:, 1]])
+        low, high = ring.min(axis=0) - margin, ring.max(axis=0) + margin
+        found |= ((place >= low) & (place <= high)).all(axis=1)
+    return found

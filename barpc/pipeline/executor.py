@@ -67,10 +67,9 @@ class CachingExecutor(Executor):
         inputs: Mapping[str, Input],
         executor: Executor | None = None,
         keep: bool = True,
-        store: Store | None = None,
     ) -> None:
         self.workspace, self.executor, self.keep = workspace, executor, keep
-        self.store = store or Store(str(workspace.cache), str(workspace.partial))
+        self.store = Store(str(workspace.cache), str(workspace.partial))
         places = {self.store.folder: "cache", self.store.room: "partial"}  # wherever the run folder lies
         self._inputs = inputs
         self._fingerprints = {**{path: one.key for path, one in inputs.items()}, **places}

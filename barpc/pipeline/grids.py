@@ -157,7 +157,7 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str
             grid = DirectGrid.of(model, view.size, alts)
             errors[view.name + GRID] = _off(sample, grid)
             write_grid(grid, place / (view.name + GRID), overwrite=True)
-        rpc, lacking, error = correction_of(rpc, sample)
+        rpc, lacking, error = grid_correction(rpc, sample)
         write_correction(lacking, rpc, place / (view.name + CORRECTION), overwrite=True)
     except (RpcError, FitError) as failure:
         raise OutputError(f"{view.name}: no grid can be made of its camera: {failure}") from failure
@@ -168,7 +168,7 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str
     return errors
 
 
-def correction_of(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss]:
+def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss]:
     """An RPC and what it lacks, and how far both together are off the camera of a sample.
 
     What `rpc` lacks may depend on the altitude: the best RPC of all trades denominators, which see altitudes, for what

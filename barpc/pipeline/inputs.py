@@ -1,11 +1,12 @@
-"""What a run is given besides images: control points, terrain, tie points, an earlier block."""
+"""What a run is given besides images: control, terrain, matches, an earlier block; all of it hashed once."""
 
 from __future__ import annotations
 
 import logging
 import os
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,19 +15,30 @@ import numpy as np
 from barpc.ba import BlockPrior
 from barpc.dem import Dem
 from barpc.errors import InputError
+from barpc.identity import Input, Stamp, changed, take
 from barpc.options import RunOptions, declared
-from barpc.pipeline.control import load_gcps
-from barpc.pipeline.heights import load_altimetry
+from barpc.pipeline.control import load_altimetry, load_gcps
+from barpc.pointio.links import Links
+from barpc.pointio.matches import read_links, tracks_of
 from barpc.pointio.names import ViewNames
-from barpc.remote import Remote, located
+from barpc.raster import hashed
+from barpc.remote import here, located, place
+from barpc.report import Run
 from barpc.scene import BoolArray, Tracks, View
 from barpc.sensor.geometry import footprint
 from barpc.sidefile import IMAGE, read_names, versioned
+from barpc.tie import Matches
+from barpc.tie.epipolar import grouped
+from barpc.tie.hook import hook_files
 from barpc.tie.ortho import Sheet
+from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 
 PRIOR = "block.npz"  # the file in a run folder that a later run starts from
+_TOGETHER = 64 << 20  # bytes that are hashed in one task, at least
+_MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
+_ASTRAY = 0.05  # of the points may lie farther off, where a matcher looks over borders; of other crops more
 
 
 def side_inputs(options: RunOptions, views: Sequence[View]) -> tuple[Dem | None, BlockPrior | None]:
@@ -65,10 +77,15 @@ def with_located(options: RunOptions) -> RunOptions:
 
     def at(path: str) -> str:
         found = located(path, options.allow_remote)
-        return os.fspath(versioned(found, IMAGE)) if isinstance(found, Remote) else path
+        return path if here([found]) else os.fspath(versioned(found, IMAGE))
 
     dem, geoid = (path if path is None else at(path) for path in (options.dem, options.geoid))
     return replace(options, dem=dem, geoid=geoid, reference=tuple(map(at, options.reference)))
+
+
+def reference_names(options: RunOptions) -> list[str]:
+    """The references as tasks call them."""
+    return [os.fspath(place(path).absolute()) for path in options.reference]
 
 
 def input_files(options: RunOptions) -> list[Path]:
@@ -78,7 +95,7 @@ def input_files(options: RunOptions) -> list[Path]:
         value = getattr(options, name)
         if one.rule.unit == "file" and value is not None:
             paths = value if isinstance(value, tuple) else (value,)
-            found += [Path(path) for path in paths if not isinstance(path, Remote)]
+            found += here(paths)
     return found
 
 
@@ -130,7 +147,7 @@ def _finder(
 
 
 def _resolved(path: str | Path) -> object:
-    return str(path) if isinstance(path, Remote) else Path(path).resolve()
+    return place(path).resolve()
 
 
 def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
@@ -147,3 +164,109 @@ def only_new(tracks: Tracks, old: BoolArray) -> Tracks:
     keep = ~is_old
     keep[order[first]] = True
     return tracks.select(keep & has_new[tracks.point])
+
+
+def hash_inputs(
+    run: Run,
+    options: RunOptions,
+    seen: Mapping[str, Stamp],
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Input]:
+    """Every input of a run by the name that tasks call it by; InputError where one changed since it was read.
+
+    `seen` holds the files that were opened so far. A matcher of the user's goes by its name, with all its files.
+    """
+    images = [view.path for view in run.views]
+    rasters = dict.fromkeys([*images, *reference_names(options)])
+    others = dict.fromkeys(
+        [*seen, *(os.fspath(path.absolute()) for path in input_files(options) if path.is_file())]
+    )
+    names = [*rasters, *(name for name in others if name not in rasters)]
+    groups = _groups(names)
+    found = [one for group in ordered(executor, hash_files, groups, "hash", progress) for one in group]
+    inputs: dict[str, Input] = dict(zip(names, found, strict=True))
+    for one in [part for whole in found for part in whole.every()]:
+        known = seen.get(one.path)
+        if known is not None and one.stamp is not None and not known.matches(one.stamp):
+            raise changed(one.path)
+    if code := hook_files(options.tie.matcher):
+        first, *rest = map(take, code)
+        inputs[options.tie.matcher] = Input(first.path, first.size, first.sha256, first.stamp, tuple(rest))
+    return inputs
+
+
+def _groups(names: Sequence[str]) -> list[tuple[tuple[str, ...]]]:
+    """Small files go together."""
+    groups: list[list[str]] = [[]]
+    size = 0
+    for name in names:
+        groups[-1].append(name)
+        size += sum(path.stat().st_size for path in here([name]))
+        if size >= _TOGETHER:
+            groups.append([])
+            size = 0
+    return [(tuple(group),) for group in groups if group]
+
+
+def hash_files(names: Sequence[str]) -> list[Input]:
+    """Hash some files, in a worker."""
+    return [hashed(name) for name in names]
+
+
+def given_tracks(paths: Sequence[str | Path], views: Sequence[View]) -> Tracks:
+    """The tie points of files as they are."""
+    return tracks_of(_linked(paths, views), ", ".join(map(str, paths)))
+
+
+def given_matches(
+    paths: Sequence[str | Path], views: Sequence[View], *, partly: bool = False
+) -> dict[tuple[int, int], Matches]:
+    """The matches of files, pair by pair; one without any is an error, but for a part (`partly`) of the images."""
+    links = _linked(paths, views, partly)
+    swapped = links.view[links.ends[:, 0]] > links.view[links.ends[:, 1]]
+    ends = np.where(swapped[:, None], links.ends[:, ::-1], links.ends)
+    places = links.xy[ends].reshape(-1, 4)  # so that the order of the file does not matter
+    ends = ends[np.lexsort(places[:, ::-1].T)]
+    first, second = links.view[ends].T
+    found = {}
+    for rows in grouped(first, second):
+        pair, chosen = (int(first[rows[0]]), int(second[rows[0]])), ends[rows]
+        if pair[0] != pair[1]:
+            found[pair] = Matches(links.xy[chosen], np.zeros(len(chosen)), -1 - chosen)
+    return found
+
+
+def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = False) -> Links:
+    """What the files say of the views, all of it inside their images."""
+    parts = [Links.of_pairs([])]
+    for path in paths:
+        try:
+            parts.append(read_links(path, [view.name for view in views]))
+        except InputError as error:
+            if not partly:
+                raise
+            logger.warning("%s", error)
+            continue
+        parts[-1] = _in_images(path, views, parts[-1])
+    return Links.joined(parts[1:] or parts)
+
+
+def _in_images(path: str | Path, views: Sequence[View], links: Links) -> Links:
+    """Without points that lie outside their images; InputError where they are more than a few."""
+    beyond = np.array([view.size for view in views])[links.view] + (_MARGIN - 1.0)
+    inside = np.asarray(((links.xy >= -_MARGIN) & (links.xy <= beyond)).all(axis=1))
+    wrong = np.flatnonzero(~inside)
+    if not len(wrong):
+        return links
+    of, (col, row) = views[links.view[wrong[0]]], links.xy[wrong[0]].tolist()
+    said = (
+        f"{path}: {len(wrong)} of {len(inside)} points lie outside their images, as ({col:g}, {row:g}) in {of.name},"
+        f" {of.size[0]} x {of.size[1]} pixels"
+    )
+    if len(wrong) > _ASTRAY * len(inside):
+        raise InputError(f"{said}; were they found in other crops, or in reduced images?")
+    logger.warning("%s: they are left out", said)
+    number = np.cumsum(inside) - 1
+    ends = links.ends[inside[links.ends].all(axis=1)]
+    return Links(links.view[inside], links.xy[inside], links.sigma[inside], number[ends])

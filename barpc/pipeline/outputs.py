@@ -19,12 +19,11 @@ from barpc.options import RunOptions
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.grids import grid_names
 from barpc.pipeline.inputs import PRIOR
-from barpc.pipeline.pictures import pictures
 from barpc.report import Run, Summary
 from barpc.report.page import REPORT, can_render, report_html
 from barpc.report.records import plain
 from barpc.report.summary import OutputEntry, StageEntry
-from barpc.report.tables import PICTURES, TABLES, gcps_geojson
+from barpc.report.tables import TABLES, gcps_geojson
 from barpc.rpcio import CARRIERS, WRITABLE, sidecars, write_camera
 from barpc.scene import View
 from barpc.sensor import SensorModel
@@ -122,7 +121,6 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """The outputs of a run, before it starts; of the tie points of pairs those that are in the folder."""
     names = [*TABLES, "summary.json", *(["report.html"] if can_render() else [])]
-    names += [PICTURES] * (can_render() and options.pictures)
     names += [GCPS] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
@@ -164,10 +162,6 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
     def now() -> Summary:
         return replace(summary, stages=(*stages, *map(StageEntry.read, workspace.stages[start:])))
 
-    options = run.options if isinstance(run.options, RunOptions) else RunOptions()
-    if can_render() and options.pictures:
-        with workspace.stage("pictures"):
-            workspace.write_text(PICTURES, pictures(run, options.tie.band))
     with workspace.stage("tables"):
         for name, content in TABLES.items():
             with workspace.output(name) as partial:

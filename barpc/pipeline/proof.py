@@ -24,7 +24,7 @@ GOOD = (SAME, MOVED)
 
 
 @dataclass(frozen=True)
-class Finding:
+class Proved:
     """What became of a file: `kind` input, output or camera, one of the words above, and more of it."""
 
     kind: str
@@ -33,7 +33,7 @@ class Finding:
     note: str = ""
 
 
-def prove(folder: Path, places: Sequence[Path] = ()) -> list[Finding]:
+def prove(folder: Path, places: Sequence[Path] = ()) -> list[Proved]:
     """Compare a run with what its summary says of it; inputs that are gone are looked for by name in `places`.
 
     InputError where the folder holds no finished run, or one of a release that hashed nothing.
@@ -50,32 +50,32 @@ def prove(folder: Path, places: Sequence[Path] = ()) -> list[Finding]:
     ]
 
 
-def _inputs(summary: Summary, places: Iterable[Path]) -> Iterator[Finding]:
+def _inputs(summary: Summary, places: Iterable[Path]) -> Iterator[Proved]:
     for one in summary.inputs or ():
         if is_url(one.path):
-            yield Finding("input", one.path, UNKNOWN, "on another host")
+            yield Proved("input", one.path, UNKNOWN, "on another host")
             continue
         found = _digest(Path(one.path))
         if found == one.sha256:
-            yield Finding("input", one.path, SAME)
+            yield Proved("input", one.path, SAME)
             continue
         elsewhere = (place / Path(one.path).name for place in places)
         moved = next((str(path) for path in elsewhere if _digest(path) == one.sha256), None)
         if moved is not None:
-            yield Finding("input", one.path, MOVED, f"it is {moved}")
+            yield Proved("input", one.path, MOVED, f"it is {moved}")
         else:
-            yield Finding("input", one.path, MISSING if found is None else CHANGED)
+            yield Proved("input", one.path, MISSING if found is None else CHANGED)
 
 
-def _outputs(summary: Summary, folder: Path) -> Iterator[Finding]:
+def _outputs(summary: Summary, folder: Path) -> Iterator[Proved]:
     for one in summary.outputs or ():
         found = _digest(folder / one.file)
-        yield Finding(
+        yield Proved(
             "output", one.file, SAME if found == one.sha256 else MISSING if found is None else CHANGED
         )
 
 
-def _cameras(summary: Summary, folder: Path) -> Iterator[Finding]:
+def _cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
     for view in summary.views:
         for name, consumers in view.outputs.items():
             stated = consumers.get("barpc")
@@ -90,16 +90,16 @@ def _holds_camera(path: Path) -> bool:
     return path.name.endswith((GRID, CORRECTION)) or row_of(path) is not None
 
 
-def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Finding:
+def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
     """What a file says of its camera, as a reader finds it: another file beside it may go before."""
     points = np.array(view.certified)
     try:
         off = np.linalg.norm(open_camera(path).model.project(points[:, :3]) - points[:, 3:], axis=1)
     except (BarpcError, OSError) as error:
-        return Finding("camera", name, MISSING if not path.exists() else CHANGED, str(error))
+        return Proved("camera", name, MISSING if not path.exists() else CHANGED, str(error))
     if off.max() <= stated + REOPENED:
-        return Finding("camera", name, SAME)
-    return Finding(
+        return Proved("camera", name, SAME)
+    return Proved(
         "camera", name, CHANGED, f"reads {off.max():.3g} px off the certified camera, {stated:.1g} stated"
     )
 

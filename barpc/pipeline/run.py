@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -12,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
-from uuid import uuid4
 
 import numpy as np
 
@@ -23,21 +21,29 @@ from barpc.errors import BarpcWarning, DisconnectedError, FitError, InputError, 
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.rpc import innermost
 from barpc.handoff import unverified
-from barpc.identity import Stamp, ask, guarded, recorded
+from barpc.identity import Input, Stamp, ask, guarded, recorded
 from barpc.options import FitOptions, RunOptions
 from barpc.pipeline.cluster import watched
-from barpc.pipeline.control import load_gcps
+from barpc.pipeline.control import load_altimetry, load_gcps
 from barpc.pipeline.executor import CachingExecutor
-from barpc.pipeline.given import given_matches, given_tracks
 from barpc.pipeline.grids import write_grids
-from barpc.pipeline.hashed import hash_inputs
-from barpc.pipeline.heights import load_altimetry
-from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs, with_located
+from barpc.pipeline.inputs import (
+    PRIOR,
+    given_matches,
+    given_tracks,
+    hash_inputs,
+    input_files,
+    only_new,
+    read_pairs,
+    reference_names,
+    side_inputs,
+    with_located,
+)
 from barpc.pipeline.outputs import MATCHES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.views import Image, image_path, load_views
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
-from barpc.remote import Remote, place
+from barpc.remote import here
 from barpc.report import Run, Summary, summarize
 from barpc.report.page import REPORT, remake_report
 from barpc.report.records import plain
@@ -51,7 +57,6 @@ from barpc.sensor.rpc import RPC
 from barpc.sidefile import plain_path
 from barpc.tie import find_tracks, read_area
 from barpc.tie.reference import Registration, register
-from barpc.tie.store import Bucket, Store
 from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace, timed
 
@@ -155,7 +160,7 @@ def adjust(
         with workspace.stage("fingerprints"), recorded(seen):
             given = side_inputs(options, run.views)
             inputs = hash_inputs(run, options, seen, executor, progress)
-        with CachingExecutor(workspace, inputs, executor, store=_store(options)) as caching:
+        with CachingExecutor(workspace, inputs, executor) as caching:
             with guarded(inputs.values()):
                 run = _solve(run, options, given, workspace, caching, progress)
             if run.adjustment is not None and options.stop_after == "all":
@@ -163,17 +168,15 @@ def adjust(
                     run = _fitted(run, options, caching, progress)
         with guarded(inputs.values()):  # asked again before outputs appear, and before the last one
             ask()
-            if run.fits:  # workers that do not see the run folder do not write there
-                run = _written(run, options, workspace, executor if options.store is None else None, progress)
+            if run.fits:
+                run = _written(run, options, workspace, executor, progress)
         if run.adjustment is not None:
             with _told(workspace, "block", progress), workspace.output(PRIOR) as partial:
                 block_prior(run.adjustment).save(partial)
         with _told(workspace, "summary", progress):
             run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
-            summary = summarize(run)
-        files = {one.path: one for given in inputs.values() for one in given.every()}
-        read = tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
-        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)), inputs=read)
+            summary = replace(summarize(run), inputs=_entries(inputs.values()))
+        summary = replace(summary, stages=tuple(map(StageEntry.read, run.stages)))
         _tell(progress, REPORT, 0)
         summary = write_tables(workspace, run, summary)
         _tell(progress, REPORT, 1)
@@ -181,6 +184,12 @@ def adjust(
     sensors = run.after or run.before
     views = [replace(view, sensor=sensor) for view, sensor in zip(run.views, sensors, strict=True)]
     return AdjustResult(_as_given(views, images, options), run, summary)
+
+
+def _entries(inputs: Iterable[Input]) -> tuple[InputEntry, ...]:
+    """Every file that was read, once, by its path."""
+    files = {one.path: one for given in inputs for one in given.every()}
+    return tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
 
 
 def _tell(progress: Progress | None, stage: str, done: int) -> None:
@@ -251,7 +260,7 @@ def _files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[
         for view in views:
             plain_source(view.path)
     inputs = (*(view.path for view in views), *(source.path for source in run.sources))
-    keep = {Path(path) for path in inputs if not isinstance(path, Remote)}
+    keep = set(here(inputs))
     keep |= set(input_files(options))
     names = output_names(views, options, folder)
     refuse_shadows(folder, names)
@@ -266,27 +275,16 @@ def _solve(
     executor: Executor,
     progress: Progress | None,
 ) -> Run:
-    for number in range(1 if options.matches_only else options.num_passes):
-        again = f" (pass {number + 1})" if number else ""
-        with workspace.stage("tie points" + again):
-            run = _with_ties(run, options, executor, progress, given[0])
-        if options.stop_after == "matching":
-            _write_matches(run, workspace)
-            return replace(run, kind="match")
-        if run.reference is None and given[0] is not None and options.reference:
-            with workspace.stage("reference"):
-                run = replace(run, reference=_registered(run, options, given[0], executor, progress))
-        with _told(workspace, "adjustment" + again, progress):
-            run = _adjusted(run, options, *given)
-    return run
-
-
-def _store(options: RunOptions) -> Store | None:
-    return None if options.store is None else Bucket(options.store, uuid4().hex)
-
-
-def _references(options: RunOptions) -> list[str]:
-    return [os.fspath(place(path).absolute()) for path in options.reference]
+    with workspace.stage("tie points"):
+        run = _with_ties(run, options, executor, progress, given[0])
+    if options.stop_after == "matching":
+        _write_matches(run, workspace)
+        return replace(run, kind="match")
+    if given[0] is not None and options.reference:
+        with workspace.stage("reference"):
+            run = replace(run, reference=_registered(run, options, given[0], executor, progress))
+    with _told(workspace, "adjustment", progress):
+        return _adjusted(run, options, *given)
 
 
 def _registered(
@@ -297,7 +295,7 @@ def _registered(
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
     return register(
         run.views,
-        _references(options),
+        reference_names(options),
         dem,
         options.tie.band,
         sigma=options.reference_sigma,
@@ -341,15 +339,12 @@ def _with_ties(
     progress: Progress | None,
     terrain: Dem | None = None,
 ) -> Run:
-    """The run with tie points: from a file, or matched, with the corrected cameras in a later pass."""
+    """The run with tie points: from a file, or matched."""
     views = run.views
     if options.matches and options.matches_only:
         return replace(run, tracks=given_tracks(options.matches, views))
     if len(views) < 2:
         return run
-    if run.adjustment is not None:
-        corrected = zip(views, run.adjustment.sensors, strict=True)
-        views = tuple(replace(view, sensor=sensor) for view, sensor in corrected)
     given: dict[str, Any] = {"executor": executor, "progress": progress, "terrain": terrain}
     if options.overlap_list is not None:
         given["only"] = read_pairs(options.overlap_list, views, [path for path, _ in run.left_out])

@@ -6,6 +6,7 @@ The same image twice ties itself to itself, perfectly and uselessly.
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -22,7 +23,7 @@ from barpc.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.identity import Stamp, also_seen, recorded
 from barpc.pointio.names import unique_names
 from barpc.raster import open_raster
-from barpc.remote import Place, Remote, located
+from barpc.remote import Place, here, located
 from barpc.rpcio.acquisition import date_taken
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
@@ -66,6 +67,17 @@ class _Read:
     sampled: bytes | None = None
     error: BarpcError | None = None
     files: Mapping[str, Stamp] = field(default_factory=dict)  # all that was opened for it
+
+    def usable(self, twins: Twins | None) -> tuple[View, Camera]:
+        """The image and its camera; what was found wrong with it, or that it is there twice, is raised."""
+        if self.error is not None:
+            raise self.error
+        also_seen(self.files)
+        assert self.view is not None
+        assert self.camera is not None
+        if twins is not None:
+            twins.add(self.view, self.sampled)
+        return self.view, self.camera
 
 
 _Given = tuple[str, Place, Image]  # name, file, and what was given
@@ -111,33 +123,23 @@ def load_views(
         raise InputError(
             f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed"
         )
-    views: list[View] = []
-    sources: list[Camera] = []
-    left_out: list[tuple[str, str]] = []
-    twins = Twins(band)
     given = sorted(zip(unique_names(files), files, images, strict=True), key=lambda row: row[:2])
-    images_read, spent = _read_all(
-        given, (band, distinct, tuple(hosts)), executor if len(given) >= _MANY else None, progress
-    )
-    for (_, file, _), read in zip(given, images_read, strict=True):
+    how = (band, distinct, tuple(hosts))
+    opened, spent = _read_all(given, how, executor if len(given) >= _MANY else None, progress)
+    twins, left_out = Twins(band), list[tuple[str, str]]()
+    used: list[tuple[View, Camera]] = []
+    for (_, file, _), read in zip(given, opened, strict=True):
         try:
-            if read.error is not None:
-                raise read.error
-            also_seen(read.files)
-            assert read.view is not None
-            assert read.camera is not None
-            if distinct:
-                twins.add(read.view, read.sampled)
-            views.append(read.view)
-            sources.append(read.camera)
+            used.append(read.usable(twins if distinct else None))
         except BarpcError as error:
             if not keep_going:
                 raise
             logger.warning("%s is left out: %s", file, error)
             left_out.append((str(file), str(error)))
-    if len(views) < min_views:
-        raise InputError(f"{len(views)} of {len(files)} images can be used: at least {min_views} are needed")
-    return LoadedViews(tuple(views), tuple(sources), tuple(left_out), spent)
+    if len(used) < min_views:
+        raise InputError(f"{len(used)} of {len(files)} images can be used: at least {min_views} are needed")
+    views, sources = zip(*used, strict=True) if used else ((), ())
+    return LoadedViews(views, sources, tuple(left_out), spent)
 
 
 def _read_all(
@@ -182,12 +184,11 @@ def _load(name: str, file: Place, image: Image, band: int, hosts: Sequence[str])
             raise InputError(f"{file}: is {size} px large, but its view says {image.size}")
     else:
         path, choices = split_spec(image, hosts)
-        camera = open_split(file if isinstance(file, Remote) else path, choices, size=size)
+        camera = open_split(path if here([path]) else file, choices, size=size)
         if camera.format in ("grid", "correction") and "camera" not in choices:
             raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
-    pixels = file if isinstance(file, Remote) else str(file)
     day = (image.date if isinstance(image, View) else "") or date_taken(file, camera.path, tags)
-    view = View(name, pixels, size, camera.model, _altitudes(camera), day)
+    view = View(name, os.fspath(file), size, camera.model, _altitudes(camera), day)
     ring = footprint(view.sensor, size, view.altitude)
     if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too
         raise RpcError(f"{file}: its RPC does not reach the ground over the image ({size[0]} x {size[1]} px)")
@@ -259,7 +260,7 @@ def _sampled(view: View, band: int) -> bytes | None:
 
 
 def _identity(path: str) -> Hashable:
-    if isinstance(path, Remote):
+    if not here([path]):
         return str(path)
     file = Path(path).stat()
     return file.st_dev, file.st_ino

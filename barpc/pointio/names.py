@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import PurePath
 
 from barpc.errors import InputError
-from barpc.remote import Place, Remote
+from barpc.remote import Place, pure
 
 MAX_NAME = 120
 """Bytes of a view's name: the file of a pair's matches carries two, and 255 are what a file system takes."""
@@ -35,7 +35,7 @@ def unique_names(files: Sequence[Place]) -> list[str]:
     >>> unique_names([Path("a/img.tif"), Path("a/img.jp2")])
     ['img.tif', 'img.jp2']
     """
-    places = [file.pure if isinstance(file, Remote) else file for file in dict.fromkeys(files)]
+    places = [pure(file) for file in dict.fromkeys(files)]
     stems = Counter((file.parent, _folded(file.stem)) for file in places)
     ends = [file.stem if stems[file.parent, _folded(file.stem)] == 1 else file.name for file in places]
     depth = [1] * len(places)

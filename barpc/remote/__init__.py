@@ -15,15 +15,13 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from ipaddress import IPv6Address
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 from barpc.errors import ImageError
 
 HOST = re.compile(r"(?:(?:https?|s3|gs|az)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:]+\])(?::\d{1,5})?")
 """An entry of the list of hosts: a host is that of https; http, and the buckets of object stores, say so."""
-BUCKET = re.compile(r"(?:s3|gs|az)://[A-Za-z0-9._-]+(?:/[A-Za-z0-9._-]+)*")
-"""A folder of an object store."""
 _URL = re.compile(r"(https?|s3|gs|az)://([^/?#]+)/([^?#]+)", re.IGNORECASE)
 _FLAT = re.compile(r"(?:https?|s3|gs|az):/[^/]")  # what pathlib makes of a URL
 
@@ -72,6 +70,10 @@ class Remote(str):
         """Itself, as every URL is absolute."""
         return self
 
+    def resolve(self) -> Remote:
+        """Itself, as no link leads elsewhere."""
+        return self
+
     def is_dir(self) -> bool:
         """No: folders are not opened."""
         return False
@@ -89,6 +91,16 @@ def is_url(text: str | os.PathLike[str]) -> bool:
 def place(path: str | os.PathLike[str]) -> Place:
     """What a file is opened by: a Remote as it is, any other text as a path of this machine."""
     return path if isinstance(path, Remote) else Path(path)
+
+
+def here(names: Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """The files of this machine among some."""
+    return [Path(name) for name in names if not isinstance(name, Remote)]
+
+
+def pure(file: Place) -> PurePath:
+    """A file's folders and name; of a Remote its host and path."""
+    return file.pure if isinstance(file, Remote) else file
 
 
 def located(path: str | os.PathLike[str], hosts: Iterable[str]) -> Place:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from functools import cache, lru_cache
 from typing import Any
 
-from barpc.errors import InputError, OutputError
 from barpc.remote import Part, Remote
 
 _NAMES = {"s3": "s3fs", "gs": "gcsfs", "az": "adlfs"}
@@ -94,33 +92,6 @@ def beside(image: Remote, names: Iterable[str]) -> dict[str, str]:
 def _listed(folder: str, _minute: int) -> tuple[str, ...]:
     found = _told(_store(folder.partition(":")[0]).ls, folder, detail=False)
     return tuple(sorted(str(path).rpartition("/")[2] for path in found))
-
-
-# --- what workers keep for each other ---------------------------------------------------------------------
-
-
-def put(url: str, data: bytes) -> None:
-    """Write an object, whole or not at all (OutputError)."""
-    try:
-        _told(_store(url.partition(":")[0]).pipe_file, url, data)
-    except OSError as error:
-        raise OutputError(f"{url}: cannot be written ({error})") from error
-
-
-def get(url: str) -> bytes | None:
-    """All of an object; None where there is none."""
-    try:
-        return bytes(_told(_store(url.partition(":")[0]).cat_file, url))
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise InputError(f"{url}: cannot be read ({error})") from error
-
-
-def drop(folder: str) -> None:
-    """Take away all objects of a folder, as far as the store lets us."""
-    with suppress(OSError):
-        _told(_store(folder.partition(":")[0]).rm, folder, recursive=True)
 
 
 def _told(ask: Any, *args: Any, **given: Any) -> Any:

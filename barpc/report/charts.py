@@ -1,4 +1,4 @@
-"""Charts of the report, each one SVG text, and what they are made of: errors, pairs, geometry, corrections.
+"""Charts of the report, each one SVG text, and what they are made of.
 
 Colours are CSS variables of the page. A chart is drawn on a sheet `WIDTH` units wide, so that its text stays readable
 on a phone, where a unit is about 0.85 pixels, and is not blown up on a desk, where the page caps the width.
@@ -15,17 +15,12 @@ from typing import Any
 import numpy as np
 
 from barpc.geodesy import Array
-from barpc.report.summary import PairEntry, ViewEntry
 
 WIDTH = 420.0  # Units of a chart from left to right
-ROW = 17.0  # Units from one row of a list chart to the next
-MAX_ROWS = 24  # A list chart shows so many rows, the most telling ones
 MAX_DRAWN = 400  # Images, and ground points, on the map and in the matrix
-_NAMES = 128.0  # units kept free for names on the left
 _RIGHT = WIDTH - 12.0
 _BINS = 48
 MAX_DOTS = 1500  # tie points on the map
-PAIR_DOTS = 300  # pairs over their angle
 
 
 def tag(name: str, *children: str, **attributes: object) -> str:
@@ -137,13 +132,6 @@ def round_ticks(low: float, high: float, most: int = 6) -> list[float]:
     return [round(k * step, 12) + 0.0 for k in range(first, last + 1)]
 
 
-def log_scale(values: Sequence[float], start: float, stop: float, floor: float = 1e-12) -> Scale:
-    """A logarithmic scale that holds all positive values with a margin."""
-    positive = [value for value in values if value > floor] or [1.0]
-    low, high = min(positive), max(positive)
-    return Scale(low / 1.25, max(high * 1.25, low * 4), start, stop, log=True)
-
-
 def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
     """Ticks with grid lines, numbers below, and the title with its unit below these."""
     parts = []
@@ -151,23 +139,6 @@ def x_axis(scale: Scale, top: float, bottom: float, title: str) -> list[str]:
         x = scale(value)
         parts += [line(x, top, x, bottom, "grid"), label(x, bottom + 13, f"{value:g}", "middle")]
     return [*parts, label(scale.stop, bottom + 29, title, "end", "axis")]
-
-
-def numbered(names: Sequence[str], most: int = 15) -> list[str]:
-    """Names behind their number in the table of images, cut in their middle, where they tell least apart.
-
-    Examples
-    --------
-    >>> numbered(["IMG_PHR1A_P_201304171032_SEN_001", "a"])
-    ['1 IMG_PH…EN_001', '2 a']
-    """
-    out = []
-    for k, name in enumerate(names):
-        room = most - len(str(k + 1)) - 1
-        tail = (room - 1) // 2
-        short = name if len(name) <= room else f"{name[: room - 1 - tail]}…{name[-tail:]}"
-        out.append(f"{k + 1} {short}")
-    return out
 
 
 def histogram(before: Array, after: Array) -> str:
@@ -206,108 +177,6 @@ def legend(names: Sequence[str], right: float, y: float) -> list[str]:
     return parts
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of a list chart: its short label, its full name, its value before and after (None: there is none)."""
-
-    label: str
-    name: str
-    before: float | None
-    after: float | None
-
-    @property
-    def last(self) -> float:
-        """The value that counts."""
-        return (self.before if self.after is None else self.after) or 0.0
-
-
-def dumbbells(key: str, title: str, axis: str, rows: Sequence[Row]) -> str:
-    """A row a name with a value before and one after, on a logarithmic axis; of more than `MAX_ROWS` the largest."""
-    shown = most_telling(rows, lambda row: -row.last)
-    scale = log_scale([value for row in shown for value in (row.before, row.after) if value], _NAMES, _RIGHT)
-    bottom = 24 + ROW * len(shown)
-    parts = x_axis(scale, 24, bottom, axis)
-    for k, row in enumerate(shown):
-        y = 24 + ROW * (k + 0.5)
-        parts.append(titled(label(_NAMES - 8, y + 4, row.label, "end"), row.name))
-        if row.before and row.after:
-            parts.append(line(scale(row.before), y, scale(row.after), y, "link"))
-        for when, value in (("before", row.before), ("after", row.after)):
-            if value:
-                dot = tag("circle", cx=scale(value), cy=y, r=4.5, class_=f"dot {when}")
-                parts.append(titled(dot, f"{row.name}: {when} {value:.3g}"))
-    parts += legend(["before", "after"] if any(row.after for row in shown) else ["before"], _RIGHT, 13)
-    described = f"{len(shown)} of {len(rows)} rows; the figures are in the table."
-    return sheet(key, title, described, bottom + 34, parts)
-
-
-def most_telling(rows: Sequence[Any], order: Any) -> list[Any]:
-    """All rows as they come, or the first `MAX_ROWS` by an order where there are more."""
-    return list(rows) if len(rows) <= MAX_ROWS else sorted(rows, key=order)[:MAX_ROWS]
-
-
 def evenly(rows: Sequence[Any], most: int) -> Sequence[Any]:
     """All rows, or so many of them as they come at even steps."""
     return rows[:: max(1, -(-len(rows) // most))]
-
-
-def convergence(pairs: Sequence[PairEntry]) -> str:
-    """Matches of each pair over its convergence angle; heights are weak on the left, matching on the right."""
-    angles = [pair.convergence_deg or 0.0 for pair in pairs]
-    high = max(angles, default=1.0)
-    x = Scale(0.0, max(high * 1.08, 8.0), 44.0, _RIGHT)
-    y = log_scale([pair.num_matches for pair in pairs], 190.0, 44.0)
-    parts = []
-    for low, up, words in ((0.0, 5.0, "weak heights"), (5.0, 35.0, "good"), (35.0, 180.0, "hard to match")):
-        if low < x.high:
-            left, right = x(low), x(min(up, x.high))
-            zone = f"zone {words.split()[0]}"
-            parts.append(tag("rect", x=left, y=30, width=right - left, height=160, class_=zone))
-            if right - left > 6.6 * len(words):
-                parts.append(label((left + right) / 2, 26, words, "middle"))
-    parts += x_axis(x, 30, 190, "convergence angle [deg]")
-    for value in y.ticks:
-        parts += [line(44, y(value), _RIGHT, y(value), "grid"), label(40, y(value) + 4, f"{value:g}", "end")]
-    parts.append(label(4, 12, "matches", class_="axis"))
-    dots = []
-    for pair, angle in evenly(list(zip(pairs, angles, strict=True)), PAIR_DOTS):
-        words = tag("title", escape(f"{pair.a} - {pair.b}: {angle:.1f} deg, {pair.num_matches} matches"))
-        dots.append(tag("circle", words, cx=round(x(angle), 1), cy=round(y(pair.num_matches), 1), r=4.5))
-    parts.append(tag("g", *dots, class_="dot after see"))
-    described = f"{len(pairs)} pairs, up to {high:.1f} degrees."
-    return sheet("angles-chart", "Matches of each pair over its convergence angle", described, 222, parts)
-
-
-def moves_of(views: Sequence[ViewEntry]) -> list[tuple[Any, Any]]:
-    """Shift and sigma (col, row) [px] of the views whose correction states both."""
-    moves = [view.correction for view in views if view.correction]
-    both = [(move.center_shift_px, move.center_sigma_px) for move in moves]
-    return [(shift, sigma) for shift, sigma in both if shift and sigma and None not in (*shift, *sigma)]
-
-
-def corrections(views: Sequence[ViewEntry]) -> str:
-    """How far each camera was moved in its image, col and row; with one sigma where that fits on the chart."""
-    names = [view.name for view in views]
-    rows = [(*both, *move) for *both, move in zip(numbered(names), names, moves_of(views), strict=True)]
-    shown = most_telling(rows, lambda row: -max(map(abs, row[2])))
-    largest = max(abs(value) for row in shown for value in row[2]) or 1e-3
-    spread = max(sigma for row in shown for sigma in row[3])
-    bars = spread <= 2 * largest
-    reach = 1.1 * (largest + spread * bars)
-    scale = Scale(-reach, reach, _NAMES, _RIGHT)
-    bottom = 24 + ROW * len(shown)
-    parts = x_axis(
-        scale, 24, bottom, f"shift in the middle of the image{', with one sigma' if bars else ''} [px]"
-    )
-    parts.append(line(scale(0), 24, scale(0), bottom, "zero"))
-    for k, (text, name, shift, sigma) in enumerate(shown):
-        middle = 24 + ROW * (k + 0.5)
-        parts.append(titled(label(_NAMES - 8, middle + 4, text, "end"), name))
-        for axis, value, error, y in zip(("col", "row"), shift, sigma, (middle - 4, middle + 4), strict=True):
-            left, right = (value - error, value + error) if bars else (min(value, 0.0), max(value, 0.0))
-            dot = tag("circle", cx=scale(value), cy=y, r=3.5, class_=f"dot {axis}")
-            words = f"{name}, {axis}: {value:+.2f} ± {error:.2f} px"
-            parts.append(titled(line(scale(left), y, scale(right), y, f"bar {axis}") + dot, words))
-    parts += legend(["col", "row"], _RIGHT, 13)
-    described = f"{len(shown)} of {len(rows)} images; the largest shift is {largest:.2g} px."
-    return sheet("moves-chart", "Shift of each camera in its image", described, bottom + 34, parts)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from operator import itemgetter
 
 import numpy as np
@@ -18,22 +18,19 @@ from barpc.report.charts import (
     evenly,
     label,
     line,
-    number,
     path,
     round_ticks,
     sheet,
     tag,
     titled,
 )
-from barpc.report.shading import moving_ground
 from barpc.report.summary import (
     CELLS,
     CheckPointEntry,
-    EllipseEntry,
     GcpEntry,
+    Summary,
     ViewEntry,
     cell_numbers,
-    metres,
 )
 from barpc.report.tables import Observations, RunFiles
 
@@ -45,10 +42,8 @@ _MOST = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
 _PANEL = 180.0
 _MANY = 30  # stacks of images: of more there are fewer numbers, and thinner lines
-_LARGEST = 34.0  # units of a semi-axis
-_TIMES = [n * 10.0**power for power in range(7, -7, -1) for n in (5, 2, 1)]
-_CIRCULAR = 2.146  # CE90 where both axes are one
 _REACH = 12.0  # units of a long residual
+_DARKEST = 0.7  # opacity where all tie points move
 
 Link = tuple[Sequence[float] | Array, Sequence[float] | Array, int, str]
 """Two places (x, y), the matches between them, a title."""
@@ -114,7 +109,7 @@ def ground_map(files: RunFiles) -> str:
     points = plane(files.points[:: max(1, -(-len(files.points) // MAX_DOTS)), :2])
     parts = [
         *grid,
-        *moving_ground(plane, summary),
+        *_moving_ground(plane, summary),
         tag("path", d="".join(f"M{x:.1f} {y:.1f}h0" for x, y in points.tolist()) or "M0 0", class_="point"),
     ]
     outlines = list(zip(range(len(summary.views)), summary.views, files.outlines, strict=True))
@@ -136,6 +131,25 @@ def ground_map(files: RunFiles) -> str:
     )
     many = {"class_": "many"} if len(stacks) > _MANY else {}
     return sheet("ground", "Map of the images", described, plane.height, [*parts, *degrees], **many)
+
+
+def _moving_ground(plane: Plane, summary: Summary) -> list[str]:
+    """Cells of the ground in which tie points move together, stronger with more of them, and where each group lies."""
+    scene = summary.scene
+    if scene is None:
+        return []
+    parts = []
+    for one in scene.moving:
+        shape = _box(plane, one.box, "moves", fill_opacity=_DARKEST * one.share)
+        parts.append(titled(shape, f"{100 * one.share:.0f} % of {one.count} tie points move together"))
+    groups = [one for one in scene.explanations if one.box is not None]
+    return parts + [titled(_box(plane, one.box or (), "group"), one.sentence) for one in groups]
+
+
+def _box(plane: Plane, box: Sequence[float], class_: str, **style: float) -> str:
+    west, south, east, north = box
+    (x, y), (right, bottom) = plane(np.array([(west, north), (east, south)])).tolist()
+    return tag("rect", x=x, y=y, width=right - x, height=bottom - y, class_=class_, **style)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,56 +183,6 @@ def _stacks(plane: Plane, outlines: Sequence[Sequence[Array]]) -> list[Stack]:
         else:
             stacks[near].views.append(k)
     return stacks
-
-
-def place_map(files: RunFiles) -> tuple[str, str] | None:
-    """Error ellipses, of each stack of images the largest, and circles of what is stated of that; what they say."""
-    views, rings = files.summary.views, [ring for outline in files.outlines for ring in outline]
-    if not rings:
-        return None
-    plane = _plane_of(np.concatenate(rings))
-    stacks, found = _stacks(plane, files.outlines), []
-    for stack in stacks:
-        known = [(view.correction.ellipse, view) for k in stack.views if (view := views[k]).correction]
-        shown = [(e.ce90_m or 0.0, e, view) for e, view in known if e is not None and e.major_m is not None]
-        if shown:
-            found.append((stack.place, *max(shown, key=itemgetter(0))[1:]))
-    largest = max([max(e.major_m or 0.0, _sigma(view) or 0.0) for _, e, view in found], default=0.0)
-    if not largest > 0:
-        return None
-    middles = np.array([place for place, *_ in found])
-    apart = np.sort(np.linalg.norm(middles[:, None] - middles, axis=2), axis=1)[:, 1:2]
-    room = min(_LARGEST, 0.5 * float(np.median(apart))) if len(found) > 1 else 2 * _LARGEST
-    times = next((t for t in _TIMES if t * largest * plane.scale <= room), _TIMES[-1])
-    grid, degrees = _graticule(plane)
-    faint = [path(plane(ring[:-1]), "faint", closed=True) for ring in evenly(rings, MAX_DRAWN)]
-    parts = [_ellipse(place, times * plane.scale, e, view) for place, e, view in evenly(found, MAX_DRAWN)]
-    lifted = [replace(stack, place=stack.place - (0.0, room + 8.0)) for stack in stacks]
-    names = _stack_names(lifted) if len(stacks) <= _MANY else []
-    dashed = "; dashed circles: as stated with the camera delivered" * any(_sigma(view) for *_, view in found)
-    times_words = f"{times:g} times as large" if times != 1 else "to scale"
-    words = f"One sigma of the place on the ground of an image's middle, {times_words} as the map{dashed}."
-    if len(found) < len(views):
-        words += " Of images that lie over each other the one with the largest."
-    body = [*grid, *faint, *parts, *names, *degrees]
-    return sheet("places", "Error ellipses of the images", words, plane.height, body), words
-
-
-def _sigma(view: ViewEntry) -> float | None:
-    """What is stated of a camera, as one sigma along an axis [m]."""
-    return None if view.stated_ce90_m is None else view.stated_ce90_m / _CIRCULAR
-
-
-def _ellipse(place: Array, scale: float, e: EllipseEntry, view: ViewEntry) -> str:
-    (x, y), sigma = place.tolist(), _sigma(view)
-    turn = f"rotate({(e.azimuth_deg or 0.0) - 90:.1f} {number(x)} {number(y)})"
-    rx, ry = scale * (e.major_m or 0.0), scale * (e.minor_m or 0.0)
-    shapes = tag("ellipse", cx=x, cy=y, rx=rx, ry=ry, transform=turn, class_="ellipse")
-    words = f"{view.name}: {metres(e.major_m or 0.0)} by {metres(e.minor_m or 0.0)}, CE90 {metres(e.ce90_m or 0.0)}"
-    if sigma is not None:
-        shapes += tag("circle", cx=x, cy=y, r=scale * sigma, class_="ellipse stated")
-        words += f", stated {metres(view.stated_ce90_m or 0.0)}"
-    return titled(shapes, words)
 
 
 def _stack_names(stacks: Sequence[Stack]) -> list[str]:
@@ -293,7 +257,7 @@ class Cells:
         return float(self.systematic.sum() / max(np.isfinite(self.rms).sum(), 1))
 
 
-def cells_of(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
+def residual_cells(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
     """Mean and spread of residuals (m, 2) [px] over a grid of cells on the image."""
     cell, num = cell_numbers(xy, size), CELLS**2
     count = np.bincount(cell, minlength=num)
@@ -307,7 +271,7 @@ def cells_of(xy: Array, residuals: Array, size: Sequence[int]) -> Cells:
 
 
 def residual_panels(
-    views: Sequence[ViewEntry], observations: Observations, when: str, looks: Mapping[str, str]
+    views: Sequence[ViewEntry], observations: Observations, when: str
 ) -> tuple[list[tuple[str, str]], list[float], str]:
     """Small maps of the residuals "before" or "after", with captions, of the images with the largest systematic part.
 
@@ -324,7 +288,7 @@ def residual_panels(
     order = order[np.argsort(observations.view[order], kind="stable")]
     rows_of = np.split(order, np.searchsorted(observations.view[order], np.arange(1, len(views))))
     grids = [
-        cells_of(observations.xy[rows], residuals[rows], view.size)
+        residual_cells(observations.xy[rows], residuals[rows], view.size)
         for view, rows in zip(views, rows_of, strict=True)
     ]
     shares = [cells.share for cells in grids]
@@ -332,28 +296,12 @@ def residual_panels(
     for k in sorted(sorted(range(len(views)), key=lambda k: -shares[k])[:_MOST]):
         rows = rows_of[k][:: max(1, -(-len(rows_of[k]) // most))]
         svg = _panel(when, k, views[k], grids[k], observations.xy[rows], residuals[rows], longest)
-        svg = _over(looks.get(views[k].name), svg)
         charts.append((svg, f"{k + 1} {views[k].name}: {_note(grids[k])}"))
     words = f"A thin line of a {_PANEL / _REACH:.0f}th of a panel's width is {longest:.2g} px"
     key = f"{words}; bold arrows are drawn twice as long."
     if len(charts) < len(views):
         key += f" The {len(charts)} of {len(views)} images with the largest systematic part are shown."
     return charts, shares, key
-
-
-def _over(look: str | None, svg: str) -> str:
-    """A panel over the quick-look of its image, which the page shows where the panel is large."""
-    if look is None:
-        return svg
-    image = tag(
-        "image",
-        href=f"data:image/jpeg;base64,{look}",
-        width="100%",
-        height="100%",
-        preserveAspectRatio="none",
-    )
-    head, end, rest = svg.partition("</desc>")
-    return f"{head}{end}{image}{rest}"
 
 
 def _note(cells: Cells) -> str:

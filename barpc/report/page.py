@@ -18,10 +18,9 @@ import numpy as np
 from barpc.errors import BarpcError, visible
 from barpc.geodesy import Array
 from barpc.report import charts
-from barpc.report.charts import MAX_ROWS, numbered
 from barpc.report.compare import flat_options
 from barpc.report.decisions import decisions, second_attempts
-from barpc.report.maps import ground_map, place_map, residual_panels
+from barpc.report.maps import ground_map, residual_panels
 from barpc.report.matrix import facts, pair_matrix
 from barpc.report.records import Cell, Table, cell_of, table
 from barpc.report.summary import (
@@ -40,7 +39,7 @@ from barpc.report.summary import (
     listed,
     metres,
 )
-from barpc.report.tables import Relief, RunFiles, TiePatches, read_summary, read_tables
+from barpc.report.tables import Relief, RunFiles, read_summary, read_tables
 from barpc.report.verdict import GOOD
 from barpc.scene import connected_groups
 from barpc.workspace import Workspace
@@ -118,8 +117,7 @@ class Section:
     """A question and its answer, with what shows it.
 
     `points`: sentences; `panels`: small maps; `folds`: words and more of them that open on demand; `bars`: words, a
-    value as text and a length in percent; `ties`: patches of tie points; `half`: half the width of a desk's screen is
-    enough.
+    value as text and a length in percent; `half`: half the width of a desk's screen is enough.
     """
 
     key: str
@@ -131,7 +129,6 @@ class Section:
     points: Sequence[str] = ()
     bars: Sequence[tuple[str, str, float]] = ()
     tables: Sequence[Table] = ()
-    ties: Sequence[TiePatches] = ()
     half: bool = False
 
 
@@ -190,17 +187,12 @@ def _bonds(files: RunFiles) -> str:
 
 
 def _errors(files: RunFiles) -> Section | None:
-    found, views = files.observations, files.summary.views
+    found = files.observations
     norms = [np.hypot(*r[found.used & np.isfinite(r).all(axis=1)].T) for r in (found.before, found.after)]
     if not any((norm > 0).any() for norm in norms):
         return None
-    labels = numbered([view.name for view in views])
-    named = zip(labels, views, strict=True)
-    rows = [charts.Row(text, view.name, view.rmse_before, view.rmse_after) for text, view in named]
-    axis = "root mean square reprojection error [px], logarithmic"
     shown = [
         (charts.histogram(*norms), "All observations that count; each curve is drawn to its own peak."),
-        (charts.dumbbells("rmse", "Error of each image", axis, rows), _which(rows, "images", "error")),
     ]
     if not files.summary.adjusted:
         answer = f"Half of the observations lie within {np.median(norms[0]):.3f} px of where their cameras put them."
@@ -213,19 +205,11 @@ def _errors(files: RunFiles) -> Section | None:
     return Section("errors", "Did the adjustment help?", answer, shown)
 
 
-def _which(rows: Sequence[Any], what: str, by: str) -> str:
-    if len(rows) <= MAX_ROWS:
-        return f"All {what}."
-    return f"The {MAX_ROWS} of {len(rows)} {what} with the largest {by}."
-
-
 def _randomness(files: RunFiles) -> Section | None:
     if not len(files.observations.view):
         return None
     views, adjusted, folds = files.summary.views, files.summary.adjusted, []
-    panels, shares, key = residual_panels(
-        views, files.observations, "after" if adjusted else "before", files.pictures.quicklooks
-    )
+    panels, shares, key = residual_panels(views, files.observations, "after" if adjusted else "before")
     marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
     answer = "Mostly: in no image do residuals point the same way in more than half of the cells."
     if marked:
@@ -237,22 +221,9 @@ def _randomness(files: RunFiles) -> Section | None:
         f" cell that is larger than chance allows. {key}"
     )
     if adjusted:
-        before, _, key = residual_panels(views, files.observations, "before", {})
+        before, _, key = residual_panels(views, files.observations, "before")
         folds.append((f"Before the adjustment. {key}", before))
     return Section("random", "Are the residuals random?", answer, panels=panels, folds=folds)
-
-
-def _ties(files: RunFiles) -> Section | None:
-    ties = files.pictures.ties
-    if not ties:
-        return None
-    worst = sum(tie.kind == "worst" for tie in ties)
-    answer = (
-        f"The {worst} with the largest residuals, then {len(ties) - worst} at random. Point at a patch or go to it with"
-        " the Tab key: it blinks between the two images, the second brought over by the cameras. What jumps is their"
-        " error; what looks like two places is a wrong match."
-    )
-    return Section("ties", "What do tie points look like?", answer, ties=ties)
 
 
 def _surface(files: RunFiles) -> Section | None:
@@ -284,26 +255,21 @@ def _pairs(files: RunFiles) -> Section | None:
     if not pairs:
         return None
     ends = [(number[pair.a] + 1, number[pair.b] + 1) for pair in pairs]
-    numbered_pairs = zip(ends, pairs, strict=True)
-    rows = [charts.Row(f"{a} - {b}", f"{p.a} - {p.b}", *p.offset_rms) for (a, b), p in numbered_pairs]
+    worst = max(
+        (before if after is None else after) or 0.0 for before, after in (p.offset_rms for p in pairs)
+    )
     answer = (
-        f"The epipolar offset, which no height explains, is {max(row.last for row in rows):.3f} px (RMS) in the worst"
+        f"The epipolar offset, which no height explains, is {worst:.3f} px (RMS) in the worst"
         " pair; stereo matching along epipolar lines wants it well below 0.5 px."
     )
-    axis = "RMS distance from the epipolar line [px], logarithmic"
-    chart = charts.dumbbells("epipolar", "Epipolar offset of each pair", axis, rows)
-    shown = [(chart, f"{_which(rows, 'pairs', 'offset')} Numbers are those of the images.")]
     seen = [pair for pair in pairs if None not in (pair.convergence_deg, pair.base_to_height)]
     if seen:
-        caption = "One dot a pair. Small angles give weak heights; beyond about 35 degrees images look too different."
-        caption += f" Of {len(seen)} pairs some are left out, evenly." * (len(seen) > charts.PAIR_DOTS)
-        shown.append((charts.convergence(seen), caption))
         answer += _heights(seen)
     caption = "Pairs: distance of matches from the epipolar line, median ± spread (1.4826 MAD)"
     found = table("pairs", caption, pairs, PairEntry, PairEntry.PAGE, files.summary.adjusted)
     found = found.numbered([Cell(f"{a}-{b}", a + b / 1e6) for a, b in ends])
     question = "Do the pairs fit for stereo, and can heights be measured?"
-    return Section("pairs", question, answer, shown, tables=[found])
+    return Section("pairs", question, answer, tables=[found])
 
 
 def _heights(pairs: Sequence[PairEntry]) -> str:
@@ -322,7 +288,8 @@ def _heights(pairs: Sequence[PairEntry]) -> str:
 
 def _corrections(files: RunFiles) -> Section | None:
     views = files.summary.views
-    moves = charts.moves_of(views)
+    known = [(c.center_shift_px, c.center_sigma_px) for view in views if (c := view.correction)]
+    moves = [(shift, sigma) for shift, sigma in known if shift and sigma and None not in (*shift, *sigma)]
     if len(moves) < len(views):
         return None
     farthest, sigma = (max(float(np.hypot(*pair)) for pair in pairs) for pairs in zip(*moves, strict=True))
@@ -332,19 +299,16 @@ def _corrections(files: RunFiles) -> Section | None:
     )
     if not files.summary.gcps:
         answer += " Most of that is common to all images: the scene's own place, which no tie point can tell."
-    shown = [(charts.corrections(views), _which(views, "images", "shift"))]
-    if (drawn := place_map(files)) is not None:
-        shown.append(drawn)
     caption = "Corrections: shift in the middle of the image ± one sigma, size of rotation and translation"
     radars = any(view.correction and view.correction.range_m is not None for view in views)
     columns = ViewEntry.CORRECTIONS + ViewEntry.CLOCKS * radars
-    found = table("corrections", caption, views, ViewEntry, columns, folded=True)
+    found = table("corrections", caption, views, ViewEntry, columns)
     tables = [found]
     if any(view.correction and view.correction.ellipse for view in views):
         caption = "Place on the ground of the middle of each image, its altitude given: one-sigma ellipse, CE90, and"
         caption += " CE90 as stated with the camera as delivered (-: nothing is)"
         tables.append(table("places", caption, views, ViewEntry, ViewEntry.PLACES, folded=True))
-    return Section("moves", "What was changed in each camera?", answer, shown, tables=tables, half=True)
+    return Section("moves", "What was changed in each camera?", answer, tables=tables, half=True)
 
 
 def _decisions(files: RunFiles) -> Section | None:
@@ -469,7 +433,7 @@ def _run(files: RunFiles) -> Section:
 
 
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (
-    _images, _map, _errors, _randomness, _ties, _pairs, _surface, _corrections, _gauge, _decisions, _check_points,
-    _files, _run,
+    _images, _map, _errors, _randomness, _pairs, _surface, _corrections, _gauge, _decisions, _check_points, _files,
+    _run,
 )  # fmt: skip
 """In the order of the page; a section that has nothing to show is None."""

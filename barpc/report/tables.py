@@ -11,7 +11,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -40,7 +40,7 @@ RESIDUALS = (
     "mean_residual_before",
     "track",
 )
-"""Columns of residuals.csv, properties of residuals.geojson; one row a track. Heights: above the ellipsoid."""
+"""Columns of residuals.csv, one row a track. Heights: above the ellipsoid."""
 
 OBSERVATIONS = ("view", "track", "col", "row", "col_before", "row_before", "col_after", "row_after", "used")
 """Columns of observations.csv, one row an observation: residuals are projected - observed [px]."""
@@ -63,24 +63,11 @@ def _per_track(run: Run) -> Array:
     )
 
 
-def _residual_rows(run: Run, empty: str) -> Iterable[list[str]]:
-    for lon, lat, alt, mean, count, before, track in _per_track(run).tolist():
-        row = [f"{lon:.9f}", f"{lat:.9f}", f"{alt:.4f}", f"{mean:.4f}", f"{count:.0f}"]
-        yield [*row, _number(before, 4, empty), f"{track:.0f}"]
-
-
 def _residuals_csv(run: Run, _: Summary) -> bytes:
-    return "".join(",".join(row) + "\n" for row in (RESIDUALS, *_residual_rows(run, ""))).encode()
-
-
-def _residuals_geojson(run: Run, _: Summary) -> bytes:
-    features = []
-    for row in _residual_rows(run, "null"):
-        place = f'{{"type": "Point", "coordinates": [{", ".join(row[:3])}]}}'
-        properties = ", ".join(f'"{name}": {value}' for name, value in zip(RESIDUALS, row, strict=True))
-        features.append(f'{{"type": "Feature", "geometry": {place}, "properties": {{{properties}}}}}')
-    text = ",\n".join(features)
-    return f'{{"type": "FeatureCollection", "features": [\n{text}\n]}}\n'.encode()
+    lines = [",".join(RESIDUALS)]
+    for lon, lat, alt, mean, count, before, track in _per_track(run).tolist():
+        lines.append(f"{lon:.9f},{lat:.9f},{alt:.4f},{mean:.4f},{count:.0f},{_number(before, 4)},{track:.0f}")
+    return ("\n".join(lines) + "\n").encode()
 
 
 def _observations_csv(run: Run, _: Summary) -> bytes:
@@ -112,8 +99,8 @@ def _cell(value: str | float | None) -> str:
     return str(value) if isinstance(value, int) else _number(value, 5)
 
 
-def _number(value: float | None, digits: int, empty: str = "") -> str:
-    return empty if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
 
 
 def _footprints(run: Run, summary: Summary) -> bytes:
@@ -179,15 +166,12 @@ def gcps_geojson(run: Run) -> bytes:
 
 TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
     "residuals.csv": _residuals_csv,
-    "residuals.geojson": _residuals_geojson,
     "observations.csv": _observations_csv,
     "pairs.csv": _pairs_csv,
     "footprints.geojson": _footprints,
     "points.ply": _points_ply,
 }
 """File name -> its bytes, of a run and its summary."""
-PICTURES = "pictures.json"
-"""Pixels for the report, of a run that wrote them."""
 SURFACE = "surface.json"
 """Two reliefs for the report, of a run of which a surface was made."""
 
@@ -208,28 +192,6 @@ class Observations:
     before: Array
     after: Array
     used: BoolArray
-
-
-@dataclass(frozen=True)
-class TiePatches:
-    """A tie point in pixels: a JPEG (base64) of the image `a`, and of `b` brought over by the cameras before and after.
-
-    `kind`: "worst" or "random"; `offset_px`: distances from the epipolar line with these cameras.
-    """
-
-    kind: str
-    a: str
-    b: str
-    offset_px: Sequence[float]
-    patches: Sequence[str]
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """What a run shows of its pixels: name of an image -> quick-look, a JPEG in base64; tie points."""
-
-    quicklooks: Mapping[str, str]
-    ties: Sequence[TiePatches]
 
 
 @dataclass(frozen=True)
@@ -259,7 +221,6 @@ class RunFiles:
     points: Array
     tracks: IntArray
     outlines: Sequence[Sequence[Array]]
-    pictures: Pictures
     reliefs: Sequence[Relief] = ()
 
     @property
@@ -320,32 +281,12 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
         raise InputError(f"{folder / 'footprints.geojson'}: {len(outlines)} outlines of {len(names)} images")
     observations = _read(folder / "observations.csv", TABLE, lambda text: _observations(text, names))
     points, tracks = _read(folder / "residuals.csv", TABLE, _points)
-    there = os.path.lexists(folder / PICTURES)
-    pictures = _read(folder / PICTURES, SUMMARY, _pictures) if there else Pictures({}, ())
     there = os.path.lexists(folder / SURFACE)
     reliefs = _read(folder / SURFACE, SUMMARY, _reliefs) if there else ()
-    return RunFiles(summary, observations, points, tracks, outlines, pictures, reliefs)
+    return RunFiles(summary, observations, points, tracks, outlines, reliefs)
 
 
 _BASE64 = re.compile(r"[A-Za-z0-9+/]{4,400000}={0,2}")
-
-
-def _pictures(text: str) -> Pictures:
-    found = parse_json(text)
-    looks = {str(name): _jpeg(data) for name, data in found["quicklooks"].items()}
-    ties = [
-        TiePatches(
-            {"worst": "worst", "random": "random"}[tie["kind"]],
-            str(tie["a"]),
-            str(tie["b"]),
-            [float(value) for value in tie["offset_px"]],
-            [_jpeg(data) for data in tie["patches"]],
-        )
-        for tie in found["ties"]
-    ]
-    if any(len(tie.patches) != len(tie.offset_px) + 1 or not tie.offset_px for tie in ties):
-        raise ValueError("a tie point without its patches")
-    return Pictures(looks, ties)
 
 
 def _reliefs(text: str) -> tuple[Relief, ...]:

@@ -13,11 +13,11 @@ from barpc.ba.apart import APART, Apart
 from barpc.ba.scan import SURE
 from barpc.ba.snooping import ControlTest
 from barpc.geodesy import Array
+from barpc.report.dem_lines import dem_lines, dem_reasons, holds_reference
 from barpc.report.records import plain
 from barpc.report.run import MANY_REJECTED, SMOOTH_LEFT, Run
 from barpc.report.summary import STATUS_WORDS, Summary, ViewEntry, listed, measure, median, metres
-from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_over, strangeness
-from barpc.report.terrain import dem_lines, dem_reasons, holds_reference
+from barpc.report.summary.causes import RIVALS, explanations, held_out_place, left_entries, strangeness
 from barpc.scene import GroundPoints
 from barpc.sensor.rpc import RPC
 from barpc.tie.reference import PEAK
@@ -264,7 +264,7 @@ def _left_reasons(run: Run) -> list[str]:
     """Where tie points were cut, or are off, more than elsewhere, or took no part and are; each image's worst."""
     assert run.adjustment is not None
     worst: dict[str, str] = {}
-    found, names = left_over(run.adjustment), run.adjustment.names
+    found, names = left_entries(run.adjustment), run.adjustment.names
     moving = [f"rows {one.first:.0f}-{one.last:.0f} of {one.image}" for one in found if one.moving]
     if moving:
         worst[""] = (

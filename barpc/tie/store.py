@@ -1,11 +1,10 @@
 """Where results lie that travel by reference: workers write and read them, the caller only knows their names.
 
-All access goes through `Store`: a folder on a disk that all see, or (`Bucket`) one of an object store.
+All access goes through `Store`: a folder on a disk that all see.
 """
 
 from __future__ import annotations
 
-import io
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -20,9 +19,7 @@ import numpy as np
 from barpc import identity
 from barpc.atomic import replacing
 from barpc.errors import InputError
-from barpc.frozen import Arrays, load_npz, unpack
-from barpc.remote.stores import drop, get, put
-from barpc.sidefile import ARRAYS
+from barpc.frozen import Arrays, load_npz
 
 
 @dataclass(frozen=True)
@@ -33,7 +30,6 @@ class Store:
     room: str  # for files on their way, on the same disk
 
     scratch = "arrays"  # where names of a run that need not outlive it begin
-    needs = "images and run folder must be on a disk that all workers see under the same path"
 
     def write(self, name: str, arrays: Arrays) -> None:
         """Keep named arrays, whole or not at all; not if a file that they were made of has changed."""
@@ -57,43 +53,15 @@ class Store:
         """Arrays of a name that was written before; InputError where this worker does not find it."""
         found = self.read(name)
         if found is None:
-            raise InputError(f"{self.folder}/{name}.npz: a worker cannot read it; {self.needs}")
+            raise InputError(
+                f"{self.folder}/{name}.npz: a worker cannot read it; images and run folder must be on a disk that all "
+                "workers see under the same path"
+            )
         return found
 
     def clear(self) -> None:
         """Take away what lies under `scratch`."""
         shutil.rmtree(Path(self.folder) / self.scratch, ignore_errors=True)
-
-
-@dataclass(frozen=True)
-class Bucket(Store):
-    """A folder of an object store, by URL: nothing is shared but the store."""
-
-    needs = "does the store answer it?"
-
-    @property
-    def scratch(self) -> str:  # type: ignore[override]  # several runs may share the folder
-        """As of `Store`."""
-        return f"arrays/{self.room}"
-
-    def write(self, name: str, arrays: Arrays) -> None:
-        """As of `Store`."""
-        identity.ask()
-        data = io.BytesIO()
-        np.savez(data, **arrays)  # type: ignore[arg-type]
-        put(f"{self.folder}/{name}.npz", data.getvalue())
-
-    def read(self, name: str) -> Arrays | None:
-        """As of `Store`."""
-        data = get(f"{self.folder}/{name}.npz")
-        try:
-            return None if data is None else unpack(io.BytesIO(data), f"{self.folder}/{name}.npz", ARRAYS)
-        except InputError:
-            return None
-
-    def clear(self) -> None:
-        """As of `Store`."""
-        drop(f"{self.folder}/{self.scratch}")
 
 
 @contextmanager

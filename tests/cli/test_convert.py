@@ -283,11 +283,14 @@ def test_a_grid_that_does_not_hold_the_camera_ends_with_3(
 # --- a folder ---------------------------------------------------------------------------------------------
 
 
-def test_what_readers_see_is_a_line_or_a_row_each(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_readers_see_is_a_line_or_a_row_each(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     readings = [Reading(Path("a"), "gdal", 1.3e-9), Reading(Path("b"), "rpcm", NAN, "no field")]
-    _tell(readings, as_json=False)
+    _tell(readings)
     assert capsys.readouterr().out == "a: gdal 1.3e-09 px\nb: rpcm no field\n"
-    _tell(readings, as_json=True)
+    monkeypatch.setattr(module, "wants_json", lambda: True)
+    _tell(readings)
     assert json.loads(capsys.readouterr().out) == [
         {"path": "a", "consumer": "gdal", "max_px": 1.3e-9, "note": ""},
         {"path": "b", "consumer": "rpcm", "max_px": None, "note": "no field"},

@@ -47,7 +47,7 @@ def option_of(target: str) -> click.Option:
         ("overwrite", (), None),
         ("overwrite", ("--overwrite",), True),
         ("adjust.model", ("--model", "shift"), "shift"),
-        ("tie.keypoints_per_image", ("--ip-per-image", "5000"), 5000),
+        ("adjust.drift", ("--drift", "2"), 2),
         ("rpc_formats", ("--rpc-format", "txt, geom"), ("txt", "geom")),
         ("rpc_formats", (), None),
         ("gcp", ("--gcp", "a", "--gcp", "b"), ("a", "b")),
@@ -67,7 +67,7 @@ def test_a_flag_is_of_the_field_s_type(target: str, words: tuple[str, ...], valu
         ("fit.tolerance", ("--tolerance", "x")),
         ("fit.tolerance", ("--tolerance", "-1")),
         ("fit.tolerance", ("--tolerance", "nan")),
-        ("tie.keypoints_per_image", ("--ip-per-image", "1.5")),
+        ("adjust.drift", ("--drift", "1.5")),
         ("adjust.model", ("--model", "nothing")),
         ("rpc_formats", ("--rpc-format", "txt,doc")),
     ],
@@ -91,7 +91,6 @@ def test_a_flag_says_its_default_bounds_and_choices() -> None:
     assert gcp.multiple
     assert str(gcp.help).endswith("(repeatable)")
     assert "default" not in str(option_of("dem").help)
-    assert option_of("tie.keypoints_per_image").opts == ["--ip-per-image"]
     assert option_of("overwrite").is_flag
 
 
@@ -104,9 +103,8 @@ def test_a_shell_completes_the_choices() -> None:
 @pytest.mark.parametrize(
     ("target", "name"),
     [
-        ("tie.keypoints_per_image", "--ip-per-image"),
         ("rpc_formats", "--rpc-format"),
-        ("adjust.dem_sigma", "--dem-sigma"),
+        ("adjust.dem_for_weak", "--dem-for-weak"),
         ("aoi", "--aoi"),
     ],
 )
@@ -143,26 +141,26 @@ def test_a_list_of_images_is_read_behind_those_of_the_command_line(tmp_path: Pat
 
 def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
     path = tmp_path / "o.toml"
-    path.write_text('overwrite = true\n[tie]\nkeypoints_per_image = 700\n[adjust]\nmodel = "shift"\n')
+    path.write_text('overwrite = true\n[tie]\nband = 7\n[adjust]\nmodel = "shift"\n')
     assert run_options({}, None) == RunOptions()
     read = run_options({}, str(path))
-    assert (read.overwrite, read.tie.keypoints_per_image, read.adjust.model) == (True, 700, "shift")
+    assert (read.overwrite, read.tie.band, read.adjust.model) == (True, 7, "shift")
     flags = {
-        "flag_tie_keypoints_per_image": 900,
+        "flag_tie_band": 9,
         "flag_adjust_model": None,
-        "flag_adjust_dem_sigma": 7.0,
+        "flag_adjust_dem_for_weak": True,
         "flag_overwrite": None,
         "flag_fit_tolerance": 0.5,
         "flag_dem": "d.tif",
         "other": 3,
     }
     found = run_options(flags, str(path))
-    assert (found.tie.keypoints_per_image, found.adjust.model, found.adjust.dem_sigma) == (900, "shift", 7.0)
+    assert (found.tie.band, found.adjust.model, found.adjust.dem_for_weak) == (9, "shift", True)
     assert (found.overwrite, found.fit.tolerance, found.dem) == (True, 0.5, "d.tif")
     alone = run_options(flags, None)
     assert (alone.tie, alone.adjust) == (
-        TieOptions(keypoints_per_image=900),
-        AdjustOptions(dem_sigma=7.0),
+        TieOptions(band=9),
+        AdjustOptions(dem_for_weak=True),
     )
     with pytest.raises(InputError, match="command line"):
         run_options({"flag_fit_tolerance": -1.0}, None)
@@ -201,7 +199,7 @@ def test_the_help_of_a_run_has_its_flags_under_what_they_are_about() -> None:
             flags.update(word.strip(",") for word in line.split() if word.startswith("--"))
     assert list(found) == ["Files and the run", "Tie points", "Cameras", "Ground"]
     assert {"--out-dir", "--overwrite", "--jobs", "--help"} <= found["Files and the run"]
-    assert {"--matcher", "--ip-per-image"} <= found["Tie points"]
+    assert {"--matcher", "--aoi"} <= found["Tie points"]
     assert {"--model", "--fixed"} <= found["Cameras"]
     assert {"--gcp", "--dem", "--geoid"} <= found["Ground"]
     assert "Tie points:" not in CliRunner().invoke(cli, ["info", "--help"]).output

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barpc.cli import points as module
-from barpc.cli.points import _print_points, _tell_failures, read_points
+from barpc.cli.points import _print_points, _tell_failures, given_points
 from barpc.errors import InputError
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
@@ -25,7 +25,7 @@ def table(
     tmp_path: Path, text: str, fill: float | None = None, names: tuple[str, ...] = XYZ
 ) -> list[list[float]]:
     (tmp_path / "t.csv").write_text(text)
-    return read_points((), str(tmp_path / "t.csv"), names, fill).tolist()
+    return given_points((), str(tmp_path / "t.csv"), names, fill).tolist()
 
 
 # --- what comes in ----------------------------------------------------------------------------------------
@@ -43,7 +43,7 @@ def table(
 def test_numbers_are_points_one_behind_the_other(
     numbers: tuple[float, ...], fill: float | None, rows: list[list[float]]
 ) -> None:
-    assert read_points(numbers, None, XYZ, fill).tolist() == rows
+    assert given_points(numbers, None, XYZ, fill).tolist() == rows
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_numbers_that_are_no_whole_points_are_wrong_usage(
     numbers: tuple[float, ...], fill: float | None, told: str
 ) -> None:
     with pytest.raises(click.UsageError, match=f"^{told} each point, or --points FILE$"):
-        read_points(numbers, None, XYZ, fill)
+        given_points(numbers, None, XYZ, fill)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_a_table_has_a_header_or_its_columns_in_order(
 ) -> None:
     assert table(tmp_path, text, fill) == rows
     monkeypatch.setattr("sys.stdin", io.StringIO(text))
-    assert read_points((), "-", XYZ, fill).tolist() == rows
+    assert given_points((), "-", XYZ, fill).tolist() == rows
 
 
 @pytest.mark.parametrize(
@@ -106,11 +106,14 @@ def test_a_table_that_lacks_something_says_what(
 # --- what goes out ----------------------------------------------------------------------------------------
 
 
-def test_points_are_printed_with_their_digits(capsys: pytest.CaptureFixture[str]) -> None:
+def test_points_are_printed_with_their_digits(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     values = np.array([[1 / 3, 2.0], [np.nan, -2 / 3]])
-    _print_points(("a", "b"), values, (6, 3), as_json=False)
+    _print_points(("a", "b"), values, (6, 3))
     assert capsys.readouterr().out == "a,b\n0.333333,2.000\nnan,-0.667\n"
-    _print_points(("a", "b"), values, (6, 3), as_json=True)
+    monkeypatch.setattr("barpc.cli.points.wants_json", lambda: True)
+    _print_points(("a", "b"), values, (6, 3))
     assert json.loads(capsys.readouterr().out) == [{"a": 0.333333, "b": 2.0}, {"a": None, "b": -0.667}]
 
 

@@ -240,14 +240,19 @@ def test_two_runs_are_compared_and_one_is_reported_again(
     [(False, False, "All well.\n"), (True, False, ""), (True, True, '{\n "a": 1\n}\n')],
 )
 def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
-    quiet: bool, as_json: bool, out: str, capsys: pytest.CaptureFixture[str]
+    quiet: bool,
+    as_json: bool,
+    out: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("barpc.cli.adjust.wants_json", lambda: as_json)
     record = a_summary([], reasons=("One.",))
     result: Any = SimpleNamespace(summary={"a": 1}, record=record, passed=True)
-    assert _tell({"quiet": quiet}, {"as_json": as_json}, result) == 0
+    assert _tell({"quiet": quiet}, result) == 0
     assert capsys.readouterr() == (out, "")
     result.passed = False
-    assert _tell({"quiet": quiet}, {"as_json": as_json}, result) == 3
+    assert _tell({"quiet": quiet}, result) == 3
     assert capsys.readouterr() == (out, "barpc: exit code 3: All well. One.\n")
 
 

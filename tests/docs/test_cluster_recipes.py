@@ -8,14 +8,12 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
 import barpc
 from barpc.cli.main import cli
-from barpc.cli.terminal import EXIT_GATE
 from barpc.options import RunOptions, TieOptions
 from tests.docs.pages import DOCS
 
@@ -112,55 +110,13 @@ def test_the_job_script_of_dask_jobqueue_asks_for_what_the_page_says():
     compile(block("jobqueue"), "page", "exec")
 
 
-def documents() -> list[dict[str, Any]]:
-    yaml = pytest.importorskip("yaml")
-    return list(yaml.safe_load_all(block("yaml")))
-
-
-def test_the_manifest_is_of_kubernetes_schemas():
-    validator = pytest.importorskip("kubernetes_validate")
-    for document in documents():
-        validator.validate(document, "1.30", strict=True)
-    with pytest.raises(validator.ValidationError):  # it does look
-        validator.validate({**documents()[0], "spec": {"ports": "8786"}}, "1.30", strict=True)
-
-
-def test_the_parts_of_the_manifest_find_each_other():
-    found = {(d["kind"], d["metadata"]["name"]): d["spec"] for d in documents()}
-    service = found["Service", "barpc-scheduler"]
-    pods = {name: spec["template"] for (kind, name), spec in found.items() if kind != "Service"}
-    assert service["selector"] == pods["barpc-scheduler"]["metadata"]["labels"]
-    assert {port["port"] for port in service["ports"]} == {8786}
-    commands = {name: pod["spec"]["containers"][0]["command"] for name, pod in pods.items()}
-    assert commands["barpc-worker"][2] == "tcp://barpc-scheduler:8786"
-    images = {pod["spec"]["containers"][0]["image"] for pod in pods.values()}
-    assert images == {f"registry.example.org/barpc:{barpc.__version__}"}
-    assert f"FROM barpc:{barpc.__version__}\n" in block("dockerfile")
-    for name, pod in pods.items():
-        mounted = {mount["name"] for mount in pod["spec"]["containers"][0].get("volumeMounts", [])}
-        assert mounted == {volume["name"] for volume in pod["spec"].get("volumes", [])}, name
-    parses([word.replace("/run/barpc/urls.txt", "none.txt") for word in commands["barpc"][1:]])
-
-
-def test_what_is_finished_is_not_run_again_and_what_was_evicted_is():
-    job = next(d["spec"] for d in documents() if d["kind"] == "Job")
-    assert job["template"]["spec"]["restartPolicy"] == "Never"  # which rules on exit codes ask for
-    evicted, ended = job["podFailurePolicy"]["rules"]
-    assert evicted["action"] == "Ignore"
-    assert (ended["action"], ended["onExitCodes"]["values"]) == ("FailJob", [2, EXIT_GATE])
-
-
 @pytest.mark.parametrize("command", ["scheduler", "worker"])
-def test_the_programs_of_the_manifest_know_their_flags(command):
+def test_the_programs_of_the_job_script_know_their_flags(command):
     module = pytest.importorskip(f"distributed.cli.dask_{command}")
     known = {
         option for parameter in module.main.params for option in (*parameter.opts, *parameter.secondary_opts)
     }
-    text = block("slurm") + " ".join(
-        word for d in documents() if command in d["metadata"]["name"] and d["kind"] == "Deployment"
-        for word in d["spec"]["template"]["spec"]["containers"][0]["command"]
-    )  # fmt: skip
-    lines = [line for line in text.splitlines() if f"dask_{command}" in line or f"dask {command}" in line]
+    lines = [line for line in block("slurm").splitlines() if f"dask_{command}" in line]
     used = set(re.findall(r"(?<= )--[a-z-]+", " ".join(lines))) - {"--exact"}
     assert len(used) >= 2
     assert used <= known

@@ -16,7 +16,7 @@ from tests.docs.pages import DOCS, PAGES, ROOT, blocks
 PRESENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
 """Pages that speak of what is: the changelog speaks of what was, too."""
 
-GENERAL = {"--help", "-h", "--version", "-q", "-v", "-vv", "--quiet", "--verbose", "--debug"}
+GENERAL = {"--help", "-h", "--version", "-q", "-v", "-vv", "--quiet", "--verbose", "--debug", "--json"}
 
 
 def commands(page: Path) -> list[str]:

@@ -45,7 +45,7 @@ def test_the_manual_page_is_what_the_code_says_and_has_every_verb_and_flag():
         told = sections[f"BARPC {verb.upper()}"].replace("\\-", "-")
         command = cli.get_command(click.Context(cli), verb)
         flags = [name for p in command.params if isinstance(p, click.Option) for name in p.opts]
-        assert flags
+        assert flags or verb in ("verify", "report")  # only those that every verb has
         for flag in flags:
             assert re.search(rf"^\.B (.*, )?{re.escape(flag)}( |,|$)", told, re.MULTILINE), f"{verb} {flag}"
 

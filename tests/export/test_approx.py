@@ -10,7 +10,7 @@ import pytest
 from barpc.export import approx
 from barpc.export.approx import (
     Pinhole,
-    Samples,
+    Sampled,
     factored,
     fit_affine,
     fit_pinhole,
@@ -54,7 +54,7 @@ def test_a_pinhole_divides_by_the_depth():
 
 
 def test_the_error_is_the_largest_distance():
-    samples = Samples(np.zeros((3, 3)), np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))
+    samples = Sampled(np.zeros((3, 3)), np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))
     assert samples.error(np.array([[0.0, 1.0], [4.0, 5.0], [2.0, 2.0]])) == 5.0
 
 
@@ -78,13 +78,13 @@ def test_a_step_turns_moves_and_stretches():
 
 def test_what_is_left_is_seen_minus_projected_and_infinite_behind_the_camera():
     points = world()
-    samples = Samples(points, TRUE.project(points) + [3.0, -4.0])
+    samples = Sampled(points, TRUE.project(points) + [3.0, -4.0])
     cost, left = approx._cost(TRUE, samples)
     assert cost == pytest.approx(25.0 * len(points))
     assert left[:2] == pytest.approx([3.0, -4.0])
     with np.errstate(all="ignore"):
         beside = replace(TRUE, translation=np.array([0.0, 0.0, 0.0]))
-        assert approx._cost(beside, Samples(np.zeros((1, 3)), np.zeros((1, 2))))[0] == np.inf
+        assert approx._cost(beside, Sampled(np.zeros((1, 3)), np.zeros((1, 2))))[0] == np.inf
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -122,13 +122,13 @@ def test_a_fit_starts_on_both_sides_at_up_to_three_times_the_distance(monkeypatc
         approx, "_start", lambda sign, *rest: given.append((sign, rest[-1])) or start(sign, *rest)
     )
     points = world()
-    fit_pinhole(Samples(points, TRUE.project(points)), **{**view_of(TRUE, points[0]), "far": 6000.0})
+    fit_pinhole(Sampled(points, TRUE.project(points)), **{**view_of(TRUE, points[0]), "far": 6000.0})
     assert given == [(sign, far) for far in (6000.0, 12000.0, 18000.0) for sign in (1.0, -1.0)]
 
 
 def test_a_pinhole_is_found_where_there_is_one():
     points = world()
-    samples = Samples(points, TRUE.project(points))
+    samples = Sampled(points, TRUE.project(points))
     found = fit_pinhole(samples, **view_of(TRUE, np.array([5.0, 8.0, 0.0])))
     assert samples.error(found.project(points)) < 1e-5
     assert found.focal == pytest.approx(TRUE.focal, rel=1e-5)
@@ -141,7 +141,7 @@ def test_a_refinement_ends_where_the_squares_are_least():
     """Noisy points: at the end no unknown would lessen the sum of squares."""
     points = world(200)
     noise = np.random.default_rng(1).normal(0, 0.5, (200, 2))
-    samples = Samples(points, TRUE.project(points) + noise)
+    samples = Sampled(points, TRUE.project(points) + noise)
     start = approx._moved(TRUE, np.array([2e-3, -1e-3, 3e-3, 2.0, 3.0, 40.0, 0.01, -0.01, 5.0, -4.0]))
     found = approx._refined(start, samples)
     jacobian, (cost, left) = approx._jacobian(found, points), approx._cost(found, samples)
@@ -156,13 +156,13 @@ def test_of_the_refinements_the_one_with_the_smallest_largest_error_is_taken(mon
     monkeypatch.setattr(
         approx, "_refined", lambda *_: replace(TRUE, center=TRUE.center + [next(errors), 0.0])
     )
-    found = fit_pinhole(Samples(points, TRUE.project(points)), **view_of(TRUE, points[0]))
+    found = fit_pinhole(Sampled(points, TRUE.project(points)), **view_of(TRUE, points[0]))
     assert found.center[0] == TRUE.center[0] + 1.0
 
 
 def test_a_step_that_makes_it_worse_is_not_taken(monkeypatch):
     points = world()
-    samples = Samples(points, TRUE.project(points) + 1.0)
+    samples = Sampled(points, TRUE.project(points) + 1.0)
     monkeypatch.setattr(approx, "_moved", lambda pinhole, _: replace(pinhole, center=pinhole.center - 1.0))
     assert approx._refined(TRUE, samples) is TRUE
 
@@ -170,7 +170,7 @@ def test_a_step_that_makes_it_worse_is_not_taken(monkeypatch):
 def test_an_affine_camera_of_noise_is_that_of_least_squares():
     points = world()
     image = np.random.default_rng(3).normal(size=(60, 2)) * 100
-    found = fit_affine(Samples(points, image))
+    found = fit_affine(Sampled(points, image))
     rows = np.column_stack([points, np.ones(60)])
     assert found == pytest.approx(np.linalg.solve(rows.T @ rows, rows.T @ image).T, abs=1e-9)
     assert project_affine(found, points) == pytest.approx(rows @ found.T)
@@ -182,7 +182,7 @@ def test_a_projective_camera_of_noise_weighs_points_as_the_image_does():
     close = replace(TRUE, translation=np.array([20.0, -10.0, 900.0]))
     seen = close.project(points)
     noise = np.random.default_rng(4).normal(0, 1.0, seen.shape)
-    found = fit_projective(Samples(points, seen + noise))
+    found = fit_projective(Sampled(points, seen + noise))
     assert found[2, 3] == 1.0
     left = (seen + noise - project_projective(found, points)).ravel()
     jacobian = []

@@ -15,7 +15,7 @@ import pytest
 from barpc.cli import main
 from barpc.errors import InputError, OutputError
 from barpc.export import TARGETS, export_run
-from barpc.export.approx import Samples, factored, fit_affine, fit_projective, project_affine
+from barpc.export.approx import Sampled, factored, fit_affine, fit_projective, project_affine
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import light_of
 from barpc.sensor.geometry import image_grid
@@ -365,7 +365,7 @@ def test_the_verb_prints_what_it_wrote(southern, tmp_path, capsys):
 
 
 def test_the_verb_offers_every_target():
-    from barpc.cli.export import _TARGETS
+    from barpc.cli.finished import _TARGETS
 
     assert tuple(TARGETS) == _TARGETS
 
@@ -374,7 +374,7 @@ def test_simple_cameras_are_found_exactly_where_they_hold():
     rng = np.random.default_rng(0)
     world = rng.uniform(-500, 500, (60, 3))
     matrix = np.array([[2.0, 0.1, 0.3, 400.0], [-0.1, -2.0, 0.2, 300.0]])
-    flat = Samples(world, world @ matrix[:, :3].T + matrix[:, 3])
+    flat = Sampled(world, world @ matrix[:, :3].T + matrix[:, 3])
     np.testing.assert_allclose(fit_affine(flat), matrix, atol=1e-9)
     assert flat.error(project_affine(fit_affine(flat), world)) < 1e-9
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -382,7 +382,7 @@ def test_simple_cameras_are_found_exactly_where_they_hold():
     calibration = np.array([[3000.0, 40.0, 500.0], [0.0, 2900.0, 300.0], [0.0, 0.0, 1.0]])
     shift = np.array([10.0, -20.0, 6000.0])
     seen = (world @ turn.T + shift) @ calibration.T
-    found = factored(fit_projective(Samples(world, seen[:, :2] / seen[:, 2:])))
+    found = factored(fit_projective(Sampled(world, seen[:, :2] / seen[:, 2:])))
     for one, truth in zip(found, (calibration, turn, shift), strict=True):
         np.testing.assert_allclose(one, truth, rtol=1e-6, atol=1e-6)
 

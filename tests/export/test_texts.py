@@ -15,7 +15,7 @@ import pytest
 
 from barpc.errors import InputError
 from barpc.export import catalogue, neural, scene, stereo
-from barpc.export.approx import Samples
+from barpc.export.approx import Sampled
 from barpc.export.scene import Scene, link, pairs_of, read_scene
 from barpc.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.rpcio import read_rpc
@@ -545,7 +545,7 @@ def test_points_are_written_with_their_covariance(south):
     ]  # fmt: skip
     unknown = catalogue.points(replace(south, summary=replace(south.summary, scene=None)), OUT)["points.csv"]
     assert unknown.decode().splitlines()[0].endswith("is known to [m]: unknown")
-    assert isinstance(south.samples(south.shots[0]), Samples)
+    assert isinstance(south.samples(south.shots[0]), Sampled)
 
 
 @pytest.mark.parametrize(

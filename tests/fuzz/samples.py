@@ -21,7 +21,7 @@ from barpc.ba.priors import CameraPrior
 from barpc.cameras import open_camera
 from barpc.cli.images import read_config
 from barpc.cli.options import image_paths
-from barpc.cli.points import read_points
+from barpc.cli.points import given_points
 from barpc.cli.terminal import print_comparison
 from barpc.dem import Dem
 from barpc.errors import RpcError
@@ -428,7 +428,7 @@ AREA = (
     b' [{"type": "Polygon", "coordinates": [[[179, 0], [-179, 0], [-179, 1], [179, 0]]]}]}}]}'
 )
 OPTIONS = (
-    b'images = "none"\nrpc_formats = ["txt", "rpb"]\nnum_passes = 2\nkeep_going = true\ngcp = ["a.gcp"]\n'
+    b'images = "none"\nrpc_formats = ["txt", "rpb"]\ntiles = 512\nkeep_going = true\ngcp = ["a.gcp"]\n'
     b'[tie]\nband = 2\nangles = [1, 40.5]\nmatcher = "guided"\n[adjust]\nmodel = "rotation"\nfixed = ["left"]\n'
     b"sigma_attitude = 3.0\nview_weights = {left = 0.5}\n[fit]\ngrid = [12, 12, 7]\ntolerance = 1e-3\n"
 )
@@ -502,7 +502,7 @@ SAMPLES: dict[str, Sample] = {
     ),
     "points of a verb": Sample(
         "p.txt",
-        lambda path: read_points((), str(path), ("lon", "lat", "alt"), 0.0),
+        lambda path: given_points((), str(path), ("lon", "lat", "alt"), 0.0),
         lambda: b"lon,lat,alt\n5.4,43.2,100\n5.5,43.3\n",
         (mutate_text,),
     ),

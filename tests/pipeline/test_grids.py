@@ -449,7 +449,7 @@ def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(
     monkeypatch.setattr(grids, "GridCorrected", lambda rpc, lacking: lacking)
     monkeypatch.setattr(grids, "_off", lambda sample, camera: (*known[camera], where))
     sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0))
-    rpc, lacking, miss = grids.correction_of(given, sample)  # type: ignore[arg-type]
+    rpc, lacking, miss = grids.grid_correction(given, sample)  # type: ignore[arg-type]
     assert asked == list(names[:tried])
     assert lacking == chosen
     assert miss == (*known[chosen], where)
@@ -467,7 +467,7 @@ def test_where_no_rpc_can_be_added_to_the_last_reason_is_given(monkeypatch) -> N
     monkeypatch.setattr(grids, "fit_rpc", fit)
     sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0))
     with pytest.raises(FitError, match="no fit by ridge"):
-        grids.correction_of(make_rpc(), sample)  # type: ignore[arg-type]
+        grids.grid_correction(make_rpc(), sample)  # type: ignore[arg-type]
 
 
 def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
@@ -546,7 +546,7 @@ def test_what_a_dead_run_left_in_the_room_is_written_again(
     rpc = make_rpc()
     (tmp_path / "a").mkdir()
     monkeypatch.setattr(grids, "DirectGrid", SimpleNamespace(of=grid))
-    monkeypatch.setattr(grids, "correction_of", correction)
+    monkeypatch.setattr(grids, "grid_correction", correction)
     monkeypatch.setattr(grids, "_off", lambda sample, camera: (0.1, 0.2, where))
     for kind in ("grid", "correction", "resampled"):
         monkeypatch.setattr(grids, f"write_{kind}", recorded(kind))

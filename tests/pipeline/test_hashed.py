@@ -13,8 +13,8 @@ import pytest
 from barpc.errors import InputError
 from barpc.identity import Stamp, take
 from barpc.options import RunOptions, TieOptions
-from barpc.pipeline import hashed
-from barpc.pipeline.hashed import hash_files, hash_inputs
+from barpc.pipeline import inputs as hashed
+from barpc.pipeline.inputs import hash_files, hash_inputs
 from barpc.remote import Remote
 from tests.rpcio.conftest import write_image
 

@@ -26,9 +26,7 @@ def test_tie_points_from_a_file_give_the_same_answer(known, matched, tmp_path):
     result, out = matched
     runs = []
     for name in ("matches.csv", "matches.npz"):
-        given = RunOptions(
-            matches_only=True, matches=str(out / name), stop_after="adjustment", pictures=False
-        )
+        given = RunOptions(matches_only=True, matches=str(out / name), stop_after="adjustment")
         again = adjust(known.images, tmp_path / name, given)
         np.testing.assert_array_equal(again.tracks.xy, result.tracks.xy)
         np.testing.assert_array_equal(again.tracks.sigma, result.tracks.sigma)
@@ -56,9 +54,7 @@ def test_asp_text_matches_hold_the_same_tie_points(matched):
 
 @WHOLE_AT_NIGHT
 def test_control_points_put_the_scene_in_its_place(known, matched, tmp_path):
-    options = RunOptions(
-        matches_only=True, matches=str(matched[1] / "matches.npz"), gcp=(str(known.gcps),), pictures=False
-    )
+    options = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), gcp=(str(known.gcps),))
     result = adjust(known.images, tmp_path / "out", options)
     rms, offset = errors_at_check_points(
         [read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], known.truth
@@ -102,7 +98,7 @@ def test_a_stray_image_is_named_and_left_out_when_asked(known, tmp_path):
     with pytest.raises(DisconnectedError) as caught:
         adjust([*known.images, stray], tmp_path / "out", RunOptions(stop_after="matching"))
     assert caught.value.groups[1] == ("img_01",)
-    options = RunOptions(keep_going=True, overwrite=True, pictures=False)
+    options = RunOptions(keep_going=True, overwrite=True)
     result = adjust([*known.images, stray], tmp_path / "out", options)  # what was found is not found again
     assert [view.name for view in result.views] == ["view_00", "view_01", "view_02"]
     assert not result.passed
@@ -131,7 +127,7 @@ def test_a_real_stray_image_is_left_out(corner, shared_data, tmp_path):
 @pytest.mark.slow  # before a commit: the option
 @WHOLE_AT_NIGHT
 def test_a_later_run_goes_on_from_an_earlier_block(known, matched, tmp_path):
-    given = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), pictures=False)
+    given = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"))
     two = tmp_path / "two.csv"
     rows = (matched[1] / "matches.csv").read_text().splitlines(keepends=True)
     two.write_text("".join(row for row in rows if not row.startswith("view_02")))
@@ -161,17 +157,6 @@ def test_what_the_earlier_block_knew_does_not_count_twice():
     assert new.view.tolist() == [1, 2, 1, 2]
     assert new.point.tolist() == [0, 0, 1, 1]
     assert new.sigma.tolist() == [0.2, 0.1, 1, 1]
-
-
-@pytest.mark.slow
-@WHOLE_AT_NIGHT
-def test_a_second_pass_matches_with_the_adjusted_cameras(known, tmp_path):
-    images = known.images if known.whole else known.images[:2]
-    result = adjust(images, tmp_path / "out", RunOptions(num_passes=2, pictures=False))
-    truth = {**known.truth, "views": known.truth["views"][: len(images)]}
-    rms, _ = errors_at_check_points([read_rpc(tmp_path / f"out/{v.name}.vrt") for v in result.views], truth)
-    assert rms <= 0.02
-    assert "tie points (pass 2)" in [stage["stage"] for stage in result.summary["stages"]]
 
 
 @pytest.mark.slow
@@ -210,9 +195,7 @@ def test_paths_with_spaces_and_accents_and_equal_stems(corner, tmp_path):
 
 @WHOLE_AT_NIGHT
 def test_check_points_are_measured_and_not_used(known, matched, tmp_path):
-    given = RunOptions(
-        matches_only=True, matches=str(matched[1] / "matches.npz"), pictures=False, stop_after="adjustment"
-    )
+    given = RunOptions(matches_only=True, matches=str(matched[1] / "matches.npz"), stop_after="adjustment")
     free = adjust(known.images, tmp_path / "free", given)
     checked = adjust(known.images, tmp_path / "checked", replace(given, check_points=(str(known.gcps),)))
     np.testing.assert_array_equal(checked.adjustment.params, free.adjustment.params)

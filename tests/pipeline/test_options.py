@@ -35,7 +35,7 @@ class Run:
     ) -> AdjustResult:
         given = () if matches is None else str(self.scene / matches)
         images = options.pop("given", sorted(self.scene.glob("*.tif")))
-        options = {"matches_only": matches is not None, "pictures": False, **options}
+        options = {"matches_only": matches is not None, **options}
         return adjust(images, self.out / out, RunOptions(matches=given, **options))
 
     def once(self, name: str, *given: Any, **options: Any) -> AdjustResult:
@@ -49,7 +49,7 @@ class Run:
     @property
     def plain(self) -> AdjustResult:
         """The run without any option; its files: `folder`."""
-        return self.once("plain", pictures=True)
+        return self.once("plain")
 
     @property
     def folder(self) -> Path:
@@ -68,7 +68,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene") / "in"
     folder.mkdir()
     images = part(folder, SIDE, 240, gcps=4).images
-    adjust(images, folder / "first", RunOptions(stop_after="matching", pictures=False))
+    adjust(images, folder / "first", RunOptions(stop_after="matching"))
     first = RunOptions(matches_only=True, matches=str(folder / "first/matches.csv"), stop_after="adjustment")
     adjust(images[:2], folder / "earlier", first)
     (folder / "dem").mkdir()
@@ -103,12 +103,6 @@ def images(run: Run, out: Path, scene: Path) -> None:
         assert _names(out / chosen) & {".vrt", ".tif"} == suffix
 
 
-def pictures(run: Run, out: Path, scene: Path) -> None:
-    run("without")
-    assert [(folder / "pictures.json").exists() for folder in (run.folder, out / "without")] == [True, False]
-    assert "data:image/jpeg" not in (out / "without/report.html").read_text()
-
-
 def grids(run: Run, out: Path, scene: Path) -> None:
     run("always", grids=True)
     needed, always = (
@@ -136,12 +130,6 @@ def rpc_formats(run: Run, out: Path, scene: Path) -> None:
     assert _names(out / "a") & {".RPB", ".geom", ".TXT"} == {".RPB", ".geom"}
     with pytest.raises(InputError, match="rpc_formats 'nitf'"):
         RunOptions(rpc_formats=("nitf",))
-
-
-def num_passes(run: Run, out: Path, scene: Path) -> None:
-    two = run("two", matches=None, num_passes=2, stop_after="adjustment")
-    stages = [{stage["stage"] for stage in found.summary["stages"]} for found in (run.plain, two)]
-    assert stages[1] - stages[0] == {"tie points (pass 2)", "adjustment (pass 2)"}
 
 
 def stop_after(run: Run, out: Path, scene: Path) -> None:
@@ -337,20 +325,14 @@ def allow_remote(run: Run, out: Path, scene: Path) -> None:  # what is read so: 
         RunOptions(allow_remote=("a b",))
 
 
-def store(run: Run, out: Path, scene: Path) -> None:  # what goes there: tests/remote/test_stores.py
-    assert RunOptions(store="s3://bucket/folder").store == "s3://bucket/folder"
-    with pytest.raises(InputError, match="store 'folder' is no s3://BUCKET/FOLDER"):
-        RunOptions(store="folder")
-
-
 ROWS = {
-    "images": images, "rpc_formats": rpc_formats, "num_passes": num_passes, "stop_after": stop_after,
-    "pictures": pictures, "grids": grids, "tiles": tiles, "resample": resample,
+    "images": images, "rpc_formats": rpc_formats, "stop_after": stop_after,
+    "grids": grids, "tiles": tiles, "resample": resample,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "altimetry": altimetry, "check_points": check_points,
     "fixed_run": fixed_run, "dem": dem, "geoid": geoid,
     "reference": reference, "reference_sigma": reference_sigma,
-    "allow_remote": allow_remote, "store": store, "tie": tie, "adjust": adjust_, "fit": fit,
+    "allow_remote": allow_remote, "tie": tie, "adjust": adjust_, "fit": fit,
 }  # fmt: skip
 
 
@@ -359,7 +341,7 @@ def test_every_option_has_a_row() -> None:
 
 
 ELSEWHERE = (
-    "overlap_list", "aoi", "gcp", "check_points", "geoid", "num_passes", "grids", "tiles", "allow_remote", "dem",
+    "overlap_list", "aoi", "gcp", "check_points", "geoid", "grids", "tiles", "allow_remote", "dem",
     "keep_going", "images",
 )  # fmt: skip
 """Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids, tests/test_dem,
@@ -381,7 +363,7 @@ def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene:
     [
         ({"images": "jpeg"}, "images"),
         ({"stop_after": "lunch"}, "stop_after"),
-        ({"num_passes": 0}, "num_passes"),
+        ({"tiles": 0}, "tiles"),
         ({"matches": "a", "matches_only": True, "aoi": "b"}, "aoi is given with matches_only"),
         (
             {"matches": "a", "matches_only": True, "overlap_list": "b"},

@@ -285,7 +285,7 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
         stop: output_names([view, other], RunOptions(stop_after=stop, rpc_formats=("rpb",)), tmp_path)
         for stop in ("matching", "adjustment", "all")
     }
-    common = [*TABLES, "summary.json"] + (["report.html", "pictures.json"] if can_render() else [])
+    common = [*TABLES, "summary.json"] + (["report.html"] if can_render() else [])
     pairs = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"]
     assert sorted(names["matching"]) == sorted([*common, "matches.csv", "matches.npz", *pairs])
     assert sorted(names["adjustment"]) == sorted([*common, PRIOR])
@@ -313,7 +313,7 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
         watched = lambda self, name, *given, real=real: (written.append(name), real(self, name, *given))[1]  # noqa: E731
         monkeypatch.setattr(Workspace, method, watched)
     with Workspace(tmp_path / "out") as run:
-        plain = SimpleNamespace(reference=None, options=RunOptions(pictures=False))
+        plain = SimpleNamespace(reference=None, options=RunOptions())
         told = outputs.write_tables(run, plain, Said("what was found"))  # type: ignore[arg-type]
     names = ["a.csv", "b.csv", *(["report.html"] if page else []), "summary.json"]
     assert list(dict.fromkeys(written)) == names
@@ -437,22 +437,19 @@ def test_points_of_a_reference_are_written_where_it_held_the_block(
     assert (tmp_path / "out/gcps.geojson").exists() == written
 
 
-@pytest.mark.parametrize(("page", "wanted"), [(True, True), (True, False), (False, True)])
-def test_pictures_are_drawn_of_the_band_that_is_matched(tmp_path, monkeypatch, page, wanted) -> None:
+@pytest.mark.parametrize("page", [True, False])
+def test_the_stages_of_a_run_are_told_with_those_of_its_tables(tmp_path, monkeypatch, page) -> None:
     monkeypatch.setattr(outputs, "TABLES", {})
     monkeypatch.setattr(outputs, "can_render", lambda: page)
     monkeypatch.setattr(outputs, "report_html", lambda summary, folder: "page")
-    monkeypatch.setattr(outputs, "pictures", lambda run, band: f"band {band}")
-    options = RunOptions(pictures=wanted, tie=TieOptions(band=3))
+    options = RunOptions(tie=TieOptions(band=3))
     run = SimpleNamespace(reference=None, adjustment=None, options=options)
     said = Said("x", (StageEntry("before", 1.0, 1.0, 1.0),))
     with Workspace(tmp_path / "out") as workspace:
         with workspace.stage("earlier"):
             pass
         told = outputs.write_tables(workspace, run, said)  # type: ignore[arg-type]
-    place = tmp_path / "out/pictures.json"
-    assert (place.read_text() if place.exists() else None) == ("band 3" if page and wanted else None)
-    stages = ["before", *["pictures"] * (page and wanted), "tables", "report"]
+    stages = ["before", "tables", "report"]
     assert [stage.stage for stage in told.stages] == stages
     assert json.loads((tmp_path / "out/summary.json").read_text())["stages"] == [
         asdict(one) for one in told.stages

@@ -13,7 +13,7 @@ import pytest
 from barpc.errors import InputError
 from barpc.pipeline import proof
 from barpc.pipeline.grids import REOPENED
-from barpc.pipeline.proof import CHANGED, GOOD, MISSING, MOVED, SAME, UNKNOWN, Finding, prove
+from barpc.pipeline.proof import CHANGED, GOOD, MISSING, MOVED, SAME, UNKNOWN, Proved, prove
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
 
@@ -38,7 +38,7 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_the_words_are_those_of_the_page() -> None:
     assert (SAME, MOVED, CHANGED, MISSING, UNKNOWN) == ("same", "moved", "changed", "missing", "not asked")
     assert GOOD == (SAME, MOVED)
-    assert Finding("input", "a", SAME).note == ""
+    assert Proved("input", "a", SAME).note == ""
 
 
 @pytest.mark.parametrize("lacks", ["inputs", "outputs"])
@@ -51,17 +51,17 @@ def test_a_run_without_hashes_is_refused(told, tmp_path, lacks) -> None:
 def test_an_input_is_looked_for_in_the_run_beside_it_and_where_one_says(told, tmp_path) -> None:
     (path := tmp_path / "in.tif").write_bytes(b"one")
     told.inputs = [noted(path)]
-    assert prove(tmp_path / "out") == [Finding("input", str(path), SAME)]
+    assert prove(tmp_path / "out") == [Proved("input", str(path), SAME)]
     path.write_bytes(b"two")
-    assert prove(tmp_path / "out") == [Finding("input", str(path), CHANGED)]
+    assert prove(tmp_path / "out") == [Proved("input", str(path), CHANGED)]
     for place in (tmp_path / "out", tmp_path / "elsewhere"):
         place.mkdir(exist_ok=True)
         (place / "in.tif").write_bytes(b"one")
         (found,) = prove(tmp_path / "out", [tmp_path / "elsewhere"])
-        assert found == Finding("input", str(path), MOVED, f"it is {place / 'in.tif'}")
+        assert found == Proved("input", str(path), MOVED, f"it is {place / 'in.tif'}")
         (place / "in.tif").unlink()
     path.unlink()
-    assert prove(tmp_path / "out") == [Finding("input", str(path), MISSING)]
+    assert prove(tmp_path / "out") == [Proved("input", str(path), MISSING)]
     told.inputs = [SimpleNamespace(path=str(tmp_path / "old" / "in.tif"), sha256=sha256(b"one").hexdigest())]
     path.write_bytes(b"one")  # beside the run
     (found,) = prove(tmp_path / "out")
@@ -70,19 +70,19 @@ def test_an_input_is_looked_for_in_the_run_beside_it_and_where_one_says(told, tm
 
 def test_an_input_on_another_host_is_not_asked(told, tmp_path) -> None:
     told.inputs = [SimpleNamespace(path="https://a.org/x.tif", sha256="0")]
-    assert prove(tmp_path / "out") == [Finding("input", "https://a.org/x.tif", UNKNOWN, "on another host")]
+    assert prove(tmp_path / "out") == [Proved("input", "https://a.org/x.tif", UNKNOWN, "on another host")]
 
 
 def test_an_output_is_the_same_changed_or_missing(told, tmp_path) -> None:
     (path := tmp_path / "out" / "a.csv").write_bytes(b"one")
     told.outputs = [noted(path, "file")]
-    assert prove(tmp_path / "out") == [Finding("output", "a.csv", SAME)]
+    assert prove(tmp_path / "out") == [Proved("output", "a.csv", SAME)]
     path.write_bytes(b"two")
-    assert prove(tmp_path / "out") == [Finding("output", "a.csv", CHANGED)]
+    assert prove(tmp_path / "out") == [Proved("output", "a.csv", CHANGED)]
     path.unlink()
-    assert prove(tmp_path / "out") == [Finding("output", "a.csv", MISSING)]
+    assert prove(tmp_path / "out") == [Proved("output", "a.csv", MISSING)]
     path.mkdir()
-    assert prove(tmp_path / "out") == [Finding("output", "a.csv", MISSING)]
+    assert prove(tmp_path / "out") == [Proved("output", "a.csv", MISSING)]
 
 
 def test_what_cannot_be_read_counts_as_missing(told, tmp_path, monkeypatch) -> None:
@@ -93,7 +93,7 @@ def test_what_cannot_be_read_counts_as_missing(told, tmp_path, monkeypatch) -> N
         raise PermissionError(path)
 
     monkeypatch.setattr(proof, "take", refuse)
-    assert prove(tmp_path / "out") == [Finding("output", "a.csv", MISSING)]
+    assert prove(tmp_path / "out") == [Proved("output", "a.csv", MISSING)]
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def camera(told, tmp_path) -> Any:
 
 
 def test_a_camera_that_reads_as_certified_is_the_same(camera, tmp_path) -> None:
-    assert prove(tmp_path / "out") == [Finding("camera", "a_RPC.TXT", SAME)]
+    assert prove(tmp_path / "out") == [Proved("camera", "a_RPC.TXT", SAME)]
 
 
 @pytest.mark.parametrize(("off", "now"), [(0.9, SAME), (1.2, CHANGED)])
@@ -128,7 +128,7 @@ def test_a_camera_may_be_off_by_what_is_stated_and_the_rounding_of_its_file(
 def test_one_point_that_is_off_is_enough_in_both_directions(camera, tmp_path) -> None:
     camera.certified[2][4] -= 5.0
     said = "reads 5 px off the certified camera, 1e-09 stated"
-    assert prove(tmp_path / "out") == [Finding("camera", "a_RPC.TXT", CHANGED, said)]
+    assert prove(tmp_path / "out") == [Proved("camera", "a_RPC.TXT", CHANGED, said)]
 
 
 def test_a_camera_that_cannot_be_opened_says_why(camera, tmp_path) -> None:

@@ -17,8 +17,16 @@ from barpc.fit import FitOptions, fit_rpc
 from barpc.options import AdjustOptions, RunOptions
 from barpc.pipeline import inputs
 from barpc.pipeline import run as stages
-from barpc.pipeline.given import given_matches, given_tracks
-from barpc.pipeline.inputs import PRIOR, input_files, only_new, read_pairs, side_inputs, with_located
+from barpc.pipeline.inputs import (
+    PRIOR,
+    given_matches,
+    given_tracks,
+    input_files,
+    only_new,
+    read_pairs,
+    side_inputs,
+    with_located,
+)
 from barpc.pipeline.outputs import output_names
 from barpc.report import Run
 from barpc.scene import Tracks, View
@@ -239,15 +247,11 @@ def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(
 # --- outputs ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("drawn", "pictures", "shown"), [(True, True, 2), (True, False, 1), (False, True, 0)]
-)
-def test_the_page_and_its_pictures_are_named_where_they_can_be_drawn(
-    tmp_path, monkeypatch, drawn, pictures, shown
-) -> None:
+@pytest.mark.parametrize("drawn", [True, False])
+def test_the_page_is_named_where_it_can_be_drawn(tmp_path, monkeypatch, drawn) -> None:
     monkeypatch.setattr("barpc.pipeline.outputs.can_render", lambda: drawn)
-    names = output_names(views(), RunOptions(pictures=pictures), tmp_path)
-    assert len({"report.html", "pictures.json"} & set(names)) == shown
+    names = output_names(views(), RunOptions(), tmp_path)
+    assert ("report.html" in names) is drawn
     assert ("gcps.geojson" in output_names(views(), RunOptions(dem="d", reference=("r",)), tmp_path)) is True
     assert "gcps.geojson" not in names
     assert names[-1] == PRIOR
@@ -367,7 +371,7 @@ def test_a_check_has_no_folder_to_make_a_report_of() -> None:
 def test_a_stage_that_is_one_task_says_its_beginning_and_its_end(corner, tmp_path) -> None:
     """Also where it ends in an error its beginning; nobody need listen."""
     told: list[tuple[str, int, int]] = []
-    options = RunOptions(pictures=False, stop_after="adjustment")
+    options = RunOptions(stop_after="adjustment")
     result = stages.adjust(
         corner.images[:2], tmp_path / "out", options, progress=lambda *now: told.append(now)
     )

@@ -18,7 +18,7 @@ from barpc.options import RunOptions
 from barpc.rpcio import write_rpc_vrt
 from tests.reliability.trials import SAMPLES, crop, outputs
 
-AGAIN = RunOptions(overwrite=True, pictures=False)
+AGAIN = RunOptions(overwrite=True)
 
 
 @pytest.fixture

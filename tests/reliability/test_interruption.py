@@ -307,7 +307,7 @@ def test_stages_are_told_with_seconds_and_memory(crops, tmp_path, caplog, whole,
     spent = time.process_time() - start
     summary = json.loads((tmp_path / "out/summary.json").read_text())
     names = [stage["stage"] for stage in summary["stages"]]
-    told = "inputs, fingerprints, tie points, adjustment, fit, write, verify, block, summary, pictures, tables, report"
+    told = "inputs, fingerprints, tie points, adjustment, fit, write, verify, block, summary, tables, report"
     assert names == told.split(", ")
     told = sum(stage["cpu_seconds"] for stage in summary["stages"])
     assert share * spent < told <= spent + 0.0005 * len(names)  # of rounding

@@ -36,7 +36,7 @@ def scene(tmp_path_factory) -> Path:
     square = [[lon + 3e-4 * x, lat + 3e-4 * y] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
     (folder / "area.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [square]}))
     (folder / "pairs.txt").write_text("view_02 view_00\nview_01 view_00\n")
-    adjust(images, folder / "ties", RunOptions(stop_after="matching", pictures=False))
+    adjust(images, folder / "ties", RunOptions(stop_after="matching"))
     rows = (folder / "ties/matches.csv").read_text().splitlines(keepends=True)
     (folder / "two.csv").write_text("".join(row for row in rows if not row.startswith("view_02")))
     two = RunOptions(matches=str(folder / "two.csv"), matches_only=True, stop_after="adjustment")
@@ -48,7 +48,6 @@ def scene(tmp_path_factory) -> Path:
 def ways(scene: Path) -> dict[str, RunOptions]:
     return {
         "the defaults": RunOptions(),
-        "two passes": RunOptions(num_passes=2),
         "given matches": RunOptions(matches=str(scene / "ties/matches.csv"), matches_only=True),
         "matches to be verified": RunOptions(matches=str(scene / "ties/matches.csv")),
         "control points": RunOptions(
@@ -251,7 +250,7 @@ def test_an_image_in_which_only_nan_differs_is_no_twin(scene, tmp_path):
 def test_a_part_of_an_image_is_named_in_the_verdict(scene, tmp_path):
     images = images_of(scene, "")
     part = crop(SAMPLES[0], tmp_path / "part.tif", side=100, start=START + 30)
-    options = RunOptions(stop_after="adjustment", pictures=False)
+    options = RunOptions(stop_after="adjustment")
     with pytest.warns(BarpcWarning, match="held in height"):
         summary = adjust([*images, part], tmp_path / "out", options).summary
     advice = {view["name"]: view["advice"] for view in summary["views"]}

@@ -24,7 +24,7 @@ def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("shadows")
     (folder / "in").mkdir()
     images = [crop(source, folder / "in" / source.name) for source in SAMPLES[:2]]
-    adjust(images, folder / "run", RunOptions(pictures=False))
+    adjust(images, folder / "run", RunOptions())
     return folder
 
 

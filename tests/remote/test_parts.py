@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from barpc import remote
-from barpc.errors import InputError, OutputError
 from barpc.remote import BLOCK, Part, Remote, RemoteFile, _Blocks, _runs, beside, is_url, place, stores, web
 
 AT = Remote("https://a.org/b/x.tif", 20 * BLOCK + 5, "one")
@@ -596,20 +595,6 @@ def test_the_files_beside_an_object_are_listed_once_a_minute(shelf, monkeypatch)
     now[0] = 61.0
     assert stores.beside(at, ["z"]) == {"z": "Z"}
     assert len(shelf.asked) == 2
-
-
-def test_objects_are_put_got_and_dropped(shelf):
-    stores.put("s3://b/new", b"data")
-    assert stores.get("s3://b/new") == b"data"
-    assert stores.get("s3://b/none") is None
-    with pytest.raises(
-        OutputError, match=r"full: cannot be written \(its store answers PermissionError: no leave\)"
-    ):
-        stores.put("s3://b/full", b"")
-    with pytest.raises(InputError, match="shut: cannot be read"):
-        stores.get("s3://b/shut")
-    stores.drop("s3://b/run")  # as far as it lets us
-    assert shelf.asked[-1] == ("rm", "s3://b/run", True)
 
 
 def test_what_a_store_says_has_300_letters_at_most_and_may_be_nothing():

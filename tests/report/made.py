@@ -20,7 +20,7 @@ from barpc.report.summary import (
     TracksEntry,
     ViewEntry,
 )
-from barpc.report.tables import Observations, Pictures, RunFiles
+from barpc.report.tables import Observations, RunFiles
 
 _VIEW: dict[str, Any] = {
     "path": "", "size": (1000, 800), "alt_range_m": (0.0, 500.0), "rpc_source": None, "gsd_m": 0.5,
@@ -79,13 +79,11 @@ def files_of(
     outlines: Sequence[Sequence[Array]] = (),
     points: Sequence[tuple[float, ...]] = (),
     observed: Observations | None = None,
-    pictures: Pictures | None = None,
 ) -> RunFiles:
     """A run's files."""
     table = np.array(points, dtype=float).reshape(-1, 4)
     rings = outlines or [()] * len(summary.views)
-    found = pictures or Pictures({}, ())
-    return RunFiles(summary, observed or seen([]), table, np.arange(len(table)), rings, found)
+    return RunFiles(summary, observed or seen([]), table, np.arange(len(table)), rings)
 
 
 def a_square(lon: float, lat: float, half: float = 0.01) -> list[Array]:

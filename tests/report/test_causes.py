@@ -16,7 +16,7 @@ from barpc.ba.moving import Motion
 from barpc.ba.placing import Look
 from barpc.ba.scan import Interval
 from barpc.report import verdict
-from barpc.report.summary.causes import _WORDS, _place, explanations, left_over, strangeness
+from barpc.report.summary.causes import _WORDS, _place, explanations, left_entries, strangeness
 
 NAMES = "west", "east"
 
@@ -161,7 +161,7 @@ def test_what_is_left_is_a_reason_where_it_is_much() -> None:
         "2.50 px."
     )
     assert second == "Rows 100-399 of east stand out: their tie points are left with 0.09 px in common."
-    assert [one.last for one in left_over(run.adjustment)] == [399.0] * 3
+    assert [one.last for one in left_entries(run.adjustment)] == [399.0] * 3
     quiet: Any = SimpleNamespace(adjustment=adjustment(left=[interval(0, 0.1, 0.05)]), met_worse=[])
     assert verdict._left_reasons(quiet) == []
 

@@ -10,16 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from barpc.report import charts, maps
-from barpc.report.maps import Plane, cells_of, ground_map, place_map, residual_panels
-from barpc.report.summary import CheckPointEntry, EllipseEntry
+from barpc.report import maps
+from barpc.report.maps import Plane, ground_map, residual_cells, residual_panels
+from barpc.report.summary import CheckPointEntry
 from barpc.report.summary.causes import ExplanationEntry
-from barpc.report.summary.moving import MovingEntry
-from barpc.report.tables import Pictures
+from barpc.report.summary.scene import MovingEntry
 
 from .made import (
     Drawing,
-    a_correction,
     a_gcp,
     a_pair,
     a_square,
@@ -302,96 +300,10 @@ def test_numbers_do_not_stand_on_each_other_and_farther_apart_where_there_are_ma
 # --- error ellipses ---------------------------------------------------------------------------------------
 
 
-def known(name: str, major: float | None, minor: float = 1.0, ce90: float = 5.0, **fields):
-    ellipse = None if major is None else EllipseEntry(major, minor, 30.0, ce90)
-    return a_view(name, correction=a_correction(ellipse=ellipse), **fields)
-
-
 def shapes_of(svg: str):
     names = "".join(rf' {name}="([\d.]+)"' for name in ("cx", "cy", "rx", "ry"))
     pattern = rf'<ellipse{names} transform="rotate\(([-\d.]+) ([\d.]+) ([\d.]+)\)"'
     return [tuple(map(float, found)) for found in re.findall(pattern, svg)]
-
-
-def test_an_ellipse_has_its_axes_its_direction_and_its_words():
-    views = [known("A", 4.0, 2.0, 7.0), known("B", 3.0, 1.0, 9.0, stated_ce90_m=2 * 2.146), known("C", 1.0)]
-    _, outlines, _ = scene()
-    svg, words = place_map(files_of(a_summary(views), outlines))
-    drawn, at = Drawing(svg), maps._plane_of(np.concatenate([*chain(*outlines)]))
-    times = float(re.search(r"([\d.e+]+) times as large", words)[1])
-    scale = times * at.scale
-    assert 34.0 / 2.5 < 3.0 * scale <= 34.0  # the largest that fits of 1, 2, 5
-    assert math.log10(times) % 1 == pytest.approx(
-        min((0, 0.30103, 0.69897), key=lambda v: abs(v - math.log10(times) % 1)), abs=1e-4
-    )
-    (b, c) = shapes_of(svg)  # of A and B the one with the larger CE90
-    x, y = at(outlines[0][0][:-1]).mean(axis=0)
-    assert b == pytest.approx((x, y, 3.0 * scale, 1.0 * scale, -60.0, x, y), abs=0.006)
-    assert c[2:4] == pytest.approx((scale, scale), abs=0.006)
-    assert drawn.of("circle", "ellipse stated", "cx", "cy", "r") == [
-        pytest.approx((x, y, 2.0 * scale), abs=0.006)
-    ]
-    assert drawn.titles("ellipse") == [
-        "B: 3.0 m by 1.0 m, CE90 9.0 m, stated 4.3 m",
-        "C: 1.0 m by 1.0 m, CE90 5.0 m",
-    ]
-    assert words == (
-        f"One sigma of the place on the ground of an image's middle, {times:g} times as large as the map; dashed "
-        "circles: as stated with the camera delivered. Of images that lie over each other the one with the largest."
-    )
-    for found, outline in zip(drawn.points("faint"), outlines, strict=True):
-        assert np.array(found) == pytest.approx(at(outline[0][:-1]), abs=0.006)
-    room = min(34.0, 0.5 * float(np.linalg.norm(at(np.array([0.1, 0.0])) - at(np.array([0.0, 0.0])))))
-    assert drawn.texts("stack")[0] == (
-        "1-2",
-        pytest.approx(x, abs=0.006),
-        pytest.approx(y - room - 8 + 4, abs=0.006),
-        "middle",
-    )
-
-
-def test_an_ellipse_alone_has_twice_the_room_and_a_map_may_be_to_scale():
-    at = maps._plane_of(a_square(10.0, 0.0)[0])
-    for major in (68.0 / at.scale, 68.1 / at.scale):
-        svg, words = place_map(files_of(a_summary([known("A", major)]), [a_square(10.0, 0.0)]))
-        fits = major * at.scale < 68.05
-        assert ("to scale as the map" in words) == fits
-        assert ("0.5 times as large" in words) == (not fits)
-        assert shapes_of(svg)[0][2] == pytest.approx(68.0 if fits else 34.05, abs=0.01)
-    assert "Of images" not in words
-    assert "dashed" not in words
-
-
-def test_near_images_have_ellipses_of_half_their_distance():
-    outlines = [a_square(10.0, 0.0), a_square(10.03, 0.0), a_square(10.06, 0.0), a_square(10.2, 0.0)]
-    at = maps._plane_of(np.concatenate([*chain(*outlines)]))
-    views = [known(name, 1.0) for name in "ABCD"]
-    _svg, words = place_map(files_of(a_summary(views), outlines))
-    times = float(re.search(r"([\d.e+]+) times as large", words)[1])
-    half = 0.5 * 0.03 * at.unit[0]
-    assert half / 2.5 < times * at.scale <= half < 34
-
-
-def test_what_is_stated_may_be_the_largest_and_what_is_not_known_is_not_drawn():
-    stated = known("A", 1.0, stated_ce90_m=100 * 2.146)
-    svg, _ = place_map(files_of(a_summary([stated]), [a_square(10.0, 0.0)]))
-    radius = Drawing(svg).of("circle", "ellipse stated", "r")[0][0]
-    assert 68 / 2.5 < radius <= 68
-    for views in ([known("A", None)], [a_view("A")], [known("A", 0.0, 0.0)]):
-        assert place_map(files_of(a_summary(views), [a_square(10.0, 0.0)])) is None
-    assert place_map(files_of(a_summary([known("A", 1.0)]))) is None  # no outline
-    _, words = place_map(
-        files_of(a_summary([known("A", 1.0), known("B", None)]), [a_square(10.0, 0.0), a_square(10.5, 0.0)])
-    )
-    assert words.endswith("the one with the largest.")
-
-
-def test_more_than_thirty_stacks_have_ellipses_without_numbers():
-    outlines = [a_square(10.0 + 0.4 * (k % 8), 0.4 * (k // 8)) for k in range(31)]
-    for num in (30, 31):
-        svg, _ = place_map(files_of(a_summary([known(f"V{k}", 1.0) for k in range(num)]), outlines[:num]))
-        assert bool(Drawing(svg).texts("stack")) == (num == 30)
-        assert len(shapes_of(svg)) == num
 
 
 # --- residuals over an image ------------------------------------------------------------------------------
@@ -399,13 +311,13 @@ def test_more_than_thirty_stacks_have_ellipses_without_numbers():
 
 def test_a_cell_has_the_rms_and_the_mean_of_its_residuals():
     xy = np.array([[10.0, 10.0], [20.0, 20.0], [799.0, 399.0]])
-    found = cells_of(xy, np.array([[3.0, 4.0], [1.0, 0.0], [0.0, -2.0]]), (800, 400))
+    found = residual_cells(xy, np.array([[3.0, 4.0], [1.0, 0.0], [0.0, -2.0]]), (800, 400))
     assert found.rms[0, 0] == pytest.approx(math.sqrt(13))
     assert found.rms[7, 7] == 2.0
     assert found.mean[0, 0] == pytest.approx([2.0, 2.0])
     assert np.isfinite(found.rms).sum() == 2
     assert found.share == 0.0
-    assert cells_of(np.zeros((0, 2)), np.zeros((0, 2)), (800, 400)).share == 0.0
+    assert residual_cells(np.zeros((0, 2)), np.zeros((0, 2)), (800, 400)).share == 0.0
 
 
 @pytest.mark.parametrize(
@@ -416,14 +328,14 @@ def test_a_mean_of_ten_or_more_above_three_times_its_error_is_systematic(num, me
     residuals = np.column_stack([np.full(num, mean), np.where(np.arange(num) % 2, 1.0, -1.0)])
     if num % 2:
         residuals[-1, 1] = 0.0
-    found = cells_of(np.full((num, 2), 10.0), residuals, (800, 800))
+    found = residual_cells(np.full((num, 2), 10.0), residuals, (800, 800))
     assert bool(found.systematic[0, 0]) == marked
     assert found.systematic.sum() == marked
     assert found.share == float(marked)
 
 
-def panels(rows, views, when="after", looks=None):
-    return residual_panels(views, seen(rows), when, looks or {})
+def panels(rows, views, when="after"):
+    return residual_panels(views, seen(rows), when)
 
 
 def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
@@ -533,20 +445,6 @@ def test_before_and_after_are_two_and_what_is_not_known_or_used_is_left_out():
     assert "is 0.5 px" in after[2]
     assert "is 2.9 px" in before[2]
     assert "is 1 px" in panels([(0, 1, (5, 5), (0, 0), (0.0, 0.0), True)], [a_view()])[2]
-
-
-def test_a_quick_look_lies_under_its_residuals():
-    rows = [(0, 0, (5, 5), (0, 0), (1.0, 0.0), True)]
-    svg = panels(rows, [a_view("A"), a_view("B")], looks={"A": "QUJD"})[0][0][0]
-    assert (
-        svg.index("</desc>")
-        < svg.index('<image href="data:image/jpeg;base64,QUJD"')
-        < svg.index('class="empty"')
-    )
-    assert 'width="100%" height="100%" preserveAspectRatio="none"/>' in svg
-    assert "<image" not in panels(rows, [a_view("A"), a_view("B")], looks={"A": "QUJD"})[0][1][0]
-    assert isinstance(Pictures({}, ()).quicklooks, dict)
-    assert charts.WIDTH == 420
 
 
 @pytest.mark.parametrize(

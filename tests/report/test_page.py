@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from barpc.cli.main import cli
 from barpc.errors import BarpcError, InputError
 from barpc.pipeline import outputs
-from barpc.report import Run, charts, maps, page, records, summarize
+from barpc.report import Run, maps, page, records, summarize
 from barpc.report.summary import metres
 from barpc.report.tables import TABLES, Observations, RunFiles
 from barpc.scene import Tracks
@@ -115,12 +115,9 @@ def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_pat
 def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatch):
     monkeypatch.setattr(maps, "_MOST", 4)
     monkeypatch.setattr(records, "MAX_TABLE_ROWS", 5)
-    monkeypatch.setattr(charts, "MAX_ROWS", 3)
-    monkeypatch.setattr(page, "MAX_ROWS", 3)
     html = page.report_html(block_run.record, block_run.folder)
     assert "The 4 of 9 images with the largest systematic part are shown." in html
     assert "the first 5 of 9, all in the files beside this page" in html
-    assert "The 3 of 9 images with the largest error." in html
     assert html.count('id="panel-after') == 2 * 4  # title and description
 
 
@@ -157,9 +154,7 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
         *(np.concatenate([column] * copies) for column in columns),
     )
     told = replace(summary, views=tuple(views), pairs=tuple(pairs), verdict=tuple(lines))
-    return RunFiles(
-        told, observations, np.concatenate(points), np.concatenate(tracks), outlines, found.pictures
-    )
+    return RunFiles(told, observations, np.concatenate(points), np.concatenate(tracks), outlines)
 
 
 @pytest.mark.slow
@@ -174,9 +169,6 @@ def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_ru
     assert html.count('class="outline doubtful"') == (views if num == 300 else views // 3)
     assert ("At most 400 of 1008 outlines are drawn, evenly taken" in html) == (num == 1000)
     assert ('id="matrix-chart-t"' in html) == (num == 300)
-    pairs = len(files.summary.pairs)
-    dots = re.search(r'<g class="dot after see">(.*?)</g>', html)[1]
-    assert dots.count("<circle") == -(-pairs // -(-pairs // 300))
 
 
 def test_a_run_without_a_single_tie_point_still_has_a_page(block_run, tmp_path):

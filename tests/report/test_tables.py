@@ -27,7 +27,6 @@ from barpc.report.tables import (
     _numbers,
     _observations,
     _outlines,
-    _pictures,
     _points,
     gcps_geojson,
     read_tables,
@@ -80,17 +79,6 @@ def test_outliers_are_in_the_table_with_the_residual_that_had_them_cut(block_run
     assert cut.sum() > 50
     assert np.median(np.hypot(*files.observations.after[cut].T)) > 3.0
     assert (~run.adjustment.inlier).sum() >= cut.sum()
-
-
-def test_geojson_holds_the_same_rows_as_the_csv(block_run):
-    collection = json.loads((block_run.folder / "residuals.geojson").read_text())
-    header, rows = rows_of(block_run.folder / "residuals.csv")
-    assert len(collection["features"]) == len(rows)
-    first, row = collection["features"][3], dict(zip(header, map(float, rows[3]), strict=True))
-    assert first["geometry"]["type"] == "Point"
-    assert first["geometry"]["coordinates"] == [row["lon"], row["lat"], row["height_above_datum"]]
-    assert first["properties"] == row
-    assert tuple(first["properties"]) == RESIDUALS
 
 
 def test_pairs_hold_the_figures_of_the_summary(block_run):
@@ -252,31 +240,8 @@ def test_a_table_with_other_columns_is_refused():
 TIE = {"kind": "worst", "a": "A", "b": "B", "offset_px": [1.5, 0.5], "patches": ["QUJD", "QUJD", "QUJDQQ=="]}
 
 
-def test_pictures_are_jpegs_and_a_tie_point_has_one_patch_more_than_offsets():
-    found = _pictures(json.dumps({"quicklooks": {"A": "QUJD" * 100_000}, "ties": [TIE]}))
-    assert found.quicklooks["A"].startswith("QUJD")
-    assert (found.ties[0].kind, found.ties[0].a, found.ties[0].b, found.ties[0].offset_px) == (
-        "worst",
-        "A",
-        "B",
-        [1.5, 0.5],
-    )
-    wrong = [
-        {"patches": ["QUJD", "QUJD"]},
-        {"offset_px": [], "patches": ["QUJD"]},
-        {"kind": "best"},
-        {"patches": ["QUJD", "QUJD", "<b>"]},
-    ]
-    for change in wrong:
-        with pytest.raises((ValueError, KeyError)):
-            _pictures(json.dumps({"quicklooks": {}, "ties": [{**TIE, **change}]}))
-    for data in ("QUJD" * 100_000 + "Q", "QUJ", ""):
-        with pytest.raises(ValueError, match="picture that is none"):
-            _pictures(json.dumps({"quicklooks": {"A": data}, "ties": []}))
-
-
 def test_numbers_of_a_table():
-    assert (_number(None, 4), _number(float("nan"), 4, "null"), _number(1.23456, 4)) == ("", "null", "1.2346")
+    assert (_number(None, 4), _number(float("nan"), 4), _number(1.23456, 4)) == ("", "", "1.2346")
     assert [_cell(value) for value in ("a,b", 7, 0.123456, None)] == ['"a,b"', "7", "0.12346", ""]
 
 
@@ -357,15 +322,3 @@ def test_points_of_a_reference_are_written_as_control_is_read():
     }
     assert first["geometry"] == {"type": "Point", "coordinates": [10.0, 20.0, 30.0]}
     assert (second["properties"]["id"], second["properties"]["ji"]) == ("Q", [5.0, 6.0])
-
-
-def test_a_run_without_pixels_has_no_pictures(block_run, tmp_path):
-    for name in TABLES:
-        (tmp_path / name).write_bytes((block_run.folder / name).read_bytes())
-    found = read_tables(block_run.record, tmp_path).pictures
-    assert (found.quicklooks, found.ties) == ({}, ())
-    (tmp_path / "pictures.json").symlink_to(
-        tmp_path / "nowhere"
-    )  # a link to nothing is no file that is not there
-    with pytest.raises(InputError, match=r"pictures\.json"):
-        read_tables(block_run.record, tmp_path)

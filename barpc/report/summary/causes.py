@@ -192,7 +192,7 @@ def _degrees(low: float, high: float, sides: str, digits: int) -> str:
     return f"{'-'.join(ends)} {sides[low >= 0.0]}"
 
 
-def left_over(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
+def left_entries(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
     """Where something stands out at the end, the most first."""
     return tuple(_left(one, adjustment.names) for one in adjustment.left)
 

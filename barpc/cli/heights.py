@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
 from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, cast
 
 import click
 import numpy as np
@@ -16,8 +18,35 @@ from barpc.geodesy import Array
 from barpc.remote import Place
 from barpc.scene import BoolArray
 
-dem_option = click.option("--dem", metavar="FILE", help="Take the altitudes from a DEM.")
-geoid_option = click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+class Heights(NamedTuple):
+    """Where a verb takes altitudes from: --alt [m], or --dem and its --geoid."""
+
+    alt: float | None
+    dem: str | None
+    geoid: str | None
+
+    def terrain(self) -> Dem | None:
+        """The DEM, if one is given; a usage error beside --alt, or for a geoid alone."""
+        return opened_dem(self.dem, self.geoid, self.alt)
+
+
+def with_heights(alt: str) -> Callable[[Function], Function]:
+    """The flags --alt, with this help, --dem and --geoid of a verb, which gets them as its `heights`."""
+
+    def added(verb: Function) -> Function:
+        @click.option("--alt", type=float, help=alt)
+        @click.option("--dem", metavar="FILE", help="Take the altitudes from a DEM.")
+        @click.option("--geoid", metavar="FILE", help="Geoid grid for a DEM of orthometric heights.")
+        @wraps(verb)
+        def told(*, alt: float | None, dem: str | None, geoid: str | None, **given: Any) -> Any:
+            return verb(heights=Heights(alt, dem, geoid), **given)
+
+        return cast(Function, told)
+
+    return added
 
 
 def opened_dem(dem: str | None, geoid: str | None, alt: float | None = None) -> Dem | None:
