@@ -284,7 +284,7 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
     elif what == "a wave":
         lonlatalt[:, 0] += 3e-4 * np.sin(np.arange(6) * 2.5)
     else:
-        xy[gcps.view == 1] += [2.0, -2.0]
+        xy[gcps.view == 1] += [4.0, -4.0]
     wrong = replace(gcps, lonlatalt=lonlatalt, xy=xy)
     believing(monkeypatch)
     with monkeypatch.context() as patch:
