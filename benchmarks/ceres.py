@@ -4,11 +4,12 @@ Ceres gets analytic derivatives in C++ (`ceres.cpp`), first points for nothing a
 of its dense, sparse and iterative Schur complements counts. barpc's "whole" is `adjust_tracks`: first points, tests of
 what is left, and covariance with it; "solve" is its minimisation alone, as Ceres' is. CPU seconds, one thread.
 
-    python benchmarks/ba.py --ceres         # needs g++ and Ceres' headers (libceres-dev); says so where they are not
+    python benchmarks/ceres.py [--repeat 3]  # or benchmarks/ba.py --ceres; needs g++ and Ceres' headers (libceres-dev); says so where they are not
 """
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import statistics
 import subprocess
@@ -128,3 +129,13 @@ def one_size(program: Path, path: Path, views: int, tracks: int, repeat: int) ->
         f"| {by[0]:10.2f} {by[1]:11.2f} | {excess:.1e}",
         flush=True,
     )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--repeat", type=int, default=3, help="scenes of each size, of which the median counts"
+    )
+    compare(parser.parse_args().repeat)
