@@ -47,7 +47,8 @@ HEAD = """# Accuracy
 
 All figures of this page come from one run of `python benchmarks/accuracy.py --data DATA`: {versions}.
 Methods, more figures and the tests that assert bounds: [adjustment](adjustment.md), [tie points](tie_points.md),
-[RPC fit](fit.md), [the RPC](rpc.md), [Sentinel-1](sensors.md), [SICD](sensors_sicd.md), [pushbroom](sensors_pushbroom.md).
+[RPC fit](fit.md), [the RPC](rpc.md), [Sentinel-1](sensors.md), [SICD](sensors_sicd.md),
+[pushbroom](sensors_pushbroom.md).
 """
 
 

@@ -28,8 +28,8 @@ HEAD = """# Options
 
 <!-- Written by docs/generate_options.py. Edit barpc/options.py and the verbs' help texts, then run it again. -->
 
-Every option has a default; a file given with `--options` wins over it, and a flag over both. An unknown name, a wrong type or a
-value out of range is refused before anything is computed. In brackets: what it may hold, and the default.
+Every option has a default; a file given with `--options` wins over it, and a flag over both. An unknown name, a wrong
+type or a value out of range is refused before anything is computed. In brackets: what it may hold, and the default.
 
 ```toml
 # run.toml: barpc adjust scene/*.tif --options run.toml -o adjusted
@@ -39,7 +39,8 @@ rpc_formats = ["txt", "geom"]
 points_per_image = 8000
 ```
 
-From Python the same, with the records named in the headings; `barpc.options.schema()` is the JSON schema of such a file:
+From Python the same, with the records named in the headings (`barpc.options.schema()`: the JSON schema of such a
+file):
 
 ```python
 import barpc
@@ -102,7 +103,7 @@ def parts(command: click.Command, name: str) -> tuple[str, str, str, list[tuple[
 def verb_section(name: str, known: dict[str, str]) -> list[str]:
     """Return a verb: its usage, its first words, its examples, and the flags that are not known yet."""
     usage, first, examples, flags = parts(cli.get_command(click.Context(cli), name), f"barpc {name}")
-    lines = ["", f"### barpc {name}", "", f"`{usage}`", "", first]
+    lines = ["", f"### {usage.replace(' [OPTIONS]', '')}".replace("[", r"\["), "", first]
     if examples:
         lines += ["", "```", *(line.strip() for line in examples.splitlines() if line.strip()), "```"]
     new, old = [], []

@@ -20,8 +20,9 @@ HEAD = """# The values of summary.json
 
 <!-- Written by docs/generate_summary.py. Edit the records in barpc/report/summary/, then run it again. -->
 
-Pixel (0, 0) is the centre of the first one. A number that is not finite is null; `?` behind a type: it may be null. *Optional*
-values may be missing. Records have headings of their own. The same as a [JSON schema](summary.schema.json).
+Pixel (0, 0) is the centre of the first one. A number that is not finite is null; `?` behind a type: it may be null; no
+type: a number or null; `*` behind a name: it may be missing. Records have headings of their own. The same as a
+[JSON schema](summary.schema.json).
 """
 
 WORDS = {"string": "text", "boolean": "true/false", "object": "record", "array": "list"}
@@ -62,8 +63,9 @@ def page() -> str:
         lines += ["## " + (", ".join(f"`{name}`" for name in names if name) or "The file"), ""]
         lines += [record.__doc__ or "", ""]
         for key, part in schema["properties"].items():
-            optional = "" if key in schema["required"] else ", *optional*"
-            lines.append(f"- `{key}` ({in_words(part)}{optional}): {part['description']}")
+            star = "" if key in schema["required"] else r"\*"
+            kind = "" if (words := in_words(part)) == "number?" else f" ({words})"
+            lines.append(f"- `{key}`{star}{kind}: {part['description']}")
         lines.append("")
     return "\n".join(lines)
 
