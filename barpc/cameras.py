@@ -117,7 +117,7 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
 
 
 def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
-    """As `open_camera`, of a file and the choices behind it (see `split_spec`)."""
+    """Return as `open_camera`, of a file and the choices behind it (see `split_spec`)."""
     texts = dict(texts)
     size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
     file = path if holder is None else place(holder)
@@ -141,7 +141,9 @@ def open_split(path: Place, texts: Mapping[str, str], **choices: Any) -> Camera:
 
 
 def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[Place, dict[str, str]]:
-    """A file and the choices given behind it, as texts; files on other hosts where these are allowed (ImageError)."""
+    """Return a file and the choices given behind it, as texts; files on other hosts where these are allowed
+    (ImageError).
+    """
     name, texts = os.fspath(spec), dict[str, str]()
     known = {"camera", "size", *(key for opener in OPENERS.values() for key in opener.choices)}
     last = re.compile(rf"(.*),({'|'.join(sorted(known))})=(.*)", re.DOTALL)
@@ -154,7 +156,7 @@ def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[Place, dict
 
 
 def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, int] | None]:
-    """The points of a table or of a localisation grid, and the image size given behind it; None of a camera."""
+    """Return the points of a table or of a localisation grid, and the image size given behind it; None of a camera."""
     path, texts = split_spec(spec)
     if path.is_dir() or b"<adsHeader>" in read_head(path, IMAGE, _HEAD):
         return None, None

@@ -54,7 +54,7 @@ class Rule:
     spoken: bool = False  # said by a person: no options file may set it
 
     def holds(self, number: float) -> bool:
-        """Whether a number lies within the bounds; NaN and the infinities do not."""
+        """Return whether a number lies within the bounds; NaN and the infinities do not."""
         return (
             math.isfinite(number)
             and (self.least is None or number >= self.least)
@@ -64,7 +64,7 @@ class Rule:
         )
 
     def bounds(self) -> str:
-        """The bounds and the unit in words, with a blank before them."""
+        """Return the bounds and the unit in words, with a blank before them."""
         ends = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
         words = " and ".join(f"{word} {value:g}" for word, value in ends.items() if value is not None)
         if self.least is not None and self.most is not None:
@@ -72,7 +72,7 @@ class Rule:
         return (f" {words}" if words else "") + (f" [{self.unit}]" if self.unit else "")
 
     def choices(self, kind: Any) -> tuple[Any, ...]:
-        """The values allowed where they are listed: of a Literal, or the rows of a table; else none."""
+        """Return the values allowed where they are listed: of a Literal, or the rows of a table; else none."""
         if get_origin(kind) is Literal:
             return get_args(kind)
         if self.rows:
@@ -82,7 +82,7 @@ class Rule:
 
 
 def option(default: T, help: str, **rule: Any) -> T:
-    """A field of an option record: its default, its meaning, and the rest of its `Rule`."""
+    """Return a field of an option record: its default, its meaning, and the rest of its `Rule`."""
     metadata = {"rule": Rule(" ".join(help.split()), **rule)}
     given: dict[str, Any] = (
         {"default_factory": default.copy} if isinstance(default, dict) else {"default": default}
@@ -138,7 +138,7 @@ class Options:
 
 
 def wanted(kind: Any, rule: Rule) -> str:
-    """What a field may hold, in words."""
+    """Return what a field may hold, in words."""
     parts = get_args(kind)
     if get_origin(kind) is Mapping:
         return f"a table, each value {wanted(parts[1], rule)}"
@@ -157,7 +157,7 @@ def wanted(kind: Any, rule: Rule) -> str:
 
 
 def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
-    """A value as its field holds it; InputError names the field where it is of another type or out of range."""
+    """Return a value as its field holds it; InputError names the field where it is of another type or out of range."""
     parts, found = get_args(kind), None
     if get_origin(kind) is tuple and rule.unit == "file" and isinstance(value, (str, os.PathLike)):
         value = (value,)  # of files one is as good as a list of one
@@ -633,7 +633,7 @@ class DsmOptions(Options):
 
 
 def with_values(options: Record, values: Mapping[str, Any], where: str = "options") -> Record:
-    """A copy of a record with some fields changed, nested records by nested mappings.
+    """Return a copy of a record with some fields changed, nested records by nested mappings.
 
     InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`.
     """
@@ -688,7 +688,7 @@ def _refuse_code(path: str | Path, record: type[Options], values: Mapping[str, A
 
 
 def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
-    """The JSON schema (draft 7) of a record, as an options file spells it."""
+    """Return the JSON schema (draft 7) of a record, as an options file spells it."""
     properties = {}
     for name, one in declared(record).items():
         if isinstance(one.default, Options):

@@ -103,7 +103,7 @@ class Tracks(Frozen):
         return int(self.point.max()) + 1 if len(self.point) else 0
 
     def select(self, keep: BoolArray) -> Tracks:
-        """The observations of a mask (K,); tracks left with fewer than two views go, indices close up."""
+        """Return the observations of a mask (K,); tracks left with fewer than two views go, indices close up."""
         count = np.bincount(self.point[keep], minlength=self.num_points)
         keep = keep & (count[self.point] >= 2)
         _, point = np.unique(self.point[keep], return_inverse=True)
@@ -161,7 +161,7 @@ class GroundPoints(Frozen):
         return cls((), places, places, index, index, np.zeros((0, 2)), np.zeros(0))
 
     def select(self, keep: BoolArray) -> GroundPoints:
-        """The points of a mask (G,) with their observations."""
+        """Return the points of a mask (G,) with their observations."""
         rows = keep[self.point]
         return replace(
             self,

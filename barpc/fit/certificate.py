@@ -109,14 +109,17 @@ class Sample:
         return float(_size(self.model.project(asked) - self.points[:, :2]).max(initial=0.0))
 
     def errors(self, rpc: RPC) -> tuple[Errors, Array]:
-        """What an RPC makes of the points all over the image, and its largest errors (2,) [px], found by looking on.
+        """Return what an RPC makes of the points all over the image, and its largest errors (2,) [px], found
+        by looking on.
 
         They are infinite where the RPC has no image point.
         """
         return self.sought(lambda ground, points: rpc.project(ground) - points[:, :2])
 
     def sought(self, off: Callable[[Array, Array], Array]) -> tuple[Errors, Array]:
-        """As `errors`, of what ground points (N, 3) and their (N, 3) col, row [px], altitude are off by: (N, 2)."""
+        """Return as `errors`, of what ground points (N, 3) and their (N, 3) col, row [px], altitude are off
+        by: (N, 2).
+        """
         points, miss = self.points, _size(off(self.ground, self.points))
         errors = Errors()
         errors.add(miss[: self.count])

@@ -104,7 +104,9 @@ def extent(points: Array) -> tuple[Array, Array]:
 
 
 def screened(ground: npt.ArrayLike, image: npt.ArrayLike, allow_mirrored: bool) -> tuple[Array, Array]:
-    """As `numbers`; FitError too where columns look swapped (unless `allow_mirrored`) or points determine no RPC."""
+    """Return as `numbers`; FitError too where columns look swapped (unless `allow_mirrored`) or points
+    determine no RPC.
+    """
     ground, image = numbers(ground, image)
     _check_geometry(ground, image, allow_mirrored)
     distinct = len(np.unique(ground, axis=0)) if len(ground) < 400 else len(ground)

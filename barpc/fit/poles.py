@@ -71,14 +71,14 @@ class Region:
 
     @classmethod
     def box(cls, box: Array) -> Region:
-        """A box (3, 2)."""
+        """Return a box (3, 2)."""
         return cls(
             box.mean(axis=1), np.diag(0.5 * (box[:, 1] - box[:, 0])), np.ones((_NODES, _NODES), dtype=bool)
         )
 
     @classmethod
     def around(cls, ground: Array, image: Array, margin: float) -> Region:
-        """The hull of normalised points (N, 3) and a margin, a share of its half width.
+        """Return the hull of normalised points (N, 3) and a margin, a share of its half width.
 
         The sides stand as those of the image do: lon, lat = `image` M + altitude k, M and k by least squares of points
         (N, 2) in the image.
@@ -110,25 +110,26 @@ class Region:
         return np.asarray((_net() @ (self.there @ cubic))[self.inside].ravel())
 
     def rows(self, index: IntArray) -> Array:
-        """What takes a cubic to some of its Bernstein coefficients (len(index), 20)."""
+        """Return what takes a cubic to some of its Bernstein coefficients (len(index), 20)."""
         nodes = np.flatnonzero(np.broadcast_to(self.inside[..., None], (_NODES,) * 3))
         return np.asarray(_net().reshape(-1, 20)[nodes[index]] @ self.there)
 
     def least(self, cubic: Array) -> float:
-        """A lower bound, near the least value, of a cubic (20,)."""
+        """Return a lower bound, near the least value, of a cubic (20,)."""
         return float(self.bernstein(cubic).min())
 
     def above(self, cubic: Array) -> bool:
-        """Whether a denominator (20,) is above `FLOOR` of what it is at the centre."""
+        """Return whether a denominator (20,) is above `FLOOR` of what it is at the centre."""
         return self.least(cubic) > FLOOR * float(self.there[0] @ cubic)
 
     def smallest(self, cubics: Array) -> float:
-        """A lower bound of cubics (k, 20) over what they are at the centre; NaN where one is 0 there."""
+        """Return a lower bound of cubics (k, 20) over what they are at the centre; NaN where one is 0 there."""
         with np.errstate(all="ignore"):
             return float(min(self.least(cubic / (self.there[0] @ cubic)) for cubic in cubics))
 
     def nearest_pole(self, cubics: Array, margin: float) -> tuple[Array, float]:
-        """Where one of cubics (k, 20) is 0 nearest to the centre (3,), and how far, 1 being the end of the points.
+        """Return where one of cubics (k, 20) is 0 nearest to the centre (3,), and how far, 1 being the end of
+        the points.
 
         Of a region with a `margin`, along rays from its centre to every side; NaN and infinite where there is none.
         """
@@ -157,12 +158,13 @@ def _inside(reach: Array, half: Array) -> npt.NDArray[np.bool_]:
 
 
 def least_value(cubic: Array, box: Array) -> float:
-    """A lower bound, near the least value, of a cubic (20,) over a `box` (3, 2)."""
+    """Return a lower bound, near the least value, of a cubic (20,) over a `box` (3, 2)."""
     return Region.box(box).least(cubic)
 
 
 def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
-    """A lower bound of the denominators over a box `low`, `high` (3,) [deg, deg, m] and 25 % around it.
+    """Return a lower bound of the denominators over a box `low`, `high` (3,) [deg, deg, m] and 25 % around
+    it.
 
     Over what they are at its centre.
     """
@@ -170,13 +172,14 @@ def smallest_denominator(rpc: RPC, low: Array, high: Array) -> float:
 
 
 def smallest_value(cubics: Array, box: Array) -> float:
-    """A lower bound of cubics (k, 20) over a box (3, 2) and 25 % around it, over what they are at its centre."""
+    """Return a lower bound of cubics (k, 20) over a box (3, 2) and 25 % around it, over what they are at its centre."""
     middle, half = box.mean(axis=1), 0.5 * np.abs(box[:, 1] - box[:, 0])
     return Region.box(middle[:, None] + (1.0 + BOX) * half[:, None] * np.array([-1.0, 1.0])).smallest(cubics)
 
 
 def bounded(system: Compressed, region: Region, active: IntArray) -> Array | None:
-    """The least squares x (k,) of a system whose denominator is at least `FLOOR` over a region; None if there is none.
+    """Return the least squares x (k,) of a system whose denominator is at least `FLOOR` over a region; None
+    if there is none.
 
     The last unknowns are the coefficients of its `active` monomials but the constant one, which is 1. By the
     inequalities that x breaks, taken in few by few: least distance programming, by non-negative least squares (Lawson

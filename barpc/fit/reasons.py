@@ -62,7 +62,9 @@ class Reason:
 
 
 def reason(rpc: RPC, sample: Sample) -> Reason | None:
-    """What the errors of an RPC on the points of a sample all over an image go by; None where they are no numbers."""
+    """Return what the errors of an RPC on the points of a sample all over an image go by; None where they are
+    no numbers.
+    """
     ground, points = sample.ground[: sample.count], sample.points[: sample.count]
     error = rpc.project(ground) - points[:, :2]
     if not (np.isfinite(error).all() and error.any()):

@@ -110,7 +110,7 @@ class RpcFit:
         return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"
 
     def summary(self) -> dict[str, Any]:
-        """The certificate as plain numbers and lists, col before row, lengths in px."""
+        """Return the certificate as plain numbers and lists, col before row, lengths in px."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
         for name in ("localisation", "free", "reason"):
             part = values.pop(name)
@@ -118,7 +118,7 @@ class RpcFit:
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:
-        """The fit with the RPC that a file of it holds: what that lost over its box is added to the errors."""
+        """Return the fit with the RPC that a file of it holds: what that lost over its box is added to the errors."""
         lost = self.rpc.off(rpc)
         return replace(
             self,
@@ -129,7 +129,7 @@ class RpcFit:
         )
 
     def verdict(self, tolerance: float) -> str:
-        """What is wrong with this fit at a tolerance [px], in words; empty if nothing is."""
+        """Return what is wrong with this fit at a tolerance [px], in words; empty if nothing is."""
         worst = float(self.max_ckp.max())
         if not self.contradiction <= max(tolerance, EXACT):
             return (

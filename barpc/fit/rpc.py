@@ -247,12 +247,12 @@ def _localised(
 
 
 def underlying_rpc(model: object) -> RPC | None:
-    """The RPC that a model is built on: itself, or what its corrections stand in front of."""
+    """Return the RPC that a model is built on: itself, or what its corrections stand in front of."""
     return inner if isinstance(inner := innermost(model), RPC) else None
 
 
 def innermost(model: object) -> object:
-    """The camera that a model's corrections stand in front of, or itself."""
+    """Return the camera that a model's corrections stand in front of, or itself."""
     while (inner := getattr(model, "sensor", None)) is not None:
         model = inner
     return model

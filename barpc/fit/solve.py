@@ -201,7 +201,7 @@ class Solution:
 
 
 def region_of(problem: Problem) -> Region:
-    """The hull of a problem's own points and its margin."""
+    """Return the hull of a problem's own points and its margin."""
     norm = problem.norm
     ground = (problem.ground - norm.ground_offset) / norm.ground_scale
     return Region.around(ground, (problem.image - norm.image_offset) / norm.image_scale, problem.margin)
@@ -261,7 +261,7 @@ def solve(
 
 
 def solve_problem(problem: Problem, options: FitOptions, method: str, vendor: RPC | None = None) -> Solution:
-    """The solution of a problem by a method, its numbers rounded to the options' precision."""
+    """Return the solution of a problem by a method, its numbers rounded to the options' precision."""
     quantize = None if options.precision is None else PRECISIONS[options.precision].coeffs
     coeffs, systems, h, passes = METHODS[method](problem, quantize, vendor)
     return Solution(coeffs, problem, systems, h, passes, method)

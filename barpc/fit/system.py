@@ -76,13 +76,13 @@ class Compressed:
         return float(rest @ rest + self.triangle[-1, -1] ** 2)
 
     def solved_by(self, solution: Array) -> Compressed:
-        """The system of the same rows that a given solution (k,) leaves nothing of but what it never reaches."""
+        """Return the system of the same rows that a given solution (k,) leaves nothing of but what it never reaches."""
         triangle = self.triangle.copy()
         triangle[:-1, -1] = self.matrix @ solution
         return Compressed(triangle, self.num_points)
 
     def penalized(self, penalty: Array, toward: Array | float = 0.0) -> Compressed:
-        """The system with the rows diag(`penalty`) x = `toward` below."""
+        """Return the system with the rows diag(`penalty`) x = `toward` below."""
         rows = np.column_stack([np.diag(penalty), np.broadcast_to(toward, penalty.shape)])
         return Compressed(_take_in(self.triangle, rows), self.num_points)
 
@@ -108,7 +108,8 @@ class Problem:
     first: Compressed | None = None  # of col without a denominator, where it is known already
 
     def screened(self) -> Problem:
-        """The same problem without the monomials that its points do not tell from those of lower degree.
+        """Return the same problem without the monomials that its points do not tell from those of lower
+        degree.
 
         All twenty stay where altitudes abound; of points at one altitude those without H, of two altitudes those of
         degree one in H. A dependent one would make a = b = 0 a solution.
@@ -160,7 +161,7 @@ class Problem:
         free: bool = True,
         numerator: Array | None = None,
     ) -> Compressed:
-        """The system of the rows of the same parameters."""
+        """Return the system of the rows of the same parameters."""
         if self.first is not None and axis == 0 and denominator is None and free:
             return self.first
         size = 2 * len(self.active) if free else len(self.active) + 1
@@ -180,12 +181,12 @@ class Problem:
         return out
 
     def errors(self, axis: int, x: Array) -> Array:
-        """What a solution leaves of a coordinate (N,), in scales of the image."""
+        """Return what a solution leaves of a coordinate (N,), in scales of the image."""
         rows = self.rows(axis, self.expanded(x)[-1])
         return np.concatenate([np.abs(block[:, :-1] @ x - block[:, -1]) for _, block in rows])
 
     def packed(self, expanded: Array) -> Array:
-        """The solution (k,) that `expanded` makes numerators and denominator of."""
+        """Return the solution (k,) that `expanded` makes numerators and denominator of."""
         return np.concatenate([expanded[0, self.active], expanded[1, self.active[1:]]])
 
 
@@ -200,7 +201,7 @@ def expected_size(active: IntArray) -> Array:
 
 
 def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float]:
-    """The system with each unknown penalised by sigma / its expected size, and sigma.
+    """Return the system with each unknown penalised by sigma / its expected size, and sigma.
 
     The free solution lets noisy denominators shrink, and the residual with them; the residual of the
     penalised one tells the noise better. Never quite singular: there is a floor at the rounding.
@@ -215,7 +216,7 @@ def noise_scaled(system: Compressed, expected: Array) -> tuple[Compressed, float
 
 
 def solution(system: Compressed, quantize: Rounding | None = None) -> Array:
-    """The least-squares solution (k,), by back substitution.
+    """Return the least-squares solution (k,), by back substitution.
 
     Where quantized, each coefficient is rounded in turn and the ones still to come make up for it (Babai's nearest
     plane).

@@ -39,7 +39,7 @@ def watched(executor: Executor | None) -> Iterator[None]:
 
 
 def other_version(theirs: str, own: str, where: str = "a worker") -> InputError:
-    """What is wrong with a worker that would give other bytes."""
+    """Return what is wrong with a worker that would give other bytes."""
     return InputError(
         f"{where} has barpc {theirs}, this process {own}: results would differ; install the same version everywhere"
     )

@@ -128,7 +128,7 @@ def _distance(points: GroundPoints, shown: Array, columns: tuple[int, int], sign
 
 
 def load_altimetry(paths: Sequence[str], views: Sequence[View]) -> Altimetry | None:
-    """The heights of several files in the images, one after the other; None without files.
+    """Return the heights of several files in the images, one after the other; None without files.
 
     InputError for a file that cannot be read or has no height in the images.
     """

@@ -46,7 +46,7 @@ Outcome = tuple[float, Any, BaseException | None]  # seconds, result, error of o
 
 
 def worker_count(executor: Executor | None) -> int:
-    """How many tasks an executor works on at a time; of a dask cluster at least what it may grow to."""
+    """Return how many tasks an executor works on at a time; of a dask cluster at least what it may grow to."""
     client = getattr(executor, "_client", None)
     if client is not None:
         return max(_CLUSTER, sum(int(n) for n in client.nthreads().values()))
@@ -102,7 +102,7 @@ class CachingExecutor(Executor):
             self.store.clear()
 
     def key(self, fn: Function, args: tuple[Any, ...]) -> str:
-        """The key under which the result of a task is kept."""
+        """Return the key under which the result of a task is kept."""
         return key_of(fn.__module__, fn.__qualname__, [self._canonical(arg) for arg in args])
 
     def _canonical(self, value: Any) -> Any:
@@ -118,7 +118,7 @@ class CachingExecutor(Executor):
         return value
 
     def guards(self, args: Any) -> tuple[Input, ...]:
-        """The inputs that the arguments of a task name."""
+        """Return the inputs that the arguments of a task name."""
         if isinstance(args, str):
             return (self._inputs[args],) if args in self._inputs else ()
         if is_dataclass(args) and not isinstance(args, type):
@@ -283,7 +283,7 @@ class Spilled:
     store: Store
 
     def load(self) -> tuple[Any, ...]:
-        """The arguments; InputError where the worker does not see the store."""
+        """Return the arguments; InputError where the worker does not see the store."""
         arrays = {name: self.store.need(place)["array"] for name, place in self.large.items()}
         arguments: tuple[Any, ...] = from_arrays({**self.small, **arrays}, sent=True)
         return arguments

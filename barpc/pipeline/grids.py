@@ -65,13 +65,13 @@ class Files:
     state: bool = False
 
     def names(self, view: View) -> list[str]:
-        """Their names."""
+        """Return their names."""
         ends = [STATE] * self.state + [GRID] * self.grids + [CORRECTION] * (self.grids or self.resampled)
         return [view.name + end for end in (*ends, *[RESAMPLED] * self.resampled)]
 
 
 def grid_names(view: View, options: RunOptions) -> list[str]:
-    """The files that `write_grids` may write for a view, before it is known whether its RPC holds it."""
+    """Return the files that `write_grids` may write for a view, before it is known whether its RPC holds it."""
     boxes = [] if options.tiles is None else tile_boxes(view.size, options.tiles)
     tiles = [*(tile_name(view, box) for box in boxes), *[view.name + TILES] * bool(boxes)]
     files = Files(grids=True, resampled=options.resample, state=is_writable(view.sensor))
@@ -169,7 +169,7 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: Files, room: str
 
 
 def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss]:
-    """An RPC and what it lacks, and how far both together are off the camera of a sample.
+    """Return an RPC and what it lacks, and how far both together are off the camera of a sample.
 
     What `rpc` lacks may depend on the altitude: the best RPC of all trades denominators, which see altitudes, for what
     changes with the rows. Then another one serves better here, though it misses by more.
@@ -238,7 +238,7 @@ def tile_boxes(size: tuple[int, int], side: int) -> list[Box]:
 
 
 def tile_name(view: View, box: Box) -> str:
-    """The file with the RPC of a tile: its first row and column."""
+    """Return the file with the RPC of a tile: its first row and column."""
     return f"{view.name}_tiles/{box[1]:05d}_{box[0]:05d}_RPC.TXT"
 
 
@@ -284,7 +284,7 @@ def _write_tiles(
 def fit_tiles(
     model: SensorModel, boxes: Sequence[Box], alt_range: tuple[float, float], options: FitOptions
 ) -> list[RpcFit]:
-    """The RPCs of some tiles of a camera, whose images begin at their first pixels."""
+    """Return the RPCs of some tiles of a camera, whose images begin at their first pixels."""
     fits = []
     for col, row, *size in boxes:
         tile = ImageCorrected(model, ImageAffine(-np.array([col, row], dtype=np.float64), np.zeros((2, 2))))

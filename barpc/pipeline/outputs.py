@@ -113,13 +113,13 @@ def verify_files(paths: Sequence[str], view: View, fit: RpcFit, model: SensorMod
 
 
 def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
-    """The files that `write_views` writes for a view."""
+    """Return the files that `write_views` writes for a view."""
     ends = [CARRIERS[images].suffixes[0]] if images in CARRIERS else []
     return [view.name + end for end in (*ends, *(WRITABLE[key].beside for key in formats))]
 
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
-    """The outputs of a run, before it starts; of the tie points of pairs those that are in the folder."""
+    """Return the outputs of a run, before it starts; of the tie points of pairs those that are in the folder."""
     names = [*TABLES, "summary.json", *(["report.html"] if can_render() else [])]
     names += [GCPS] * bool(options.reference)
     if options.stop_after == "matching":
@@ -153,7 +153,8 @@ def refuse_shadows(folder: Path, names: Sequence[str]) -> None:
 
 
 def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
-    """The tables, report.html where jinja2 is installed, and summary.json last: a folder with it is complete.
+    """Return the tables, report.html where jinja2 is installed, and summary.json last: a folder with it is
+    complete.
 
     Returns the summary with the stages that this took.
     """

@@ -84,7 +84,7 @@ _Given = tuple[str, Place, Image]  # name, file, and what was given
 
 
 def image_path(image: Image, hosts: Sequence[str] = ()) -> Place:
-    """The file with the pixels, absolute; on another host where it is one of `hosts`."""
+    """Return the file with the pixels, absolute; on another host where it is one of `hosts`."""
     path = located(image.path, hosts) if isinstance(image, View) else split_spec(image, hosts)[0]
     return path.absolute()
 

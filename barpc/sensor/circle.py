@@ -25,7 +25,7 @@ def aside(position: Array, velocity: Array, right: bool) -> Array:
 def on_circle(
     position: Array, velocity: Array, distance: Array, alt: Array, right: bool, ahead: Array | float = 0.0
 ) -> tuple[Array, Array]:
-    """The points of a circle that have a given altitude: Newton on the look angle.
+    """Return the points of a circle that have a given altitude: Newton on the look angle.
 
     Parameters
     ----------

@@ -130,7 +130,7 @@ class Correction(Frozen):
         return f"rotation {1e6 * turn:.3g} urad, translation {move:.3g} m{bent}{grown}"
 
     def motion(self, ecef: Array, row: Array | None = None) -> Motion:
-        """The motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
+        """Return the motion of points (3, n) [m], ECEF, seen at the rows (n,) [px]."""
         drift = None
         if row is not None:
             u = (row - self.row_offset) / self.row_scale
@@ -152,7 +152,8 @@ class Correction(Frozen):
 
 
 def correction_of(matrix: Array, at: Array) -> Correction:
-    """The correction that brings a motion of the ground into a camera: it shows X where it showed X before the motion.
+    """Return the correction that brings a motion of the ground into a camera: it shows X where it showed X
+    before the motion.
 
     Parameters
     ----------

@@ -37,14 +37,14 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def is_state(head: bytes) -> bool:
-    """Whether the first bytes of a file begin a state."""
+    """Return whether the first bytes of a file begin a state."""
     return re.match(rb"\s*(USGS_ASTRO_\w+\s*)?\{", head) is not None and (
         b"USGS_ASTRO_" in head or b'"m_centerEphemerisTime"' in head or b'"m_modelName"' in head
     )
 
 
 def open_state(path: Path) -> tuple[Pushbroom | Frame, tuple[int, int]]:
-    """The camera of a state and the size (width, height) [px] of its image.
+    """Return the camera of a state and the size (width, height) [px] of its image.
 
     Raises
     ------

@@ -52,14 +52,14 @@ _PLAIN: dict[str, Any] = {
 
 
 def is_writable(model: SensorModel) -> bool:
-    """Whether a camera is a pushbroom one of a straight detector, behind corrections in space only."""
+    """Return whether a camera is a pushbroom one of a straight detector, behind corrections in space only."""
     while isinstance(model, Corrected):
         model = model.sensor
     return isinstance(model, Pushbroom) and model.look.shape[1] == 2 and bool(model.line_period > 0)
 
 
 def state_text(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> str:
-    """The state of a camera that `is_writable`, of an image of `size` (width, height) [px].
+    """Return the state of a camera that `is_writable`, of an image of `size` (width, height) [px].
 
     Orbit and attitude are sampled with the corrections in them. What bends light is a turn of the camera that changes
     with the row, true in the middle of the altitudes; what that lacks is measured by opening the state again.

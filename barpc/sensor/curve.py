@@ -57,7 +57,7 @@ class Curve(Frozen):
 
     @classmethod
     def through(cls, times: npt.ArrayLike, values: npt.ArrayLike, degree: int = 5) -> Curve:
-        """The spline through samples: smooth to the second but one derivative, not-a-knot at its ends.
+        """Return the spline through samples: smooth to the second but one derivative, not-a-knot at its ends.
 
         `values` (N, 3) are positions [m] or rotation vectors [rad]; `degree` is 3 or 5, less where there are too few
         samples. A quintic through positions every 10 s is true to 1e-4 m between them. RpcError for fewer than two
@@ -110,7 +110,7 @@ class Curve(Frozen):
 
 
 def about_middle(rotations: Rotation) -> tuple[Array, Array]:
-    """The middle one (3, 3) of N rotations, and the rotation vectors (N, 3) [rad] from there, in its axes."""
+    """Return the middle one (3, 3) of N rotations, and the rotation vectors (N, 3) [rad] from there, in its axes."""
     middle = rotations[len(rotations) // 2]
     return np.asarray(middle.as_matrix()), np.asarray((middle.inv() * rotations).as_rotvec())
 
@@ -158,7 +158,7 @@ class Orbit(Curve):
 
 
 def fit_orbit(time: Array, position: Array, velocity: Array, window: tuple[float, float]) -> Orbit:
-    """The orbit through state vectors around the time of an image: one polynomial of time.
+    """Return the orbit through state vectors around the time of an image: one polynomial of time.
 
     Least squares on positions AND velocities. How far each can be trusted differs from product to product
     (Sentinel-1: positions to 2e-6 m in auxiliary products and 2e-4 m in downlinked ones, velocities to 1e-5 and
@@ -285,7 +285,9 @@ class Turn:
         return v - self._a * bent + self._b * twice, v - self._b * bent + self._c * twice
 
     def rate(self, v: Array) -> Array:
-        """The right Jacobian times v: exp([w + v]x) is exp([w]x) exp([rate]x) to first order in v (..., 3, N)."""
+        """Return the right Jacobian times v: exp([w + v]x) is exp([w]x) exp([rate]x) to first order in v
+        (..., 3, N).
+        """
         bent = cross(self._w, v)
         return np.asarray(v - self._b * bent + self._c * cross(self._w, bent))
 

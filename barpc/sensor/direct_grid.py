@@ -98,7 +98,9 @@ class DirectGrid(Frozen):
 
     @classmethod
     def from_points(cls, ground: npt.ArrayLike, image: npt.ArrayLike) -> DirectGrid:
-        """The grid whose nodes, ground (N, 3) and image (N, 2), are listed in any order; RpcError if one is missing."""
+        """Return the grid whose nodes, ground (N, 3) and image (N, 2), are listed in any order; RpcError if
+        one is missing.
+        """
         ground = np.asarray(ground, dtype=np.float64)
         image = np.asarray(image, dtype=np.float64)
         values = (ground[:, 2], image[:, 1], image[:, 0])
@@ -118,7 +120,8 @@ class DirectGrid(Frozen):
         alt_range: tuple[float, float],
         tolerance: float = LINEAR,
     ) -> DirectGrid:
-        """The grid of a camera from corner to corner of an image of `size` (width, height) and over its altitudes.
+        """Return the grid of a camera from corner to corner of an image of `size` (width, height) and over
+        its altitudes.
 
         Linear interpolation between its nodes misses by no more than `tolerance` [px], unless that asks for
         millions of nodes. RpcError where the camera sees no ground.

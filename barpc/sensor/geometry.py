@@ -41,7 +41,7 @@ class Radar(Protocol):
 
 
 def altitude_range(rpc: RPC) -> tuple[float, float]:
-    """The altitudes [m] that an RPC states: its offset -/+ its scale."""
+    """Return the altitudes [m] that an RPC states: its offset -/+ its scale."""
     offset, scale = float(rpc.ground_offset[2]), abs(float(rpc.ground_scale[2]))
     return offset - scale, offset + scale
 
@@ -138,7 +138,7 @@ def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
 
 
 def ground_sample_distance(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """How large a pixel is on level ground at points (..., 3).
+    """Return how large a pixel is on level ground at points (..., 3).
 
     Returns
     -------
@@ -184,7 +184,7 @@ class Several:
         self._parts = [(sensors[of_row[rows[0]]], rows) for rows in np.split(order, starts)[1:]]
 
     def each(self, function: Callable[[SensorModel, Array], Array], ground: Array) -> Array:
-        """What a function of a camera and ground points gives, (N, 3), for ground points (N, 3)."""
+        """Return what a function of a camera and ground points gives, (N, 3), for ground points (N, 3)."""
         found = np.empty((len(ground), 3))
         for sensor, rows in self._parts:
             found[rows] = function(sensor, ground[rows])
@@ -313,7 +313,7 @@ def epipolar_offset(
     alt: float | npt.ArrayLike = 0.0,
     steps: int = 6,
 ) -> tuple[Array, Array]:
-    """How far matches lie off the epipolar line: what no altitude explains.
+    """Return how far matches lie off the epipolar line: what no altitude explains.
 
     The altitude that brings the ray of a nearest to the point in b is found by Gauss-Newton along the
     ray; the signed distance that is left, across the epipolar line, is the offset.

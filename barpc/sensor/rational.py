@@ -45,7 +45,7 @@ DERIVATIVE = _derivative_matrices()  # the derivatives of the monomials on the f
 
 
 def monomials(normalized: Array, out: Array | None = None) -> Array:
-    """The twenty monomials (20, N), in RPC00B order, of normalised ground points (3, N)."""
+    """Return the twenty monomials (20, N), in RPC00B order, of normalised ground points (3, N)."""
     x, y, z = normalized
     if out is None:
         out = np.empty((20, x.shape[0]))
@@ -98,7 +98,8 @@ class Rational:
         return value, out
 
     def solve(self, target: Array, z: Array, work: Array | None = None) -> tuple[Array, BoolArray]:
-        """The inverse: points (3, N) whose third variable is `z` (N,) and whose values are `target` (2, N).
+        """Return the inverse: points (3, N) whose third variable is `z` (N,) and whose values are `target`
+        (2, N).
 
         The cubic inverse and one Newton step; one more where that was too long to prove it enough; then, and out
         of the box, damped Newton from the centre and a check of value, denominators and orientation. The second result

@@ -104,13 +104,13 @@ class RPC(Frozen):
         return pointwise(self._localize, CHUNK, [(3,)], image, alt, rows=20)[0]
 
     def off(self, other: RPC) -> Array:
-        """How far another RPC's image points are off (729, 2) [px], over the box; 0 where neither has any."""
+        """Return how far another RPC's image points are off (729, 2) [px], over the box; 0 where neither has any."""
         places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 3), axis=-1).reshape(-1, 3)
         image, seen = (rpc.project(self.ground_offset + places * self.ground_scale) for rpc in (self, other))
         return np.where(np.isnan(image) & np.isnan(seen), 0.0, np.abs(seen - image))
 
     def localize_direct(self, image: Array, alt: Array) -> Array:
-        """As `localize`, by the localisation RPC: no iteration, and as near as that was fitted."""
+        """Return as `localize`, by the localisation RPC: no iteration, and as near as that was fitted."""
         return pointwise(self._localize_direct, CHUNK, [(3,)], image, alt, rows=20)[0]
 
     def _localize_direct(self, image: Array, alt: Array, work: Array) -> list[Array]:
@@ -162,11 +162,11 @@ class RPC(Frozen):
         return np.asarray(on_earth & (np.abs(self.project(ground) - image) <= tolerance).all(axis=1))
 
     def crop(self, col: float, row: float) -> RPC:
-        """The RPC of a crop whose top-left pixel is (col, row) [px] of this image: exact, no refit."""
+        """Return the RPC of a crop whose top-left pixel is (col, row) [px] of this image: exact, no refit."""
         return replace(self, image_offset=self.image_offset - np.array([col, row], dtype=np.float64))
 
     def window(self, col: float, row: float, step_col: float = 1.0, step_row: float = 1.0) -> RPC:
-        """The RPC of an image cut out of this one and resampled: exact, no refit.
+        """Return the RPC of an image cut out of this one and resampled: exact, no refit.
 
         Parameters
         ----------

@@ -39,7 +39,7 @@ def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, 
 
 
 def bsplines(u: Array, count: int) -> Array:
-    """All uniform cubic B-splines (count, n) at u (n,) in -1 .. 1."""
+    """Return all uniform cubic B-splines (count, n) at u (n,) in -1 .. 1."""
     first, pieces = bspline_pieces(u, count)
     basis = np.zeros((count, len(u)))
     for n, piece in enumerate(pieces):
@@ -48,7 +48,7 @@ def bsplines(u: Array, count: int) -> Array:
 
 
 def profile(place: Array, start: Array, stop: Array, origin: Array, rate: Array) -> Array:
-    """How much of a strip's displacement there is at places [px]: see `RowSpline.strips`."""
+    """Return how much of a strip's displacement there is at places [px]: see `RowSpline.strips`."""
     with np.errstate(invalid="ignore"):
         inside = (place >= start) & (place < stop)
         return np.asarray(np.where(inside, np.exp(-np.maximum((place - origin) * rate, 0.0)), 0.0))
@@ -124,7 +124,7 @@ class RowSpline(Frozen):
         return 2.0 * self.row_scale / (len(self.coeffs) - 3) if len(self.coeffs) else np.nan
 
     def at(self, image: Array) -> Array:
-        """The displacement (..., 2) [px] of points seen at image points (..., 2) [px]."""
+        """Return the displacement (..., 2) [px] of points seen at image points (..., 2) [px]."""
         out = self._along(image[..., 1], rate=False)
         if len(self.steps):
             out += self.steps[
@@ -137,7 +137,7 @@ class RowSpline(Frozen):
         return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
 
     def rate(self, row: Array) -> Array:
-        """Its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
+        """Return its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
         out = self._along(row, rate=True) / self.row_scale
         for (axis, start, stop, origin, rate), moved in zip(self.strips, self.moved, strict=True):
             if axis == 1.0:

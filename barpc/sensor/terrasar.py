@@ -37,13 +37,13 @@ _GRID_TOLERANCE = 5.0  # px: a grid farther off does not belong to the orbit
 
 
 def find_annotation(folder: Path) -> Path | None:
-    """The annotation in a product folder; None where it is not one."""
+    """Return the annotation in a product folder; None where it is not one."""
     found = sorted(folder.glob(_NAME))
     return found[0] if len(found) == 1 else None
 
 
 def open_terrasar(path: str | Path) -> RangeDoppler:
-    """The model of a TerraSAR-X, TanDEM-X or PAZ image.
+    """Return the model of a TerraSAR-X, TanDEM-X or PAZ image.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ class Timing(Frozen):
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, self.coeffs))
 
     def rate(self, along: Array) -> Array:
-        """Their derivative by the coordinate (2, N)."""
+        """Return their derivative by the coordinate (2, N)."""
         slopes = polynomial.polyder(self.coeffs) / self.scale
         return np.asarray(polynomial.polyval((along - self.offset) / self.scale, slopes))
 
@@ -62,7 +62,7 @@ class Clocked(SensorModel, Protocol):
         ...
 
     def timed(self, timing: Timing) -> Self:
-        """The model with a timing, its coordinate in pixels, in place of its own."""
+        """Return the model with a timing, its coordinate in pixels, in place of its own."""
         ...
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
@@ -74,7 +74,9 @@ class Clocked(SensorModel, Protocol):
 
 
 def is_clocked(sensor: SensorModel) -> TypeGuard[Clocked]:
-    """Whether a model is a radar whose clocks can be corrected: asking the protocol itself costs 70 us a view."""
+    """Return whether a model is a radar whose clocks can be corrected: asking the protocol itself costs 70 us
+    a view.
+    """
     return hasattr(sensor, "timed")
 
 

@@ -27,7 +27,7 @@ def read_linescan(
     aberration: bool | None = None,
     refraction: bool | None = None,
 ) -> Linescan:
-    """The physical model in an XML file.
+    """Return the physical model in an XML file.
 
     Parameters
     ----------

@@ -31,14 +31,14 @@ _STEP = 0.05  # s: at which a polynomial attitude is sampled
 
 
 def light(root: Fields) -> Light:
-    """What the product's settings say that its model allows for: nothing (Pleiades), refraction (Neo)."""
+    """Return what the product's settings say that its model allows for: nothing (Pleiades), refraction (Neo)."""
     stated = "Processing_Information/Product_Settings/Geometric_Settings/{}_SETTING"
     said = (root.element.findtext(stated.format(w), "") for w in ("LIGHT_SPEED", "ATMOSPHERIC_REFRACTION"))
     return Light(*(text.strip().lower() == "true" for text in said))
 
 
 def read(root: Fields, band: str | None = None) -> Linescan:
-    """The model of a DIMAP; RpcFormatError where it is damaged or has none, InputError for no such `band`."""
+    """Return the model of a DIMAP; RpcFormatError where it is damaged or has none, InputError for no such `band`."""
     if root.element.find("Geometric_Data/Refined_Model") is None:
         raise RpcFormatError(
             f"{root.name}: no Geometric_Data/Refined_Model: it holds no physical camera model"

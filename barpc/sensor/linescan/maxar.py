@@ -34,7 +34,7 @@ def light(_root: Fields) -> Light:
 
 
 def read(root: Fields, band: str | None = None) -> Linescan:
-    """The model of an ISD; RpcFormatError where it is damaged, InputError where `band` is none of its bands."""
+    """Return the model of an ISD; RpcFormatError where it is damaged, InputError where `band` is none of its bands."""
     level = root.text("IMD/PRODUCTLEVEL")
     if "1B" not in level.upper():
         raise RpcFormatError(

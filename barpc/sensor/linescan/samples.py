@@ -56,7 +56,8 @@ class Linescan:
 
 
 def build(samples: Samples, detector: Detector, sigma: tuple[float, float] | None = None) -> Linescan:
-    """The camera of some samples; `sigma` are stated standard deviations of attitude [rad] and position [m].
+    """Return the camera of some samples; `sigma` are stated standard deviations of attitude [rad] and
+    position [m].
 
     RpcFormatError for samples that cannot be those of one image.
     """

@@ -75,7 +75,8 @@ def mosaic(
 
 
 def mosaic_offsets(swaths: Sequence[Annotation]) -> Array:
-    """Where the stitched frames of the swaths of one SLC product begin in that of their mosaic: col, row (S, 2) [px].
+    """Return where the stitched frames of the swaths of one SLC product begin in that of their mosaic: col,
+    row (S, 2) [px].
 
     Whole numbers to within 1e-3 in products since 2016. InputError for a GRD, or swaths that are not of one product.
     """
@@ -110,7 +111,7 @@ def open_product(
     atmosphere: bool = False,
     bistatic: Bistatic | None = None,
 ) -> RangeDoppler:
-    """The model of a Sentinel-1 product.
+    """Return the model of a Sentinel-1 product.
 
     Parameters
     ----------

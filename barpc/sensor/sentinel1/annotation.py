@@ -122,7 +122,8 @@ class Annotation:
 
 
 def burst_rows(annotation: Annotation) -> list[BurstRows]:
-    """Where the bursts of a TOPS SLC swath stand in the stitched frame; overlaps are cut at their middle.
+    """Return where the bursts of a TOPS SLC swath stand in the stitched frame; overlaps are cut at their
+    middle.
 
     RpcFormatError for bursts out of order, or one without a valid line.
     """
@@ -183,7 +184,8 @@ def read_annotation(source: bytes | Path, name: str | None = None) -> Annotation
 
 
 def read_orbit_file(path: Path, annotation: Annotation) -> StateVectors:
-    """The state vectors of a precise or restituted orbit file (``S1A_OPER_AUX_POEORB_....EOF``) around an image.
+    """Return the state vectors of a precise or restituted orbit file (``S1A_OPER_AUX_POEORB_....EOF``) around
+    an image.
 
     RpcFormatError where it is no orbit file, another satellite's, or without a vector near that time.
     """

@@ -128,7 +128,9 @@ class Delays:
         return self.atmosphere or self.bistatic is not None or self.timing is not None
 
     def shift(self, times: Array, ground: Array, sight: Array) -> Array:
-        """What is added to times (2, N), of points (N, 3) that see the satellite along unit vectors (3, N) [s]."""
+        """Return what is added to times (2, N), of points (N, 3) that see the satellite along unit vectors
+        (3, N) [s].
+        """
         out = np.zeros_like(times)
         if self.bistatic is not None:
             out[0] = self.bistatic - 0.5 * times[1]
@@ -164,7 +166,7 @@ class Delays:
 
 
 def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
-    """The constant b [s] of the bistatic correction of azimuth time, b - tau/2.
+    """Return the constant b [s] of the bistatic correction of azimuth time, b - tau/2.
 
     The satellite flies on while the pulse is on its way. The processor allows for that at one range, the
     middle of the whole product (IW2, EW3), which shows in its geolocation grid: the time of a grid line

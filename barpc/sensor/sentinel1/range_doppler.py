@@ -114,7 +114,7 @@ class RangeDoppler(Frozen):
         atmosphere: bool = False,
         bistatic: Bistatic | None = None,
     ) -> RangeDoppler:
-        """The model of one SLC swath (bursts stitched, or stripmap), one burst, or a GRD.
+        """Return the model of one SLC swath (bursts stitched, or stripmap), one burst, or a GRD.
 
         Column 0 is the annotation's pixel 0. Row 0 is its line 0; in a stitched swath rows go on by
         zero-Doppler time, and `burst_rows` says where the lines of each burst lie.
@@ -159,13 +159,13 @@ class RangeDoppler(Frozen):
         return float(np.linalg.norm(velocity))
 
     def timed(self, timing: Timing) -> RangeDoppler:
-        """The model with a timing by the row [px] in place of its own."""
+        """Return the model with a timing by the row [px] in place of its own."""
         interval = self.frame.interval
         timing = replace(timing, offset=timing.offset * interval, scale=timing.scale * interval)
         return replace(self, delays=replace(self.delays, timing=timing))
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """As of `barpc.sensor.timing.Clocked`; rows of pure geometry."""
+        """Return as of `barpc.sensor.timing.Clocked`; rows of pure geometry."""
         image, by_ground, by_timing, row = pointwise(
             self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground
         )
@@ -318,7 +318,7 @@ def build(
     atmosphere: bool,
     bistatic: Bistatic | None,
 ) -> RangeDoppler:
-    """The model of swaths side by side, the nearest first; row 0 at `epoch`."""
+    """Return the model of swaths side by side, the nearest first; row 0 at `epoch`."""
     nearest = swaths[0]
     alt = np.concatenate([a.grid.ground[:, 2] for a in swaths])
     states = nearest.states if orbit is None else read_orbit_file(orbit, nearest)

@@ -27,12 +27,12 @@ _SEGMENTS = ((6, 10), (4, 6), (0, 0), (4, 5), (4, 9))
 
 
 def is_sicd(head: bytes) -> bool:
-    """Whether the first bytes of a document begin a SICD, its namespace with a prefix or without."""
+    """Return whether the first bytes of a document begin a SICD, its namespace with a prefix or without."""
     return re.search(rb"<([\w.-]{1,40}:)?SICD[\s>]", head) is not None
 
 
 def find_sicd(path: Path) -> bytes | None:
-    """The SICD document that a file is or, in a NITF, holds; None where there is none.
+    """Return the SICD document that a file is or, in a NITF, holds; None where there is none.
 
     RpcFormatError for a NITF whose header is damaged, InputError for a document that is too large.
     """
@@ -75,7 +75,7 @@ def _digits(file: BinaryIO, count: int) -> int:
 
 
 def open_sicd(path: Path) -> Monostatic:
-    """The model of a SICD image, an XML or a NITF file.
+    """Return the model of a SICD image, an XML or a NITF file.
 
     Row and column 0 are the image's own first, also where it is a part of a larger one.
 

@@ -45,7 +45,7 @@ class Formation(Frozen, ABC):
         self._array("time", (None, None), RpcError)
 
     def at(self, x: Array, y: Array, orbit: Curve) -> Aperture:
-        """The apertures of N pixels at x, y (N,) [m]."""
+        """Return the apertures of N pixels at x, y (N,) [m]."""
         time: Array = np.asarray(polynomial.polyval2d(x, y, self.time), dtype=np.float64)
         position, velocity = orbit(time)
         return Aperture(position, velocity, *self._contour(x, y, time, position, velocity, orbit), time)

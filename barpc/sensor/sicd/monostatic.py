@@ -100,13 +100,13 @@ class Monostatic(Frozen):
         return float(np.linalg.norm(velocity))
 
     def timed(self, timing: Timing) -> Monostatic:
-        """The model with a timing by the column [px] in place of its own."""
+        """Return the model with a timing by the column [px] in place of its own."""
         pixel, zero = self.spacing[1], self.origin[1]
         timing = replace(timing, offset=(timing.offset - zero) * pixel, scale=timing.scale * pixel)
         return replace(self, timing=timing)
 
     def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """As of `barpc.sensor.timing.Clocked`; columns where the points are seen."""
+        """Return as of `barpc.sensor.timing.Clocked`; columns where the points are seen."""
         image, by_ground, by_timing, col = pointwise(
             self._derivatives, CHUNK, [(2,), (2, 3), (2, 2), ()], ground
         )
